@@ -1,0 +1,19 @@
+"""The one way a kernel is compiled: ahead of its first call, cached, without re-ordering of sums.
+
+`fastmath` stays off, so LLVM may not re-associate floating point: the same inputs give the same bits
+on the same platform fingerprint. The sequential code has no parallel sections for the same reason.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar, cast
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+def compiled(function: F) -> F:
+    """Compile `function` with Numba: cached on disk, IEEE order of operations, no Python objects."""
+    return cast(F, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
