@@ -15,5 +15,3 @@ F = TypeVar("F", bound=Callable[..., object])
 def compiled(function: F) -> F:
     """Compile `function` with Numba: cached on disk, IEEE order of operations, no Python objects."""
     return cast(F, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
-
-
