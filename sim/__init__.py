@@ -1,0 +1,1 @@
+"""Worlds and data sets, and above them launch, replay, evaluation and the command line."""

@@ -1,0 +1,1 @@
+"""What the team shares (estimation, wire, recording) and the member itself (robot)."""

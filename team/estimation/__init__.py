@@ -1,0 +1,1 @@
+"""Estimation on arrays: no network, no files, no clock."""

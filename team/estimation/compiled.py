@@ -1,7 +1,7 @@
-"""The one way a kernel is compiled: ahead of its first call, cached, without re-ordering of sums.
+"""The one way a kernel is compiled: ahead of its first call, cached, sums stay in order.
 
-`fastmath` stays off, so LLVM may not re-associate floating point: the same inputs give the same bits
-on the same platform fingerprint. The sequential code has no parallel sections for the same reason.
+`fastmath` stays off, so LLVM may not re-associate floating point: the same inputs give the same
+bits on the same platform fingerprint. There are no parallel sections for the same reason.
 """
 
 from collections.abc import Callable
@@ -13,5 +13,5 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def compiled(function: F) -> F:
-    """Compile `function` with Numba: cached on disk, IEEE order of operations, no Python objects."""
+    """Compile `function` with Numba: cached on disk, IEEE order of operations."""
     return cast(F, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))

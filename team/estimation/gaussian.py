@@ -8,7 +8,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 class NotACovarianceError(ValueError):
-    """A matrix that is used as a covariance is not finite, not symmetric or not positive definite."""
+    """A matrix used as a covariance is not finite, not symmetric or not positive definite."""
 
     def __init__(self, what: str, why: str) -> None:
         super().__init__(f"the covariance of {what} is {why}")

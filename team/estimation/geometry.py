@@ -1,4 +1,4 @@
-"""SE(2): poses are (x [m], y [m], theta [rad]); `a_from_b` maps coordinates of frame b into frame a.
+"""SE(2): poses are (x [m], y [m], theta [rad]); `a_from_b` maps coordinates in b into a.
 
 Perturbations are on the right, in the tangent space of the pose they perturb:
 `pose ∘ Exp(xi)` with xi = (forward [m], left [m], turn [rad]). Every function is compiled, works on

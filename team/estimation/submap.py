@@ -1,4 +1,4 @@
-"""The value that a robot sends: one Gaussian over (end pose, landmarks) in the submap's own frame."""
+"""What a robot sends: one Gaussian over (end pose, landmarks) in the submap's own frame."""
 
 from dataclasses import dataclass
 
