@@ -89,4 +89,4 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     estimator: Estimator = "hybrid"
     fusion: FusionRule = "join"
     exchange_s: Positive = 10.0
-    seed: Annotated[int, Meta(ge=0, lt=2**63)] = 1
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1

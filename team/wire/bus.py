@@ -1,0 +1,191 @@
+"""A bus carries payloads by key. Two implementations: here in memory, and `zenoh_bus`.
+
+A `Sample` is what arrives: the relative key, the payload as it was published, and beside it the
+team time, the publisher's wall clock and its counter of this key. A node never sees a bus: its
+shell takes samples from it, decodes them at the door, and publishes what the node returns.
+"""
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+from team.wire.channels import ALIVE, Channel, channel_of
+from team.wire.codec import WireError, decoded, encoded
+from team.wire.messages import Liveliness, Message
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One publication as it arrived."""
+
+    key: str
+    payload: bytes
+    stamp_ns: int
+    wall_ns: int
+    counter: int
+
+
+class Outgoing(NamedTuple):
+    """A message on its channel, for one robot or node (empty where the key has no name)."""
+
+    channel: Channel
+    name: str
+    message: Message
+
+    @property
+    def key(self) -> str:
+        """The relative key."""
+        return self.channel.key(self.name)
+
+
+class BusError(RuntimeError):
+    """The bus can not do what it was asked: nobody listens, the port is taken, the link is cut."""
+
+
+Answer = Callable[[bytes], Iterable[bytes]]
+"""Answers a query: the request's payload in, the replies' payloads out."""
+
+
+class Bus(Protocol):
+    """What a shell needs of a bus."""
+
+    def publish(self, out: Outgoing) -> None:
+        """Publish; blocks, with a bound, when the receivers do not keep up."""
+
+    def subscribe(self, channel: Channel, name: str = "*") -> None:
+        """From now on `receive` returns what is published there."""
+
+    def receive(self, timeout_s: float) -> list[Sample]:
+        """What has arrived, in order; waits at most `timeout_s` for the first."""
+
+    def answer(self, channel: Channel, name: str, answer: Answer) -> None:
+        """Answer the queries of `channel`."""
+
+    def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
+        """The replies' payloads; empty when nobody answers."""
+
+    def declare_alive(self, node: str) -> None:
+        """Hold a liveliness token until the bus is closed."""
+
+    def watch_alive(self, node: str = "**") -> None:
+        """Receive `Liveliness` samples when tokens appear and go, the present ones first."""
+
+
+def opened(sample: Sample) -> tuple[Channel, str, Message]:
+    """The message of a sample, checked against its key; raises `WireError`.
+
+    A robot's message on another robot's key is refused.
+    """
+    found = channel_of(sample.key)
+    if found is None:
+        raise WireError("wrong tag", f"no channel has the key {sample.key!r}")
+    channel, name = found
+    message = decoded(sample.payload, channel.message)
+    robot = getattr(message, "robot", name)
+    if "{robot}" in channel.template and robot != name:
+        raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
+    return channel, name, message
+
+
+@dataclass
+class MemoryNetwork:
+    """The keys of one process: publications are delivered at once, in order, to every bus on it.
+
+    It keeps what `latest` and `all` channels promise late joiners.
+    """
+
+    buses: list["MemoryBus"] = field(default_factory=list)
+    kept: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
+    answers: dict[str, Answer] = field(default_factory=dict)
+    alive: dict[str, Sample] = field(default_factory=dict)
+    counters: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+
+    def deliver(self, channel: Channel, sample: Sample) -> None:
+        """Hand a sample to every bus that subscribed to it, and keep it for late joiners."""
+        if channel.delivery == "latest":
+            self.kept[sample.key] = [sample]
+        elif channel.delivery == "all":
+            self.kept[sample.key].append(sample)
+        for bus in self.buses:
+            bus.offer(channel, sample)
+
+
+class MemoryBus:
+    """A bus within one process: synchronous and deterministic."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        self._network = network
+        self._arrived: deque[Sample] = deque()
+        self._wanted: list[tuple[str, str]] = []
+        self._tokens: list[str] = []
+        network.buses.append(self)
+
+    def publish(self, out: Outgoing) -> None:
+        """Encode and deliver at once; the wall clock of a memory bus is always zero."""
+        counter = self._network.counters[out.key]
+        self._network.counters[out.key] = counter + 1
+        stamp = out.message.stamp_ns
+        sample = Sample(out.key, encoded(out.message), stamp, 0, counter)
+        self._network.deliver(out.channel, sample)
+
+    def subscribe(self, channel: Channel, name: str = "*") -> None:
+        """Receive this channel, what it keeps for late joiners first."""
+        self._wanted.append((channel.name, name))
+        for samples in list(self._network.kept.values()):
+            for sample in samples:
+                if self._matches(channel, sample.key, name):
+                    self._arrived.append(sample)
+
+    @staticmethod
+    def _matches(channel: Channel, key: str, name: str) -> bool:
+        owner = channel.owner(key)
+        return owner is not None and name in ("*", "**", owner)
+
+    def offer(self, channel: Channel, sample: Sample) -> None:
+        """Take the sample if this bus subscribed to it."""
+        for wanted, name in self._wanted:
+            if wanted == channel.name and self._matches(channel, sample.key, name):
+                self._arrived.append(sample)
+                return
+
+    def receive(self, timeout_s: float = 0.0) -> list[Sample]:
+        """Everything that has arrived; a memory bus never waits."""
+        samples = list(self._arrived)
+        self._arrived.clear()
+        return samples
+
+    def answer(self, channel: Channel, name: str, answer: Answer) -> None:
+        """Answer queries on this key."""
+        self._network.answers[channel.key(name)] = answer
+
+    def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
+        """The answers, at once."""
+        answer = self._network.answers.get(channel.key(name))
+        return [] if answer is None else list(answer(encoded(request)))
+
+    def declare_alive(self, node: str) -> None:
+        """Hold a token."""
+        self._tokens.append(node)
+        self._token(node, alive=True)
+
+    def watch_alive(self, node: str = "**") -> None:
+        """Receive changes of tokens, the present ones first."""
+        self._wanted.append((ALIVE.name, node))
+        self._arrived.extend(self._network.alive.values())
+
+    def _token(self, node: str, *, alive: bool) -> None:
+        sample = Sample(ALIVE.key(node), encoded(Liveliness(0, node, alive)), 0, 0, 0)
+        if alive:
+            self._network.alive[node] = sample
+        else:
+            self._network.alive.pop(node, None)
+        for bus in self._network.buses:
+            bus.offer(ALIVE, sample)
+
+    def close(self) -> None:
+        """Leave the network; the tokens go."""
+        self._network.buses.remove(self)
+        for node in self._tokens:
+            self._token(node, alive=False)
+        self._tokens = []

@@ -1,0 +1,124 @@
+"""The table of channels: the only place where a key is spelt.
+
+Keys are relative to the team; a bus puts `team/<team name>/` before them. `{robot}` stands for a
+robot's name, `{node}` for `world`, `central`, `recorder` or `robot/<name>`.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from team.wire import messages as m
+
+Delivery = Literal["stream", "latest", "all"]
+"""How a message must arrive. Nothing is ever dropped by congestion; beyond that:
+
+stream: what a receiver misses it asks its source for, by the reading counter.
+latest: a late joiner gets the newest one, a cut link recovers what it missed.
+all:    a late joiner and a cut link get every one.
+"""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One row: what travels on a key, how often, how, and what a log does with it."""
+
+    name: str
+    template: str
+    message: type[m.Message]
+    rate: str
+    delivery: Delivery
+    recorded: bool
+    recomputable: bool
+    meaning: str
+
+    def key(self, name: str = "") -> str:
+        """The key for one robot or node."""
+        return self.template.replace("{robot}", name).replace("{node}", name)
+
+    def owner(self, key: str) -> str | None:
+        """The robot or node that `key` belongs to on this channel; None when it is another's."""
+        pattern = re.escape(self.template).replace(r"\{robot\}", "(?P<name>[^/]+)")
+        match = re.fullmatch(pattern.replace(r"\{node\}", "(?P<name>.+)"), key)
+        return None if match is None else match.groupdict().get("name", "")
+
+
+START = Channel("start", "robot/{robot}/start", m.Start, "once per epoch", "all", True, False,
+                "reading 0: the start pose, if known")  # fmt: skip
+ODOMETRY = Channel("odometry", "robot/{robot}/odometry", m.Odometry, "8-100 Hz", "stream", True,
+                   False, "one odometry interval")  # fmt: skip
+OBSERVATIONS = Channel("observations", "robot/{robot}/observations", m.Observations, "1-30 Hz",
+                       "stream", True, False, "landmarks seen")  # fmt: skip
+SIGHTINGS = Channel("sightings", "robot/{robot}/sightings", m.Sightings, "0-10 Hz", "stream", True,
+                    False, "teammates seen")  # fmt: skip
+SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)
+
+TRUTH = Channel("truth", "truth/{robot}", m.Truth, "1 Hz, batched", "all", True, False,
+                "true poses; the evaluator's only")  # fmt: skip
+TRUTH_LANDMARKS = Channel("truth_landmarks", "truth_landmarks", m.TruthLandmarks, "once", "latest",
+                          True, False, "true landmarks; the evaluator's only")  # fmt: skip
+
+ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configured, "once per epoch",
+                       "latest", True, False, "the robot's configuration")  # fmt: skip
+SUBMAP = Channel("submap", "robot/{robot}/submap", m.Submap, "one per window", "all", True, True,
+                 "what the rule `join` consumes")  # fmt: skip
+OWN_MAP = Channel("own_map", "robot/{robot}/own/map", m.MapEstimate, "one per window or exchange",
+                  "latest", True, True,
+                  "running landmark means and covariances; consumed by rules with feedback")  # fmt: skip
+OWN_POSE = Channel("own_pose", "robot/{robot}/own/pose", m.PoseEstimate, "one per epoch", "latest",
+                   True, True, "running pose from own readings alone")  # fmt: skip
+TEAM_POSE = Channel("team_pose", "robot/{robot}/team/pose", m.PoseEstimate, "one per epoch",
+                    "latest", True, True, "pose given the fused map; never an input of fusion")  # fmt: skip
+PARTICLES = Channel("particles", "robot/{robot}/particles", m.ParticleCloud, "one per window",
+                    "latest", True, True, "thinned cloud, for viewers")  # fmt: skip
+ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 readings",
+                         "latest", True, False, "credit for the world")  # fmt: skip
+ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per epoch", "latest", True,
+                     True, "all readings consumed, last submap sent")  # fmt: skip
+
+CENTRAL_CONFIG = Channel("central_config", "central/config", m.Configured, "once", "latest", True,
+                         False, "the centre's configuration")  # fmt: skip
+FUSED_MAP = Channel("fused_map", "central/map", m.FusedMap, "one per broadcast", "latest", True,
+                    True, "the team's map")  # fmt: skip
+PRIOR = Channel("prior", "central/prior/{robot}", m.Prior, "one per broadcast", "latest", True,
+                True, "the joint marginal that a robot needs")  # fmt: skip
+FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
+                    "the team's map with its joint covariance")  # fmt: skip
+TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per epoch",
+                     "all", True, True, "smoothed end poses of the submaps")  # fmt: skip
+CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress,
+                           "one per submap", "latest", True, False, "credit for the robots")  # fmt: skip
+
+WORLD_CONFIG = Channel("world_config", "world/config", m.Configured, "once", "latest", True, False,
+                       "the scenario")  # fmt: skip
+END = Channel("end", "world/end", m.End, "once", "latest", True, False,
+              "everything is published; the last counters")  # fmt: skip
+RECORDER_PROGRESS = Channel("recorder_progress", "recorder/progress/{robot}", m.Progress,
+                            "every 256 readings", "latest", False, False,
+                            "credit for the world")  # fmt: skip
+STATUS = Channel("status", "{node}/status", m.Status, "1 Hz", "latest", True, False,
+                 "what a node is doing, for people")  # fmt: skip
+ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", True, False,
+                "liveliness token; its changes are logged as messages")  # fmt: skip
+
+READINGS = Channel("readings", "world/readings/{robot}", m.ReadingsWanted, "query", "stream", False,
+                   False, "a query; the replies are the readings")  # fmt: skip
+SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "stream", False, False,
+                  "a query; the replies are the submaps in the centre's set")  # fmt: skip
+
+CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
+QUERIES = (READINGS, SUBMAPS)
+EVERYTHING = "**"
+
+
+def robot_node(robot: str) -> str:
+    """The node name of a robot, as liveliness tokens and status carry it."""
+    return f"robot/{robot}"
+
+
+def channel_of(key: str) -> tuple[Channel, str] | None:
+    """The channel that a relative key belongs to, and the robot or node in it."""
+    for channel in CHANNELS:
+        if channel not in QUERIES and (name := channel.owner(key)) is not None:
+            return channel, name
+    return None

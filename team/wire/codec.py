@@ -1,0 +1,98 @@
+"""Bytes to messages and back: one door, through which only sound messages come in."""
+
+from typing import TypeVar, cast
+
+import msgpack
+import msgspec
+
+from team.wire.messages import BY_TAG, Message
+
+M = TypeVar("M", bound=Message)
+
+LARGEST_PAYLOAD = 64 * 2**20
+"""Bytes; a joint covariance of 4096 rows takes as much."""
+_LARGEST_ARRAY = 100_000
+_LARGEST_MAP = 1_000
+_LARGEST_TEXT = 100_000
+
+
+class WireError(ValueError):
+    """Bytes that are no sound message; `reason` is one of the words below, `detail` a sentence.
+
+    Reasons: "wrong tag", "wrong version", "truncated", "trailing bytes", "wrong length",
+    "not finite", "not symmetric", "not positive definite", "not ascending", "out of bounds",
+    "too large", "too deep", "damaged", "wrong field".
+    """
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(f"{reason}: {detail}")
+        self.reason = reason
+        self.detail = detail
+
+
+def encoded(message: Message) -> bytes:
+    """The message's payload bytes: a MessagePack array [tag, field, …]."""
+    fields = msgspec.to_builtins(message, builtin_types=(bytes,))
+    return cast(bytes, msgpack.packb(fields, use_bin_type=True))
+
+
+def decoded(payload: bytes, expected: type[M] | None = None) -> M:
+    """The message in `payload`, checked field by field; raises `WireError`.
+
+    `expected` is the class that the channel carries; without it any known message is accepted.
+    """
+    fields = _unpacked(payload)
+    kind = _kind(fields, expected)
+    try:
+        message = msgspec.convert(fields, type=kind, builtin_types=(bytes,), strict=True)
+    except msgspec.ValidationError as error:
+        raise WireError("wrong field", f"{kind.__name__}: {error}") from None
+    try:
+        message.check()
+    except ValueError as error:
+        reason, _, detail = str(error).partition(": ")
+        raise WireError(reason, f"{kind.__name__}.{detail}") from None
+    return cast(M, message)
+
+
+def _unpacked(payload: bytes) -> object:
+    if len(payload) > LARGEST_PAYLOAD:
+        raise WireError("too large", f"{len(payload)} bytes, {LARGEST_PAYLOAD} at most")
+    try:
+        return msgpack.unpackb(
+            payload,
+            max_str_len=_LARGEST_TEXT,
+            max_bin_len=LARGEST_PAYLOAD,
+            max_array_len=_LARGEST_ARRAY,
+            max_map_len=_LARGEST_MAP,
+            max_ext_len=0,
+        )
+    except msgpack.ExtraData:
+        raise WireError("trailing bytes", "the message ends before its payload does") from None
+    except (msgpack.StackError, RecursionError):
+        raise WireError("too deep", "nested beyond any message's structure") from None
+    except msgpack.FormatError:
+        raise WireError("damaged", "not MessagePack") from None
+    except UnicodeDecodeError:
+        raise WireError("damaged", "a text is not UTF-8") from None
+    except ValueError as error:
+        if "incomplete" in str(error):
+            raise WireError("truncated", "the payload ends inside the message") from None
+        if "exceeds" in str(error):
+            raise WireError("too large", str(error)) from None
+        raise WireError("damaged", str(error)) from None
+
+
+def _kind(fields: object, expected: type[Message] | None) -> type[Message]:
+    if not (isinstance(fields, list) and fields and isinstance(fields[0], str)):
+        raise WireError("wrong tag", "a message is an array that begins with its tag")
+    tag = fields[0]
+    kind = BY_TAG.get(tag)
+    if kind is not None and (expected is None or kind is expected):
+        return kind
+    wanted = "" if expected is None else str(expected.__struct_config__.tag)
+    name = tag[:60].partition("/")[0]
+    known = [wanted] if wanted else [t for t in BY_TAG if t.startswith(f"{name}/")]
+    if any(t.partition("/")[0] == name for t in known):
+        raise WireError("wrong version", f"{tag[:60]!r} where {', '.join(known)} is understood")
+    raise WireError("wrong tag", f"{tag[:60]!r}" + (f" where {wanted!r} belongs" if wanted else ""))

@@ -1,0 +1,406 @@
+"""The messages: frozen, versioned, positional.
+
+On the wire a message is a MessagePack array `[tag, field, field, …]` in the order below; `tag` is
+"name/version". A later version of the program may append fields (with defaults) without a new
+version; readers ignore what follows the fields that they know. A new meaning, unit or frame is a
+new version. Arrays travel as `bin`: little-endian, C order, of the type that the field's name in
+`Floats`, `Ids` or `Stamps` says. SI units, radians, bearings in (−π, π].
+
+Every message has `stamp_ns`, its team time: the time of the reading that it is about.
+`check` raises `ValueError` with the reason when the numbers can not be what the message says.
+"""
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from team.wire.arrays import (
+    Floats,
+    Ids,
+    Stamps,
+    check_angles,
+    check_ascending,
+    check_covariance,
+    check_finite,
+    check_packed_covariance,
+    floats,
+    ids,
+    stamps,
+)
+
+Name = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
+Text = Annotated[str, Meta(max_length=20_000)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+StampNs = Annotated[int, Meta(ge=-(2**62), lt=2**62)]
+Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
+Real = Annotated[float, Meta(ge=-1e300, le=1e300)]
+"""A finite number: the bounds reject NaN and the infinities."""
+
+
+class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """What every message has: the team time that it is about."""
+
+    stamp_ns: StampNs
+
+    def check(self) -> None:
+        """Raise ValueError where the arrays do not fit together; nothing to check here."""
+
+
+class Reading(Message, frozen=True, array_like=True, gc=False):
+    """What every reading of a sensor stream has: robot, epoch and the robot's reading counter."""
+
+    robot: Name
+    epoch: Count
+    reading: Count
+
+
+class Start(Reading, frozen=True, array_like=True, gc=False, tag="start/1"):
+    """Reading 0 of an epoch: the start pose in the team's frame, if it is known.
+
+    pose: 3 floats (x, y, theta), or empty when unknown. covariance: 3 × 3 floats, row by row; empty
+    for a pose that is exactly known.
+    """
+
+    pose: Floats
+    covariance: Floats
+
+    def check(self) -> None:  # noqa: D102 - the base class says what a check is
+        if len(floats(self.pose, "pose")) not in (0, 3):
+            raise ValueError("wrong length: pose has neither 0 nor 3 numbers")
+        check_finite(self.pose, "pose")
+        if self.covariance:
+            check_covariance(self.covariance, 3, "covariance")
+
+
+class Odometry(Reading, frozen=True, array_like=True, gc=False, tag="odometry/1"):
+    """One odometry interval that ends at stamp_ns: mean forward speed and yaw rate over it."""
+
+    duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
+    forward: Real
+    yaw_rate: Real
+
+
+class Observations(Reading, frozen=True, array_like=True, gc=False, tag="observations/1"):
+    """Range [m] and bearing [rad] of landmarks with known identities, seen at stamp_ns."""
+
+    ids: Ids
+    ranges: Floats
+    bearings: Floats
+
+    def check(self) -> None:  # noqa: D102
+        n = len(ids(self.ids, "ids"))
+        check_finite(self.ranges, "ranges", n)
+        if n and floats(self.ranges, "ranges").min() < 0.0:
+            raise ValueError("out of bounds: a range is negative")
+        check_angles(self.bearings, "bearings", n)
+
+
+class Sightings(Reading, frozen=True, array_like=True, gc=False, tag="sightings/1"):
+    """Range [m] and bearing [rad] of teammates, seen at stamp_ns."""
+
+    teammates: tuple[Name, ...]
+    ranges: Floats
+    bearings: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.ranges, "ranges", len(self.teammates))
+        if self.teammates and floats(self.ranges, "ranges").min() < 0.0:
+            raise ValueError("out of bounds: a range is negative")
+        check_angles(self.bearings, "bearings", len(self.teammates))
+
+
+class Truth(Message, frozen=True, array_like=True, gc=False, tag="truth/1"):
+    """True poses of a robot, for the evaluator only: T stamps and T × 3 floats (x, y, theta)."""
+
+    robot: Name
+    stamps: Stamps
+    poses: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.poses, "poses", 3 * len(stamps(self.stamps, "stamps")))
+
+
+class TruthLandmarks(Message, frozen=True, array_like=True, gc=False, tag="truth_landmarks/1"):
+    """True landmark positions, for the evaluator only: L ids and L × 2 floats."""
+
+    ids: Ids
+    positions: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_ascending(self.ids, "ids")
+        check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
+
+
+class Configured(Message, frozen=True, array_like=True, gc=False, tag="configured/1"):
+    """A node's configuration (JSON), announced once; `digest` is its 8-byte name elsewhere."""
+
+    node: Text
+    epoch: Count
+    digest: Digest
+    configuration: Text
+
+
+class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
+    """One window's Gaussian, the only input of the rule `join`; stamp_ns is its end pose's stamp.
+
+    It names its inputs: the readings first_reading … last_reading of (robot, epoch), and the
+    configuration by digest (the seed is in it). ids: L, ascending. mean: 3 + 2L floats (end pose,
+    landmarks) in the frame of the start pose. covariance: packed upper triangle, row by row.
+    """
+
+    robot: Name
+    epoch: Count
+    sequence: Count
+    first_reading: Count
+    last_reading: Count
+    start_ns: StampNs
+    config: Digest
+    ids: Ids
+    mean: Floats
+    covariance: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_ascending(self.ids, "ids")
+        n = 3 + 2 * len(ids(self.ids, "ids"))
+        check_finite(self.mean, "mean", n)
+        check_packed_covariance(self.covariance, n, "covariance")
+        if self.last_reading < self.first_reading or self.stamp_ns < self.start_ns:
+            raise ValueError("out of bounds: the interval of readings or of time is empty")
+
+
+class MapEstimate(Message, frozen=True, array_like=True, gc=False, tag="map/1"):
+    """A robot's own running map in the team's frame: landmark means and covariances.
+
+    exchange: counts the maps that a rule with feedback exchanged (lockstep), 0 under `join`.
+    means: L × 2 floats. covariance: packed upper triangle of the 2L × 2L joint if `joint`, else the
+    L packed 2 × 2 blocks (3 floats each).
+    """
+
+    robot: Name
+    epoch: Count
+    sequence: Count
+    exchange: Count
+    joint: bool
+    ids: Ids
+    means: Floats
+    covariance: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
+
+
+class PoseEstimate(Message, frozen=True, array_like=True, gc=False, tag="pose/1"):
+    """A robot's pose in the team's frame at stamp_ns, with its 3 × 3 covariance.
+
+    `map_digest` names the fused map that went into it (8 zero bytes: none), `sequence` the submap
+    in progress.
+    """
+
+    robot: Name
+    epoch: Count
+    sequence: Count
+    map_digest: Digest
+    pose: Floats
+    covariance: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.pose, "pose", 3)
+        check_covariance(self.covariance, 3, "covariance")
+
+
+class ParticleCloud(Message, frozen=True, array_like=True, gc=False, tag="particles/1"):
+    """A thinned particle cloud in the team's frame, for viewers: P × 3 poses and P weights."""
+
+    robot: Name
+    poses: Floats
+    weights: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.poses, "poses", 3 * len(floats(self.weights, "weights")))
+        check_finite(self.weights, "weights")
+
+
+class Member(msgspec.Struct, frozen=True, array_like=True):
+    """One entry of a version vector: all submaps of (robot, epoch) up to `sequence` are in."""
+
+    robot: Name
+    epoch: Count
+    sequence: int
+
+
+class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1"):
+    """The team's map: landmark means and covariances, its set and its frame.
+
+    members: the version vector of its set, ordered; missing: submaps known to be in a gap of it, as
+    (robot, epoch, sequence). digest: 8-byte name of the set (and of the rule and its settings).
+    frame: "robot/epoch" whose start fixes it. provisional: some members lie ahead of the watermark.
+    covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 where the rule has none.
+    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined.
+    """
+
+    rule: Text
+    digest: Digest
+    frame: Text
+    final: bool
+    provisional: bool
+    exchange: Count
+    members: tuple[Member, ...]
+    missing: tuple[Member, ...]
+    joint: bool
+    ids: Ids
+    means: Floats
+    covariance: Floats
+    chi2: Annotated[float, Meta(ge=0.0, le=1e300)]
+    dof: int
+    reasons: tuple[Text, ...] = ()
+
+    def check(self) -> None:  # noqa: D102
+        check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
+
+
+class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
+    """For one robot: the joint marginal of its last fused end pose and the landmarks.
+
+    The set is named by digest; `sequence` is the robot's last submap in it (−1: none; the pose is
+    the start pose). mean: 3 + 2L floats; covariance: packed upper triangle.
+    """
+
+    robot: Name
+    epoch: Count
+    sequence: int
+    digest: Digest
+    ids: Ids
+    mean: Floats
+    covariance: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_ascending(self.ids, "ids")
+        n = 3 + 2 * len(ids(self.ids, "ids"))
+        check_finite(self.mean, "mean", n)
+        check_packed_covariance(self.covariance, n, "covariance")
+
+
+class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajectory/1"):
+    """A robot's smoothed submap end poses in the final map: K stamps, K × 3 poses, K × 9 floats."""
+
+    robot: Name
+    epoch: Count
+    digest: Digest
+    stamps: Stamps
+    poses: Floats
+    covariances: Floats
+
+    def check(self) -> None:  # noqa: D102
+        k = len(stamps(self.stamps, "stamps"))
+        check_finite(self.poses, "poses", 3 * k)
+        check_finite(self.covariances, "covariances", 9 * k)
+        for i in range(k):
+            check_covariance(self.covariances[72 * i : 72 * (i + 1)], 3, "covariances")
+
+
+class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"):
+    """How far a node is: per (robot, epoch) the count of readings consumed and of submaps sent.
+
+    A robot reports itself; the centre reports submaps that are in its set; the recorder reports
+    readings that it has taken.
+    """
+
+    node: Text
+    robot: Name
+    epoch: Count
+    readings: Count
+    submaps: Count
+
+
+class Disposed(msgspec.Struct, frozen=True, array_like=True):
+    """How many readings of a robot ended in one way: in a submap, rejected for a reason, lost…"""
+
+    disposition: Text
+    readings: Count
+
+
+class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
+    """A robot has consumed every reading of its stream and sent its last submap."""
+
+    robot: Name
+    epoch: Count
+    readings: Count
+    steps: Count
+    submaps: Count
+    ledger: tuple[Disposed, ...]
+
+
+class StreamEnd(msgspec.Struct, frozen=True, array_like=True):
+    """The last counters of one robot's stream: its readings are numbered 0 … readings − 1."""
+
+    robot: Name
+    epoch: Count
+    readings: Count
+
+
+class End(Message, frozen=True, array_like=True, gc=False, tag="end/1"):
+    """The world has published everything; its last counters."""
+
+    streams: tuple[StreamEnd, ...]
+    notes: tuple[Text, ...] = ()
+
+
+class Status(Message, frozen=True, array_like=True, gc=False, tag="status/1"):
+    """What a node is doing, for people: a state word, figures by name, warnings in words."""
+
+    node: Text
+    state: Text
+    figures: dict[str, float]
+    warnings: tuple[Text, ...] = ()
+
+
+class Liveliness(Message, frozen=True, array_like=True, gc=False, tag="liveliness/1"):
+    """A node's liveliness token appeared or went; a recorded input of whoever reacted to it."""
+
+    node: Text
+    alive: bool
+
+
+class ReadingsWanted(Message, frozen=True, array_like=True, gc=False, tag="readings_wanted/1"):
+    """A query to a source: readings first … last of (robot, epoch); last −1: all there are."""
+
+    robot: Name
+    epoch: Count
+    first: Count
+    last: int
+
+
+class SubmapsWanted(Message, frozen=True, array_like=True, gc=False, tag="submaps_wanted/1"):
+    """A query to the centre: the submaps of one robot that are in its set."""
+
+    robot: Name
+
+
+def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: bool) -> None:
+    """Raise ValueError unless ids ascend and means and covariance fit them (joint or blocks)."""
+    check_ascending(id_bytes, "ids")
+    n = len(ids(id_bytes, "ids"))
+    check_finite(means, "means", 2 * n)
+    if joint:
+        check_packed_covariance(covariance, 2 * n, "covariance")
+        return
+    check_finite(covariance, "covariance", 3 * n)
+    a, b, c = floats(covariance, "covariance").reshape(n, 3).T
+    if not np.all((a > 0.0) & (c > 0.0) & (a * c - b * b > 0.0)):
+        raise ValueError("not positive definite: covariance")
+
+
+def _by_tag(base: type[Message]) -> dict[str, type[Message]]:
+    found: dict[str, type[Message]] = {}
+    for message in base.__subclasses__():
+        tag = message.__struct_config__.tag
+        if isinstance(tag, str):
+            found[tag] = message
+        found |= _by_tag(message)
+    return found
+
+
+BY_TAG = _by_tag(Message)
+"""Every message class by its tag."""
