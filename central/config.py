@@ -11,14 +11,14 @@ from team.robot.config import FusionRule, Positive
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The rule and its figures.
 
-    fusion: `join` keeps a set of submaps and joins them by least squares; the other three fuse whole
-    maps that the robots absorb again (feedback: their covariance counts readings more than once,
-    save `covariance-intersection`).
+    fusion: `join` keeps a set of submaps and joins them by least squares; the other three fuse
+    whole maps that the robots absorb again (feedback: their covariance counts readings more than
+    once, save `covariance-intersection`).
     tick_s: the fold takes the submaps of this much team time at once.
     broadcast_s: at least this much team time lies between two broadcasts of the fused map.
-    robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap; absent: plain least squares.
-    covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors are
-    independent from reading to reading.
+    robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap; absent: plain squares.
+    covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors
+    are independent from reading to reading.
     """
 
     fusion: FusionRule = "join"

@@ -70,13 +70,12 @@ def transformed(a_from_b: Pose, point_in_b: Point) -> Point:
 
 
 @compiled
-def exponential(xi: Pose) -> Pose:
-    """Exp: R³ → SE(2), the motion at constant twist xi = (forward, left, turn) for unit time.
+def swept(forward: float, left: float, turn: float) -> tuple[float, float]:
+    """V(turn)·(forward, left): where a constant twist leads in unit time, without an allocation.
 
-    Exp(xi) = (V(θ)·(xi₀, xi₁), θ) with V = [[sin θ/θ, −(1−cos θ)/θ], [(1−cos θ)/θ, sin θ/θ]]; near
-    θ = 0 the two quotients are taken from their series, so the limit is exact and smooth.
+    V(θ) = [[sin θ/θ, −(1−cos θ)/θ], [(1−cos θ)/θ, sin θ/θ]]; near θ = 0 the two quotients are taken
+    from their series, so the limit is exact and smooth.
     """
-    turn = xi[2]
     if abs(turn) < 1e-4:
         square = turn * turn
         a = 1.0 - square / 6.0
@@ -84,7 +83,17 @@ def exponential(xi: Pose) -> Pose:
     else:
         a = math.sin(turn) / turn
         b = (1.0 - math.cos(turn)) / turn
-    return np.array([a * xi[0] - b * xi[1], b * xi[0] + a * xi[1], wrapped(turn)])
+    return a * forward - b * left, b * forward + a * left
+
+
+@compiled
+def exponential(xi: Pose) -> Pose:
+    """Exp: R³ → SE(2), the motion at constant twist xi = (forward, left, turn) for unit time.
+
+    Exp(xi) = (V(θ)·(xi₀, xi₁), θ) with V of `swept`.
+    """
+    x, y = swept(xi[0], xi[1], xi[2])
+    return np.array([x, y, wrapped(xi[2])])
 
 
 @compiled
