@@ -1,0 +1,158 @@
+"""A fill-reducing order of elimination for a block-sparse symmetric matrix: minimum degree.
+
+The graph has a vertex per block variable (a pose: 3 unknowns, a landmark: 2) and an edge per
+non-zero block. Eliminating a vertex ties its neighbours to each other; the vertex that is
+eliminated next is the one whose neighbours hold the fewest unknowns, the smallest index among
+equals (George & Liu 1989, without its approximations). The neighbours at that moment are the
+structure of the vertex's column in the Cholesky factor, so the order comes with the symbolic
+factorisation.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int64
+
+from team.estimation.compiled import compiled
+
+Indices = Int64[np.ndarray, " _"]
+
+
+class Elimination(NamedTuple):
+    """The order and what it leaves; arrays indexed by step of elimination.
+
+    order:     block eliminated at each step.
+    parent:    step at which the first of its column's rows is eliminated; −1 at a root.
+    start:     column of step k has the rows `structure[start[k] : start[k + 1]]`.
+    structure: steps at which those rows are eliminated, ascending; without the diagonal.
+    """
+
+    order: Indices
+    parent: Indices
+    start: Indices
+    structure: Indices
+
+
+def minimum_degree(sizes: Indices, column_start: Indices, rows: Indices) -> Elimination:
+    """Eliminate by minimum degree, then renumber in postorder (a subtree is contiguous).
+
+    sizes: unknowns per block; blocks (rows[k], j) with column_start[j] ≤ k < column_start[j + 1]
+    are the non-zero blocks of the lower triangle, diagonal included or not.
+    """
+    order, start, structure = _eliminated(sizes, column_start, rows)
+    return Elimination(*_postordered(order, start, structure))
+
+
+@compiled
+def _eliminated(
+    sizes: Indices, column_start: Indices, rows: Indices
+) -> tuple[Indices, Indices, Indices]:
+    n = len(sizes)
+    one = np.uint64(1)
+    words = (n + 63) // 64
+    adjacent = np.zeros((n, words), dtype=np.uint64)
+    degree = np.zeros(n, dtype=np.int64)
+    for j in range(n):
+        for k in range(column_start[j], column_start[j + 1]):
+            i = rows[k]
+            if i != j and not adjacent[i, j >> 6] & (one << np.uint64(j & 63)):
+                adjacent[i, j >> 6] |= one << np.uint64(j & 63)
+                adjacent[j, i >> 6] |= one << np.uint64(i & 63)
+                degree[i] += sizes[j]
+                degree[j] += sizes[i]
+    order = np.empty(n, dtype=np.int64)
+    start = np.zeros(n + 1, dtype=np.int64)
+    structure = np.empty(max(8 * n, 1), dtype=np.int64)
+    eliminated = np.zeros(n, dtype=np.bool_)
+    for step in range(n):
+        v = -1
+        for i in range(n):
+            if not eliminated[i] and (v < 0 or degree[i] < degree[v]):
+                v = i
+        eliminated[v] = True
+        order[step] = v
+        begin = start[step]
+        end = begin
+        if begin + n > len(structure):
+            grown = np.empty(2 * len(structure) + n, dtype=np.int64)
+            grown[:begin] = structure[:begin]
+            structure = grown
+        for word in range(words):
+            bits = adjacent[v, word]
+            i = word << 6
+            while bits:
+                if bits & one:
+                    structure[end] = i
+                    end += 1
+                bits >>= one
+                i += 1
+        start[step + 1] = end
+        for a in range(begin, end):
+            i = structure[a]
+            adjacent[i, v >> 6] &= ~(one << np.uint64(v & 63))
+            degree[i] -= sizes[v]
+            for b in range(begin, a):
+                j = structure[b]
+                if not adjacent[i, j >> 6] & (one << np.uint64(j & 63)):
+                    adjacent[i, j >> 6] |= one << np.uint64(j & 63)
+                    adjacent[j, i >> 6] |= one << np.uint64(i & 63)
+                    degree[i] += sizes[j]
+                    degree[j] += sizes[i]
+    return order, start, structure[: start[n]].copy()
+
+
+@compiled
+def _postordered(
+    order: Indices, start: Indices, structure: Indices
+) -> tuple[Indices, Indices, Indices, Indices]:
+    n = len(order)
+    step_of = np.empty(n, dtype=np.int64)
+    for step in range(n):
+        step_of[order[step]] = step
+    parent = np.full(n, -1, dtype=np.int64)
+    for step in range(n):
+        for k in range(start[step], start[step + 1]):
+            row = step_of[structure[k]]
+            if parent[step] < 0 or row < parent[step]:
+                parent[step] = row
+    child = np.full(n + 1, -1, dtype=np.int64)
+    sibling = np.full(n, -1, dtype=np.int64)
+    for step in range(n - 1, -1, -1):
+        above = parent[step] if parent[step] >= 0 else n
+        sibling[step] = child[above]
+        child[above] = step
+    old_of_new = np.empty(n, dtype=np.int64)
+    new_of_old = np.full(n, -1, dtype=np.int64)
+    visited = 0
+    root = child[n]
+    while root >= 0:
+        step = root
+        while True:
+            while child[step] >= 0:
+                down = child[step]
+                child[step] = -1
+                step = down
+            old_of_new[visited] = step
+            new_of_old[step] = visited
+            visited += 1
+            if step == root:
+                break
+            step = sibling[step] if sibling[step] >= 0 else parent[step]
+        root = sibling[root]
+    new_order = np.empty(n, dtype=np.int64)
+    new_parent = np.full(n, -1, dtype=np.int64)
+    new_start = np.zeros(n + 1, dtype=np.int64)
+    new_structure = np.empty_like(structure)
+    for new in range(n):
+        old = old_of_new[new]
+        new_order[new] = order[old]
+        if parent[old] >= 0:
+            new_parent[new] = new_of_old[parent[old]]
+        begin = new_start[new]
+        end = begin
+        for k in range(start[old], start[old + 1]):
+            new_structure[end] = new_of_old[step_of[structure[k]]]
+            end += 1
+        new_structure[begin:end] = np.sort(new_structure[begin:end])
+        new_start[new + 1] = end
+    return new_order, new_parent, new_start, new_structure

@@ -1,0 +1,163 @@
+"""Sparse symmetric positive definite systems of small blocks: A = L Lᵀ, solutions, inverse entries.
+
+Analysis (order, structure) is apart from the numbers and serves as long as the pattern stays. The
+factor is stored by supernodes: neighbouring columns with (nearly) the same rows share one dense
+panel (Davis 2006, "Direct Methods for Sparse Linear Systems", chapters 4 and 6). All sums run in a
+fixed order.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation import sparse_kernel
+from team.estimation.ordering import minimum_degree
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+COLUMNS_AT_ONCE = 64
+
+
+class NotPositiveDefiniteError(ValueError):
+    """A pivot of the factorisation is not positive: `variable` (a block) is not determined."""
+
+    def __init__(self, variable: int) -> None:
+        super().__init__(f"the matrix is not positive definite: pivot of variable {variable}")
+        self.variable = variable
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Which blocks of the lower triangle of a symmetric matrix are stored, and where.
+
+    sizes: unknowns of each block variable. Entry e with column_start[j] ≤ e < column_start[j + 1]
+    is block (rows[e], j), rows[e] ≥ j; the first entry of each column is its diagonal block. The
+    numbers of a matrix are one flat array: block e row-major from value_start[e] on, diagonal
+    blocks as full squares.
+    """
+
+    sizes: Indices
+    column_start: Indices
+    rows: Indices
+
+    def __post_init__(self) -> None:
+        if not np.array_equal(self.rows[self.column_start[:-1]], np.arange(len(self.sizes))):
+            raise ValueError("each column of a pattern begins with its diagonal block")
+
+    @cached_property
+    def columns(self) -> Indices:
+        """Column of each entry."""
+        return np.repeat(np.arange(len(self.sizes)), np.diff(self.column_start))
+
+    @cached_property
+    def value_start(self) -> Indices:
+        """Where each entry's block begins; the last number is their total length."""
+        areas = self.sizes[self.rows] * self.sizes[self.columns]
+        return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(areas)])
+
+    @cached_property
+    def offset(self) -> Indices:
+        """First unknown of each variable; the last number is the number of unknowns."""
+        return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(self.sizes)])
+
+    def diagonal_block(self, values: Values, variable: int) -> Float[np.ndarray, "k k"]:
+        """Block (variable, variable) of a matrix on this pattern."""
+        size = int(self.sizes[variable])
+        begin = int(self.value_start[self.column_start[variable]])
+        return values[begin : begin + size * size].reshape(size, size)
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """Where each number of a pattern lands in the panels of L; numbers of unknowns are permuted.
+
+    permutation: place in the elimination of each unknown. Supernode s has the columns
+    columns_of[s] … columns_of[s + 1] − 1 and the rows row[row_start[s] : row_start[s + 1]], its own
+    columns first; its panel lies column-major from panel_start[s] on. target: place in the panels
+    of each number of the pattern (the mirrored one for the upper half of a diagonal block).
+    """
+
+    pattern: Pattern
+    permutation: Indices
+    columns_of: Indices
+    row_start: Indices
+    row: Indices
+    panel_start: Indices
+    supernode_of: Indices
+    target: Indices
+
+    @property
+    def structure(self) -> sparse_kernel.Structure:
+        """The arrays that the kernels walk."""
+        return (self.columns_of, self.row_start, self.row, self.panel_start, self.supernode_of)
+
+
+@dataclass(frozen=True, eq=False)
+class Cholesky:
+    """The panels of L with L Lᵀ = A (permuted)."""
+
+    analysis: Analysis
+    panels: Values
+
+
+def analysed(pattern: Pattern) -> Analysis:
+    """Order, symbolic factorisation and supernodes of a pattern."""
+    elimination = minimum_degree(pattern.sizes, pattern.column_start, pattern.rows)
+    permutation, columns_of, row_start, row, panel_start, supernode_of = sparse_kernel.supernodes(
+        pattern.sizes, pattern.offset, *elimination
+    )
+    target = sparse_kernel.targets(
+        pattern.sizes,
+        pattern.offset,
+        pattern.columns,
+        pattern.rows,
+        pattern.value_start,
+        permutation,
+        (columns_of, row_start, row, panel_start, supernode_of),
+    )
+    return Analysis(
+        pattern, permutation, columns_of, row_start, row, panel_start, supernode_of, target
+    )
+
+
+def factorised(analysis: Analysis, values: Values) -> Cholesky:
+    """L with L Lᵀ = A. Raises NotPositiveDefiniteError that names the pivot's variable."""
+    panels, failed = sparse_kernel.factorise(analysis.structure, analysis.target, values)
+    if failed >= 0:
+        unknown = int(np.flatnonzero(analysis.permutation == failed)[0])
+        offset = analysis.pattern.offset
+        raise NotPositiveDefiniteError(int(np.searchsorted(offset, unknown, side="right")) - 1)
+    return Cholesky(analysis, panels)
+
+
+def solved(cholesky: Cholesky, right: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """X with A X = right."""
+    permutation = cholesky.analysis.permutation
+    permuted = np.empty_like(right)
+    permuted[permutation] = right
+    sparse_kernel.solve_in_place(cholesky.analysis.structure, cholesky.panels, permuted)
+    return permuted[permutation]
+
+
+def inverse_columns(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "n k"]:
+    """The columns of A⁻¹ that belong to `unknowns`: their covariance with everything."""
+    total = len(cholesky.analysis.permutation)
+    columns = np.empty((total, len(unknowns)))
+    for begin in range(0, len(unknowns), COLUMNS_AT_ONCE):
+        chosen = unknowns[begin : begin + COLUMNS_AT_ONCE]
+        unit = np.zeros((total, len(chosen)))
+        unit[chosen, np.arange(len(chosen))] = 1.0
+        columns[:, begin : begin + len(chosen)] = solved(cholesky, unit)
+    return columns
+
+
+def selected_inverse(cholesky: Cholesky) -> Values:
+    """The entries of A⁻¹ on the pattern of A, in the layout of A's numbers.
+
+    Takahashi's recursion over the pattern of L, from the last supernode back (Takahashi, Fagan &
+    Chin 1973): with Y = L_RJ L_JJ⁻¹, Z_RJ = −Z_RR Y and Z_JJ = (L_JJ L_JJᵀ)⁻¹ − Yᵀ Z_RJ.
+    """
+    analysis = cholesky.analysis
+    return sparse_kernel.takahashi(analysis.structure, cholesky.panels)[analysis.target]
