@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.robot.config import FusionRule, Positive
+from team.config import FusionRule, Positive
 
 
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

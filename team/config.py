@@ -1,0 +1,92 @@
+"""What a robot is told before it starts: its models, its estimator and its rule.
+
+The fields are SI; angles in radians unless the name says `_deg`. Noise of motion is a density, so
+it does not depend on the rate of the odometry: a standard deviation per square root of a second, of
+a metre driven and of a radian turned; the three add in variance.
+"""
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+Estimator = Literal["hybrid", "hybrid-thesis"]
+FusionRule = Literal["join", "kalman", "kalman-per-axis", "covariance-intersection"]
+
+
+class MotionNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Densities of one noise: variance = per_s² t + per_m² |distance| + per_rad² |turn|."""
+
+    per_s: NonNegative = 0.0
+    per_m: NonNegative = 0.0
+    per_rad: NonNegative = 0.0
+
+
+class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a robot moves in one odometry interval, and how far the odometry may be wrong.
+
+    kind: "turn-then-drive" (thesis, section 4.3.1) turns by yaw_rate·t, then drives forward·t;
+    "velocity" (Ma & Ma eq. 1-4) drives the arc of constant (forward, yaw_rate).
+    forward [m], turn [rad], final_turn [rad] (a rotation after the motion) and lateral [m] are the
+    independent noises. forward_scale and yaw_scale multiply the logged values first.
+    """
+
+    kind: Literal["turn-then-drive", "velocity"] = "velocity"
+    forward: MotionNoise = MotionNoise()
+    turn: MotionNoise = MotionNoise()
+    final_turn: MotionNoise = MotionNoise()
+    lateral: MotionNoise = MotionNoise()
+    forward_scale: Positive = 1.0
+    yaw_scale: Positive = 1.0
+    yaw_rate_limit: Positive | None = None
+
+
+class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A range-bearing sensor: true range = (reading − range_offset)/range_scale.
+
+    Range sigma at a predicted range r is hypot(range_sigma, range_sigma_per_m · r); the predicted
+    range is used, not the measured one (else maps shrink: Peelle's puzzle).
+    Readings outside [min_range, max_range] or more than field_of_view/2 from the axis are rejected.
+    """
+
+    range_sigma: Positive = 0.1
+    range_sigma_per_m: NonNegative = 0.0
+    bearing_sigma: Positive = 0.02
+    min_range: NonNegative = 0.0
+    max_range: Positive = 1e6
+    field_of_view: Positive = 6.283185307179586
+    range_offset: float = 0.0
+    range_scale: Positive = 1.0
+    bearing_offset: float = 0.0
+
+
+class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The particle front end of one window and the rule that closes the window.
+
+    window_s: a window closes with the first odometry interval that ends this long after its start.
+    keyframe_s: sightings within this time are reduced to one per landmark (median, moved with the
+    odometry to the keyframe's end); 0 takes every observation message as an epoch of its own.
+    """
+
+    particles: Annotated[int, Meta(ge=4, le=100_000)] = 100
+    proposal: Literal["fastslam2", "fastslam1"] = "fastslam2"
+    resample_below: Fraction = 0.5
+    window_s: Positive = 12.0
+    keyframe_s: NonNegative = 0.0
+
+
+class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that a robot's estimate depends on beside its readings and the seed."""
+
+    id: Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
+    motion: MotionModel = MotionModel()
+    sensor: Sensor = Sensor()
+    front_end: FrontEnd = FrontEnd()
+    estimator: Estimator = "hybrid"
+    fusion: FusionRule = "join"
+    exchange_s: Positive = 10.0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
