@@ -1,0 +1,223 @@
+"""The motion of one interval as a Gaussian on SE(2), and the range-bearing sensor.
+
+Both are the field's textbook models (Thrun, Burgard and Fox 2005, sections 5.3 and 6.6) with the
+noise of motion carried to the tangent space of the motion's end, so that motions compose.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from team.estimation.compiled import compiled
+from team.estimation.geometry import Point, Pose, adjoint, compose, exponential, inverse, wrapped
+from team.robot.config import MotionModel, MotionNoise, Sensor
+
+NEAREST_M = 1e-3
+"""A point that is nearer than this has no bearing; ranges are taken as at least this [m]."""
+
+
+@dataclass(frozen=True)
+class Increment:
+    """b_from_b': truth = mean ∘ Exp(xi), xi ~ N(0, covariance) in (forward, left, turn).
+
+    mean:       (x [m], y [m], theta [rad]).
+    covariance: symmetric positive semi-definite, of any rank, [m², m·rad, rad²].
+    """
+
+    mean: Pose
+    covariance: Float[np.ndarray, "3 3"]
+
+    @classmethod
+    def identity(cls) -> Self:
+        """Standing still, exactly."""
+        return cls(np.zeros(3), np.zeros((3, 3)))
+
+    def then(self, other: "Increment") -> "Increment":
+        """mean₁ ∘ mean₂ with covariance Ad C₁ Adᵀ + C₂, Ad = Ad(mean₂⁻¹)."""
+        return Increment(
+            *_composed(self.mean, self.covariance, other.mean, other.covariance),
+        )
+
+
+@compiled
+def _composed(
+    mean: Pose, covariance: Float[np.ndarray, "3 3"], then: Pose, added: Float[np.ndarray, "3 3"]
+) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
+    """T₁Exp(ξ₁)T₂Exp(ξ₂) = T₁T₂Exp(Ad(T₂⁻¹)ξ₁)Exp(ξ₂), to first order in the noise."""
+    Ad = adjoint(inverse(then))
+    half = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            half[i, j] = (
+                Ad[i, 0] * covariance[0, j]
+                + Ad[i, 1] * covariance[1, j]
+                + Ad[i, 2] * covariance[2, j]
+            )
+    total = np.empty((3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            total[i, j] = added[i, j] + (
+                half[i, 0] * Ad[j, 0] + half[i, 1] * Ad[j, 1] + half[i, 2] * Ad[j, 2]
+            )
+            total[j, i] = total[i, j]
+    return compose(mean, then), total
+
+
+def increment_of(
+    motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
+) -> Increment:
+    """One odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
+
+    With d = forward_scale·forward·t and φ = clip(yaw_scale·yaw_rate, ±yaw_rate_limit)·t and the
+    independent noises a (forward, on d), b (turn, on φ), c (final turn), l (lateral):
+    "velocity":        Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al. table 5.3 and
+                       Ma & Ma eq. 1-4, with its limit φ → 0.
+    "turn-then-drive": turn φ + b, drive d + a, then (0, l, c): the thesis, section 4.3.1.
+    Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|.
+    """
+    rate = motion.yaw_scale * yaw_rate
+    if motion.yaw_rate_limit is not None:
+        rate = min(max(rate, -motion.yaw_rate_limit), motion.yaw_rate_limit)
+    distance = motion.forward_scale * forward * duration_s
+    turn = rate * duration_s
+    kernel = _arc if motion.kind == "velocity" else _turn_then_drive
+    return Increment(
+        *kernel(
+            distance,
+            turn,
+            _variance(motion.forward, duration_s, distance, turn),
+            _variance(motion.turn, duration_s, distance, turn),
+            _variance(motion.final_turn, duration_s, distance, turn),
+            _variance(motion.lateral, duration_s, distance, turn),
+        )
+    )
+
+
+def _variance(noise: MotionNoise, duration_s: float, distance: float, turn: float) -> float:
+    return (
+        noise.per_s * noise.per_s * duration_s
+        + noise.per_m * noise.per_m * abs(distance)
+        + noise.per_rad * noise.per_rad * abs(turn)
+    )
+
+
+@compiled
+def _arc(
+    distance: float, turn: float, forward_var: float, turn_var: float, final: float, lateral: float
+) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
+    """The two columns of SE(2)'s right Jacobian at (d, 0, φ) that the noises a and b act through.
+
+    Jr₁ = (sin φ/φ, −(1 − cos φ)/φ, 0), Jr₃ = (d(φ − sin φ)/φ², d(1 − cos φ)/φ², 1); Solà et al.,
+    A micro Lie theory, eq. 163. Near φ = 0 the quotients are taken from their series.
+    """
+    if abs(turn) < 1e-3:
+        square = turn * turn
+        sine = 1.0 - square / 6.0
+        cosine = 0.5 - square / 24.0
+        cubic = turn * (1.0 / 6.0 - square / 120.0)
+    else:
+        sine = math.sin(turn) / turn
+        cosine = 2.0 * (math.sin(0.5 * turn) / turn) ** 2
+        cubic = (turn - math.sin(turn)) / (turn * turn)
+    ax, ay = sine, -turn * cosine
+    bx, by = distance * cubic, distance * cosine
+    covariance = np.empty((3, 3))
+    covariance[0, 0] = forward_var * ax * ax + turn_var * bx * bx
+    covariance[0, 1] = forward_var * ax * ay + turn_var * bx * by
+    covariance[1, 1] = forward_var * ay * ay + turn_var * by * by + lateral
+    covariance[0, 2] = turn_var * bx
+    covariance[1, 2] = turn_var * by
+    covariance[2, 2] = turn_var + final
+    covariance[1, 0] = covariance[0, 1]
+    covariance[2, 0] = covariance[0, 2]
+    covariance[2, 1] = covariance[1, 2]
+    return exponential(np.array([distance, 0.0, turn])), covariance
+
+
+@compiled
+def _turn_then_drive(
+    distance: float, turn: float, forward_var: float, turn_var: float, final: float, lateral: float
+) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
+    """The noises (a, b) reach the end's tangent space by J = [[1, 0], [0, d], [0, 1]]."""
+    covariance = np.zeros((3, 3))
+    covariance[0, 0] = forward_var
+    covariance[1, 1] = turn_var * distance * distance + lateral
+    covariance[1, 2] = turn_var * distance
+    covariance[2, 1] = turn_var * distance
+    covariance[2, 2] = turn_var + final
+    return (
+        np.array([distance * math.cos(turn), distance * math.sin(turn), wrapped(turn)]),
+        covariance,
+    )
+
+
+@compiled
+def predicted(pose: Pose, landmark: Point) -> tuple[float, float]:
+    """Range [m] and bearing [rad] of a point landmark seen from pose, both in the map frame.
+
+    range = max(‖landmark − (x, y)‖, NEAREST_M), bearing = atan2(Δy, Δx) − theta in (−π, π].
+    """
+    dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
+    distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
+    return distance, wrapped(math.atan2(dy, dx) - pose[2])
+
+
+@compiled
+def pose_jacobian(distance: float, bearing: float) -> Float[np.ndarray, "2 3"]:
+    """∂z/∂xi of h(pose ∘ Exp(xi), landmark) at xi = 0, from the predicted (range, bearing)."""
+    c, s = math.cos(bearing), math.sin(bearing)
+    return np.array([[-c, -s, 0.0], [s / distance, -c / distance, -1.0]])
+
+
+@compiled
+def landmark_jacobian(distance: float, direction: float) -> Float[np.ndarray, "2 2"]:
+    """∂z/∂landmark, from the predicted range and the direction = theta + bearing in the map."""
+    c, s = math.cos(direction), math.sin(direction)
+    return np.array([[c, s], [-s / distance, c / distance]])
+
+
+@compiled
+def located(pose: Pose, distance: float, bearing: float) -> Point:
+    """The inverse model: the point at (range, bearing) from pose, in the pose's map frame."""
+    direction = pose[2] + bearing
+    return np.array(
+        [pose[0] + distance * math.cos(direction), pose[1] + distance * math.sin(direction)]
+    )
+
+
+def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
+    """(σ_range² [m²], σ_bearing² [rad²]) at a predicted range: σ_r² = range_sigma² + (per_m r)²."""
+    slope = sensor.range_sigma_per_m * predicted_range
+    return sensor.range_sigma**2 + slope * slope, sensor.bearing_sigma**2
+
+
+def corrected(
+    sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The sensor's calibration applied: ((r − range_offset)/range_scale, b − bearing_offset)."""
+    turned = bearings - sensor.bearing_offset
+    turns = np.floor((np.pi - turned) / (2.0 * np.pi))
+    return (ranges - sensor.range_offset) / sensor.range_scale, turned + 2.0 * np.pi * turns
+
+
+def acceptable(
+    sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Which raw readings lie in [min_range, max_range] and in the field of view.
+
+    Readings that are not finite do not; neither does one whose corrected range is not positive.
+    """
+    distances, _ = corrected(sensor, ranges, bearings)
+    inside: Bool[np.ndarray, " n"] = (
+        (ranges >= sensor.min_range)
+        & (ranges <= sensor.max_range)
+        & (distances > 0.0)
+        & (
+            np.abs(np.remainder(bearings + np.pi, 2.0 * np.pi) - np.pi)
+            <= 0.5 * sensor.field_of_view
+        )
+    )
+    return inside

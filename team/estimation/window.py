@@ -1,0 +1,240 @@
+"""One window of Hybrid-SLAM: particles that start at zero, and the one Gaussian they become.
+
+The front end runs FastSLAM in the frame of the window's start. Its particles at any time are one
+submap by moment matching, after each landmark of each particle is solved again over the window's
+readings along that particle's path: an EKF is linearised at the first, noisiest reading, and that
+bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from team.estimation import fastslam
+from team.estimation.compiled import compiled
+from team.estimation.fastslam import Particles
+from team.estimation.gaussian import cholesky_factor
+from team.estimation.geometry import wrapped
+from team.estimation.models import NEAREST_M, Increment
+from team.estimation.submap import LocalMap
+from team.robot.config import FrontEnd, Sensor
+
+POSE_JITTER = (1e-6, 1e-6, 1e-8)
+"""Added to the end pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
+
+SOLVED = 1e-6
+"""A Gauss-Newton step of squared Mahalanobis length below this changes nothing that matters."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Particles since the window's start, their paths, and the readings that they have used.
+
+    paths:    the pose of each particle's line of descent at each of the K observation epochs.
+    epochs:   the epoch of each of the N readings, in [0, K).
+    ids:      the landmark of each reading.
+    readings: (range [m], bearing [rad]) with the sensor's calibration applied.
+    """
+
+    front_end: FrontEnd
+    sensor: Sensor
+    particles: Particles
+    paths: Float[np.ndarray, "K M 3"]
+    epochs: Int64[np.ndarray, " N"]
+    ids: UInt32[np.ndarray, " N"]
+    readings: Float[np.ndarray, "N 2"]
+
+
+def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
+    """A window at its start: every particle exactly at zero, no landmark, no reading."""
+    return Window(
+        front_end,
+        sensor,
+        fastslam.at_origin(front_end.particles),
+        np.empty((0, front_end.particles, 3)),
+        np.empty(0, np.int64),
+        np.empty(0, np.uint32),
+        np.empty((0, 2)),
+    )
+
+
+def advanced(
+    window: Window,
+    increment: Increment,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    generator: np.random.Generator,
+) -> Window:
+    """One observation epoch: the motion since the last one, then its readings (there may be none).
+
+    The readings are accepted and corrected already (`models.acceptable`, `models.corrected`).
+    """
+    particles, info = fastslam.propagated_and_updated(
+        window.particles,
+        increment,
+        window.sensor,
+        ids,
+        ranges,
+        bearings,
+        window.front_end.proposal,
+        window.front_end.resample_below,
+        generator,
+    )
+    paths = window.paths if info.parents is None else window.paths[:, info.parents]
+    epoch = np.full(len(ids), len(paths))
+    return Window(
+        window.front_end,
+        window.sensor,
+        particles,
+        np.concatenate((paths, particles.poses[None])),
+        np.concatenate((window.epochs, epoch)),
+        np.concatenate((window.ids, ids)),
+        np.concatenate((window.readings, np.column_stack((ranges, bearings)))),
+    )
+
+
+def moved(window: Window, increment: Increment, generator: np.random.Generator) -> Window:
+    """Motion without an observation epoch, as from the last one to the window's end.
+
+    It never resamples: the weights of the last readings stay as they are.
+    """
+    return replace(window, particles=fastslam.propagated(window.particles, increment, generator))
+
+
+def gaussian(window: Window) -> LocalMap:
+    """The window so far as one Gaussian over (end pose, landmarks by ascending id).
+
+    With w and (pose, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
+    Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ, headings on the circle (Xu, eq. 4.5-4.6), plus
+    POSE_JITTER. The landmarks given a path come from `landmarks_along_paths`.
+    Raises NotACovarianceError if P is not finite or not positive definite.
+    """
+    particles = window.particles
+    order = np.argsort(particles.ids)
+    ids = particles.ids[order]
+    slots = np.searchsorted(ids, window.ids)
+    by_slot = np.argsort(slots, kind="stable")
+    means, covariances = landmarks_along_paths(
+        particles.means[:, order],
+        particles.covariances[:, order],
+        window.paths,
+        np.searchsorted(slots[by_slot], np.arange(len(ids) + 1)),
+        window.epochs[by_slot],
+        window.readings[by_slot],
+        window.sensor.range_sigma**2,
+        window.sensor.range_sigma_per_m**2,
+        window.sensor.bearing_sigma**2,
+    )
+    mean, covariance = moments(particles.poses, np.exp(particles.log_weights), means, covariances)
+    covariance[np.arange(3), np.arange(3)] += POSE_JITTER
+    cholesky_factor(covariance, "the submap of a window")
+    return LocalMap(ids, mean, covariance)
+
+
+@compiled
+def landmarks_along_paths(
+    starts: Float[np.ndarray, "M L 2"],
+    start_covariances: Float[np.ndarray, "M L 3"],
+    paths: Float[np.ndarray, "K M 3"],
+    bounds: Int64[np.ndarray, " L+1"],
+    epochs: Int64[np.ndarray, " N"],
+    readings: Float[np.ndarray, "N 2"],
+    range_variance: float,
+    range_variance_per_m2: float,
+    bearing_variance: float,
+) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
+    """Each landmark of each particle by Gauss-Newton over its readings, given the particle's path.
+
+    Minimises Σ ‖z − h(path, landmark)‖² in R⁻¹ from the EKF's mean with at most three steps, each
+    kept only if the cost falls; the covariance is (Σ Hᵀ R⁻¹ H)⁻¹ at the result, (xx, xy, yy). R is
+    that of the range predicted at the start. Readings bounds[l] to bounds[l + 1] belong to landmark
+    l. Where no evaluation is finite the EKF's mean and covariance stay.
+    """
+    means, covariances = starts.copy(), start_covariances.copy()
+    range_information = np.empty(len(readings))
+    for i in range(means.shape[0]):
+        for landmark in range(means.shape[1]):
+            x, y = starts[i, landmark]
+            least = np.inf
+            for iteration in range(4):
+                cost, gx, gy, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for k in range(bounds[landmark], bounds[landmark + 1]):
+                    pose = paths[epochs[k], i]
+                    dx, dy = x - pose[0], y - pose[1]
+                    distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
+                    if iteration == 0:
+                        range_information[k] = 1.0 / (
+                            range_variance + range_variance_per_m2 * distance * distance
+                        )
+                    ex, ey = dx / distance, dy / distance
+                    of_range = readings[k, 0] - distance
+                    of_bearing = wrapped(readings[k, 1] + pose[2] - math.atan2(dy, dx))
+                    wr = range_information[k]
+                    wb = 1.0 / bearing_variance
+                    cost += wr * of_range * of_range + wb * of_bearing * of_bearing
+                    wr_r, wb_b = wr * of_range, wb * of_bearing / distance
+                    gx += wr_r * ex - wb_b * ey
+                    gy += wr_r * ey + wb_b * ex
+                    wt = wb / (distance * distance)
+                    xx += wr * ex * ex + wt * ey * ey
+                    xy += (wr - wt) * ex * ey
+                    yy += wr * ey * ey + wt * ex * ex
+                determinant = xx * yy - xy * xy
+                if not (cost < least and determinant > 0.0):
+                    break
+                least = cost
+                step_x, step_y = (
+                    (yy * gx - xy * gy) / determinant,
+                    (xx * gy - xy * gx) / determinant,
+                )
+                means[i, landmark, 0], means[i, landmark, 1] = x, y
+                covariances[i, landmark, 0] = yy / determinant
+                covariances[i, landmark, 1] = -xy / determinant
+                covariances[i, landmark, 2] = xx / determinant
+                if step_x * gx + step_y * gy < SOLVED:
+                    break
+                x, y = x + step_x, y + step_y
+    return means, covariances
+
+
+@compiled
+def moments(
+    poses: Float[np.ndarray, "M 3"],
+    weights: Float[np.ndarray, " M"],
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """Mean and covariance of the mixture Σ wᵢ N(μᵢ, blkdiag(0, Σ₁, …, Σ_L)), n = 3 + 2L."""
+    count, n = len(poses), 3 + 2 * means.shape[1]
+    deviations = np.empty((count, n))
+    deviations[:, :3] = poses
+    deviations[:, 3:] = means.reshape(count, n - 3)
+    mean = np.zeros(n)
+    sine, cosine = 0.0, 0.0
+    for i in range(count):
+        sine += weights[i] * math.sin(poses[i, 2])
+        cosine += weights[i] * math.cos(poses[i, 2])
+        for j in range(n):
+            mean[j] += weights[i] * deviations[i, j]
+    mean[2] = math.atan2(sine, cosine)
+    P = np.zeros((n, n))
+    for i in range(count):
+        for j in range(n):
+            deviations[i, j] -= mean[j]
+        deviations[i, 2] = wrapped(deviations[i, 2])
+        for j in range(n):
+            scaled = weights[i] * deviations[i, j]
+            for k in range(j + 1):
+                P[j, k] += scaled * deviations[i, k]
+        for landmark in range(means.shape[1]):
+            j = 3 + 2 * landmark
+            P[j, j] += weights[i] * covariances[i, landmark, 0]
+            P[j + 1, j] += weights[i] * covariances[i, landmark, 1]
+            P[j + 1, j + 1] += weights[i] * covariances[i, landmark, 2]
+    for j in range(n):
+        for k in range(j):
+            P[k, j] = P[j, k]
+    return mean, P
