@@ -53,23 +53,29 @@ class Bus(Protocol):
     def publish(self, out: Outgoing) -> None:
         """Publish; blocks, with a bound, when the receivers do not keep up."""
 
+    def publish_raw(self, sample: Sample) -> None:
+        """Publish a sample of a log again: its bytes, its stamps and its counter."""
+
     def subscribe(self, channel: Channel, name: str = "*") -> None:
-        """From now on `receive` returns what is published there."""
+        """From now on `receive` returns what others publish there, each sample once."""
 
     def receive(self, timeout_s: float) -> list[Sample]:
         """What has arrived, in order; waits at most `timeout_s` for the first."""
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer the queries of `channel`."""
+        """Answer the queries of `channel` for one name, or `*`; an asker is told a ValueError."""
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads; empty when nobody answers."""
+        """The replies' payloads, in order; empty when nobody answers, `BusError` on an error."""
 
     def declare_alive(self, node: str) -> None:
         """Hold a liveliness token until the bus is closed."""
 
     def watch_alive(self, node: str = "**") -> None:
-        """Receive `Liveliness` samples when tokens appear and go, the present ones first."""
+        """Receive `Liveliness` of others' tokens as they appear and go, the present ones first."""
+
+    def close(self) -> None:
+        """Leave; the tokens go."""
 
 
 def opened(sample: Sample) -> tuple[Channel, str, Message]:
