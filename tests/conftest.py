@@ -1,0 +1,20 @@
+"""What holds in every test run: one BLAS thread, shapes and types checked, system tests in a row."""
+
+import os
+
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"  # before NumPy is imported, here and in every child process
+
+import pytest
+from jaxtyping import install_import_hook
+
+import tests.shapes
+
+install_import_hook(["team", "central", "sim"], f"{tests.shapes.__name__}.checked")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that start processes share one worker, so that they do not starve each other."""
+    for item in items:
+        if "system" in item.path.relative_to(item.config.rootpath).parts:
+            item.add_marker(pytest.mark.xdist_group("system"))
