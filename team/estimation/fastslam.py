@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team.config import Sensor
 from team.estimation import fastslam_kernel
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.models import Increment
-from team.robot.config import Sensor
 
 Proposal = Literal["fastslam2", "fastslam1"]
 

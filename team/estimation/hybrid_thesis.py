@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from team.config import Sensor
 from team.estimation import fastslam
 from team.estimation.fastslam import Particles
 from team.estimation.geometry import Pose
 from team.estimation.models import Increment
 from team.estimation.window import moments
-from team.robot.config import Sensor
 
 
 @dataclass(frozen=True)

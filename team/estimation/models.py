@@ -11,9 +11,9 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float
 
+from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Point, Pose, adjoint, compose, exponential, inverse, wrapped
-from team.robot.config import MotionModel, MotionNoise, Sensor
 
 NEAREST_M = 1e-3
 """A point that is nearer than this has no bearing; ranges are taken as at least this [m]."""

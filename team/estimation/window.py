@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team.config import FrontEnd, Sensor
 from team.estimation import fastslam
 from team.estimation.compiled import compiled
 from team.estimation.fastslam import Particles
@@ -19,7 +20,6 @@ from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import wrapped
 from team.estimation.models import NEAREST_M, Increment
 from team.estimation.submap import LocalMap
-from team.robot.config import FrontEnd, Sensor
 
 POSE_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to the end pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
