@@ -1,0 +1,116 @@
+"""How the robots of a simulated world truly move.
+
+A step is a pair (distance [m], turn [rad]); poses (x, y, θ) are in the world's frame. Two ways to
+make steps: `followed` cuts a polyline into equal ones, `driven` steers from way-point to way-point.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from math import atan2, cos, hypot, pi, sin
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+Kind = Literal["turn-then-drive", "velocity"]
+Pose = tuple[float, float, float]
+Step = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """K true steps and the K + 1 true poses that they lead through."""
+
+    poses: Float[np.ndarray, "K_plus_1 3"]
+    steps: Float[np.ndarray, "K 2"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a robot can do in one step, and when a way-point counts as reached."""
+
+    distance: float
+    turn: float
+    tolerance: float
+
+
+def wrapped(angle: float) -> float:
+    """The angle in (−π, π]."""
+    turned = (angle + pi) % (2.0 * pi) - pi
+    return pi if turned == -pi else turned
+
+
+def followed(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
+    """The polyline through the way-points in steps of equal arc length: turn, then drive.
+
+    A step that takes in a corner is its chord. The first pose looks along the first step.
+    """
+    legs = np.hypot(*np.diff(way_points, axis=0).T)
+    arc = np.concatenate(([0.0], np.cumsum(legs)))
+    at = np.linspace(0.0, arc[-1], steps + 1)
+    xy = np.column_stack([np.interp(at, arc, way_points[:, i]) for i in (0, 1)])
+    chord = np.diff(xy, axis=0)
+    heading = np.arctan2(chord[:, 1], chord[:, 0])
+    heading = np.concatenate((heading[:1], heading))
+    turns = np.array([wrapped(turn) for turn in np.diff(heading)])
+    return Drive(
+        poses=np.column_stack([xy, heading]),
+        steps=np.column_stack([np.hypot(chord[:, 0], chord[:, 1]), turns]),
+    )
+
+
+def driven(
+    start: Pose,
+    way_points: Iterator[tuple[float, float]],
+    limits: Limits,
+    kind: Kind,
+    steps: int,
+    slip: Callable[[int, Step], tuple[float, float]],
+) -> Drive:
+    """Steer to each way-point in turn; after the last one, stand.
+
+    A step turns towards the way-point as far as the limit lets it and drives the less, the more the
+    way-point lies to the side. slip(k, step): the final turn [rad] and the slip to the left [m] of
+    step k; they move the robot and are in no odometry.
+    """
+    poses, taken = [start], []
+    target = next(way_points, None)
+    for k in range(steps):
+        x, y, _ = poses[-1]
+        while target and hypot(target[0] - x, target[1] - y) <= limits.tolerance:
+            target = next(way_points, None)
+        step = _towards(poses[-1], target, limits) if target else (0.0, 0.0)
+        taken.append(step)
+        poses.append(moved(poses[-1], step, kind, *slip(k, step)))
+    return Drive(np.array(poses), np.array(taken))
+
+
+def moved(
+    pose: Pose, step: Step, kind: Kind, final_turn: float = 0.0, lateral: float = 0.0
+) -> Pose:
+    """The pose after one step, a slip to the left at its end and a last turn.
+
+    turn-then-drive: the whole turn first, then straight on. velocity: the circular arc, whose chord
+    has the length distance · sin(φ/2)/(φ/2) and the direction θ + φ/2.
+    """
+    x, y, heading = pose
+    distance, turn = step
+    end = heading + turn
+    if kind == "turn-then-drive":
+        chord, direction = distance, end
+    else:
+        half = 0.5 * turn
+        chord, direction = distance * float(np.sinc(half / pi)), heading + half
+    return (
+        x + chord * cos(direction) - lateral * sin(end),
+        y + chord * sin(direction) + lateral * cos(end),
+        wrapped(end + final_turn),
+    )
+
+
+def _towards(pose: Pose, target: tuple[float, float], limits: Limits) -> Step:
+    dx, dy = target[0] - pose[0], target[1] - pose[1]
+    aside = wrapped(atan2(dy, dx) - pose[2])
+    turn = min(max(aside, -limits.turn), limits.turn)
+    distance = min(limits.distance, hypot(dx, dy)) * max(0.0, cos(aside - turn))
+    return distance, turn

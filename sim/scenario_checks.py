@@ -1,0 +1,71 @@
+"""Say what is wrong with a scenario in its own words: the field's path, what is known, a remedy."""
+
+import difflib
+import math
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import msgspec
+
+SAID_ONCE = ("seed", "estimator", "fusion")
+"""Fields of robots and centre that the scenario says once, at its top, for all of them."""
+
+
+class ScenarioError(ValueError):
+    """A scenario that can not be run; the text names file, field and remedy."""
+
+
+def check_fields(value: object, declared: Any, at: str) -> None:
+    """Raise ScenarioError for unknown fields, wrong choices and numbers that are not finite.
+
+    declared: the type of `value`; `at`: its path in the file. Types and bounds are left to msgspec.
+    """
+    if get_origin(declared) is Annotated:
+        declared = get_args(declared)[0]
+    if get_origin(declared) is Literal:
+        choices = get_args(declared)
+        if value not in choices:
+            known = ", ".join(f'"{choice}"' for choice in choices)
+            raise ScenarioError(f"expected one of {known}, got {value!r} at {at}")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ScenarioError(f"expected a finite number, got {value} at {at}")
+    elif isinstance(value, list):
+        part_type = get_args(declared)[0] if get_origin(declared) is tuple else object
+        for i, part in enumerate(value):
+            check_fields(part, part_type, f"{at}[{i}]")
+    elif isinstance(value, dict) and _is_struct(declared):
+        types = {field.name: field.type for field in msgspec.structs.fields(declared)}
+        tag = declared.__struct_config__.tag_field
+        for name, part in value.items():
+            if name != tag:
+                check_known(name, [known for known in types if _here(known, at)], at)
+                check_fields(part, types[name], f"{at}.{name}" if at else name)
+
+
+def check_known(name: str, known: list[str], at: str) -> None:
+    """Raise ScenarioError if `name` is not among the known fields at this place."""
+    if name in known:
+        return
+    where = f"at {at}" if at else "at the top"
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"; did you mean `{close[0]}`?" if close else ""
+    if name in SAID_ONCE:
+        hint = f"; `{name}` is said once for the whole team, at the top of the file"
+    raise ScenarioError(f"unknown field `{name}` {where}; known: {', '.join(known)}{hint}")
+
+
+def plain(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
+    """From "Expected `float`, got `str` - at `$.a.b`" to "expected float, got str at a.b"."""
+    problem, _, path = str(error).partition(" - at `")
+    field = path.rstrip("`").removeprefix("$").lstrip(".")
+    where = ".".join(part for part in (at, field) if part)
+    problem = problem[:1].lower() + problem[1:].replace("`", "")
+    return ScenarioError(f"{problem} at {where}" if where else problem)
+
+
+def _is_struct(declared: Any) -> bool:
+    return isinstance(declared, type) and issubclass(declared, msgspec.Struct)
+
+
+def _here(name: str, at: str) -> bool:
+    """The fields that are said once are known at the top only."""
+    return not at or name not in SAID_ONCE

@@ -1,0 +1,228 @@
+"""What any world is, simulated or recorded: readings of each robot in order, and the truth.
+
+One counter spans all readings of a robot, in the order (stamp, kind); reading 0 is the start pose.
+An odometry reading is an interval that is stamped with its *end*, and the intervals of a robot are
+contiguous in time. So at equal stamps what was seen at the end of an interval comes before it.
+SI units, radians, bearings in (−π, π].
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt8, UInt32
+
+START = 0
+OBSERVATIONS = 1
+SIGHTINGS = 2
+ODOMETRY = 3
+
+KIND_NAMES = ("start pose", "observations", "sightings", "odometry")
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """The pose (x, y, θ) of reading 0 in the team's frame; covariance None: exactly known."""
+
+    pose: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"] | None
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """Odometry intervals: end stamp, length, and the mean forward speed [m/s] and yaw rate [rad/s].
+
+    Interval k ends where interval k + 1 begins.
+    """
+
+    end_ns: Int64[np.ndarray, " I"]
+    duration_ns: Int64[np.ndarray, " I"]
+    forward: Float[np.ndarray, " I"]
+    yaw_rate: Float[np.ndarray, " I"]
+
+
+@dataclass(frozen=True)
+class Detections:
+    """M messages of range-bearing readings: message m has the rows offsets[m] … offsets[m + 1].
+
+    ids are landmark identities, or indices into a tuple of teammates.
+    """
+
+    stamps_ns: Int64[np.ndarray, " M"]
+    offsets: Int64[np.ndarray, " M_plus_1"]
+    ids: UInt32[np.ndarray, " R"]
+    ranges: Float[np.ndarray, " R"]
+    bearings: Float[np.ndarray, " R"]
+
+    def rows(self, message: int) -> slice:
+        """The rows of one message."""
+        return slice(int(self.offsets[message]), int(self.offsets[message + 1]))
+
+
+class OdometryReading(NamedTuple):
+    """One interval that ends at stamp_ns."""
+
+    stamp_ns: int
+    duration_ns: int
+    forward: float
+    yaw_rate: float
+
+
+class ObservationReading(NamedTuple):
+    """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty."""
+
+    stamp_ns: int
+    ids: UInt32[np.ndarray, " R"]
+    ranges: Float[np.ndarray, " R"]
+    bearings: Float[np.ndarray, " R"]
+
+
+class SightingReading(NamedTuple):
+    """Teammates seen at stamp_ns: names, ranges [m], bearings [rad]."""
+
+    stamp_ns: int
+    teammates: tuple[str, ...]
+    ranges: Float[np.ndarray, " R"]
+    bearings: Float[np.ndarray, " R"]
+
+
+@dataclass(frozen=True)
+class RobotStream:
+    """All readings of one robot; the index into kinds, stamps_ns and rows is the reading counter.
+
+    start: None when the start pose is not known. rows: the reading's row in the arrays of its kind.
+    truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was repaired or can not be
+    given, in a user's words.
+    """
+
+    robot: str
+    start: StartPose | None
+    kinds: UInt8[np.ndarray, " N"]
+    stamps_ns: Int64[np.ndarray, " N"]
+    rows: Int64[np.ndarray, " N"]
+    intervals: Intervals
+    landmark_detections: Detections
+    teammate_detections: Detections
+    teammates: tuple[str, ...]
+    truth_ns: Int64[np.ndarray, " T"] | None = None
+    truth: Float[np.ndarray, "T 3"] | None = None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """The number of readings, the start pose included."""
+        return len(self.kinds)
+
+    def odometry(self, counter: int) -> OdometryReading:
+        """The odometry interval with this reading counter."""
+        row = self._row(counter, ODOMETRY)
+        intervals = self.intervals
+        return OdometryReading(
+            int(intervals.end_ns[row]),
+            int(intervals.duration_ns[row]),
+            float(intervals.forward[row]),
+            float(intervals.yaw_rate[row]),
+        )
+
+    def observations(self, counter: int) -> ObservationReading:
+        """The landmarks seen, of the message with this reading counter."""
+        seen = self.landmark_detections
+        at = seen.rows(self._row(counter, OBSERVATIONS))
+        stamp_ns = int(self.stamps_ns[counter])
+        return ObservationReading(stamp_ns, seen.ids[at], seen.ranges[at], seen.bearings[at])
+
+    def sightings(self, counter: int) -> SightingReading:
+        """The teammates seen, of the message with this reading counter."""
+        seen = self.teammate_detections
+        at = seen.rows(self._row(counter, SIGHTINGS))
+        names = tuple(self.teammates[i] for i in seen.ids[at])
+        stamp_ns = int(self.stamps_ns[counter])
+        return SightingReading(stamp_ns, names, seen.ranges[at], seen.bearings[at])
+
+    def _row(self, counter: int, kind: int) -> int:
+        found = int(self.kinds[counter])
+        if found != kind:
+            raise LookupError(
+                f"reading {counter} of {self.robot}: {KIND_NAMES[found]}, not {KIND_NAMES[kind]}"
+            )
+        return int(self.rows[counter])
+
+
+@dataclass(frozen=True)
+class WorldStreams:
+    """The streams of a team, the true landmark positions (None: not known), and where it is from.
+
+    landmark_ids ascend; without positions they are empty.
+    """
+
+    streams: tuple[RobotStream, ...]
+    landmark_ids: UInt32[np.ndarray, " L"]
+    landmarks: Float[np.ndarray, "L 2"] | None
+    source: str
+    notes: tuple[str, ...] = ()
+
+    def order(self) -> tuple[Int64[np.ndarray, " A"], Int64[np.ndarray, " A"]]:
+        """All readings of the team by (stamp, stream, counter): their stream indices and counters.
+
+        Restricted to one stream the counters ascend, since its stamps never decrease.
+        """
+        lengths = [len(stream) for stream in self.streams]
+        stream = np.repeat(np.arange(len(lengths), dtype=np.int64), lengths)
+        counter = np.concatenate([np.arange(n, dtype=np.int64) for n in lengths])
+        stamps = np.concatenate([each.stamps_ns for each in self.streams])
+        by_time = np.lexsort((counter, stream, stamps))
+        return stream[by_time], counter[by_time]
+
+
+def robot_stream(
+    robot: str,
+    start_ns: int,
+    start: StartPose | None,
+    intervals: Intervals,
+    observations: Detections,
+    sightings: Detections,
+    teammates: Sequence[str],
+    truth_ns: Int64[np.ndarray, " T"] | None = None,
+    truth: Float[np.ndarray, "T 3"] | None = None,
+    notes: Sequence[str] = (),
+) -> RobotStream:
+    """Number the readings of one robot by (stamp, kind), the start pose first.
+
+    Raises ValueError for a reading before the start, or odometry that is not contiguous.
+    """
+    parts = (np.array([start_ns]), observations.stamps_ns, sightings.stamps_ns, intervals.end_ns)
+    stamps = np.concatenate(parts)
+    kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in parts])
+    rows = np.concatenate([np.arange(len(part), dtype=np.int64) for part in parts])
+    if stamps.min() < start_ns:
+        raise ValueError(f"{robot}: a reading at {stamps.min()} ns is before its start, {start_ns}")
+    begins = intervals.end_ns - intervals.duration_ns
+    if np.any(begins[1:] != intervals.end_ns[:-1]):
+        raise ValueError(f"{robot}: odometry intervals are not contiguous in time")
+    order = np.lexsort((kinds, stamps))
+    return RobotStream(
+        robot=robot,
+        start=start,
+        kinds=kinds[order],
+        stamps_ns=stamps[order],
+        rows=rows[order],
+        intervals=intervals,
+        landmark_detections=observations,
+        teammate_detections=sightings,
+        teammates=tuple(teammates),
+        truth_ns=truth_ns,
+        truth=truth,
+        notes=tuple(notes),
+    )
+
+
+def grouped(
+    stamps_ns: Int64[np.ndarray, " R"],
+    ids: UInt32[np.ndarray, " R"],
+    ranges: Float[np.ndarray, " R"],
+    bearings: Float[np.ndarray, " R"],
+) -> Detections:
+    """Readings in order of time → one message per stamp."""
+    first = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[:1] - 1))
+    offsets = np.append(first, len(stamps_ns)).astype(np.int64)
+    return Detections(stamps_ns[first], offsets, ids, ranges, bearings)

@@ -1,0 +1,72 @@
+"""The two kinds of world that a scenario may name, as a user describes them."""
+
+from itertools import pairwise
+from math import hypot
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from team.config import NonNegative, Positive
+
+Point = tuple[float, float]
+
+
+class SimulatedWorld(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="simulated"
+):
+    """A square place of side size_m with point landmarks; robots drive steps of step_s seconds.
+
+    landmarks: their positions, or landmark_count of them at random.
+    paths: path i is the way-points of robot i. A robot without one drives to random way-points at
+    up to speed_m_s and turn_rate_rad_s, a way-point being reached within way_point_tolerance_m.
+    visible_from_m, visible_to_m: what lies at a *true* range between them is seen; absent: the
+    limits of the robot's sensor. They are the world's, since a robot that gates its noisy readings
+    at the same limits selects by the noise, and its map is biased.
+    unknown_starts: the robots whose start pose is not told to the team.
+    """
+
+    steps: Annotated[int, Meta(ge=1, le=1_000_000)]
+    size_m: Positive = 100.0
+    step_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 1.0
+    landmarks: tuple[Point, ...] = ()
+    landmark_count: Annotated[int, Meta(ge=0, le=100_000)] = 0
+    paths: tuple[tuple[Point, ...], ...] = ()
+    speed_m_s: Positive = 1.0
+    turn_rate_rad_s: Positive = 1.0
+    way_point_tolerance_m: Positive = 1.0
+    visible_from_m: NonNegative | None = None
+    visible_to_m: Positive | None = None
+    unknown_starts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.landmarks and self.landmark_count:
+            raise ValueError("landmarks and landmark_count exclude each other: leave one away")
+        for i, path in enumerate(self.paths):
+            if sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(path)) == 0.0:
+                raise ValueError(f"path {i} has no length: give two way-points or more")
+
+
+class UtiasWorld(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="utias"
+):
+    """A data set in the UTIAS MRCLAM format.
+
+    path: its folder or zip. odometry_delay_s: odometry logged at t acts at t + odometry_delay_s on
+    the camera's clock. start_sigma_m, start_sigma_rad: how well the start poses are known; both 0:
+    exactly. duration_s: only this much from the team's first reading. errata: repair known faults.
+    """
+
+    path: str = ""
+    odometry_delay_s: NonNegative = 0.0
+    start_sigma_m: NonNegative = 0.0
+    start_sigma_rad: NonNegative = 0.0
+    duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
+    errata: bool = True
+
+    def __post_init__(self) -> None:
+        if (self.start_sigma_m == 0.0) != (self.start_sigma_rad == 0.0):
+            raise ValueError("start_sigma_m and start_sigma_rad are both 0 or both above 0")
+
+
+World = SimulatedWorld | UtiasWorld
