@@ -1,7 +1,8 @@
 """Gaussians as (mean, covariance), and the checks and packings of covariance matrices."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
+from scipy.linalg.lapack import dpotri
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
@@ -27,6 +28,40 @@ def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
         return np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         raise NotACovarianceError(what, "not positive definite") from None
+
+
+def information(covariance: Matrix, what: str) -> Matrix:
+    """P⁻¹ = L⁻ᵀL⁻¹ from the Cholesky factor of P, exactly symmetric."""
+    if not len(covariance):
+        return np.zeros((0, 0))
+    lower, _ = dpotri(cholesky_factor(covariance, what), lower=1)
+    triangle = np.tril(lower)
+    return np.asarray(triangle + np.tril(triangle, -1).T)
+
+
+def with_marginal(
+    mean: Vector,
+    covariance: Matrix,
+    index: Int64[np.ndarray, " k"],
+    marginal_mean: Float[np.ndarray, " k"],
+    marginal_covariance: Float[np.ndarray, "k k"],
+) -> tuple[Vector, Matrix]:
+    """N(mean, covariance) with the marginal of its entries s = `index` replaced by N(m, C).
+
+    The conditional of the others stays (Jeffrey's rule), they follow by regression:
+    K = P_os P_ss⁻¹, x_o + K (m − x_s), P_oo − K P_so + K C Kᵀ, and K C between them.
+    """
+    if not len(index):
+        return mean.copy(), covariance.copy()
+    own = covariance[np.ix_(index, index)]
+    gain = covariance[:, index] @ information(own, "the marginal to replace")
+    gain[index] = np.eye(len(index))
+    change = marginal_covariance - own
+    replaced = covariance + gain @ change @ gain.T
+    replaced[np.ix_(index, index)] = marginal_covariance
+    moved = mean + gain @ (marginal_mean - mean[index])
+    moved[index] = marginal_mean
+    return moved, 0.5 * (replaced + replaced.T)
 
 
 def packed(covariance: Matrix) -> Float[np.ndarray, " m"]:

@@ -138,7 +138,8 @@ def solved(cholesky: Cholesky, right: Float[np.ndarray, "n k"]) -> Float[np.ndar
     permuted = np.empty_like(right)
     permuted[permutation] = right
     sparse_kernel.solve_in_place(cholesky.analysis.structure, cholesky.panels, permuted)
-    return permuted[permutation]
+    solution: Float[np.ndarray, "n k"] = permuted[permutation]
+    return solution
 
 
 def inverse_columns(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "n k"]:
@@ -160,4 +161,5 @@ def selected_inverse(cholesky: Cholesky) -> Values:
     Chin 1973): with Y = L_RJ L_JJ⁻¹, Z_RJ = −Z_RR Y and Z_JJ = (L_JJ L_JJᵀ)⁻¹ − Yᵀ Z_RJ.
     """
     analysis = cholesky.analysis
-    return sparse_kernel.takahashi(analysis.structure, cholesky.panels)[analysis.target]
+    entries: Values = sparse_kernel.takahashi(analysis.structure, cholesky.panels)[analysis.target]
+    return entries

@@ -17,7 +17,7 @@ Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 Structure: TypeAlias = tuple[Indices, Indices, Indices, Indices, Indices]
 PIVOT_TOLERANCE = 1e-14
-"""A pivot below this part of its diagonal entry is rounding noise: the unknown is not determined."""
+"""A pivot below this part of its diagonal entry is rounding noise: the unknown is undetermined."""
 PADDING = 0.25
 """Supernodes grow while explicit zeros are less than this part of the panel."""
 
@@ -183,10 +183,8 @@ def factorise(structure: Structure, target: Indices, values: Values) -> tuple[Va
 
 
 @compiled
-def solve_in_place(
-    structure: Structure, panels: Values, right: Float[np.ndarray, "n k"]
-) -> None:
-    """right := (L Lᵀ)⁻¹ right."""
+def solve_in_place(structure: Structure, panels: Values, right: Float[np.ndarray, "n k"]) -> None:
+    """Overwrite `right` with (L Lᵀ)⁻¹ right."""
     columns_of, row_start, row, panel_start, _ = structure
     count = len(columns_of) - 1
     many = right.shape[1]

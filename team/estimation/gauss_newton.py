@@ -1,0 +1,221 @@
+"""The solution of a submap graph: Gauss-Newton, damped only where the cost would rise.
+
+Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ‖start − prior‖², where ρ is the identity, or Cauchy's loss on
+√(χ²/dim) per submap, by iterated re-weighting. A robust submap enters with a wide scale that narrows
+with each iteration it has lived through, so a true loop closure is not taken for an outlier before
+the chain has bent.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation import joining_kernel as kernel
+from team.estimation import sparse
+from team.estimation.geometry import wrapped
+from team.estimation.submap_graph import Graph
+
+Values = Float[np.ndarray, " _"]
+LEAST_DAMPING = 1e-4
+MOST_DAMPING = 1e8
+ROUNDING = 1e-10
+"""A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
+
+
+@dataclass(frozen=True)
+class JoinSettings:
+    """How submaps are joined.
+
+    iterations_per_tick: Gauss-Newton iterations of `folded`.
+    robust_c: Cauchy's scale on √(χ²/dim) of a submap; None for least squares. The scale begins at
+        robust_start · c and is multiplied by robust_decay with each iteration until it is c.
+    covariance_factor: every submap's covariance is taken times this.
+    max_iterations, step_tolerance: a full solve ends when no unknown moves by more [m, rad].
+    alignment_confidence: quantile of the χ² test before a free island is merged.
+    alignment_heading_sigma: the shared landmarks must give the heading at least this well [rad].
+    """
+
+    iterations_per_tick: int = 2
+    robust_c: float | None = None
+    robust_start: float = 8.0
+    robust_decay: float = 0.7
+    covariance_factor: float = 1.0
+    max_iterations: int = 50
+    step_tolerance: float = 1e-6
+    alignment_confidence: float = 0.999
+    alignment_heading_sigma: float = 0.3
+
+
+class NotDeterminedError(ValueError):
+    """The submaps leave a node of the graph undetermined."""
+
+    def __init__(self, node: str) -> None:
+        super().__init__(f"{node} is not determined by the submaps")
+        self.node = node
+
+
+@dataclass(frozen=True, eq=False)
+class Island:
+    """One frame: its graph, the state (poses and landmarks by node) and the submaps' ages.
+
+    age: iterations that each submap has lived through; the robust scale follows from it.
+    """
+
+    graph: Graph
+    state: Values
+    age: Int64[np.ndarray, " F"]
+    settings: JoinSettings
+
+    @property
+    def scale(self) -> Float[np.ndarray, " F"]:
+        """The robust scale c of each submap at its age."""
+        settings = self.settings
+        if settings.robust_c is None:
+            return np.full(len(self.age), math.inf)
+        wide = settings.robust_start * settings.robust_decay ** self.age.astype(np.float64)
+        return settings.robust_c * np.maximum(1.0, wide)
+
+    @cached_property
+    def chi2(self) -> Float[np.ndarray, " F"]:
+        """rᵀ(f P)⁻¹r of each submap."""
+        factor = self.settings.covariance_factor
+        return kernel.costs(self.state, self.graph.offset, self.graph.factors, factor)
+
+    @property
+    def weight(self) -> Float[np.ndarray, " F"]:
+        """Robust weight of each submap, 1 without a robust loss."""
+        return 1.0 / (1.0 + self.chi2 / (self.graph.dimensions * self.scale**2))
+
+    @cached_property
+    def prior_chi2(self) -> Float[np.ndarray, " priors"]:
+        """χ² of each prior on a start."""
+        return np.array([_prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
+
+    @cached_property
+    def cost(self) -> float:
+        """What is minimised, at the present scales."""
+        scale = self.scale**2 * self.graph.dimensions
+        if self.settings.robust_c is None:
+            return float(self.chi2.sum() + self.prior_chi2.sum())
+        return float((scale * np.log1p(self.chi2 / scale)).sum() + self.prior_chi2.sum())
+
+    @cached_property
+    def normal_equations(self) -> tuple[Values, Values]:
+        """A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and the gradient Σ w JᵀP⁻¹r."""
+        graph, pattern = self.graph, self.graph.pattern
+        values, gradient, _ = kernel.normal_equations(
+            self.state,
+            graph.offset,
+            graph.fixed,
+            graph.factors,
+            self.settings.covariance_factor,
+            self.scale,
+            graph.entry,
+            pattern.column_start,
+            pattern.value_start,
+        )
+        for k, prior in enumerate(graph.priors):
+            slope, hessian, _ = _prior_terms(self, k)
+            begin = graph.offset[prior.node]
+            gradient[begin : begin + 3] += slope
+            pattern.diagonal_block(values, prior.node)[...] += hessian
+        return values, gradient
+
+    @cached_property
+    def posterior(self) -> sparse.Cholesky:
+        """Cholesky factor of the information matrix at this state."""
+        return _factorised(self.graph, self.normal_equations[0])
+
+    @cached_property
+    def selected_covariance(self) -> Values:
+        """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
+        return sparse.selected_inverse(self.posterior)
+
+
+def _prior_terms(
+    island: Island, k: int
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float]:
+    node, mean, information = island.graph.priors[k]
+    begin = island.graph.offset[node]
+    residual = island.state[begin : begin + 3] - mean
+    residual[2] = wrapped(residual[2])
+    slope = information @ residual
+    return slope, information, float(residual @ slope)
+
+
+def _factorised(graph: Graph, values: Values) -> sparse.Cholesky:
+    try:
+        return sparse.factorised(graph.analysis, values)
+    except sparse.NotPositiveDefiniteError as error:
+        raise NotDeterminedError(graph.name(error.variable)) from error
+
+
+def _moved(island: Island, step: Values) -> Island:
+    state = island.state + step
+    headings = state[island.graph.headings]
+    state[island.graph.headings] = np.pi - np.mod(np.pi - headings, 2.0 * np.pi)
+    return replace(island, state=state)
+
+
+def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
+    """One iteration: the island, the damping for the next one, the largest change [m, rad]."""
+    values, gradient = island.normal_equations
+    diagonal = island.graph.diagonal
+    older = island.age + 1
+    while damping < MOST_DAMPING:
+        damped = values.copy()
+        damped[diagonal] *= 1.0 + damping
+        cholesky = island.posterior if damping == 0.0 else _factorised(island.graph, damped)
+        step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
+        moved = _moved(island, step)
+        if moved.cost <= island.cost * (1.0 + ROUNDING) + ROUNDING:
+            eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
+            largest = float(np.abs(step).max(initial=0.0))
+            return replace(moved, age=older), eased, largest
+        damping = max(10.0 * damping, LEAST_DAMPING)
+    return replace(island, age=older), 0.0, 0.0
+
+
+def iterated(island: Island) -> Island:
+    """The iterations of one tick."""
+    damping = 0.0
+    for _ in range(island.settings.iterations_per_tick):
+        island, damping, _ = _iterated(island, damping)
+    return island
+
+
+def settled(island: Island) -> tuple[Island, int, float]:
+    """The full solution from here, the iterations it took and the last change [m, rad].
+
+    A robust scale is annealed anew for all submaps. Ends at `max_iterations` at the latest: the
+    last change tells whether it converged.
+    """
+    settings = island.settings
+    island = replace(island, age=np.zeros_like(island.age))
+    damping, change, count = 0.0, math.inf, 0
+    while count < settings.max_iterations:
+        narrow = settings.robust_c is None or bool((island.scale == settings.robust_c).all())
+        island, damping, change = _iterated(island, damping)
+        count += 1
+        if narrow and damping == 0.0 and change < settings.step_tolerance:
+            break
+    return island, count, change
+
+
+def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:
+    """Mean and joint covariance of some nodes in their given order; a fixed node has covariance 0.
+
+    By back-substitution of unit vectors, one per number of the nodes.
+    """
+    graph = island.graph
+    spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
+    unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
+    covariance = sparse.inverse_columns(island.posterior, unknowns)[unknowns]
+    constant = np.repeat(graph.fixed[list(nodes)], [len(span) for span in spans])
+    covariance[constant] = 0.0
+    covariance[:, constant] = 0.0
+    return island.state[unknowns], 0.5 * (covariance + covariance.T)

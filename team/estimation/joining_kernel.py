@@ -1,0 +1,327 @@
+"""The kernels of map joining: a submap as a factor, its cost, and the sparse normal equations.
+
+A submap that starts at pose s, ends at pose e and sees landmarks l says, with the rotation R of the
+heading of s,
+
+    r = (Rᵀ(p_e − p_s), wrap(θ_e − θ_s), Rᵀ(l₁ − p_s), …) − mean ~ N(0, P).
+
+Seen in the map frame, r' = T r with T = blkdiag(R, 1, R, …), its Jacobian is the identity for
+(e, l₁, …) and
+
+    G = [−I | (v_y, −v_x)ᵀ] per point v = p − p_s,  [0 0 −1] for the heading
+
+for s, and its metric is M = T P⁻¹ Tᵀ. The state is additive in (x, y, θ).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation.compiled import compiled
+from team.estimation.geometry import wrapped
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+
+
+class Factors(NamedTuple):
+    """All submaps of a graph in flat arrays, in the order in which they were taken.
+
+    member[member_start[f] : member_start[f + 1]] are the nodes of submap f: start pose, end pose,
+    landmarks by id. mean and information (P⁻¹, row-major) lie likewise from mean_start and
+    information_start on.
+    """
+
+    member: Indices
+    member_start: Indices
+    mean: Values
+    mean_start: Indices
+    information: Values
+    information_start: Indices
+
+
+@compiled
+def block_pattern(
+    fixed: Bool[np.ndarray, " _"], member: Indices, member_start: Indices
+) -> tuple[Indices, Indices, Indices]:
+    """Pattern of Σ JᵀP⁻¹J, and the entry that each pair of members of each factor adds to.
+
+    Returns column_start, rows (as in `sparse.Pattern`) and, factor by factor, a k × k table over
+    the members: entry for (a, b) if node a ≥ node b, else −1; −1 too if one of them is fixed.
+    """
+    n = len(fixed)
+    pairs = 0
+    for f in range(len(member_start) - 1):
+        pairs += (member_start[f + 1] - member_start[f]) ** 2
+    entry = np.full(pairs, -1, dtype=np.int64)
+    bucket_start = np.zeros(n + 1, dtype=np.int64)
+    for f in range(len(member_start) - 1):
+        nodes = member[member_start[f] : member_start[f + 1]]
+        for i in nodes:
+            for j in nodes:
+                if i >= j and not (fixed[i] or fixed[j]):
+                    bucket_start[j + 1] += 1
+    for j in range(n):
+        bucket_start[j + 1] += bucket_start[j]
+    bucket_row = np.empty(bucket_start[n], dtype=np.int64)
+    bucket_pair = np.empty(bucket_start[n], dtype=np.int64)
+    filled = bucket_start.copy()
+    pair = 0
+    for f in range(len(member_start) - 1):
+        nodes = member[member_start[f] : member_start[f + 1]]
+        for i in nodes:
+            for j in nodes:
+                if i >= j and not (fixed[i] or fixed[j]):
+                    bucket_row[filled[j]] = i
+                    bucket_pair[filled[j]] = pair
+                    filled[j] += 1
+                pair += 1
+    column_start = np.zeros(n + 1, dtype=np.int64)
+    rows = np.empty(n + bucket_start[n], dtype=np.int64)
+    latest = np.full(n, -1, dtype=np.int64)
+    count = 0
+    for j in range(n):
+        rows[count] = j
+        latest[j] = count
+        count += 1
+        for k in range(bucket_start[j], bucket_start[j + 1]):
+            i = bucket_row[k]
+            if latest[i] < column_start[j]:
+                rows[count] = i
+                latest[i] = count
+                count += 1
+            entry[bucket_pair[k]] = latest[i]
+        column_start[j + 1] = count
+    return column_start, rows[:count].copy(), entry
+
+
+@compiled
+def submap_residual(
+    state: Values, at: Indices, mean: Values
+) -> tuple[Values, Float[np.ndarray, "n 2"]]:
+    """The residual r' in the map frame, and v = p − p_s of each point (end pose first).
+
+    at: first number in `state` of the start pose, of the end pose and of each landmark.
+    """
+    start, end = at[0], at[1]
+    c, s = math.cos(state[start + 2]), math.sin(state[start + 2])
+    residual = np.empty(len(mean))
+    offsets = np.empty((len(at) - 1, 2))
+    for point in range(len(at) - 1):
+        row = 0 if point == 0 else 2 * point + 1
+        offsets[point, 0] = state[at[point + 1]] - state[start]
+        offsets[point, 1] = state[at[point + 1] + 1] - state[start + 1]
+        residual[row] = offsets[point, 0] - (c * mean[row] - s * mean[row + 1])
+        residual[row + 1] = offsets[point, 1] - (s * mean[row] + c * mean[row + 1])
+    residual[2] = wrapped(state[end + 2] - state[start + 2] - mean[2])
+    return residual, offsets
+
+
+@compiled
+def rotated_information(
+    information: Float[np.ndarray, "n n"], heading: float
+) -> Float[np.ndarray, "n n"]:
+    """M = T P⁻¹ Tᵀ: the metric of a submap, turned into the map frame."""
+    c, s = math.cos(heading), math.sin(heading)
+    turned = information.copy()
+    n = len(information)
+    row = 0
+    while row < n:
+        for k in range(n):
+            a, b = turned[row, k], turned[row + 1, k]
+            turned[row, k] = c * a - s * b
+            turned[row + 1, k] = s * a + c * b
+        row += 3 if row == 0 else 2
+    row = 0
+    while row < n:
+        for k in range(n):
+            a, b = turned[k, row], turned[k, row + 1]
+            turned[k, row] = c * a - s * b
+            turned[k, row + 1] = s * a + c * b
+        row += 3 if row == 0 else 2
+    return turned
+
+
+@compiled
+def submap_normal(
+    state: Values, at: Indices, mean: Values, information: Float[np.ndarray, "n n"]
+) -> tuple[Float[np.ndarray, "m m"], Values, float]:
+    """JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r of one submap over (start pose, end pose, landmarks)."""
+    n = len(mean)
+    residual, offsets = submap_residual(state, at, mean)
+    metric = rotated_information(information, state[at[0] + 2])
+    jacobian = np.zeros((n, 3))
+    for point in range(len(at) - 1):
+        row = 0 if point == 0 else 2 * point + 1
+        jacobian[row, 0] = -1.0
+        jacobian[row + 1, 1] = -1.0
+        jacobian[row, 2] = offsets[point, 1]
+        jacobian[row + 1, 2] = -offsets[point, 0]
+    jacobian[2, 2] = -1.0
+    hessian = np.zeros((n + 3, n + 3))
+    gradient = np.zeros(n + 3)
+    chi2 = 0.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            hessian[i + 3, j + 3] = metric[i, j]
+            total += metric[i, j] * residual[j]
+        gradient[i + 3] = total
+        chi2 += residual[i] * total
+        for a in range(3):
+            gradient[a] += jacobian[i, a] * total
+        for j in range(n):
+            for a in range(3):
+                hessian[a, j + 3] += jacobian[i, a] * metric[i, j]
+    for j in range(n):
+        for a in range(3):
+            hessian[j + 3, a] = hessian[a, j + 3]
+            for b in range(3):
+                hessian[a, b] += hessian[a, j + 3] * jacobian[j, b]
+    return hessian, gradient, chi2
+
+
+@compiled
+def robust_weight(chi2: float, dimension: int, scale: float) -> float:
+    """Cauchy's weight on √(χ²/dim): 1/(1 + χ²/(dim c²)); 1 for c = ∞."""
+    return 1.0 / (1.0 + chi2 / (dimension * scale * scale))
+
+
+@compiled
+def _places(offset: Indices, nodes: Indices) -> Indices:
+    at = np.empty(len(nodes), dtype=np.int64)
+    for k in range(len(nodes)):
+        at[k] = offset[nodes[k]]
+    return at
+
+
+@compiled
+def costs(state: Values, offset: Indices, factors: Factors, covariance_factor: float) -> Values:
+    """χ² of each submap in the metric (covariance_factor · P)⁻¹."""
+    result = np.empty(len(factors.member_start) - 1)
+    for f in range(len(result)):
+        at = _places(offset, factors.member[factors.member_start[f] : factors.member_start[f + 1]])
+        mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
+        n = len(mean)
+        begin = factors.information_start[f]
+        information = factors.information[begin : begin + n * n].reshape(n, n)
+        residual, _ = submap_residual(state, at, mean)
+        c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+        row = 0
+        while row < n:
+            a, b = residual[row], residual[row + 1]
+            residual[row] = c * a + s * b
+            residual[row + 1] = -s * a + c * b
+            row += 3 if row == 0 else 2
+        chi2 = 0.0
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += information[i, j] * residual[j]
+            chi2 += residual[i] * total
+        result[f] = chi2 / covariance_factor
+    return result
+
+
+@compiled
+def normal_equations(
+    state: Values,
+    offset: Indices,
+    fixed: Bool[np.ndarray, " _"],
+    factors: Factors,
+    covariance_factor: float,
+    scale: Values,
+    entry: Indices,
+    column_start: Indices,
+    value_start: Indices,
+) -> tuple[Values, Values, Values]:
+    """Σ w JᵀP⁻¹J on the pattern, Σ w JᵀP⁻¹r, and χ² of each submap (unweighted).
+
+    scale: the robust c of each submap. A fixed node keeps an identity block without couplings and
+    a zero gradient, so that its step is zero.
+    """
+    values = np.zeros(value_start[-1])
+    gradient = np.zeros(offset[-1])
+    chi2 = np.empty(len(factors.member_start) - 1)
+    for node in range(len(fixed)):
+        if fixed[node]:
+            size = offset[node + 1] - offset[node]
+            for p in range(size):
+                values[value_start[column_start[node]] + p * size + p] = 1.0
+    pair = 0
+    for f in range(len(chi2)):
+        nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
+        at = _places(offset, nodes)
+        mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
+        n = len(mean)
+        begin = factors.information_start[f]
+        information = factors.information[begin : begin + n * n].reshape(n, n)
+        hessian, slope, raw = submap_normal(state, at, mean, information)
+        chi2[f] = raw / covariance_factor
+        weight = robust_weight(chi2[f], n, scale[f]) / covariance_factor
+        row = 0
+        for a in range(len(nodes)):
+            size = offset[nodes[a] + 1] - offset[nodes[a]]
+            if not fixed[nodes[a]]:
+                for p in range(size):
+                    gradient[at[a] + p] += weight * slope[row + p]
+            column = 0
+            for b in range(len(nodes)):
+                other = offset[nodes[b] + 1] - offset[nodes[b]]
+                if entry[pair] >= 0:
+                    base = value_start[entry[pair]]
+                    for p in range(size):
+                        for q in range(other):
+                            values[base + p * other + q] += weight * hessian[row + p, column + q]
+                pair += 1
+                column += other
+            row += size
+    return values, gradient, chi2
+
+
+@compiled
+def explained(
+    state: Values,
+    offset: Indices,
+    factors: Factors,
+    covariance_factor: float,
+    entry: Indices,
+    value_start: Indices,
+    inverse: Values,
+) -> Values:
+    """tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution takes up.
+
+    inverse: the entries of Σ on the pattern. For a solution with these weights the sum over all
+    factors is the number of unknowns.
+    """
+    result = np.zeros(len(factors.member_start) - 1)
+    pair = 0
+    for f in range(len(result)):
+        nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
+        at = _places(offset, nodes)
+        mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
+        n = len(mean)
+        begin = factors.information_start[f]
+        information = factors.information[begin : begin + n * n].reshape(n, n)
+        hessian, _, _ = submap_normal(state, at, mean, information)
+        row = 0
+        for a in range(len(nodes)):
+            size = offset[nodes[a] + 1] - offset[nodes[a]]
+            column = 0
+            for b in range(len(nodes)):
+                other = offset[nodes[b] + 1] - offset[nodes[b]]
+                if entry[pair] >= 0:
+                    base = value_start[entry[pair]]
+                    times = 1.0 if a == b else 2.0
+                    for p in range(size):
+                        for q in range(other):
+                            result[f] += (
+                                times * hessian[row + p, column + q] * inverse[base + p * other + q]
+                            )
+                pair += 1
+                column += other
+            row += size
+        result[f] /= covariance_factor
+    return result

@@ -1,0 +1,181 @@
+"""What a joined map says: means and marginal covariances, and how well its submaps agree.
+
+Everything is in the frame of an island: the main one, or the one that a stream is in.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.estimation import joining_kernel as kernel
+from team.estimation.gauss_newton import Island, joint_marginal
+from team.estimation.joining import Fold
+from team.estimation.submap_graph import Stream
+
+
+class LandmarkMap(NamedTuple):
+    """Landmarks by ascending id: means [m], joint covariance [m²] of (x₁, y₁, x₂, …)."""
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+class LandmarkBlocks(NamedTuple):
+    """Landmarks by ascending id: means [m] and each one's own covariance [m²]."""
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariances: Float[np.ndarray, "L 2 2"]
+
+
+class RobotPrior(NamedTuple):
+    """A robot's last end pose and landmarks: joint covariance of (x, y, θ, x₁, y₁, …)."""
+
+    pose: Float[np.ndarray, "3"]
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+class Trajectory(NamedTuple):
+    """End poses of a stream's submaps in their order, each with its covariance."""
+
+    poses: Float[np.ndarray, "K 3"]
+    covariances: Float[np.ndarray, "K 3 3"]
+
+
+class SubmapCost(NamedTuple):
+    """How one submap agrees with the rest: χ² should be near dof.
+
+    chi2 is unweighted; dof = dim − w tr(JᵀP⁻¹J Σ) is the part of its dimension that the solution
+    does not take up (its redundancy, Baarda 1968); weight w is robust, 1 without a robust loss.
+    """
+
+    stream: Stream
+    sequence: int
+    chi2: float
+    dof: float
+    weight: float
+
+
+class Agreement(NamedTuple):
+    """Joint cost Σ w χ² and its degrees of freedom, in all, per robot and per submap.
+
+    Without a robust loss the joint dof is the sum of the submaps' dimensions (and of the start
+    priors') less the number of unknowns. A lasting chi2/dof above 1.1 is a warning, above 1.3 the
+    covariances are not to be trusted.
+    """
+
+    chi2: float
+    dof: float
+    robots: dict[str, tuple[float, float]]
+    submaps: tuple[SubmapCost, ...]
+
+
+def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
+    """The main island's landmarks (all, or those asked for) with their joint covariance."""
+    chosen = sorted(fold.main.graph.landmarks if ids is None else ids)
+    mean, covariance = joint_marginal(fold.main, _nodes(fold.main, chosen))
+    return LandmarkMap(np.array(chosen, dtype=np.uint32), mean.reshape(-1, 2), covariance)
+
+
+def landmark_blocks(fold: Fold) -> LandmarkBlocks:
+    """The main island's landmarks, each with its own covariance, by selected inversion."""
+    island = fold.main
+    chosen = sorted(island.graph.landmarks)
+    means = np.zeros((len(chosen), 2))
+    covariances = np.zeros((len(chosen), 2, 2))
+    for k, node in enumerate(_nodes(island, chosen)):
+        means[k], covariances[k] = _own_marginal(island, node)
+    return LandmarkBlocks(np.array(chosen, dtype=np.uint32), means, covariances)
+
+
+def prior_for(fold: Fold, robot: str, epoch: int, ids: Sequence[int] | None = None) -> RobotPrior:
+    """What a robot needs to place itself: its last end pose and the landmarks, jointly."""
+    island = fold.island(robot, epoch)
+    chosen = sorted(island.graph.landmarks if ids is None else ids)
+    last = island.graph.streams[(robot, epoch)][-1]
+    mean, covariance = joint_marginal(island, [last, *_nodes(island, chosen)])
+    landmarks = mean[3:].reshape(-1, 2)
+    return RobotPrior(mean[:3], np.array(chosen, dtype=np.uint32), landmarks, covariance)
+
+
+def trajectory(fold: Fold, robot: str, epoch: int) -> Trajectory:
+    """Where the submaps of a stream end, in the frame of its island."""
+    island = fold.island(robot, epoch)
+    nodes = island.graph.streams[(robot, epoch)][1:]
+    marginals = [_own_marginal(island, node) for node in nodes]
+    return Trajectory(
+        np.array([pose for pose, _ in marginals]), np.array([spread for _, spread in marginals])
+    )
+
+
+def joint_cost(fold: Fold) -> Agreement:
+    """The agreement of the main island's submaps, at the present estimate."""
+    island = fold.main
+    graph = island.graph
+    explained = kernel.explained(
+        island.state,
+        graph.offset,
+        graph.factors,
+        island.settings.covariance_factor,
+        graph.entry,
+        graph.pattern.value_start,
+        island.selected_covariance,
+    )
+    weight = island.weight
+    dof = graph.dimensions - weight * explained
+    submaps = tuple(
+        SubmapCost(*of, float(island.chi2[f]), float(dof[f]), float(weight[f]))
+        for f, of in enumerate(_submaps(fold))
+    )
+    robots: dict[str, tuple[float, float]] = {}
+    for robot, chi2, own in [
+        *((each.stream[0], each.weight * each.chi2, each.dof) for each in submaps),
+        *_priors(island),
+    ]:
+        before = robots.get(robot, (0.0, 0.0))
+        robots[robot] = (before[0] + chi2, before[1] + own)
+    chi2 = sum(robots[robot][0] for robot in sorted(robots))
+    total = sum(robots[robot][1] for robot in sorted(robots))
+    return Agreement(chi2, total, {robot: robots[robot] for robot in sorted(robots)}, submaps)
+
+
+def _nodes(island: Island, ids: Sequence[int]) -> list[int]:
+    return [island.graph.landmarks[id_] for id_ in ids]
+
+
+def _own_marginal(
+    island: Island, node: int
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    begin, end = island.graph.offset[node], island.graph.offset[node + 1]
+    block = island.graph.pattern.diagonal_block(island.selected_covariance, node)
+    fixed = bool(island.graph.fixed[node])
+    return island.state[begin:end], np.zeros_like(block) if fixed else block
+
+
+def _submaps(fold: Fold) -> list[tuple[Stream, int]]:
+    """Stream and sequence of each submap of the main island, in the order of its factors."""
+    nodes = {
+        node: (stream, sequence)
+        for stream, ends in fold.main.graph.streams.items()
+        for sequence, node in enumerate(ends[1:])
+    }
+    factors = fold.main.graph.factors
+    return [nodes[node] for node in factors.member[factors.member_start[:-1] + 1].tolist()]
+
+
+def _priors(island: Island) -> list[tuple[str, float, float]]:
+    """(robot, χ², dof) of the priors on starts."""
+    robots = {nodes[0]: stream[0] for stream, nodes in island.graph.streams.items()}
+    return [
+        (
+            robots[prior.node],
+            float(chi2),
+            3.0 - float(np.sum(prior.information * _own_marginal(island, prior.node)[1])),
+        )
+        for prior, chi2 in zip(island.graph.priors, island.prior_chi2, strict=True)
+    ]

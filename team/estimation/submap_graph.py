@@ -1,0 +1,309 @@
+"""The factor graph of one frame: pose nodes, landmarks, submaps as factors, priors on starts.
+
+A `Graph` is the structure; it stays while the state moves. Every function returns new values. The
+value of a node that is added is found by composition from the nodes that are there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation.gaussian import information
+from team.estimation.geometry import compose, transformed
+from team.estimation.joining_kernel import Factors, block_pattern
+from team.estimation.sparse import Analysis, Pattern, analysed
+from team.estimation.submap import LocalMap
+
+Stream: TypeAlias = tuple[str, int]
+"""(robot, epoch): one unbroken life of a robot's sensor stream."""
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+
+
+@dataclass(frozen=True, eq=False)
+class Contribution:
+    """One submap of the set: `sequence` counts the submaps of (robot, epoch) from 0."""
+
+    robot: str
+    epoch: int
+    sequence: int
+    end_ns: int
+    local: LocalMap
+
+    @property
+    def stream(self) -> Stream:
+        """(robot, epoch)."""
+        return (self.robot, self.epoch)
+
+    @property
+    def key(self) -> tuple[int, str, int, int]:
+        """Place in the canonical order: (end stamp, robot, epoch, sequence)."""
+        return (self.end_ns, self.robot, self.epoch, self.sequence)
+
+    @cached_property
+    def information(self) -> Float[np.ndarray, "n n"]:
+        """P⁻¹ of the submap. Raises NotACovarianceError that names the submap."""
+        return information(self.local.covariance, f"submap {self.sequence} of {named(self.stream)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a stream starts in the common frame: exactly (covariance None) or N(pose, covariance).
+
+    The covariance is of (x [m], y [m], theta [rad]) in the common frame.
+    """
+
+    robot: str
+    epoch: int
+    pose: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"] | None = None
+
+    @property
+    def stream(self) -> Stream:
+        """(robot, epoch)."""
+        return (self.robot, self.epoch)
+
+    @cached_property
+    def information(self) -> Float[np.ndarray, "3 3"] | None:
+        """P⁻¹, None for an exact start."""
+        if self.covariance is None:
+            return None
+        return information(self.covariance, f"the start of {named(self.stream)}")
+
+
+class Prior(NamedTuple):
+    """A pose node with (x, y, theta) ~ N(mean, information⁻¹), never down-weighted."""
+
+    node: int
+    mean: Float[np.ndarray, "3"]
+    information: Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Nodes in the order in which they came, and what ties them.
+
+    streams:   nodes of each stream: its start, then the end pose of submap 0, 1, …
+    landmarks: node of each landmark id.
+    offset:    first number of each node in the state; the last is the state's length.
+    fixed:     nodes that are constants (exact starts, the gauge).
+    """
+
+    streams: Mapping[Stream, tuple[int, ...]]
+    landmarks: Mapping[int, int]
+    offset: Indices
+    fixed: Bool[np.ndarray, " _"]
+    factors: Factors
+    priors: tuple[Prior, ...]
+
+    @cached_property
+    def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
+        column_start, rows, entry = block_pattern(
+            self.fixed, self.factors.member, self.factors.member_start
+        )
+        return Pattern(np.diff(self.offset), column_start, rows), entry
+
+    @property
+    def pattern(self) -> Pattern:
+        """Blocks of the normal equations: a block variable per node."""
+        return self._pattern_and_entry[0]
+
+    @property
+    def entry(self) -> Indices:
+        """Entry of the pattern for each pair of members of each submap (see `block_pattern`)."""
+        return self._pattern_and_entry[1]
+
+    @cached_property
+    def analysis(self) -> Analysis:
+        """Order of elimination and places in the Cholesky factor."""
+        return analysed(self.pattern)
+
+    @cached_property
+    def dimensions(self) -> Indices:
+        """Numbers in each submap."""
+        return np.diff(self.factors.mean_start)
+
+    @cached_property
+    def headings(self) -> Indices:
+        """Where the headings lie in the state."""
+        headings: Indices = self.offset[:-1][np.diff(self.offset) == 3] + 2
+        return headings
+
+    @cached_property
+    def diagonal(self) -> Indices:
+        """Where the diagonal of the normal equations lies in the numbers of the pattern."""
+        sizes = self.pattern.sizes
+        begin = np.repeat(self.pattern.value_start[self.pattern.column_start[:-1]], sizes)
+        within = np.arange(self.offset[-1]) - np.repeat(self.offset[:-1], sizes)
+        return begin + within * (np.repeat(sizes, sizes) + 1)
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers to be estimated."""
+        return int(np.diff(self.offset)[~self.fixed].sum())
+
+    def name(self, node: int) -> str:
+        """What a node is, for messages."""
+        for stream, nodes in self.streams.items():
+            if node == nodes[0]:
+                return f"the start of {named(stream)}"
+            if node in nodes:
+                return f"the end of submap {nodes.index(node) - 1} of {named(stream)}"
+        ids = [id_ for id_, at in self.landmarks.items() if at == node]
+        return f"landmark {ids[0]}"
+
+
+EMPTY_GRAPH = Graph(
+    {},
+    {},
+    np.zeros(1, dtype=np.int64),
+    np.zeros(0, dtype=np.bool_),
+    Factors(
+        np.zeros(0, dtype=np.int64),
+        np.zeros(1, dtype=np.int64),
+        np.zeros(0),
+        np.zeros(1, dtype=np.int64),
+        np.zeros(0),
+        np.zeros(1, dtype=np.int64),
+    ),
+    (),
+)
+
+
+def named(stream: Stream) -> str:
+    """`r3 (epoch 2)`."""
+    return f"{stream[0]} (epoch {stream[1]})"
+
+
+class _Growth:
+    """The nodes that are being added to a graph, with their values; alive inside `extended`."""
+
+    def __init__(self, graph: Graph, state: Values) -> None:
+        self.streams = dict(graph.streams)
+        self.landmarks = dict(graph.landmarks)
+        self.offset = graph.offset
+        self.state = state
+        self.count = len(graph.fixed)
+        self.values: list[Values] = []
+        self.fixed: list[bool] = []
+
+    def value(self, node: int, size: int) -> Values:
+        before = len(self.offset) - 1
+        if node >= before:
+            return self.values[node - before]
+        return self.state[self.offset[node] : self.offset[node] + size]
+
+    def add(self, value: Values, fixed: bool) -> int:
+        self.values.append(value)
+        self.fixed.append(fixed)
+        self.count += 1
+        return self.count - 1
+
+
+def extended(
+    graph: Graph,
+    state: Values,
+    contributions: Sequence[Contribution],
+    starts: Mapping[Stream, Start],
+) -> tuple[Graph, Values]:
+    """The graph with more submaps, in the given order; a stream without a start begins at 0.
+
+    A new end pose is start ∘ local end pose, a new landmark is placed by the first submap that
+    sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of its frame.
+    """
+    growth = _Growth(graph, state)
+    priors = list(graph.priors)
+    member: list[int] = []
+    members: list[int] = []
+    for contribution in contributions:
+        stream, local = contribution.stream, contribution.local
+        if stream not in growth.streams:
+            start = starts.get(stream, Start(*stream, np.zeros(3)))
+            node = growth.add(start.pose, start.covariance is None)
+            growth.streams[stream] = (node,)
+            if start.information is not None:
+                priors.append(Prior(node, start.pose, start.information))
+        start_node = growth.streams[stream][-1]
+        map_from_start = growth.value(start_node, 3)
+        end_node = growth.add(compose(map_from_start, local.end_pose), fixed=False)
+        growth.streams[stream] = (*growth.streams[stream], end_node)
+        for id_, point in zip(local.ids.tolist(), local.landmarks, strict=True):
+            if id_ not in growth.landmarks:
+                growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
+        member += [start_node, end_node, *(growth.landmarks[id_] for id_ in local.ids.tolist())]
+        members.append(2 + len(local.ids))
+    factors = Factors(
+        np.concatenate([graph.factors.member, np.array(member, dtype=np.int64)]),
+        _continued(graph.factors.member_start, members),
+        np.concatenate([graph.factors.mean, *(c.local.mean for c in contributions)]),
+        _continued(graph.factors.mean_start, [len(c.local.mean) for c in contributions]),
+        np.concatenate(
+            [graph.factors.information, *(c.information.ravel() for c in contributions)]
+        ),
+        _continued(graph.factors.information_start, [c.information.size for c in contributions]),
+    )
+    grown = Graph(
+        growth.streams,
+        growth.landmarks,
+        _continued(graph.offset, [len(value) for value in growth.values]),
+        np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
+        factors,
+        tuple(priors),
+    )
+    return grown, np.concatenate([state, *growth.values])
+
+
+def _continued(starts: Indices, lengths: Sequence[int]) -> Indices:
+    return np.concatenate([starts, starts[-1] + np.cumsum(np.array(lengths, dtype=np.int64))])
+
+
+def merged(
+    main: Graph,
+    state: Values,
+    other: Graph,
+    other_state: Values,
+    main_from_other: Float[np.ndarray, "3"],
+) -> tuple[Graph, Values]:
+    """Both graphs in the main frame; landmarks with equal ids become one, at the main's value.
+
+    What was fixed in the other frame (its gauge) becomes free.
+    """
+    common = {
+        node: main.landmarks[id_] for id_, node in other.landmarks.items() if id_ in main.landmarks
+    }
+    node_of = np.empty(len(other.fixed), dtype=np.int64)
+    values: list[Values] = []
+    for node, size in enumerate(np.diff(other.offset).tolist()):
+        if node in common:
+            node_of[node] = common[node]
+            continue
+        node_of[node] = len(main.fixed) + len(values)
+        value = other_state[other.offset[node] : other.offset[node + 1]]
+        moved = compose if size == 3 else transformed
+        values.append(moved(main_from_other, value))
+    a, b = main.factors, other.factors
+    factors = Factors(
+        np.concatenate([a.member, node_of[b.member]]),
+        _continued(a.member_start, np.diff(b.member_start).tolist()),
+        np.concatenate([a.mean, b.mean]),
+        _continued(a.mean_start, np.diff(b.mean_start).tolist()),
+        np.concatenate([a.information, b.information]),
+        _continued(a.information_start, np.diff(b.information_start).tolist()),
+    )
+    streams = {
+        stream: tuple(node_of[list(nodes)].tolist()) for stream, nodes in other.streams.items()
+    }
+    landmarks = {id_: int(node_of[node]) for id_, node in other.landmarks.items()}
+    graph = Graph(
+        {**main.streams, **streams},
+        {**landmarks, **main.landmarks},
+        _continued(main.offset, [len(value) for value in values]),
+        np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
+        factors,
+        main.priors,
+    )
+    return graph, np.concatenate([state, *values])
