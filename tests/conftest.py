@@ -1,4 +1,4 @@
-"""What holds in every test run: one BLAS thread, shapes and types checked, system tests in a row."""
+"""What holds in every test run: one BLAS thread, checked shapes, system tests one by one."""
 
 import os
 

@@ -1,0 +1,27 @@
+# One image for every process of a team: the command says which one it is.
+FROM python:3.11-slim AS build
+WORKDIR /src
+COPY pyproject.toml README.md LICENSE constraints.txt ./
+COPY team team
+COPY central central
+COPY sim sim
+RUN pip install --no-cache-dir --constraint constraints.txt pip \
+ && PIP_BUILD_CONSTRAINT=/src/constraints.txt pip wheel --no-cache-dir --no-deps --wheel-dir /dist .
+
+FROM python:3.11-slim
+# Kernels are compiled for the processor that they run on, so the cache is filled at the first start
+# and kept in a volume; the log's folder belongs to the user, too.
+RUN useradd --system --uid 10001 --no-create-home teamslam \
+ && install --directory --owner teamslam /logs /var/cache/teamslam
+RUN --mount=type=bind,from=build,source=/dist,target=/dist \
+    --mount=type=bind,source=constraints.txt,target=/constraints.txt \
+    pip install --no-cache-dir --constraint /constraints.txt /dist/*.whl
+ENV PYTHONUNBUFFERED=1 \
+    OPENBLAS_NUM_THREADS=1 \
+    OMP_NUM_THREADS=1 \
+    NUMBA_CACHE_DIR=/var/cache/teamslam/numba \
+    MPLCONFIGDIR=/var/cache/teamslam/matplotlib
+USER teamslam
+WORKDIR /logs
+ENTRYPOINT ["teamslam"]
+CMD ["--help"]

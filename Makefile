@@ -1,0 +1,73 @@
+# Needs make and a Python of 3.11 or newer; everything else goes into .venv, at pinned versions.
+#
+#   make run        a team maps a random place; what `make test` needs is not installed for it
+#   make test       all tests
+#   make check      format, lint, strict types, the direction of imports
+#   make setup      what all of these need
+#   make constraints    writes constraints.txt anew from what .venv holds
+#   make clean      removes what any of these made
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
+
+# One BLAS thread per process: same bits everywhere, and robots do not take each other's cores.
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+export PIP_BUILD_CONSTRAINT := $(abspath constraints.txt)
+
+.DEFAULT_GOAL := run
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: run test check setup constraints clean
+
+run: $(VENV)/.runtime
+	$(BIN)/teamslam launch waypoints --speed max
+
+# loadgroup: what starts processes shares one worker, everything else is spread over both.
+test: $(VENV)/.dev
+	$(BIN)/pytest --numprocesses 2 --dist loadgroup
+
+check: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+setup: $(VENV)/.dev
+
+constraints: $(VENV)/.dev
+	@echo '# Made by `make constraints`: every distribution that a run, a test or a check takes.' > $@.new
+	$(BIN)/pip freeze --all --exclude-editable >> $@.new
+	mv $@.new $@.txt
+
+clean:
+	rm -rf $(VENV) build dist runs *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find team central sim tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# A Python that is too old, that is only a launcher's stub or that can not make environments is
+# passed over. PYTHON=/path/to/python chooses one.
+$(VENV)/.python:
+	@found=; for python in $${PYTHON:-$(CANDIDATES)}; do \
+	  if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
+	  then found=$$python; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	  echo "teamslam needs Python 3.11 or newer with its venv module; tried: $${PYTHON:-$(CANDIDATES)}." >&2; \
+	  echo "Install one (Debian and Ubuntu: apt install python3 python3-venv) or name it: make PYTHON=/path/to/python" >&2; \
+	  exit 1; \
+	fi; \
+	echo "Setting up $(VENV) with $$("$$found" --version)"; \
+	"$$found" -m venv --clear $(VENV)
+	$(PIP) install --constraint constraints.txt pip
+	touch $@
+
+$(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/.python
+	$(PIP) install --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/.python
+	$(PIP) install --constraint constraints.txt --editable '.[dev]'
+	touch $(VENV)/.runtime $@
