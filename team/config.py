@@ -80,7 +80,12 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that a robot's estimate depends on beside its readings and the seed."""
+    """Everything that a robot's estimate depends on beside its readings.
+
+    exchange_s: under a rule with feedback, the least team time between two exchanges of maps (at
+    window ends; for `hybrid-thesis` at epochs). pose_s: the least team time between two running
+    poses.
+    """
 
     id: Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
     motion: MotionModel = MotionModel()
@@ -88,5 +93,6 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     front_end: FrontEnd = FrontEnd()
     estimator: Estimator = "hybrid"
     fusion: FusionRule = "join"
-    exchange_s: Positive = 10.0
+    exchange_s: NonNegative = 0.0
+    pose_s: NonNegative = 0.0
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1

@@ -1,0 +1,139 @@
+"""The rules that fuse whole maps which the robots absorb again, in lockstep.
+
+Each round takes the map that every robot sent for it. What comes back replaces the robots' own
+landmarks, so the next round's maps hold this round's: under `kalman` and `kalman-per-axis` the same
+readings are counted again and again, and the covariance that they give is worth nothing.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from central.config import CentralConfig
+from central.rules import MapEstimate, covariance_intersection, kalman, kalman_per_axis
+from team import translate
+from team.config import FusionRule
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+
+RULES: Mapping[FusionRule, Callable[[Sequence[MapEstimate]], MapEstimate]] = {
+    "kalman": kalman,
+    "kalman-per-axis": kalman_per_axis,
+    "covariance-intersection": covariance_intersection,
+}
+
+
+class FeedbackRule:
+    """Waits for every robot's map of a round, fuses them in the order of the robots' names."""
+
+    def __init__(self, config: CentralConfig, digest: bytes) -> None:
+        self._rule = config.fusion
+        self._config_digest = digest
+        self._rounds: dict[int, dict[str, m.MapEstimate]] = {}
+        self._fused: m.FusedMap | None = None
+        self._next = 1
+        self.landmarks = 0
+
+    def take_map(self, estimate: m.MapEstimate) -> None:
+        """A robot's map for the round that it names."""
+        if estimate.exchange >= self._next:
+            self._rounds.setdefault(estimate.exchange, {})[estimate.robot] = estimate
+
+    def rounds_sent(self, robot: str) -> int:
+        """The last round that the robot has sent a map for, of those that are open."""
+        sent = [number for number, maps in self._rounds.items() if robot in maps]
+        return max(sent, default=self._next - 1)
+
+    def advance(
+        self, taking_part: Callable[[str, int], bool], robots: Sequence[str]
+    ) -> list[Outgoing]:
+        """Fuse every round that no robot is missing from; `taking_part(robot, round)` says who."""
+        out: list[Outgoing] = []
+        while self._next in self._rounds:
+            maps = self._rounds[self._next]
+            if any(r not in maps and taking_part(r, self._next) for r in robots):
+                break
+            self._fused = self._fuse(self._next, [maps[r] for r in sorted(maps)])
+            del self._rounds[self._next]
+            self._next += 1
+            out.append(Outgoing(ch.FUSED_MAP, "", self._fused))
+        return out
+
+    def conclude(self, now_ns: int) -> list[Outgoing]:
+        """The last round's map is the final one."""
+        last = self._fused
+        if last is None:
+            last = self._message(
+                0,
+                now_ns,
+                (),
+                MapEstimate(np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 0))),
+                b"",
+            )
+        final = m.FusedMap(
+            last.stamp_ns,
+            last.rule,
+            last.digest,
+            last.frame,
+            True,
+            False,
+            last.exchange,
+            last.members,
+            (),
+            last.joint,
+            last.ids,
+            last.means,
+            last.covariance,
+            0.0,
+            0,
+            ("this rule counts readings more than once: its covariance is not valid",)
+            if self._rule != "covariance-intersection"
+            else (),
+        )
+        return [Outgoing(ch.FINAL_MAP, "", final)]
+
+    def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> m.FusedMap:
+        values = [
+            MapEstimate(*translate.landmarks_of(x), translate.landmark_covariance_of(x))
+            for x in maps
+        ]
+        members = tuple(m.Member(x.robot, x.epoch, x.sequence) for x in maps)
+        payload = b"".join(x.ids + x.means + x.covariance for x in maps)
+        previous = b"" if self._fused is None else self._fused.digest
+        stamp_ns = max(x.stamp_ns for x in maps)
+        return self._message(
+            number, stamp_ns, members, RULES[self._rule](values), payload + previous
+        )
+
+    def _message(
+        self,
+        number: int,
+        stamp_ns: int,
+        members: tuple[m.Member, ...],
+        value: MapEstimate,
+        inputs: bytes,
+    ) -> m.FusedMap:
+        self.landmarks = len(value.ids)
+        joint = self._rule != "kalman-per-axis"
+        digest = translate.digest_of(self._config_digest, number.to_bytes(8, "little"), inputs)
+        return m.FusedMap(
+            stamp_ns,
+            self._rule,
+            digest,
+            "start poses",
+            False,
+            False,
+            number,
+            members,
+            (),
+            joint,
+            from_ids(value.ids),
+            from_floats(value.means),
+            translate.joint_bytes(value.covariance)
+            if joint
+            else translate.block_bytes(translate.blocks_of(value.covariance)),
+            0.0,
+            0,
+        )

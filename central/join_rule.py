@@ -1,0 +1,201 @@
+"""The rule `join`: the team's map is a pure function of the set of submaps."""
+
+from typing import Literal
+
+import numpy as np
+
+from central.config import CentralConfig
+from central.submap_set import Stream, SubmapSet
+from central.tick_fold import TickFold
+from team import translate
+from team.estimation import marginals
+from team.estimation.joining import Fold, converged
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded
+
+Tail = Literal["final", "closed", "provisional"]
+
+PRIOR_LANDMARKS = 400
+"""Landmarks in a robot's prior at the most: the best known ones."""
+JOINT_LANDMARKS = 2000
+"""With more landmarks than this the final map carries their own covariances only."""
+
+
+class JoinRule:
+    """Keeps the set and its fold; gives the messages of a broadcast and of the end."""
+
+    def __init__(self, config: CentralConfig, digest: bytes) -> None:
+        self._config = config
+        self._digest = digest
+        self._set = SubmapSet()
+        self._ticks = TickFold(config)
+        self._starts: dict[Stream, m.Start] = {}
+        self._entered: dict[Stream, int] = {}
+        self._broadcast_ns: int | None = None
+        self.cost: tuple[float, float] = (0.0, 0.0)
+        self.landmarks = 0
+        self.warnings: list[str] = []
+        self.refused = 0
+
+    def take_start(self, start: m.Start) -> None:
+        """A stream begins; its submaps wait for this."""
+        if (start.robot, start.epoch) not in self._starts:
+            self._starts[(start.robot, start.epoch)] = start
+            value = translate.start_of(start)
+            if value is not None:
+                self._ticks.know_start(value)
+            self._enter((start.robot, start.epoch))
+
+    def take_submap(self, submap: m.Submap) -> int:
+        """Admit a submap; how many of its stream are there without a gap."""
+        stream = (submap.robot, submap.epoch)
+        reason = self._set.admit(submap)
+        if reason is not None:
+            self.refused += 1
+            self.warnings.append(f"refused: {reason}")
+        self._enter(stream)
+        return self._set.count(stream)
+
+    def _enter(self, stream: Stream) -> None:
+        """Hand the fold what now is there without a gap."""
+        if stream not in self._starts:
+            return
+        chain = self._set.chain(stream)
+        for submap in chain[self._entered.get(stream, 0) :]:
+            self._ticks.add(submap, translate.digest_of(encoded(submap)))
+        self._entered[stream] = len(chain)
+
+    @property
+    def streams(self) -> list[Stream]:
+        """The streams that the set has submaps of."""
+        return sorted(self._set.streams)
+
+    def count(self, stream: Stream) -> int:
+        """How many submaps of a stream are in the fold's reach."""
+        return self._entered.get(stream, 0)
+
+    def submaps(self, robot: str) -> list[m.Submap]:
+        """What is in the set of the latest epoch of one robot."""
+        epochs = [epoch for name, epoch in self._set.streams if name == robot]
+        return self._set.chain((robot, max(epochs))) if epochs else []
+
+    def start(self, robot: str, epoch: int) -> m.Start | None:
+        """The start of a stream, if it has come."""
+        return self._starts.get((robot, epoch))
+
+    def advance(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
+        """Fold what the watermark allows; a broadcast when one is due."""
+        taken = self._ticks.take_until(watermark_ns)
+        since = None if self._broadcast_ns is None else newest_ns - self._broadcast_ns
+        due = since is None or since >= self._config.broadcast_s * 1e9
+        if taken and due:
+            return self._broadcast(self._ticks.fold, "closed", newest_ns)
+        stalled = since is not None and since >= 3e9 * max(
+            self._config.broadcast_s, self._config.tick_s
+        )
+        if stalled and self._entered:
+            return self._broadcast(self._ticks.provisional(), "provisional", newest_ns)
+        return []
+
+    def conclude(self, newest_ns: int) -> list[Outgoing]:
+        """The final map: everything folded, solved until it stands still, with what it says."""
+        self._ticks.take_until(float("inf"))
+        fold = self._ticks.fold
+        if fold.contributions:
+            fold = converged(fold, self._ticks.settings)
+        return self._broadcast(fold, "final", newest_ns)
+
+    def _broadcast(self, fold: Fold, tail: Tail, now_ns: int) -> list[Outgoing]:
+        self._broadcast_ns = now_ns
+        digest = self._ticks.digest(fold, self._digest, tail.encode())
+        fused = self._fused(fold, tail, digest)
+        if tail == "final":
+            out = [Outgoing(ch.TRAJECTORY, stream[0], t) for stream, t in self._paths(fold, digest)]
+            return [*out, Outgoing(ch.FINAL_MAP, "", fused)]
+        return [Outgoing(ch.FUSED_MAP, "", fused), *self._priors(fold, digest)]
+
+    def _fused(self, fold: Fold, tail: Tail, digest: bytes) -> m.FusedMap:
+        chi2 = dof = 0.0
+        if fold.contributions and tail == "final":
+            agreement = marginals.joint_cost(fold)
+            chi2, dof = agreement.chi2, agreement.dof
+            self.cost = (chi2, dof)
+        joint = False
+        if not fold.contributions:
+            ids, means, covariance = np.empty(0, np.uint32), np.empty((0, 2)), b""
+        elif tail == "final" and len(fold.main.graph.landmarks) <= JOINT_LANDMARKS:
+            joint = True
+            ids, means, matrix = marginals.landmark_map(fold)
+            covariance = translate.joint_bytes(matrix)
+        else:
+            ids, means, blocks = marginals.landmark_blocks(fold)
+            covariance = translate.block_bytes(blocks)
+        self.landmarks = len(ids)
+        frame = fold.frame
+        last_ns = fold.contributions[-1].end_ns if fold.contributions else 0
+        return m.FusedMap(
+            last_ns,
+            "join",
+            digest,
+            "" if frame is None else f"{frame[0]}/{frame[1]}",
+            tail == "final",
+            tail == "provisional",
+            0,
+            tuple(m.Member(*s, n) for s, n in self._ticks.members(fold).items()),
+            self._set.missing(),
+            joint,
+            from_ids(ids),
+            from_floats(means),
+            covariance,
+            chi2,
+            round(dof),
+            tuple(fold.reasons[k] for k in sorted(fold.reasons)),
+        )
+
+    def _priors(self, fold: Fold, digest: bytes) -> list[Outgoing]:
+        out = []
+        latest: dict[str, int] = {}
+        for robot, epoch in fold.home:
+            latest[robot] = max(latest.get(robot, 0), epoch)
+        chosen = self._best_known(fold)
+        for robot, epoch in sorted(latest.items()):
+            if fold.home[(robot, epoch)] != fold.main_key:
+                continue
+            prior = marginals.prior_for(fold, robot, epoch, chosen)
+            sequence = fold.next_sequence((robot, epoch)) - 1
+            message = translate.prior_message(
+                fold.contributions[-1].end_ns,
+                robot,
+                epoch,
+                sequence,
+                digest,
+                prior.ids,
+                np.concatenate((prior.pose, prior.means.ravel())),
+                prior.covariance,
+            )
+            out.append(Outgoing(ch.PRIOR, robot, message))
+        return out
+
+    @staticmethod
+    def _best_known(fold: Fold) -> list[int] | None:
+        if not fold.contributions or len(fold.main.graph.landmarks) <= PRIOR_LANDMARKS:
+            return None
+        ids, _, blocks = marginals.landmark_blocks(fold)
+        order = np.argsort(blocks[:, 0, 0] + blocks[:, 1, 1], kind="stable")
+        return sorted(int(i) for i in ids[order[:PRIOR_LANDMARKS]])
+
+    def _paths(self, fold: Fold, digest: bytes) -> list[tuple[Stream, m.Trajectory]]:
+        paths = []
+        for robot, epoch in sorted(fold.home):
+            if fold.home[(robot, epoch)] != fold.main_key:
+                continue
+            poses, covariances = marginals.trajectory(fold, robot, epoch)
+            ends = [s.stamp_ns for s in self._set.chain((robot, epoch))][: len(poses)]
+            message = translate.trajectory_message(
+                ends[-1], robot, epoch, digest, ends, poses, covariances
+            )
+            paths.append(((robot, epoch), message))
+        return paths

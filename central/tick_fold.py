@@ -1,0 +1,111 @@
+"""The fold over the set in its canonical order, by ticks of team time, with its checkpoints.
+
+Tick b takes the submaps that end in (b·tick, (b + 1)·tick]. Behind the watermark every submap of a
+tick is there, so the fold is final; what comes late rolls it back to the checkpoint before.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping
+
+from central.config import CentralConfig
+from team import translate
+from team.estimation.joining import EMPTY_FOLD, Contribution, Fold, JoinSettings, folded, started
+from team.estimation.joining import Start as StartValue
+from team.wire.messages import Submap
+
+Stream = tuple[str, int]
+
+
+def join_settings(config: CentralConfig) -> JoinSettings:
+    """The join's settings in a centre's configuration."""
+    return JoinSettings(
+        iterations_per_tick=config.gauss_newton_per_tick,
+        robust_c=config.robust_c,
+        covariance_factor=config.covariance_factor,
+    )
+
+
+class TickFold:
+    """Holds the contributions by tick and the fold after each tick that has been taken."""
+
+    def __init__(self, config: CentralConfig) -> None:
+        self.settings = join_settings(config)
+        self._tick_ns = round(config.tick_s * 1e9)
+        self._ticks: dict[int, dict[tuple[int, str, int, int], Contribution]] = defaultdict(dict)
+        self._digests: dict[tuple[int, str, int, int], bytes] = {}
+        self._starts: dict[Stream, StartValue] = {}
+        self._taken: list[tuple[int, Fold]] = []
+
+    def know_start(self, start: StartValue) -> None:
+        """Where a stream starts; to be told before its first submap is added."""
+        self._starts[(start.robot, start.epoch)] = start
+
+    def add(self, submap: Submap, digest: bytes) -> None:
+        """Put a submap in its tick; the fold goes back to before that tick if it was taken."""
+        contribution = translate.contribution_of(submap)
+        tick = self._tick_of(submap.stamp_ns)
+        self._ticks[tick][contribution.key] = contribution
+        self._digests[contribution.key] = digest
+        while self._taken and self._taken[-1][0] >= tick:
+            self._taken.pop()
+
+    def _tick_of(self, end_ns: int) -> int:
+        return (end_ns - 1) // self._tick_ns
+
+    @property
+    def fold(self) -> Fold:
+        """The fold over the ticks that have been taken."""
+        return self._taken[-1][1] if self._taken else EMPTY_FOLD
+
+    @property
+    def end_ns(self) -> int:
+        """The end of the last tick that has been taken."""
+        return (self._taken[-1][0] + 1) * self._tick_ns if self._taken else 0
+
+    def take_until(self, watermark_ns: float) -> bool:
+        """Take every tick that ends at the watermark or before; True if there was one."""
+        taken = False
+        for tick in self._open_ticks():
+            if (tick + 1) * self._tick_ns > watermark_ns:
+                break
+            self._taken.append((tick, self._with_tick(self.fold, tick)))
+            taken = True
+        return taken
+
+    def provisional(self) -> Fold:
+        """The fold over everything that is there, ahead of the watermark too."""
+        fold = self.fold
+        for tick in self._open_ticks():
+            fold = self._with_tick(fold, tick)
+        return fold
+
+    def _open_ticks(self) -> list[int]:
+        last = self._taken[-1][0] if self._taken else None
+        return sorted(tick for tick in self._ticks if last is None or tick > last)
+
+    def _with_tick(self, fold: Fold, tick: int) -> Fold:
+        members = self._ticks[tick]
+        for key in sorted(members):
+            stream = members[key].stream
+            if members[key].sequence == 0 and stream in self._starts:
+                fold = started(fold, self._starts[stream])
+        return folded(fold, [members[key] for key in sorted(members)], self.settings)
+
+    def digest(self, fold: Fold, *more: bytes) -> bytes:
+        """The name of the fold's set: starts and submaps in canonical order, and `more`."""
+        starts = [
+            translate.digest_of(
+                robot.encode(),
+                epoch.to_bytes(8, "little"),
+                start.pose.tobytes(),
+                b"" if start.covariance is None else start.covariance.tobytes(),
+            )
+            for (robot, epoch), start in sorted(self._starts.items())
+            if (robot, epoch) in fold.home
+        ]
+        members = [self._digests[c.key] for c in fold.contributions]
+        return translate.digest_of(*more, *starts, *members)
+
+    def members(self, fold: Fold) -> Mapping[Stream, int]:
+        """The version vector: the last sequence of each stream in the fold."""
+        return {stream: fold.next_sequence(stream) - 1 for stream in sorted(fold.home)}

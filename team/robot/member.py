@@ -1,0 +1,135 @@
+"""Hybrid-SLAM on one robot's readings: windows of particles, each closed into one submap."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from team.config import RobotConfig
+from team.estimation import window as windows
+from team.estimation.gaussian import Matrix
+from team.estimation.randomness import generator
+from team.estimation.submap import LocalMap
+from team.estimation.whole_map import WholeMap, begun, joined
+from team.estimation.window import Window
+from team.robot.segmenter import Epoch, Segmenter
+
+
+@dataclass(frozen=True)
+class ClosedWindow:
+    """A submap with the names of its inputs."""
+
+    sequence: int
+    first_reading: int
+    last_reading: int
+    start_ns: int
+    end_ns: int
+    local: LocalMap
+
+
+class HybridMember:
+    """One epoch of a robot's stream, from its start or from its last submap.
+
+    A window begins at zero where the last one ended, so each depends on its own readings, the
+    configuration and (seed, robot, epoch, sequence) alone. Beside the submaps the member keeps its
+    own whole map by joining them one by one (Brooks & Bailey's back end): that is what the robot
+    knows by itself, and no submap depends on it.
+    """
+
+    def __init__(self, config: RobotConfig, epoch: int) -> None:
+        self._config = config
+        self._window_ns = round(config.front_end.window_s * 1e9)
+        self._epoch = epoch
+        self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
+        self.sequence = 0
+        self._first_reading = 0
+        self._last_reading = -1
+        self._start_ns: int | None = None
+        self._window: Window = windows.opened(config.front_end, config.sensor)
+        self._generator = generator(config.seed, config.id, epoch, 0)
+        self.whole: WholeMap = begun(np.zeros(3), None)
+        self.last_epoch_ns: int | None = None
+
+    def start(self, pose: Float[np.ndarray, "3"] | None, covariance: Matrix | None) -> None:
+        """The start pose, if it is known; without one the own map's frame is the start itself."""
+        self.whole = begun(np.zeros(3) if pose is None else pose, covariance)
+
+    def resume(self, closed: ClosedWindow) -> None:
+        """Take over a submap of an earlier life: the next window begins where it ended."""
+        self.whole = joined(self.whole, closed.local)
+        self.sequence = closed.sequence
+        self._begin_window(closed.sequence + 1, closed.last_reading + 1, closed.end_ns)
+
+    def consumed(self, reading: int) -> None:
+        """The reading belongs to the open window (or was rejected while it was open)."""
+        self._last_reading = reading
+
+    def observe(self, stamp_ns: int, scan: tuple[np.ndarray, np.ndarray, np.ndarray]) -> str | None:
+        """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
+        return self._segmenter.observe(stamp_ns, *scan)
+
+    def drive(
+        self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
+    ) -> ClosedWindow | None:
+        """Take one odometry interval; the submap that it closes, if it does."""
+        if self._start_ns is None:
+            self._start_ns = stamp_ns - duration_ns
+            self._segmenter.begin(self._start_ns)
+        for epoch in self._segmenter.drive(stamp_ns, duration_ns, forward, yaw_rate):
+            self._advance(epoch)
+        if stamp_ns - self._start_ns < self._window_ns:
+            return None
+        return self._close(stamp_ns)
+
+    def finish(self) -> tuple[ClosedWindow | None, int]:
+        """The stream has ended: the last submap, and how many scans no odometry covered."""
+        uncovered = self._segmenter.uncovered
+        end_ns = self._segmenter.now_ns
+        if self._start_ns is None or end_ns is None or end_ns <= self._start_ns:
+            return None, uncovered
+        return self._close(end_ns), uncovered
+
+    def open_gaussian(self) -> LocalMap:
+        """The open window's Gaussian at its last epoch."""
+        return windows.gaussian(self._window)
+
+    @property
+    def window(self) -> Window:
+        """The open window, for viewers."""
+        return self._window
+
+    def _advance(self, epoch: Epoch) -> None:
+        self._window = windows.advanced(
+            self._window,
+            epoch.increment,
+            epoch.ids,
+            epoch.ranges,
+            epoch.bearings,
+            self._generator,
+        )
+        self.last_epoch_ns = epoch.stamp_ns
+
+    def _close(self, stamp_ns: int) -> ClosedWindow:
+        epochs, rest = self._segmenter.cut(stamp_ns)
+        for epoch in epochs:
+            self._advance(epoch)
+        if rest.mean.any() or rest.covariance.any():
+            self._window = windows.moved(self._window, rest, self._generator)
+        local = windows.gaussian(self._window)
+        assert self._start_ns is not None
+        closed = ClosedWindow(
+            self.sequence, self._first_reading, self._last_reading, self._start_ns, stamp_ns, local
+        )
+        self.whole = joined(self.whole, local)
+        self._begin_window(self.sequence + 1, self._last_reading + 1, stamp_ns)
+        return closed
+
+    def _begin_window(self, sequence: int, first_reading: int, stamp_ns: int) -> None:
+        self.sequence = sequence
+        self._first_reading = first_reading
+        self._last_reading = first_reading - 1
+        self._start_ns = stamp_ns
+        self._segmenter.begin(stamp_ns)
+        self._window = windows.opened(self._config.front_end, self._config.sensor)
+        self._generator = generator(self._config.seed, self._config.id, self._epoch, sequence)
+        self.last_epoch_ns = None

@@ -1,0 +1,403 @@
+"""The robot's node: messages in, messages out; no I/O, no clock.
+
+Law 1 lives here: what is published for fusion (`submap`) depends on the robot's own readings alone.
+The fused map comes in as a prior and goes out as `team/pose`, and nowhere else. Only a rule with
+feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) absorbs the fused map into the map
+that the robot publishes; such a robot waits for the answer of each exchange before it goes on.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from team import translate
+from team.config import RobotConfig
+from team.estimation.conditioning import team_pose
+from team.estimation.submap import LocalMap
+from team.estimation.whole_map import absorbed
+from team.robot.inbox import Inbox
+from team.robot.member import ClosedWindow, HybridMember
+from team.robot.thesis_member import ThesisMember
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+
+CREDIT_SUBMAPS = 64
+"""A robot is at most this many submaps ahead of a living centre."""
+PROGRESS_READINGS = 64
+"""A robot reports its progress at least once per this many readings."""
+CLOUD_PARTICLES = 32
+"""Particles in the cloud for viewers."""
+
+
+class RobotNode:
+    """One robot: `begin`, then `handle` for every message, until `finished`."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        self.config = config
+        self.robot = config.id
+        self._inbox = Inbox()
+        self._announcement = translate.configured(ch.robot_node(config.id), 0, 0, config)
+        self._hybrid = HybridMember(config, 0)
+        self._thesis = ThesisMember(config, 0)
+        self._locals: list[LocalMap] = []
+        self._prior: m.Prior | None = None
+        self._ledger: Counter[str] = Counter()
+        self._end: m.StreamEnd | None = None
+        self._centre_alive = False
+        self._acknowledged = 0
+        self._exchange = 0
+        self._awaited = 0
+        self._exchange_ns: int | None = None
+        self._pose_ns: int | None = None
+        self._reported = 0
+        self._now_ns = 0
+        self._done = False
+        self.steps = 0
+        self.finished = False
+        self.warnings: list[str] = []
+
+    # What the shell asks.
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the stream that is being consumed."""
+        return self._inbox.epoch
+
+    @property
+    def submaps(self) -> int:
+        """How many submaps of this epoch have been sent, in this life or an earlier one."""
+        return len(self._locals)
+
+    def wanted(self) -> m.ReadingsWanted | None:
+        """The readings that are missing and must be asked for at their source."""
+        gap = self._inbox.gap
+        if gap is not None:
+            return self._wanted(*gap)
+        if self._end is not None and not self._complete and not self._inbox.waiting:
+            return self._wanted(self._inbox.next_reading, self._end.readings - 1)
+        return None
+
+    def _wanted(self, first: int, last: int) -> m.ReadingsWanted:
+        return m.ReadingsWanted(self._now_ns, self.robot, self.epoch, first, last)
+
+    def begin(self) -> list[Outgoing]:
+        """What the node says first: its configuration."""
+        return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
+
+    def resume(self, start: m.Start, submaps: Sequence[m.Submap]) -> None:
+        """Go on after the last of this robot's own submaps, as an earlier life sent them.
+
+        `submaps` are those of the latest epoch, without a gap from sequence 0.
+        """
+        self._begin_epoch(start)
+        for submap in submaps:
+            local = translate.local_map_of(submap)
+            self._locals.append(local)
+            self._hybrid.resume(
+                ClosedWindow(
+                    submap.sequence,
+                    submap.first_reading,
+                    submap.last_reading,
+                    submap.start_ns,
+                    submap.stamp_ns,
+                    local,
+                )
+            )
+        last = submaps[-1]
+        self._ledger["in a submap"] = last.last_reading + 1
+        self._acknowledged = len(submaps)
+        self._now_ns = last.stamp_ns
+        self._inbox.resume(last.epoch, last.last_reading + 1)
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
+        match message:
+            case m.Reading():
+                self._inbox.put(message)
+            case m.Prior():
+                self._prior = message
+            case m.FusedMap():
+                return self._take_fused(message) + self._go_on()
+            case m.Progress():
+                self._acknowledged = max(self._acknowledged, message.submaps)
+            case m.Liveliness():
+                self._centre_alive = message.alive
+            case m.End():
+                self._take_end(message)
+            case _:
+                self.warnings.append(f"no use for a {type(message).__name__}")
+        return self._go_on()
+
+    def status(self) -> m.Status:
+        """What the robot is doing, for people."""
+        figures = {
+            "steps": float(self.steps),
+            "readings": float(self._inbox.next_reading),
+            "submaps": float(self.submaps),
+            "particles": float(self.config.front_end.particles),
+            "landmarks": float(len(self._own_landmarks()[0])),
+            "pose_sigma_m": self._pose_sigma,
+        }
+        state = "done" if self._done else "mapping" if self._inbox.next_reading else "waiting"
+        node = ch.robot_node(self.robot)
+        return m.Status(self._now_ns, node, state, figures, tuple(self.warnings[-3:]))
+
+    # The stream.
+
+    _pose_sigma = 0.0
+
+    def _go_on(self) -> list[Outgoing]:
+        out: list[Outgoing] = []
+        readings = self._inbox.taken()
+        while not self._blocked:
+            reading = next(readings, None)
+            if reading is None:
+                break
+            out += self._take(reading)
+        if not self._done and not self._blocked and self._complete:
+            out += self._finish()
+        return out
+
+    @property
+    def _blocked(self) -> bool:
+        if not self._centre_alive:
+            return False
+        ahead = self.submaps - self._acknowledged
+        return self._awaited > self._exchange or (
+            self.config.fusion == "join" and ahead > CREDIT_SUBMAPS
+        )
+
+    @property
+    def _complete(self) -> bool:
+        return (
+            self._end is not None
+            and self._inbox.epoch == self._end.epoch
+            and self._inbox.next_reading >= self._end.readings
+        )
+
+    def _take(self, reading: m.Reading) -> list[Outgoing]:
+        self._now_ns = max(self._now_ns, reading.stamp_ns)
+        out: list[Outgoing] = []
+        match reading:
+            case m.Start():
+                if self._locals or self.steps:
+                    out += self._close_epoch()
+                self._begin_epoch(reading)
+                self._ledger["start pose"] += 1
+            case m.Odometry():
+                out += self._drive(reading)
+            case m.Observations():
+                self._observe(reading)
+            case m.Sightings():
+                self._hybrid.consumed(reading.reading)
+                self._ledger["rejected: sightings are not used by this estimator"] += 1
+        self._reported += 1
+        if self._reported >= PROGRESS_READINGS:
+            out.append(self._progress())
+        return out
+
+    def _begin_epoch(self, start: m.Start) -> None:
+        pose, covariance = translate.pose_of(start)
+        self._hybrid = HybridMember(self.config, start.epoch)
+        self._hybrid.start(pose, covariance)
+        self._hybrid.consumed(start.reading)
+        self._thesis = ThesisMember(self.config, start.epoch)
+        self._thesis.start(pose)
+        self._locals = []
+        self._acknowledged = 0
+        self._prior = None
+        self._now_ns = max(self._now_ns, start.stamp_ns)
+
+    def _observe(self, reading: m.Observations) -> None:
+        member = self._thesis if self._thesis_rule else self._hybrid
+        self._hybrid.consumed(reading.reading)
+        reason = member.observe(reading.stamp_ns, translate.scan_of(reading))
+        self._ledger[self._used if reason is None else f"rejected: {reason}"] += 1
+
+    def _drive(self, reading: m.Odometry) -> list[Outgoing]:
+        self.steps += 1
+        self._ledger[self._used] += 1
+        motion = (reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate)
+        if self._thesis_rule:
+            before = self._thesis.epochs
+            self._thesis.drive(*motion)
+            return self._after_thesis_epoch() if self._thesis.epochs > before else []
+        self._hybrid.consumed(reading.reading)
+        before_ns = self._hybrid.last_epoch_ns
+        closed = self._hybrid.drive(*motion)
+        if closed is not None:
+            return self._send(closed)
+        moved = self._hybrid.last_epoch_ns != before_ns
+        return self._poses(self._hybrid.last_epoch_ns) if moved else []
+
+    @property
+    def _thesis_rule(self) -> bool:
+        return self.config.estimator == "hybrid-thesis"
+
+    @property
+    def _used(self) -> str:
+        return "in the running map" if self._thesis_rule else "in a submap"
+
+    # What goes out.
+
+    def _send(self, closed: ClosedWindow) -> list[Outgoing]:
+        self._locals.append(closed.local)
+        submap = translate.submap_message(
+            self.robot,
+            self.epoch,
+            closed.sequence,
+            (closed.first_reading, closed.last_reading),
+            (closed.start_ns, closed.end_ns),
+            self._announcement.digest,
+            closed.local,
+        )
+        out = [Outgoing(ch.SUBMAP, self.robot, submap)]
+        out += self._poses(closed.end_ns)
+        out += self._exchanged(closed.end_ns)
+        return [*out, self._progress()]
+
+    def _exchanged(self, stamp_ns: int, *, last: bool = False) -> list[Outgoing]:
+        """The own map: for viewers under `join`, and the exchange itself under the other rules."""
+        feedback = self.config.fusion != "join"
+        if feedback:
+            since = None if self._exchange_ns is None else stamp_ns - self._exchange_ns
+            if not last and since is not None and since < self.config.exchange_s * 1e9:
+                return []
+            self._exchange_ns = stamp_ns
+            self._awaited = self._exchange + 1
+        ids, means, covariance = self._own_landmarks()
+        joint = feedback and not self._thesis_rule
+        estimate = m.MapEstimate(
+            stamp_ns,
+            self.robot,
+            self.epoch,
+            self._thesis.epochs if self._thesis_rule else self._hybrid.sequence,
+            self._awaited,
+            joint,
+            from_ids(ids),
+            from_floats(means),
+            translate.joint_bytes(covariance)
+            if joint
+            else translate.block_bytes(translate.blocks_of(covariance)),
+        )
+        return [Outgoing(ch.OWN_MAP, self.robot, estimate)]
+
+    def _own_landmarks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if self._thesis_rule:
+            state = self._thesis.state
+            joint = np.zeros((2 * len(state.ids), 2 * len(state.ids)))
+            for i, block in enumerate(state.covariances):
+                joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
+            return state.ids, state.landmarks, joint
+        whole = self._hybrid.whole
+        return whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:]
+
+    def _after_thesis_epoch(self) -> list[Outgoing]:
+        stamp_ns = self._thesis.last_epoch_ns
+        assert stamp_ns is not None
+        return self._poses(stamp_ns) + self._exchanged(stamp_ns)
+
+    def _poses(self, stamp_ns: int | None) -> list[Outgoing]:
+        """The running poses: from own readings, and given the fused map."""
+        if stamp_ns is None or (
+            self._pose_ns is not None and stamp_ns - self._pose_ns < self.config.pose_s * 1e9
+        ):
+            return []
+        self._pose_ns = stamp_ns
+        if self._thesis_rule:
+            state = self._thesis.state
+            covariance = state.pose_covariance + np.diag([1e-6, 1e-6, 1e-8])
+            return self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, (state.pose, covariance))
+        whole = self._hybrid.whole
+        own = (whole.mean[:3], whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance)
+        window = self._hybrid.open_gaussian() if self._hybrid.last_epoch_ns is not None else None
+        out = self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, team_pose(own, (), window))
+        prior = self._prior
+        if prior is None or prior.epoch != self.epoch:
+            return out
+        ids, mean, covariance = translate.prior_of(prior)
+        fused = (mean[:3], ids, mean[3:].reshape(-1, 2), covariance)
+        pending = self._locals[prior.sequence + 1 :]
+        posed = team_pose(fused, pending, window)
+        self._pose_sigma = float(np.sqrt(posed[1][0, 0] + posed[1][1, 1]))
+        return out + self._pose(ch.TEAM_POSE, stamp_ns, prior.digest, posed)
+
+    def _pose(
+        self,
+        channel: ch.Channel,
+        stamp_ns: int,
+        digest: bytes,
+        pose: tuple[np.ndarray, np.ndarray],
+    ) -> list[Outgoing]:
+        message = translate.pose_message(
+            stamp_ns, self.robot, self.epoch, self._hybrid.sequence, digest, *pose
+        )
+        return [Outgoing(channel, self.robot, message)]
+
+    def _progress(self) -> Outgoing:
+        self._reported = 0
+        return Outgoing(
+            ch.ROBOT_PROGRESS,
+            self.robot,
+            m.Progress(
+                self._now_ns,
+                ch.robot_node(self.robot),
+                self.robot,
+                self.epoch,
+                self._inbox.next_reading,
+                self.submaps,
+            ),
+        )
+
+    # What comes back.
+
+    def _take_fused(self, fused: m.FusedMap) -> list[Outgoing]:
+        if fused.final:
+            self.finished = True
+            return []
+        if self.config.fusion == "join" or fused.exchange <= self._exchange:
+            return []
+        self._exchange = fused.exchange
+        ids, means = translate.landmarks_of(fused)
+        covariance = translate.landmark_covariance_of(fused)
+        if self._thesis_rule:
+            self._thesis.absorb(ids, means, translate.blocks_of(covariance))
+        else:
+            self._hybrid.whole = absorbed(self._hybrid.whole, ids, means, covariance)
+        return []
+
+    # The end.
+
+    def _take_end(self, end: m.End) -> None:
+        mine = [s for s in end.streams if s.robot == self.robot]
+        self._end = mine[0] if mine else m.StreamEnd(self.robot, self.epoch, 0)
+
+    def _close_epoch(self) -> list[Outgoing]:
+        if self._thesis_rule:
+            uncovered = self._thesis.uncovered
+            out = []
+        else:
+            closed, uncovered = self._hybrid.finish()
+            out = [] if closed is None else self._send(closed)
+        if uncovered:
+            self._ledger[self._used] -= uncovered
+            self._ledger["rejected: no odometry covers it"] += uncovered
+        return out
+
+    def _finish(self) -> list[Outgoing]:
+        self._done = True
+        out = self._close_epoch()
+        ledger = tuple(m.Disposed(k, n) for k, n in sorted(self._ledger.items()) if n)
+        done = m.Done(
+            self._now_ns,
+            self.robot,
+            self.epoch,
+            self._inbox.next_reading,
+            self.steps,
+            self.submaps,
+            ledger,
+        )
+        return [*out, self._progress(), Outgoing(ch.ROBOT_DONE, self.robot, done)]

@@ -1,0 +1,153 @@
+"""From a stream of odometry intervals and observations to the epochs that an estimator takes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import MotionModel, Sensor
+from team.estimation import geometry
+from team.estimation.models import Increment, acceptable, corrected, increment_of, located
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """The motion since the last epoch and what was seen at its end (accepted and calibrated)."""
+
+    stamp_ns: int
+    increment: Increment
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """One observation message; `pose` is where the robot was, since the keyframe's start."""
+
+    stamp_ns: int
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+    pose: Float[np.ndarray, "3"]
+
+
+class Segmenter:
+    """Integrates odometry between epochs; an interval is split where an observation falls into it.
+
+    With keyframe_s = 0 every observation message is an epoch. Otherwise the scans within keyframe_s
+    are reduced to one range and bearing per landmark (the median, each scan first moved by the
+    odometry to the end of the interval that closes the keyframe).
+    """
+
+    def __init__(self, motion: MotionModel, sensor: Sensor, keyframe_s: float) -> None:
+        self._motion = motion
+        self._sensor = sensor
+        self._keyframe_ns = round(keyframe_s * 1e9)
+        self._increment = Increment.identity()
+        self._waiting: list[_Scan] = []
+        self._keyframe: list[_Scan] = []
+        self._keyframe_start_ns = 0
+        self._scan_motion = np.zeros(3)
+        self.now_ns: int | None = None
+
+    def begin(self, stamp_ns: int) -> None:
+        """A stream or a window begins at this team time."""
+        self.now_ns = stamp_ns
+        self._keyframe_start_ns = stamp_ns
+
+    def observe(
+        self,
+        stamp_ns: int,
+        ids: UInt32[np.ndarray, " n"],
+        ranges: Float[np.ndarray, " n"],
+        bearings: Float[np.ndarray, " n"],
+    ) -> str | None:
+        """Keep a scan until the odometry covers its time; the reason if it is rejected instead."""
+        if self.now_ns is not None and stamp_ns < self.now_ns:
+            return "older than the odometry"
+        mask = acceptable(self._sensor, ranges, bearings)
+        if len(ids) and not mask.any():
+            return "outside the sensor's limits"
+        r, b = corrected(self._sensor, ranges[mask], bearings[mask])
+        self._waiting.append(_Scan(stamp_ns, ids[mask], r, b, np.zeros(3)))
+        return None
+
+    def drive(
+        self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
+    ) -> list[Epoch]:
+        """Integrate one odometry interval; the epochs that lie in it, in order."""
+        epochs = []
+        here_ns = stamp_ns - duration_ns
+        while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
+            scan = self._waiting.pop(0)
+            at_ns = max(scan.stamp_ns, here_ns)
+            self._integrate(at_ns - here_ns, forward, yaw_rate)
+            here_ns = at_ns
+            if self._keyframe_ns:
+                self._keyframe.append(
+                    _Scan(at_ns, scan.ids, scan.ranges, scan.bearings, self._scan_motion)
+                )
+            else:
+                epochs.append(self._epoch(at_ns, scan.ids, scan.ranges, scan.bearings))
+        self._integrate(stamp_ns - here_ns, forward, yaw_rate)
+        self.now_ns = stamp_ns
+        if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
+            epochs.append(self._close_keyframe(stamp_ns))
+        return epochs
+
+    def cut(self, stamp_ns: int) -> tuple[list[Epoch], Increment]:
+        """A window ends here: its last epoch if one is open, and the motion after it."""
+        epochs = [self._close_keyframe(stamp_ns)] if self._keyframe else []
+        rest = self._increment
+        self._increment = Increment.identity()
+        self._keyframe_start_ns = stamp_ns
+        self._scan_motion = np.zeros(3)
+        return epochs, rest
+
+    @property
+    def uncovered(self) -> int:
+        """Scans that wait for odometry that covers their time."""
+        return len(self._waiting)
+
+    def _integrate(self, duration_ns: int, forward: float, yaw_rate: float) -> None:
+        if duration_ns <= 0:
+            return
+        step = increment_of(self._motion, duration_ns * 1e-9, forward, yaw_rate)
+        self._increment = self._increment.then(step)
+        if self._keyframe_ns:
+            self._scan_motion = geometry.compose(self._scan_motion, step.mean)
+
+    def _epoch(
+        self,
+        stamp_ns: int,
+        ids: UInt32[np.ndarray, " n"],
+        ranges: Float[np.ndarray, " n"],
+        bearings: Float[np.ndarray, " n"],
+    ) -> Epoch:
+        epoch = Epoch(stamp_ns, self._increment, ids, ranges, bearings)
+        self._increment = Increment.identity()
+        return epoch
+
+    def _close_keyframe(self, stamp_ns: int) -> Epoch:
+        points: dict[int, list[tuple[float, float]]] = {}
+        for scan in self._keyframe:
+            back = geometry.between(self._scan_motion, scan.pose)
+            for landmark, r, b in zip(scan.ids, scan.ranges, scan.bearings, strict=True):
+                x, y = located(back, float(r), float(b))
+                points.setdefault(int(landmark), []).append((np.hypot(x, y), np.arctan2(y, x)))
+        ids = sorted(points)
+        ranges = [float(np.median([r for r, _ in points[i]])) for i in ids]
+        bearings = [_median_direction([b for _, b in points[i]]) for i in ids]
+        self._keyframe = []
+        self._keyframe_start_ns = stamp_ns
+        self._scan_motion = np.zeros(3)
+        return self._epoch(
+            stamp_ns, np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
+        )
+
+
+def _median_direction(angles: list[float]) -> float:
+    """The median of directions, taken about the first of them."""
+    offsets = [geometry.wrapped(angle - angles[0]) for angle in angles]
+    return geometry.wrapped(angles[0] + float(np.median(offsets)))

@@ -1,0 +1,221 @@
+"""Estimation values to messages and back: the one module that knows both."""
+
+import hashlib
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.estimation.gaussian import Matrix, packed, unpacked
+from team.estimation.joining import Contribution
+from team.estimation.joining import Start as StartValue
+from team.estimation.submap import LocalMap
+from team.wire import messages as m
+from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, stamps
+
+NO_MAP = bytes(8)
+"""The digest that stands for no map."""
+
+
+def digest_of(*parts: bytes) -> bytes:
+    """The 8-byte BLAKE2b digest by which messages name a configuration or a set."""
+    digest = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.digest()
+
+
+def configured(node: str, epoch: int, stamp_ns: int, configuration: msgspec.Struct) -> m.Configured:
+    """The announcement of a configuration, with its digest."""
+    text = msgspec.json.encode(configuration, order="deterministic")
+    return m.Configured(stamp_ns, node, epoch, digest_of(text), text.decode())
+
+
+def pose_of(message: m.Start) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
+    """The start pose and its covariance (None: unknown; exactly known)."""
+    pose = floats(message.pose, "pose").copy() if message.pose else None
+    covariance = (
+        floats(message.covariance, "covariance").reshape(3, 3).copy()
+        if message.covariance
+        else None
+    )
+    return pose, covariance
+
+
+def start_of(message: m.Start) -> StartValue | None:
+    """The start as the join takes it; None for an unknown pose."""
+    pose, covariance = pose_of(message)
+    return None if pose is None else StartValue(message.robot, message.epoch, pose, covariance)
+
+
+def scan_of(message: m.Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(ids, ranges [m], bearings [rad]) in the machine's byte order."""
+    return (
+        ids(message.ids, "ids").astype(np.uint32),
+        floats(message.ranges, "ranges").astype(np.float64),
+        floats(message.bearings, "bearings").astype(np.float64),
+    )
+
+
+def submap_message(
+    robot: str,
+    epoch: int,
+    sequence: int,
+    readings: tuple[int, int],
+    span_ns: tuple[int, int],
+    config: bytes,
+    local: LocalMap,
+) -> m.Submap:
+    """A local map with the names of its inputs."""
+    return m.Submap(
+        span_ns[1],
+        robot,
+        epoch,
+        sequence,
+        readings[0],
+        readings[1],
+        span_ns[0],
+        config,
+        from_ids(local.ids),
+        from_floats(local.mean),
+        from_floats(packed(local.covariance)),
+    )
+
+
+def local_map_of(message: m.Submap) -> LocalMap:
+    """The local map in a submap message."""
+    mean = floats(message.mean, "mean").astype(np.float64)
+    return LocalMap(
+        ids(message.ids, "ids").astype(np.uint32),
+        mean,
+        unpacked(floats(message.covariance, "covariance"), len(mean)),
+    )
+
+
+def contribution_of(message: m.Submap) -> Contribution:
+    """A submap message as the join takes it."""
+    return Contribution(
+        message.robot, message.epoch, message.sequence, message.stamp_ns, local_map_of(message)
+    )
+
+
+def pose_message(
+    stamp_ns: int,
+    robot: str,
+    epoch: int,
+    sequence: int,
+    digest: bytes,
+    pose: Float[np.ndarray, "3"],
+    covariance: Float[np.ndarray, "3 3"],
+) -> m.PoseEstimate:
+    """A pose with its covariance, symmetric to the last bit."""
+    symmetric = 0.5 * (covariance + covariance.T)
+    return m.PoseEstimate(
+        stamp_ns, robot, epoch, sequence, digest, from_floats(pose), from_floats(symmetric)
+    )
+
+
+def joint_bytes(covariance: Matrix) -> bytes:
+    """A joint covariance, packed."""
+    return from_floats(packed(covariance))
+
+
+def block_bytes(blocks: Float[np.ndarray, "L 2 2"]) -> bytes:
+    """The packed upper triangles of L 2 × 2 blocks."""
+    return from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
+
+
+def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
+    """The 2 × 2 diagonal blocks of a joint landmark covariance."""
+    n = len(covariance) // 2
+    grid = covariance.reshape(n, 2, n, 2)
+    return grid[np.arange(n), :, np.arange(n), :]
+
+
+def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
+    """The joint 2L × 2L covariance; block-diagonal where the message carries blocks only."""
+    n = len(ids(message.ids, "ids"))
+    values = floats(message.covariance, "covariance")
+    if message.joint:
+        return unpacked(values, 2 * n)
+    joint = np.zeros((2 * n, 2 * n))
+    for i, (xx, xy, yy) in enumerate(values.reshape(n, 3)):
+        joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[xx, xy], [xy, yy]]
+    return joint
+
+
+def landmarks_of(
+    message: m.MapEstimate | m.FusedMap | m.TruthLandmarks,
+) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """Identities and positions [m] of a map message."""
+    values = message.positions if isinstance(message, m.TruthLandmarks) else message.means
+    return (
+        ids(message.ids, "ids").astype(np.uint32),
+        floats(values, "means").astype(np.float64).reshape(-1, 2),
+    )
+
+
+def prior_message(
+    stamp_ns: int,
+    robot: str,
+    epoch: int,
+    sequence: int,
+    digest: bytes,
+    landmark_ids: UInt32[np.ndarray, " L"],
+    mean: Float[np.ndarray, " n"],
+    covariance: Matrix,
+) -> m.Prior:
+    """The joint marginal of a robot's last fused end pose and the landmarks."""
+    return m.Prior(
+        stamp_ns,
+        robot,
+        epoch,
+        sequence,
+        digest,
+        from_ids(landmark_ids),
+        from_floats(mean),
+        joint_bytes(covariance),
+    )
+
+
+def prior_of(message: m.Prior) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, " n"], Matrix]:
+    """(ids, mean, covariance) of a prior."""
+    mean = floats(message.mean, "mean").astype(np.float64)
+    return (
+        ids(message.ids, "ids").astype(np.uint32),
+        mean,
+        unpacked(floats(message.covariance, "covariance"), len(mean)),
+    )
+
+
+def trajectory_message(
+    stamp_ns: int,
+    robot: str,
+    epoch: int,
+    digest: bytes,
+    pose_stamps: list[int],
+    poses: Float[np.ndarray, "K 3"],
+    covariances: Float[np.ndarray, "K 3 3"],
+) -> m.Trajectory:
+    """The smoothed end poses of a robot's submaps."""
+    symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    return m.Trajectory(
+        stamp_ns,
+        robot,
+        epoch,
+        digest,
+        from_stamps(pose_stamps),
+        from_floats(poses),
+        from_floats(symmetric),
+    )
+
+
+def trajectory_of(
+    message: m.Trajectory | m.Truth,
+) -> tuple[np.ndarray, Float[np.ndarray, "K 3"]]:
+    """(stamps_ns, poses) of a smoothed or a true trajectory."""
+    return (
+        stamps(message.stamps, "stamps").astype(np.int64),
+        floats(message.poses, "poses").astype(np.float64).reshape(-1, 3),
+    )
