@@ -1,0 +1,110 @@
+"""Text tables in a folder or a zip: fast to read, exact about what is wrong in them."""
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+LARGEST = 4e9
+"""No number of a data set is beyond this (the time of the year 2096); so stamps fit in int64 ns."""
+
+File = Path | zipfile.Path
+
+
+class DatasetError(ValueError):
+    """A data set that can not be read; the text names the file, the place and the remedy."""
+
+
+@contextmanager
+def opened(path: str, marker: str) -> Iterator[Mapping[str, File]]:
+    """The files by name of the one folder, in `path` (a folder or zip), that holds `marker`."""
+    place = Path(path)
+    if not place.exists():
+        raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
+    if place.is_dir():
+        yield _files_beside(place, marker, path)
+        return
+    try:
+        with zipfile.ZipFile(place) as archive:
+            yield _files_beside(zipfile.Path(archive), marker, path)
+    except zipfile.BadZipFile as error:
+        raise DatasetError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
+
+
+EXPECTED = (
+    "expected the folder or zip of one UTIAS MRCLAM set as it is distributed (Barcodes.dat, "
+    "Landmark_Groundtruth.dat, RobotN_Odometry.dat, …). It is not shipped with this program"
+)
+
+
+def table(file: File, columns: tuple[str, ...]) -> Float[np.ndarray, "rows columns"]:
+    """The numbers of a white-space table with `#` comments; no row at all gives 0 rows.
+
+    Raises DatasetError that names file, line and text of a line without so many finite numbers.
+    """
+    lines = file.read_bytes().decode("utf-8", errors="replace").splitlines()
+    rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if not rows:
+        return np.zeros((0, len(columns)))
+    try:
+        numbers = np.loadtxt(rows, dtype=np.float64, ndmin=2)
+    except ValueError as error:
+        raise _damage(file.name, lines, columns, str(error)) from None
+    within = np.abs(numbers) <= LARGEST
+    if numbers.shape[1] != len(columns) or not within.all():
+        raise _damage(file.name, lines, columns, "not a table of finite numbers")
+    return numbers
+
+
+def optional_table(
+    files: Mapping[str, File], name: str, columns: tuple[str, ...]
+) -> Float[np.ndarray, "rows columns"]:
+    """The numbers of a table that may be missing: no rows then."""
+    return table(files[name], columns) if name in files else np.zeros((0, len(columns)))
+
+
+def _damage(name: str, lines: list[str], columns: tuple[str, ...], otherwise: str) -> DatasetError:
+    """What is wrong with the first bad line."""
+    for number, line in enumerate(lines, 1):
+        words = line.partition("#")[0].split()
+        problem = _problem(words, columns) if words else None
+        if problem:
+            shown = line.strip()[:80]
+            return DatasetError(f"{name}, line {number}: {problem}: `{shown}`")
+    return DatasetError(f"{name}: {otherwise}")
+
+
+def _problem(words: list[str], columns: tuple[str, ...]) -> str | None:
+    if len(words) != len(columns):
+        return f"{len(words)} columns, {len(columns)} expected ({', '.join(columns)})"
+    for word, column in zip(words, columns, strict=True):
+        try:
+            value = float(word)
+        except ValueError:
+            return f"{column}: {word!r} is not a number"
+        if not np.isfinite(value):
+            return f"{column}: {word!r} is not finite"
+        if abs(value) > LARGEST:
+            return f"{column}: {word} is out of bounds"
+    return None
+
+
+def _files_beside(root: File, marker: str, path: str) -> Mapping[str, File]:
+    found = [folder for folder in _folders(root, depth=3) if (folder / marker).is_file()]
+    if not found:
+        raise DatasetError(f"{path}: no {marker} in it; {EXPECTED}")
+    if len(found) > 1:
+        names = ", ".join(sorted(folder.name for folder in found))
+        raise DatasetError(f"{path}: more than one data set in it ({names}); give one of them")
+    return {entry.name: entry for entry in found[0].iterdir() if entry.is_file()}
+
+
+def _folders(folder: File, depth: int) -> Iterator[File]:
+    yield folder
+    if depth:
+        for entry in folder.iterdir():
+            if entry.is_dir():
+                yield from _folders(entry, depth - 1)

@@ -1,0 +1,100 @@
+"""One robot of a UTIAS data set: its three files, in order of time, cut where nothing is known."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from sim.datasets.tables import DatasetError, File, optional_table
+from sim.datasets.utias_rows import Readings, counted, intervals_of, readings_of, truth_of
+from sim.streams import Intervals
+
+TRUTH = ("time [s]", "x [m]", "y [m]", "orientation [rad]")
+ODOMETRY = ("time [s]", "forward velocity [m/s]", "angular velocity [rad/s]")
+MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
+
+
+@dataclass(frozen=True)
+class Log:
+    """Odometry, readings by subject and truth; start_ns: where the first of the readings begins."""
+
+    robot: str
+    subject: int
+    start_ns: int
+    intervals: Intervals
+    readings: Readings
+    truth_ns: Int64[np.ndarray, " T"]
+    truth: Float[np.ndarray, "T 3"]
+    notes: tuple[str, ...]
+
+    def without(self, dropped: Bool[np.ndarray, " R"], reason: str) -> "Log":
+        """The log without some readings, and a note that counts them."""
+        note = counted(int(np.count_nonzero(dropped)), "measurement", f"dropped: {reason}")
+        notes = (*self.notes, note) if note else self.notes
+        return replace(self, readings=self.readings.where(~dropped), notes=notes)
+
+    def until(self, end_ns: int) -> "Log":
+        """The log up to the last odometry interval that ends at end_ns or before."""
+        whole = self.intervals.end_ns <= end_ns
+        intervals = Intervals(
+            self.intervals.end_ns[whole],
+            self.intervals.duration_ns[whole],
+            self.intervals.forward[whole],
+            self.intervals.yaw_rate[whole],
+        )
+        last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
+        samples = int(np.searchsorted(self.truth_ns, end_ns)) + 1
+        return replace(
+            self,
+            intervals=intervals,
+            readings=self.readings.where(self.readings.stamps_ns <= last_ns),
+            truth_ns=self.truth_ns[:samples],
+            truth=self.truth[:samples],
+        )
+
+
+def present_robots(files: Mapping[str, File]) -> list[int]:
+    """The numbers of the robots that have a file of odometry or of measurements."""
+    matches = (re.fullmatch(r"Robot([1-9]\d*)_(Odometry|Measurement)\.dat", name) for name in files)
+    return sorted({int(match[1]) for match in matches if match})
+
+
+def log_of(
+    robot: str, files: Mapping[str, File], subject_of: Mapping[int, int], delay_ns: int
+) -> Log:
+    """The files of the robot r1, r2, …; subject_of: barcode → subject. Raises DatasetError."""
+    present = present_robots(files)
+    subject = int(robot[1:]) if re.fullmatch(r"r[1-9]\d*", robot) else 0
+    if subject not in present:
+        known = ", ".join(f"r{number}" for number in present)
+        raise DatasetError(f"the data set has no readings of a robot {robot}; it has {known}")
+    odometry = optional_table(files, f"Robot{subject}_Odometry.dat", ODOMETRY)
+    measured = optional_table(files, f"Robot{subject}_Measurement.dat", MEASUREMENT)
+    true_rows = optional_table(files, f"Robot{subject}_Groundtruth.dat", TRUTH)
+    intervals, odometry_notes = intervals_of(odometry, delay_ns)
+    readings, reading_notes = readings_of(measured, subject_of)
+    truth_ns, truth, truth_notes = truth_of(true_rows)
+    missing = (
+        "no odometry: only what it saw is given" if not len(intervals.end_ns) else "",
+        "no measurements: only its odometry is given" if not len(readings.stamps_ns) else "",
+        "no ground truth: its trajectory's error can not be computed" if not len(truth) else "",
+    )
+    if missing[0] and missing[1]:
+        raise DatasetError(f"robot {robot}: neither odometry nor measurements in its files")
+    begins = (intervals.end_ns[:1] - intervals.duration_ns[:1], readings.stamps_ns[:1])
+    log = Log(
+        robot=robot,
+        subject=subject,
+        start_ns=int(np.concatenate(begins).min()),
+        intervals=intervals,
+        readings=readings,
+        truth_ns=truth_ns,
+        truth=truth,
+        notes=(*filter(None, missing), *odometry_notes, *reading_notes, *truth_notes),
+    )
+    if missing[0]:
+        return log
+    late = readings.stamps_ns > intervals.end_ns[-1]
+    return log.without(late, "after its last odometry, where its motion is not known")

@@ -1,0 +1,169 @@
+"""Rows of UTIAS tables → readings in order of time, with a note for all that is not handed out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64, UInt32
+
+from sim.streams import Intervals
+
+LONG_GAP_NS = 2_000_000_000
+"""A gap in the odometry or the truth that is worth a note."""
+
+START_WINDOW_NS = 200_000_000
+"""The start pose comes from the ground truth within this time of the robot's first reading …"""
+
+START_SPREAD_RAD = 0.2
+"""… whose headings are within this of each other (the base turns at most 0.58 rad/s)."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Range-bearing readings of one robot in order of time, by subject (landmark or robot)."""
+
+    stamps_ns: Int64[np.ndarray, " R"]
+    subjects: UInt32[np.ndarray, " R"]
+    ranges: Float[np.ndarray, " R"]
+    bearings: Float[np.ndarray, " R"]
+
+    def where(self, chosen: Bool[np.ndarray, " R"]) -> "Readings":
+        """The chosen ones."""
+        return Readings(
+            self.stamps_ns[chosen],
+            self.subjects[chosen],
+            self.ranges[chosen],
+            self.bearings[chosen],
+        )
+
+
+def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
+    """Seconds, rounded to the microsecond (a double holds no more of a time since 1970)."""
+    return np.rint(seconds * 1e6).astype(np.int64) * 1000
+
+
+def intervals_of(
+    rows: Float[np.ndarray, "N 3"], delay_ns: int
+) -> tuple[Intervals, tuple[str, ...]]:
+    """Odometry rows (t, v, ω): row k's velocities act over [t_k, t_{k+1}] + delay."""
+    rows, backward = _by_time(rows)
+    stamps = nanoseconds(rows[:, 0]) + delay_ns
+    duration = np.diff(stamps)
+    lasting = duration > 0
+    intervals = Intervals(
+        end_ns=stamps[1:][lasting],
+        duration_ns=duration[lasting],
+        forward=rows[:-1, 1][lasting],
+        yaw_rate=rows[:-1, 2][lasting],
+    )
+    notes = [
+        counted(backward, "odometry row", "earlier than the row before: sorted by time"),
+        counted(
+            int(np.count_nonzero(~lasting)),
+            "odometry row",
+            "dropped: another row has the same time, so it lasts no time",
+        ),
+    ]
+    if np.any(duration > LONG_GAP_NS):
+        seconds = duration.max() * 1e-9
+        notes.append(f"odometry has a gap of {seconds:.1f} s: its last velocities hold over it")
+    return intervals, tuple(filter(None, notes))
+
+
+def readings_of(
+    rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
+) -> tuple[Readings, tuple[str, ...]]:
+    """Measurement rows (t, barcode, range, bearing) → readings by subject."""
+    rows, backward = _by_time(rows)
+    codes = np.array(sorted(subject_of), dtype=np.float64)
+    subjects = np.array([subject_of[int(code)] for code in codes], dtype=np.uint32)
+    at = np.minimum(np.searchsorted(codes, rows[:, 1]), len(codes) - 1)
+    known = codes[at] == rows[:, 1]
+    positive = rows[:, 2] > 0.0
+    readings = Readings(
+        nanoseconds(rows[:, 0]), subjects[at], rows[:, 2].copy(), _on_circle(rows[:, 3])
+    )
+    kept = known & positive
+    single = _first_of_each(readings.stamps_ns, readings.subjects, kept)
+    notes = (
+        counted(backward, "measurement", "earlier than the row before: sorted by time"),
+        counted(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
+        counted(
+            int(np.count_nonzero(known & ~positive)), "measurement", "dropped: range not above 0"
+        ),
+        counted(
+            int(np.count_nonzero(kept & ~single)),
+            "measurement",
+            "dropped: a second one of the same subject at the same time",
+        ),
+    )
+    return readings.where(single), tuple(filter(None, notes))
+
+
+def truth_of(
+    rows: Float[np.ndarray, "N 4"],
+) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], tuple[str, ...]]:
+    """Ground truth rows (t, x, y, θ) as they are, in order of time."""
+    rows, backward = _by_time(rows)
+    stamps = nanoseconds(rows[:, 0])
+    notes = [counted(backward, "ground truth row", "earlier than the row before: sorted by time")]
+    gaps = np.diff(stamps)
+    if np.any(gaps > LONG_GAP_NS):
+        notes.append(f"ground truth has gaps, the longest of {gaps.max() * 1e-9:.1f} s")
+    return stamps, rows[:, 1:].copy(), tuple(filter(None, notes))
+
+
+def start_pose(
+    truth_ns: Int64[np.ndarray, " T"], truth: Float[np.ndarray, "T 3"], start_ns: int
+) -> Float[np.ndarray, "3"] | None:
+    """The true pose at start_ns, interpolated on the circle; None without truth at that time.
+
+    Resampled truth has wrong headings beside the wrap at ±π, so the samples about the start vote:
+    those away from the one that is nearest to all others are left out.
+    """
+    first, last = np.searchsorted(
+        truth_ns, [start_ns - START_WINDOW_NS, start_ns + START_WINDOW_NS + 1]
+    )
+    if first == last:
+        return None
+    poses = truth[first:last]
+    apart = np.abs(_on_circle(poses[:, 2, np.newaxis] - poses[:, 2]))
+    middle = int(np.argmin(apart.sum(axis=1)))
+    agreeing = apart[middle] <= START_SPREAD_RAD
+    since = (truth_ns[first:last][agreeing] - start_ns).astype(np.float64)
+    x, y, heading = poses[agreeing].T
+    turned = _on_circle(heading - poses[middle, 2])
+    at = [float(np.interp(0.0, since, values)) for values in (x, y, turned)]
+    return np.array([at[0], at[1], _on_circle(np.array(at[2] + poses[middle, 2])).item()])
+
+
+def _by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
+    """Rows in stable order of their first column, and how often it went backward."""
+    backward = int(np.count_nonzero(np.diff(rows[:, 0]) < 0.0))
+    return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward
+
+
+def _first_of_each(
+    stamps_ns: Int64[np.ndarray, " R"],
+    subjects: UInt32[np.ndarray, " R"],
+    kept: Bool[np.ndarray, " R"],
+) -> Bool[np.ndarray, " R"]:
+    """Of the kept readings, the first of each (stamp, subject)."""
+    rows = np.flatnonzero(kept)
+    order = rows[np.lexsort((subjects[rows], stamps_ns[rows]))]
+    again = (np.diff(stamps_ns[order]) == 0) & (np.diff(subjects[order].astype(np.int64)) == 0)
+    single = kept.copy()
+    single[order[1:][again]] = False
+    return single
+
+
+def _on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+    """The angles in (−π, π]; those that are there already keep their bits."""
+    turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    turned = np.where(turned == -np.pi, np.pi, turned)
+    return np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)
+
+
+def counted(count: int, thing: str, what: str) -> str:
+    """A note such as "2 measurements dropped: unknown barcode"; empty for none."""
+    return f"{count} {thing}{'s' if count != 1 else ''} {what}" if count else ""
