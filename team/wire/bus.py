@@ -96,25 +96,28 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
 
 @dataclass
 class MemoryNetwork:
-    """The keys of one process: publications are delivered at once, in order, to every bus on it.
+    """The keys of one process: publications are delivered at once, in order, to every other bus.
 
     It keeps what `latest` and `all` channels promise late joiners.
     """
 
     buses: list["MemoryBus"] = field(default_factory=list)
-    kept: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
-    answers: dict[str, Answer] = field(default_factory=dict)
-    alive: dict[str, Sample] = field(default_factory=dict)
-    counters: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    kept: dict[str, list[tuple["MemoryBus", Sample]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    answers: list[tuple[Channel, str, Answer]] = field(default_factory=list)
+    alive: dict[str, tuple["MemoryBus", Sample]] = field(default_factory=dict)
 
-    def deliver(self, channel: Channel, sample: Sample) -> None:
-        """Hand a sample to every bus that subscribed to it, and keep it for late joiners."""
-        if channel.delivery == "latest":
-            self.kept[sample.key] = [sample]
-        elif channel.delivery == "all":
-            self.kept[sample.key].append(sample)
+    def deliver(self, source: "MemoryBus", sample: Sample) -> None:
+        """Hand a sample to every other bus that subscribed, and keep it for late joiners."""
+        found = channel_of(sample.key)
+        delivery = "stream" if found is None else found[0].delivery
+        if delivery != "stream":
+            kept = self.kept[sample.key]
+            kept[:] = [*(kept if delivery == "all" else []), (source, sample)]
         for bus in self.buses:
-            bus.offer(channel, sample)
+            if bus is not source:
+                bus.offer(sample)
 
 
 class MemoryBus:
@@ -123,37 +126,35 @@ class MemoryBus:
     def __init__(self, network: MemoryNetwork) -> None:
         self._network = network
         self._arrived: deque[Sample] = deque()
-        self._wanted: list[tuple[str, str]] = []
-        self._tokens: list[str] = []
+        self._wanted: list[tuple[Channel, str]] = []
+        self._counters: dict[str, int] = defaultdict(int)
         network.buses.append(self)
 
     def publish(self, out: Outgoing) -> None:
         """Encode and deliver at once; the wall clock of a memory bus is always zero."""
-        counter = self._network.counters[out.key]
-        self._network.counters[out.key] = counter + 1
-        stamp = out.message.stamp_ns
-        sample = Sample(out.key, encoded(out.message), stamp, 0, counter)
-        self._network.deliver(out.channel, sample)
+        counter = self._counters[out.key]
+        self._counters[out.key] = counter + 1
+        stamp_ns = out.message.stamp_ns
+        self.publish_raw(Sample(out.key, encoded(out.message), stamp_ns, 0, counter))
+
+    def publish_raw(self, sample: Sample) -> None:
+        """Deliver at once, as it is."""
+        self._network.deliver(self, sample)
 
     def subscribe(self, channel: Channel, name: str = "*") -> None:
-        """Receive this channel, what it keeps for late joiners first."""
-        self._wanted.append((channel.name, name))
-        for samples in list(self._network.kept.values()):
-            for sample in samples:
-                if self._matches(channel, sample.key, name):
-                    self._arrived.append(sample)
+        """Receive this channel, what is kept for late joiners first."""
+        for key, kept in self._network.kept.items():
+            if _is_of(channel, name, key) and not self._subscribed(key):
+                self._arrived.extend(sample for source, sample in kept if source is not self)
+        self._wanted.append((channel, name))
 
-    @staticmethod
-    def _matches(channel: Channel, key: str, name: str) -> bool:
-        owner = channel.owner(key)
-        return owner is not None and name in ("*", "**", owner)
+    def _subscribed(self, key: str) -> bool:
+        return any(_is_of(channel, name, key) for channel, name in self._wanted)
 
-    def offer(self, channel: Channel, sample: Sample) -> None:
+    def offer(self, sample: Sample) -> None:
         """Take the sample if this bus subscribed to it."""
-        for wanted, name in self._wanted:
-            if wanted == channel.name and self._matches(channel, sample.key, name):
-                self._arrived.append(sample)
-                return
+        if self._subscribed(sample.key):
+            self._arrived.append(sample)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """Everything that has arrived; a memory bus never waits."""
@@ -162,36 +163,48 @@ class MemoryBus:
         return samples
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer queries on this key."""
-        self._network.answers[channel.key(name)] = answer
+        """Answer queries, within `ask`."""
+        self._network.answers.append((channel, name, answer))
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
         """The answers, at once."""
-        answer = self._network.answers.get(channel.key(name))
-        return [] if answer is None else list(answer(encoded(request)))
+        for answered, names, answer in self._network.answers:
+            if answered is channel and _is_of(channel, names, channel.key(name)):
+                try:
+                    return list(answer(encoded(request)))
+                except ValueError as error:
+                    raise BusError(f"{channel.key(name)}: {error}") from error
+        return []
 
     def declare_alive(self, node: str) -> None:
         """Hold a token."""
-        self._tokens.append(node)
         self._token(node, alive=True)
 
     def watch_alive(self, node: str = "**") -> None:
         """Receive changes of tokens, the present ones first."""
-        self._wanted.append((ALIVE.name, node))
-        self._arrived.extend(self._network.alive.values())
+        self._wanted.append((ALIVE, node))
+        for source, sample in self._network.alive.values():
+            if source is not self:
+                self.offer(sample)
 
     def _token(self, node: str, *, alive: bool) -> None:
         sample = Sample(ALIVE.key(node), encoded(Liveliness(0, node, alive)), 0, 0, 0)
         if alive:
-            self._network.alive[node] = sample
+            self._network.alive[node] = (self, sample)
         else:
             self._network.alive.pop(node, None)
         for bus in self._network.buses:
-            bus.offer(ALIVE, sample)
+            if bus is not self:
+                bus.offer(sample)
 
     def close(self) -> None:
         """Leave the network; the tokens go."""
         self._network.buses.remove(self)
-        for node in self._tokens:
+        own = [node for node, (source, _) in self._network.alive.items() if source is self]
+        for node in own:
             self._token(node, alive=False)
-        self._tokens = []
+
+
+def _is_of(channel: Channel, name: str, key: str) -> bool:
+    owner = channel.owner(key)
+    return owner is not None and name in ("*", "**", owner)

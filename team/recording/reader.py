@@ -1,0 +1,262 @@
+"""The reader: the samples of a log, also of one whose recorder was killed.
+
+Reads the records itself, one after another, because a log is untrusted input: every length is
+checked before it is believed, every chunk's CRC is checked, and a chunk that claims to expand
+beyond what the recorder can have written is refused before it is expanded.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple, cast
+
+import msgpack
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as LogChannel
+from mcap.records import Chunk, Metadata
+from mcap.writer import MCAP0_MAGIC
+
+from team.recording.recorder import METADATA, Count
+from team.wire.bus import Sample
+from team.wire.channels import Channel, channel_of
+from team.wire.codec import LARGEST_PAYLOAD
+
+LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
+"""Bytes of one chunk, expanded: the largest message behind a chunk that was almost full."""
+LARGEST_RATIO = 10_000
+"""Of expanded to compressed bytes; a map of zeros reaches a thousand, a bomb ten thousands."""
+_FRAME = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_FOOTER_SIZE = _FRAME.size + 20
+_REPAIR = "`teamslam repair` saves the rest"
+
+
+class LogError(ValueError):
+    """A file that is no log of ours, or a damaged one: which file, what is wrong, what to do."""
+
+    def __init__(self, path: Path, what: str, remedy: str) -> None:
+        super().__init__(f"{path}: {what}; {remedy}")
+        self.path = path
+        self.what = what
+        self.remedy = remedy
+
+
+class DamagedChunkError(LogError):
+    """One chunk can not be read; what comes after it can, by `Log.chunks`."""
+
+
+class _Frame(NamedTuple):
+    offset: int
+    opcode: int
+    body: bytes
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log on disk. `complete` is False when its recorder did not finish it.
+
+    `metadata` is its provenance, `team` the team's name. An incomplete log reads up to the last
+    chunk that is whole.
+    """
+
+    path: Path
+    team: str
+    complete: bool
+    metadata: dict[str, str] = field(repr=False)
+
+    def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
+        """Samples in the order of the file, of the given channels (all without); `LogError`.
+
+        A counter comes back modulo 2³², a stamp before zero as it was.
+        """
+        for chunk in self.chunks(channels):
+            if isinstance(chunk, DamagedChunkError):
+                raise chunk
+            yield from chunk
+
+    def in_time_order(self, channels: Collection[Channel] | None = None) -> list[Sample]:
+        """Samples by team time, equal stamps in the order of the file; all in memory."""
+        return sorted(self.samples(channels), key=lambda sample: sample.stamp_ns)
+
+    def counts(self) -> dict[str, Count]:
+        """Messages and payload bytes of each key, by reading the whole log."""
+        counts: dict[str, Count] = {}
+        for sample in self.samples():
+            messages, size = counts.get(sample.key, Count(0, 0))
+            counts[sample.key] = Count(messages + 1, size + len(sample.payload))
+        return counts
+
+    def chunks(
+        self, channels: Collection[Channel] | None = None
+    ) -> Iterator[list[Sample] | DamagedChunkError]:
+        """The samples chunk by chunk; in the place of a damaged chunk, its error."""
+        names = None if channels is None else {channel.name for channel in channels}
+        with self.path.open("rb") as file:
+            # The index repeats the channels: a chunk that introduced one may be damaged.
+            keys = dict(self._channels(_index(file, self.path), names)) if self.complete else {}
+            for frame in _frames(file, self.path):
+                if frame.opcode == Opcode.CHUNK:
+                    try:
+                        yield self._samples(frame, names, keys)
+                    except (McapError, ValueError, struct.error, zstandard.ZstdError) as error:
+                        what = f"damaged chunk at offset {frame.offset}: {error}"
+                        yield DamagedChunkError(self.path, what, _REPAIR)
+                elif frame.opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                    return
+        if self.complete:
+            raise LogError(self.path, "ends before its own index", _REPAIR)
+
+    def _channels(
+        self, frames: Iterator[_Frame], names: set[str] | None
+    ) -> Iterator[tuple[int, str | None]]:
+        try:
+            for frame in frames:
+                if frame.opcode == Opcode.CHANNEL:
+                    channel = LogChannel.read(ReadDataStream(BytesIO(frame.body)))
+                    yield channel.id, self._key(channel.topic, names)
+        except (McapError, ValueError, struct.error) as error:
+            raise LogError(self.path, f"damaged index: {error}", _REPAIR) from None
+
+    def _samples(
+        self, frame: _Frame, names: set[str] | None, keys: dict[int, str | None]
+    ) -> list[Sample]:
+        samples = []
+        for record in _records(_expanded(_chunk(frame.body))):
+            if record.opcode == Opcode.CHANNEL:
+                keys.update(self._channels(iter([record]), names))
+            elif record.opcode == Opcode.MESSAGE:
+                number, sequence, log_time, wall_ns = _MESSAGE.unpack_from(record.body)
+                if number not in keys:
+                    raise ValueError(f"message on channel {number}, which nothing describes")
+                if (key := keys[number]) is not None:
+                    payload = record.body[_MESSAGE.size :]
+                    stamp_ns = log_time or _stamp_in(payload)
+                    samples.append(Sample(key, payload, stamp_ns, wall_ns, sequence))
+        return samples
+
+    def _key(self, topic: str, names: set[str] | None) -> str | None:
+        key = topic.removeprefix(f"team/{self.team}/")
+        if names is None:
+            return key
+        found = channel_of(key)
+        return key if found is not None and found[0].name in names else None
+
+
+def open_log(path: str | Path) -> Log:
+    """The log at `path`; raises `LogError` when it is not one."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            return _opened(file, path)
+    except FileNotFoundError:
+        raise LogError(path, "not found", "give the path of a log that was recorded") from None
+    except OSError as error:
+        raise LogError(path, str(error.strerror), "give the path of a readable file") from error
+
+
+def _opened(file: IO[bytes], path: Path) -> Log:
+    size = os.fstat(file.fileno()).st_size
+    if size == 0:
+        raise LogError(path, "empty file", "its recorder was stopped before it began")
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise LogError(path, "not an MCAP file", "give a log that `teamslam record` wrote")
+    complete = False
+    if size > _FOOTER_SIZE + 2 * len(MCAP0_MAGIC):
+        file.seek(-_FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
+        tail = file.read()
+        complete = tail[0] == Opcode.FOOTER and tail.endswith(MCAP0_MAGIC)
+    metadata = _metadata(file, path)
+    return Log(path, metadata.pop("team", ""), complete, metadata)
+
+
+def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
+    for frame in _frames(file, path):
+        if frame.opcode == Opcode.METADATA:
+            try:
+                record = Metadata.read(ReadDataStream(BytesIO(frame.body)))
+            except (McapError, ValueError, struct.error) as error:
+                raise LogError(path, f"damaged metadata: {error}", "nothing can be read") from None
+            if record.name == METADATA:
+                return dict(record.metadata)
+        elif frame.opcode != Opcode.HEADER:
+            break
+    raise LogError(
+        path, "an MCAP file of another program", f"a log of ours begins with metadata {METADATA!r}"
+    )
+
+
+def _index(file: IO[bytes], path: Path) -> Iterator[_Frame]:
+    """The records of the summary section; the footer says where it starts (0: there is none)."""
+    file.seek(_FRAME.size - _FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
+    (start,) = struct.unpack("<Q", file.read(8))
+    return _frames(file, path, start) if start else iter(())
+
+
+def _frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[_Frame]:
+    """The whole records of the file from `start`; a record that is cut off is the end."""
+    size = os.fstat(file.fileno()).st_size
+    if start > size:
+        raise LogError(path, f"its index claims to start at {start} of {size} bytes", _REPAIR)
+    offset = file.seek(start)
+    while len(head := file.read(_FRAME.size)) == _FRAME.size:
+        opcode, length = _FRAME.unpack(head)
+        if opcode == 0 or offset + _FRAME.size + length > size:
+            return  # zeros, or half a record: what a machine that went down leaves behind
+        if length > LARGEST_CHUNK:
+            what = f"record of {length} bytes at offset {offset}, {LARGEST_CHUNK} at most"
+            raise LogError(path, what, _REPAIR)
+        yield _Frame(offset, opcode, file.read(length))
+        offset += _FRAME.size + length
+
+
+def _records(data: bytes) -> Iterator[_Frame]:
+    offset = 0
+    while offset < len(data):
+        opcode, length = _FRAME.unpack_from(data, offset)
+        start = offset + _FRAME.size
+        if start + length > len(data):
+            raise ValueError("a record ends beyond its chunk")
+        yield _Frame(offset, opcode, data[start : start + length])
+        offset = start + length
+
+
+def _chunk(body: bytes) -> Chunk:
+    return cast(Chunk, Chunk.read(ReadDataStream(BytesIO(body))))
+
+
+def _expanded(chunk: Chunk) -> bytes:
+    """The chunk's records; ValueError before anything is expanded that can not be ours."""
+    size, packed = chunk.uncompressed_size, len(chunk.data)
+    if size > min(LARGEST_CHUNK, LARGEST_RATIO * packed):
+        raise ValueError(f"{packed} bytes claim to expand to {size}, which no recorder writes")
+    if chunk.compression == "zstd":
+        if zstandard.frame_content_size(chunk.data) != size:
+            raise ValueError("two different sizes are claimed")
+        data = zstandard.decompress(chunk.data, max_output_size=size)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise ValueError(f"compression {chunk.compression!r}, which no recorder of ours writes")
+    if len(data) != size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
+        raise ValueError("the CRC does not match")
+    return data
+
+
+def _stamp_in(payload: bytes) -> int:
+    """The stamp in a message whose log time is zero: MCAP's times can not be negative."""
+    unpacker = msgpack.Unpacker()
+    unpacker.feed(payload[:128])  # the tag and the stamp are within
+    try:
+        unpacker.read_array_header()
+        unpacker.skip()
+        stamp = unpacker.unpack()
+    except (ValueError, msgpack.UnpackException):
+        return 0  # not a message of ours: there is no stamp to restore
+    return stamp if isinstance(stamp, int) else 0

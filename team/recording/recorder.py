@@ -1,0 +1,156 @@
+"""The recorder: samples into an MCAP file, their payload bytes as they came.
+
+Channel: the full key, encoding `msgpack`, the JSON Schema of its message. Log time: team time.
+Publish time: the publisher's wall clock. Sequence: its counter modulo 2³². MCAP's times are
+unsigned: a stamp before zero is logged at zero, and its true value stays in the payload, where the
+reader takes it from. Who wrote the log and how stands in the metadata record "teamslam".
+"""
+
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import IO, NamedTuple, Self
+
+from mcap.writer import Writer
+
+from team.recording.schemas import schema_of, tag_of
+from team.wire.bus import Sample
+from team.wire.channels import channel_of
+
+METADATA = "teamslam"
+FLUSH_S = 0.5
+"""Seconds between flushes: what a killed recorder can lose."""
+
+
+class RecorderError(RuntimeError):
+    """The log can not be written: the file exists, the folder does not, the disk is full."""
+
+
+class Count(NamedTuple):
+    """What is in the log of one key."""
+
+    messages: int
+    bytes: int
+
+
+class Recorder:
+    """Writes one log, on a thread of its own; what goes wrong there is raised by the next call.
+
+    Raises `RecorderError` when the file can not be created; it never overwrites one.
+    """
+
+    def __init__(self, path: str | Path, team: str, metadata: Mapping[str, str]) -> None:
+        self.path = Path(path)
+        self._prefix = f"team/{team}/"
+        self._queue: SimpleQueue[Sample | None] = SimpleQueue()
+        self._counts: dict[str, Count] = defaultdict(lambda: Count(0, 0))
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._failure: Exception | None = None
+        self._closed = False
+        try:
+            self._file: IO[bytes] = self.path.open("xb")
+        except FileExistsError:
+            raise RecorderError(f"{self.path} exists: choose another name or remove it") from None
+        except OSError as error:
+            raise RecorderError(f"{self.path}: {error.strerror}; choose another place") from error
+        self._writer = Writer(self._file)
+        self._writer.start(profile="teamslam")
+        self._writer.add_metadata(METADATA, {**metadata, "team": team})
+        _flush(self._writer)
+        # A daemon: a program that dies without `close` must end, and loses half a second at most.
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def write(self, samples: Iterable[Sample]) -> None:
+        """Hand samples over to the writing thread; raises `RecorderError` once it has failed."""
+        self._check()
+        if self._closed:
+            raise RecorderError(f"{self.path} is closed")
+        for sample in samples:
+            self._queue.put(sample)
+
+    def counts(self) -> dict[str, Count]:
+        """Messages and payload bytes written so far, by relative key."""
+        return dict(self._counts)
+
+    def waiting(self) -> int:
+        """Samples that are handed over and not written yet."""
+        return self._queue.qsize()
+
+    def close(self) -> None:
+        """Write what is handed over, then the index; raises `RecorderError` if that failed."""
+        if not self._closed:
+            self._closed = True
+            self._queue.put(None)
+            self._thread.join()
+            self._file.close()
+        self._check()
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise RecorderError(
+                f"{self.path}: {self._failure}; what was flushed before can be repaired"
+            ) from self._failure
+
+    def _run(self) -> None:
+        try:
+            self._write_all()
+            self._writer.finish()  # type: ignore[no-untyped-call] # mcap leaves out `-> None`
+            self._file.flush()
+        except Exception as error:  # raised by the next call, on the caller's thread
+            self._failure = error
+
+    def _write_all(self) -> None:
+        flushed = time.monotonic()
+        unflushed = False
+        while True:
+            try:
+                sample = self._queue.get(timeout=FLUSH_S)
+            except Empty:
+                pass
+            else:
+                if sample is None:
+                    return
+                self._write(sample)
+                unflushed = True
+            if unflushed and time.monotonic() - flushed >= FLUSH_S:
+                _flush(self._writer)
+                flushed, unflushed = time.monotonic(), False
+
+    def _write(self, sample: Sample) -> None:
+        channel = self._channels.get(sample.key)
+        if channel is None:
+            channel = self._channels[sample.key] = self._register(sample.key)
+        self._writer.add_message(
+            channel_id=channel,
+            log_time=max(sample.stamp_ns, 0),
+            data=sample.payload,
+            publish_time=max(sample.wall_ns, 0),
+            sequence=sample.counter % 2**32,
+        )
+        messages, size = self._counts[sample.key]
+        self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
+
+    def _register(self, key: str) -> int:
+        found = channel_of(key)
+        if found is None:  # a viewer's own messages: kept as they are, verified by nobody
+            return self._writer.register_channel(self._prefix + key, "", 0)
+        tag = tag_of(found[0].message)
+        if tag not in self._schemas:
+            schema = schema_of(found[0].message)
+            self._schemas[tag] = self._writer.register_schema(tag, "jsonschema", schema)
+        return self._writer.register_channel(self._prefix + key, "msgpack", self._schemas[tag])
+
+
+def _flush(writer: Writer) -> None:
+    writer.flush()  # type: ignore[no-untyped-call] # mcap leaves out `-> None`

@@ -1,0 +1,21 @@
+"""When a log's samples are to be published again: a function of their stamps alone."""
+
+from collections.abc import Iterable, Iterator
+
+from team.wire.bus import Sample
+
+
+def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:
+    """(delay [s] after the one before, sample), in the order given, at `speed` × team time.
+
+    delay = max(0, t − newest stamp so far)/speed: a sample that is older than what went before
+    goes at once, and the delays add up to the team time that has passed. The first goes at once.
+    An infinite speed never waits. Raises ValueError unless speed > 0.
+    """
+    if not speed > 0.0:
+        raise ValueError(f"out of bounds: speed {speed} is not positive")
+    newest: int | None = None
+    for sample in samples:
+        ahead_ns = 0 if newest is None else max(0, sample.stamp_ns - newest)
+        newest = sample.stamp_ns if newest is None else max(newest, sample.stamp_ns)
+        yield 1e-9 * ahead_ns / speed, sample
