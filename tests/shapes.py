@@ -7,13 +7,11 @@ in decorated classes only, and the import hook decorates their methods one by on
 from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
-from beartype import BeartypeConf, BeartypeHintOverrides, beartype
+from beartype import BeartypeConf, FrozenDict, beartype
 
 F = TypeVar("F", bound=Callable[..., object])
 
-_CONFIGURATION = BeartypeConf(
-    is_pep484_tower=True, hint_overrides=BeartypeHintOverrides({Self: Any})
-)
+_CONFIGURATION = BeartypeConf(is_pep484_tower=True, hint_overrides=FrozenDict({Self: Any}))
 
 
 def checked(function: F) -> F:

@@ -1,0 +1,235 @@
+"""The project around the code: what is shipped, under which licences, what the texts promise."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+import threadpoolctl
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("team", "central", "sim")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+PERMISSIVE = {
+    "0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause",
+    "CC0-1.0", "ISC", "MIT", "MIT-CMU", "PSF-2.0", "Zlib",
+}  # fmt: skip
+"""Licences of parts of our environment that ask for no more than their notice."""
+
+WORDED = {
+    "Apache 2.0": "Apache-2.0",
+    "Apache License": "Apache-2.0",
+    "Apache Software License": "Apache-2.0",
+    "BSD": "BSD-3-Clause",
+    "BSD 2-Clause License": "BSD-2-Clause",
+    "BSD 3-Clause License": "BSD-3-Clause",
+    "BSD License": "BSD-3-Clause",
+    "ISC License": "ISC",
+    "ISC License (ISCL)": "ISC",
+    "MIT License": "MIT",
+    "Python Software Foundation License": "PSF-2.0",
+    "Simplified BSD license": "BSD-2-Clause",
+}
+"""What distributions without an SPDX expression say, in SPDX."""
+
+REVIEWED = {
+    "eclipse-zenoh": "EPL-2.0 OR Apache-2.0, its NOTICE says; we take Apache-2.0",
+    "certifi": "MPL-2.0, unchanged; only for check-jsonschema, never shipped",
+    "hypothesis": "MPL-2.0, unchanged; only for tests, never shipped",
+    "pathspec": "MPL-2.0, unchanged; only for mypy, never shipped",
+}
+"""Distributions whose licence was read by a person, with the reason why it is compatible."""
+
+
+def closure(*roots: str) -> dict[str, metadata.Distribution]:
+    """The installed distributions that the requirements need, through all levels, by name."""
+    found: dict[str, metadata.Distribution] = {}
+    pending = [Requirement(root) for root in roots]
+    seen = set()
+    while pending:
+        requirement = pending.pop()
+        name = canonicalize_name(requirement.name)
+        wanted = (name, frozenset(requirement.extras))
+        if wanted in seen:
+            continue
+        seen.add(wanted)
+        found[name] = metadata.distribution(name)
+        for text in found[name].requires or []:
+            needed = Requirement(text)
+            extras = {"", *requirement.extras}
+            if needed.marker is None or any(needed.marker.evaluate({"extra": e}) for e in extras):
+                pending.append(needed)
+    del found["teamslam"]
+    return found
+
+
+def licences(distribution: metadata.Distribution) -> set[str]:
+    """The SPDX names, or the words, under which a distribution stands."""
+    expression = distribution.metadata.get("License-Expression")
+    if expression:
+        return {part.strip(" ()") for part in re.split(r"\bAND\b|\bOR\b", expression)}
+    labels = {
+        label.rpartition(" :: ")[2]
+        for label in distribution.metadata.get_all("Classifier") or []
+        if label.startswith("License :: OSI Approved :: ")
+    }
+    worded = labels or {(distribution.metadata.get("License") or "none stated").splitlines()[0]}
+    return {WORDED.get(word, word) for word in worded}
+
+
+def tracked() -> list[Path]:
+    """The files under version control; skips where this is no checkout."""
+    git = shutil.which("git")
+    if git is None or not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout: nothing is tracked")
+    listed = subprocess.run([git, "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+    files = [ROOT / name for name in listed.stdout.decode().split("\0") if name]
+    return [file for file in files if file.is_file()]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
+    """The wheel, built from a copy with the setuptools at hand, so that nothing is fetched."""
+    source = tmp_path_factory.mktemp("source")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for package in PACKAGES:
+        shutil.copytree(
+            ROOT / package, source / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet"]
+    command += ["--no-index", "--wheel-dir", str(source / "dist"), str(source)]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    (built,) = (source / "dist").glob("*.whl")
+    with zipfile.ZipFile(built) as archive:
+        yield archive
+
+
+def test_the_wheel_holds_the_three_packages_their_scenarios_and_nothing_else(
+    wheel: zipfile.ZipFile,
+) -> None:
+    about = f"teamslam-{PROJECT['version']}.dist-info/"
+    shipped = {name for name in wheel.namelist() if not name.startswith(about)}
+    expected = {
+        path.relative_to(ROOT).as_posix()
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*")
+        if path.suffix in {".py", ".toml"} or path.name == "py.typed"
+    }
+    assert shipped == expected
+    assert {f"{package}/py.typed" for package in PACKAGES} <= shipped
+    assert {f"sim/scenarios/{n}.toml" for n in ("thesis", "thesis-b", "waypoints")} <= shipped
+
+
+def test_the_wheel_installs_the_command_and_carries_the_licence(wheel: zipfile.ZipFile) -> None:
+    about = f"teamslam-{PROJECT['version']}.dist-info"
+    assert "teamslam = sim.cli:main" in wheel.read(f"{about}/entry_points.txt").decode()
+    assert "Apache License" in wheel.read(f"{about}/licenses/LICENSE").decode()
+
+
+def test_the_version_is_written_once() -> None:
+    assert metadata.version("teamslam") == PROJECT["version"]
+    again = [
+        path for package in PACKAGES for path in (ROOT / package).rglob("*.py")
+        if re.search(r"^__version__\s*=\s*[\"']", path.read_text(), re.MULTILINE)
+    ]  # fmt: skip
+    assert again == []
+
+
+def test_the_changelog_tells_of_this_version() -> None:
+    assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_everything_that_runs_with_us_has_a_permissive_licence() -> None:
+    unclear = {
+        name: licences(distribution)
+        for name, distribution in closure("teamslam[dev]").items()
+        if name not in REVIEWED and not licences(distribution) <= PERMISSIVE
+    }
+    assert unclear == {}
+
+
+def test_only_zenoh_s_licence_needed_reading_among_what_users_install() -> None:
+    assert set(REVIEWED) & set(closure("teamslam[limit]")) == {"eclipse-zenoh"}
+    assert set(REVIEWED) <= set(closure("teamslam[dev]"))
+
+
+def test_a_copyleft_licence_would_be_noticed() -> None:
+    assert not licences(metadata.distribution("hypothesis")) <= PERMISSIVE
+    assert not licences(metadata.distribution("certifi")) <= PERMISSIVE
+
+
+def test_constraints_pin_every_distribution_by_version_alone() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if not line.startswith("#")]
+    assert [pin for pin in pins if not re.fullmatch(r"[\w.-]+==[\w.]+", pin)] == []
+    pinned = {canonicalize_name(pin.partition("==")[0]) for pin in pins}
+    assert set(closure("teamslam[dev]")) - pinned == set()
+    assert {"pip", "setuptools"} <= pinned
+
+
+def test_no_path_of_a_machine_is_committed() -> None:
+    machine = re.compile(
+        rf"(?<![\w.}}])/(?:{'|'.join(['work', 'root', 'farm', 'home', 'Users'])})/"
+    )
+    found = [
+        f"{file.relative_to(ROOT)}: {line.strip()[:80]}"
+        for file in tracked()
+        for line in file.read_text(encoding="utf-8", errors="replace").splitlines()
+        if machine.search(line)
+    ]
+    assert found == []
+
+
+def test_no_data_set_and_no_log_is_committed() -> None:
+    data = {".dat", ".zip", ".gz", ".mcap", ".npy", ".npz", ".nbi", ".nbc"}
+    assert [file for file in tracked() if file.suffix in data] == []
+    assert [file for file in tracked() if file.stat().st_size > 1_000_000] == []
+
+
+def commands(page: Path, program: str) -> set[str]:
+    """The sub-commands of `program` in the page's indented and fenced code."""
+    found = re.findall(rf"^\s*(?:\$ )?{program} ([a-z][\w-]*)", page.read_text(), re.MULTILINE)
+    return set(found)
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_every_make_target_that_a_page_names_exists(page: str) -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    spoken = set(re.findall(r"`make (\w+)`", (ROOT / page).read_text()))
+    named = commands(ROOT / page, "make") | spoken
+    assert named
+    assert named <= targets
+
+
+def test_every_command_that_the_readme_names_exists() -> None:
+    named = commands(ROOT / "README.md", "teamslam")
+    assert {"launch", "replay", "router", "world", "robot", "central", "record"} <= named
+    for command in sorted(named):
+        result = subprocess.run(
+            [Path(sys.executable).with_name("teamslam"), command, "--help"],
+            capture_output=True, text=True, check=False, timeout=60,
+        )  # fmt: skip
+        assert result.returncode == 0, f"teamslam {command}: {result.stderr}"
+
+
+def test_ci_checks_and_tests() -> None:
+    script = (ROOT / ".ci" / "run").read_text()
+    assert re.findall(r"^make (\w+)$", script, re.MULTILINE) == ["check", "test"]
+    assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
+
+
+def test_linear_algebra_has_one_thread() -> None:
+    np.linalg.inv(np.eye(64))  # the library is loaded and has made its threads
+    pools = threadpoolctl.threadpool_info()
+    assert {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"} == {1}
