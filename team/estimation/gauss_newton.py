@@ -1,9 +1,9 @@
 """The solution of a submap graph: Gauss-Newton, damped only where the cost would rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ‖start − prior‖², where ρ is the identity, or Cauchy's loss on
-√(χ²/dim) per submap, by iterated re-weighting. A robust submap enters with a wide scale that narrows
-with each iteration it has lived through, so a true loop closure is not taken for an outlier before
-the chain has bent.
+√(χ²/dim) per submap, by iterated re-weighting. A robust submap enters with a wide scale that
+narrows with each iteration it has lived through, so a true loop closure is not taken for an outlier
+before the chain has bent.
 """
 
 import math
@@ -88,7 +88,8 @@ class Island:
     @property
     def weight(self) -> Float[np.ndarray, " F"]:
         """Robust weight of each submap, 1 without a robust loss."""
-        return 1.0 / (1.0 + self.chi2 / (self.graph.dimensions * self.scale**2))
+        relative: Values = self.chi2 / (self.graph.dimensions * self.scale**2)
+        return 1.0 / (1.0 + relative)
 
     @cached_property
     def prior_chi2(self) -> Float[np.ndarray, " priors"]:

@@ -39,29 +39,29 @@ def information(covariance: Matrix, what: str) -> Matrix:
     return np.asarray(triangle + np.tril(triangle, -1).T)
 
 
-def with_marginal(
+def carried_along(
     mean: Vector,
     covariance: Matrix,
-    index: Int64[np.ndarray, " k"],
-    marginal_mean: Float[np.ndarray, " k"],
-    marginal_covariance: Float[np.ndarray, "k k"],
-) -> tuple[Vector, Matrix]:
-    """N(mean, covariance) with the marginal of its entries s = `index` replaced by N(m, C).
+    shared: Int64[np.ndarray, " k"],
+    new_mean: Float[np.ndarray, " m"],
+    new_covariance: Float[np.ndarray, "m m"],
+    in_new: Int64[np.ndarray, " k"],
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
+    """The joint Gaussian of (own others o, everything new) after the shared part s was replaced.
 
-    The conditional of the others stays (Jeffrey's rule), they follow by regression:
-    K = P_os P_ss⁻¹, x_o + K (m − x_s), P_oo − K P_so + K C Kᵀ, and K C between them.
+    The entries `shared` of N(mean, covariance) are the entries `in_new` of the new Gaussian N(m, C),
+    which replaces their marginal. The conditional of o given s stays (Jeffrey's rule): with the
+    regression K = P_os P_ss⁻¹ the others have x_o + K (m_s − x_s), P_oo − K P_so + K C_ss Kᵀ, and
+    K C_s· with everything new. Nothing shared: the two stay independent.
     """
-    if not len(index):
-        return mean.copy(), covariance.copy()
-    own = covariance[np.ix_(index, index)]
-    gain = covariance[:, index] @ information(own, "the marginal to replace")
-    gain[index] = np.eye(len(index))
-    change = marginal_covariance - own
-    replaced = covariance + gain @ change @ gain.T
-    replaced[np.ix_(index, index)] = marginal_covariance
-    moved = mean + gain @ (marginal_mean - mean[index])
-    moved[index] = marginal_mean
-    return moved, 0.5 * (replaced + replaced.T)
+    others = np.setdiff1d(np.arange(len(mean)), shared)
+    own = information(covariance[np.ix_(shared, shared)], "the part to be replaced")
+    gain = covariance[np.ix_(others, shared)] @ own
+    cross = gain @ new_covariance[in_new]
+    spread = covariance[np.ix_(others, others)] - gain @ covariance[np.ix_(shared, others)]
+    joint = np.block([[spread + cross[:, in_new] @ gain.T, cross], [cross.T, new_covariance]])
+    moved = mean[others] + gain @ (new_mean[in_new] - mean[shared])
+    return np.concatenate([moved, new_mean]), 0.5 * (joint + joint.T)
 
 
 def packed(covariance: Matrix) -> Float[np.ndarray, " m"]:

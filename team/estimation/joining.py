@@ -13,16 +13,9 @@ from itertools import pairwise
 import numpy as np
 
 from team.estimation import alignment
+from team.estimation.contribution import Contribution, Start, Stream, named
 from team.estimation.gauss_newton import Island, JoinSettings, iterated, joint_marginal, settled
-from team.estimation.submap_graph import (
-    EMPTY_GRAPH,
-    Contribution,
-    Start,
-    Stream,
-    extended,
-    merged,
-    named,
-)
+from team.estimation.submap_graph import EMPTY_GRAPH, extended, merged
 
 __all__ = [
     "EMPTY_FOLD",

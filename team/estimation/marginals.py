@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.estimation import joining_kernel as kernel
+from team.estimation.conditioning import RobotPrior
+from team.estimation.contribution import Stream
 from team.estimation.gauss_newton import Island, joint_marginal
 from team.estimation.joining import Fold
-from team.estimation.submap_graph import Stream
 
 
 class LandmarkMap(NamedTuple):
@@ -29,15 +30,6 @@ class LandmarkBlocks(NamedTuple):
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]
     covariances: Float[np.ndarray, "L 2 2"]
-
-
-class RobotPrior(NamedTuple):
-    """A robot's last end pose and landmarks: joint covariance of (x, y, θ, x₁, y₁, …)."""
-
-    pose: Float[np.ndarray, "3"]
-    ids: UInt32[np.ndarray, " L"]
-    means: Float[np.ndarray, "L 2"]
-    covariance: Float[np.ndarray, "n n"]
 
 
 class Trajectory(NamedTuple):

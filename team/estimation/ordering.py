@@ -11,11 +11,12 @@ factorisation.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64, UInt64
 
 from team.estimation.compiled import compiled
 
 Indices = Int64[np.ndarray, " _"]
+Bits = UInt64[np.ndarray, "_ _"]
 
 
 class Elimination(NamedTuple):
@@ -44,61 +45,104 @@ def minimum_degree(sizes: Indices, column_start: Indices, rows: Indices) -> Elim
 
 
 @compiled
+def _tie(adjacent: Bits, degree: Indices, sizes: Indices, i: int, j: int) -> None:
+    """Make i ≠ j neighbours; `degree` counts the unknowns of the neighbours."""
+    bit = np.uint64(1) << np.uint64(j & 63)
+    if not adjacent[i, j >> 6] & bit:
+        adjacent[i, j >> 6] |= bit
+        adjacent[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)
+        degree[i] += sizes[j]
+        degree[j] += sizes[i]
+
+
+@compiled
+def _neighbours(adjacent: Bits, vertex: int, found: Indices) -> int:
+    """Write the neighbours of a vertex, ascending, to the front of `found`; their number."""
+    count = 0
+    for word in range(adjacent.shape[1]):
+        bits = adjacent[vertex, word]
+        i = word << 6
+        while bits:
+            if bits & np.uint64(1):
+                found[count] = i
+                count += 1
+            bits >>= np.uint64(1)
+            i += 1
+    return count
+
+
+@compiled
+def _least(degree: Indices, eliminated: Bool[np.ndarray, " n"]) -> int:
+    """The vertex of least degree that is left, the first among equals."""
+    least = -1
+    for i in range(len(degree)):
+        if not eliminated[i] and (least < 0 or degree[i] < degree[least]):
+            least = i
+    return least
+
+
+@compiled
 def _eliminated(
     sizes: Indices, column_start: Indices, rows: Indices
 ) -> tuple[Indices, Indices, Indices]:
     n = len(sizes)
-    one = np.uint64(1)
-    words = (n + 63) // 64
-    adjacent = np.zeros((n, words), dtype=np.uint64)
+    adjacent = np.zeros((n, (n + 63) // 64), dtype=np.uint64)
     degree = np.zeros(n, dtype=np.int64)
     for j in range(n):
-        for k in range(column_start[j], column_start[j + 1]):
-            i = rows[k]
-            if i != j and not adjacent[i, j >> 6] & (one << np.uint64(j & 63)):
-                adjacent[i, j >> 6] |= one << np.uint64(j & 63)
-                adjacent[j, i >> 6] |= one << np.uint64(i & 63)
-                degree[i] += sizes[j]
-                degree[j] += sizes[i]
+        for i in rows[column_start[j] : column_start[j + 1]]:
+            if i != j:
+                _tie(adjacent, degree, sizes, i, j)
     order = np.empty(n, dtype=np.int64)
     start = np.zeros(n + 1, dtype=np.int64)
     structure = np.empty(max(8 * n, 1), dtype=np.int64)
     eliminated = np.zeros(n, dtype=np.bool_)
     for step in range(n):
-        v = -1
-        for i in range(n):
-            if not eliminated[i] and (v < 0 or degree[i] < degree[v]):
-                v = i
+        v = _least(degree, eliminated)
         eliminated[v] = True
         order[step] = v
         begin = start[step]
-        end = begin
         if begin + n > len(structure):
             grown = np.empty(2 * len(structure) + n, dtype=np.int64)
             grown[:begin] = structure[:begin]
             structure = grown
-        for word in range(words):
-            bits = adjacent[v, word]
-            i = word << 6
-            while bits:
-                if bits & one:
-                    structure[end] = i
-                    end += 1
-                bits >>= one
-                i += 1
+        end = begin + _neighbours(adjacent, v, structure[begin:])
         start[step + 1] = end
         for a in range(begin, end):
             i = structure[a]
-            adjacent[i, v >> 6] &= ~(one << np.uint64(v & 63))
+            adjacent[i, v >> 6] &= ~(np.uint64(1) << np.uint64(v & 63))
             degree[i] -= sizes[v]
             for b in range(begin, a):
-                j = structure[b]
-                if not adjacent[i, j >> 6] & (one << np.uint64(j & 63)):
-                    adjacent[i, j >> 6] |= one << np.uint64(j & 63)
-                    adjacent[j, i >> 6] |= one << np.uint64(i & 63)
-                    degree[i] += sizes[j]
-                    degree[j] += sizes[i]
+                _tie(adjacent, degree, sizes, i, structure[b])
     return order, start, structure[: start[n]].copy()
+
+
+@compiled
+def _postorder(parent: Indices) -> Indices:
+    """The steps of a forest with every subtree before its root, children in ascending order."""
+    n = len(parent)
+    child = np.full(n + 1, -1, dtype=np.int64)
+    sibling = np.full(n, -1, dtype=np.int64)
+    for step in range(n - 1, -1, -1):
+        above = parent[step] if parent[step] >= 0 else n
+        sibling[step] = child[above]
+        child[above] = step
+    visited = np.empty(n, dtype=np.int64)
+    count = 0
+    root = child[n]
+    while root >= 0:
+        step = root
+        while True:
+            while child[step] >= 0:
+                down = child[step]
+                child[step] = -1
+                step = down
+            visited[count] = step
+            count += 1
+            if step == root:
+                break
+            step = sibling[step] if sibling[step] >= 0 else parent[step]
+        root = sibling[root]
+    return visited
 
 
 @compiled
@@ -111,34 +155,12 @@ def _postordered(
         step_of[order[step]] = step
     parent = np.full(n, -1, dtype=np.int64)
     for step in range(n):
-        for k in range(start[step], start[step + 1]):
-            row = step_of[structure[k]]
-            if parent[step] < 0 or row < parent[step]:
-                parent[step] = row
-    child = np.full(n + 1, -1, dtype=np.int64)
-    sibling = np.full(n, -1, dtype=np.int64)
-    for step in range(n - 1, -1, -1):
-        above = parent[step] if parent[step] >= 0 else n
-        sibling[step] = child[above]
-        child[above] = step
-    old_of_new = np.empty(n, dtype=np.int64)
-    new_of_old = np.full(n, -1, dtype=np.int64)
-    visited = 0
-    root = child[n]
-    while root >= 0:
-        step = root
-        while True:
-            while child[step] >= 0:
-                down = child[step]
-                child[step] = -1
-                step = down
-            old_of_new[visited] = step
-            new_of_old[step] = visited
-            visited += 1
-            if step == root:
-                break
-            step = sibling[step] if sibling[step] >= 0 else parent[step]
-        root = sibling[root]
+        if start[step + 1] > start[step]:
+            parent[step] = np.min(step_of[structure[start[step] : start[step + 1]]])
+    old_of_new = _postorder(parent)
+    new_of_old = np.empty(n, dtype=np.int64)
+    for new in range(n):
+        new_of_old[old_of_new[new]] = new
     new_order = np.empty(n, dtype=np.int64)
     new_parent = np.full(n, -1, dtype=np.int64)
     new_start = np.zeros(n + 1, dtype=np.int64)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int64
 
 from team.estimation import sparse_kernel
 from team.estimation.ordering import minimum_degree
+from team.estimation.sparse_layout import Structure, supernodes, targets
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -71,27 +72,18 @@ class Pattern:
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """Where each number of a pattern lands in the panels of L; numbers of unknowns are permuted.
+    """Where each number of a pattern lands in the panels of L.
 
-    permutation: place in the elimination of each unknown. Supernode s has the columns
-    columns_of[s] … columns_of[s + 1] − 1 and the rows row[row_start[s] : row_start[s + 1]], its own
-    columns first; its panel lies column-major from panel_start[s] on. target: place in the panels
-    of each number of the pattern (the mirrored one for the upper half of a diagonal block).
+    permutation: place in the elimination of each unknown.
+    structure:   the panels (see `sparse_layout`).
+    target:      place in the panels of each number of the pattern (the mirrored one for the upper
+                 half of a diagonal block).
     """
 
     pattern: Pattern
     permutation: Indices
-    columns_of: Indices
-    row_start: Indices
-    row: Indices
-    panel_start: Indices
-    supernode_of: Indices
+    structure: Structure
     target: Indices
-
-    @property
-    def structure(self) -> sparse_kernel.Structure:
-        """The arrays that the kernels walk."""
-        return (self.columns_of, self.row_start, self.row, self.panel_start, self.supernode_of)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,21 +97,17 @@ class Cholesky:
 def analysed(pattern: Pattern) -> Analysis:
     """Order, symbolic factorisation and supernodes of a pattern."""
     elimination = minimum_degree(pattern.sizes, pattern.column_start, pattern.rows)
-    permutation, columns_of, row_start, row, panel_start, supernode_of = sparse_kernel.supernodes(
-        pattern.sizes, pattern.offset, *elimination
-    )
-    target = sparse_kernel.targets(
+    permutation, structure = supernodes(pattern.sizes, pattern.offset, *elimination)
+    target = targets(
         pattern.sizes,
         pattern.offset,
         pattern.columns,
         pattern.rows,
         pattern.value_start,
         permutation,
-        (columns_of, row_start, row, panel_start, supernode_of),
+        structure,
     )
-    return Analysis(
-        pattern, permutation, columns_of, row_start, row, panel_start, supernode_of, target
-    )
+    return Analysis(pattern, permutation, structure, target)
 
 
 def factorised(analysis: Analysis, values: Values) -> Cholesky:

@@ -1,0 +1,168 @@
+"""Rules that fuse whole maps which the robots then absorb: kept because users compare them.
+
+`kalman_per_axis` and `kalman` treat the maps as independent. They are not once a robot has absorbed
+a fused map and sends its own again: every reading is then counted again with each exchange, and the
+covariance loses its meaning. Covariance intersection stays consistent for any correlation of the
+landmarks that it fuses, at the price of what the maps truly have in addition.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from team.estimation.gaussian import carried_along, cholesky_factor, information
+
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+SEARCH_STEPS = 60
+"""Golden sections of [0, 1]: the last interval is 3·10⁻¹³ wide."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapEstimate:
+    """N(means, covariance) of landmarks in the common frame [m]; ids ascending."""
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+def kalman(maps: Sequence[MapEstimate]) -> MapEstimate:
+    """Full-covariance Kalman fusion in the given order, as if the maps were independent.
+
+    K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's further landmarks follow
+    by regression on c. Counts readings again when its result is absorbed and sent once more.
+    """
+    return _one_by_one(_kalman_pair, maps)
+
+
+def kalman_per_axis(maps: Sequence[MapEstimate]) -> MapEstimate:
+    """The thesis' fusion: each coordinate by itself, correlations dropped (Xu, eq. 5.1-5.4).
+
+    TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and
+    S = S^A S^B/(S^A + S^B). Counts readings again when its result is absorbed and sent once more.
+    """
+    return _one_by_one(_per_axis_pair, maps)
+
+
+def covariance_intersection(
+    maps: Sequence[MapEstimate], criterion: Literal["trace", "det"] = "det"
+) -> MapEstimate:
+    """Fusion that holds for any correlation between the maps (Julier & Uhlmann 1997).
+
+    On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
+    of the least trace or determinant of C. The landmarks of one map alone follow by regression on
+    the common ones in that map; what the regression leaves is taken as that map's own.
+    """
+
+    def pair(a: MapEstimate, b: MapEstimate) -> MapEstimate:
+        return _intersected_pair(a, b, criterion)
+
+    return _one_by_one(pair, maps)
+
+
+def _one_by_one(
+    pair: Callable[[MapEstimate, MapEstimate], MapEstimate], maps: Sequence[MapEstimate]
+) -> MapEstimate:
+    if not maps:
+        return MapEstimate(np.zeros(0, dtype=np.uint32), np.zeros((0, 2)), np.zeros((0, 0)))
+    fused = maps[0]
+    for each in maps[1:]:
+        fused = pair(fused, each)
+    return fused
+
+
+def _shared(a: MapEstimate, b: MapEstimate) -> tuple[Int64[np.ndarray, " k"], ...]:
+    """Places of the common landmarks' coordinates in a and in b."""
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    return _points(in_a), _points(in_b)
+
+
+def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    return (2 * index[:, None] + np.arange(2)).ravel()
+
+
+def _carried(a: MapEstimate, fused: MapEstimate) -> MapEstimate:
+    """`fused` with those landmarks of `a` that it does not know, by regression on the others."""
+    in_a, in_fused = _shared(a, fused)
+    mean, covariance = carried_along(
+        a.means.ravel(), a.covariance, in_a, fused.means.ravel(), fused.covariance, in_fused
+    )
+    ids = np.concatenate([np.setdiff1d(a.ids, fused.ids), fused.ids])
+    order = np.argsort(ids)
+    place = _points(order)
+    return MapEstimate(ids[order], mean.reshape(-1, 2)[order], covariance[np.ix_(place, place)])
+
+
+def _kalman_pair(a: MapEstimate, b: MapEstimate) -> MapEstimate:
+    in_a, in_b = _shared(a, b)
+    R = b.covariance[np.ix_(in_b, in_b)]
+    innovation = information(a.covariance[np.ix_(in_a, in_a)] + R, "two maps' difference")
+    gain = a.covariance[:, in_a] @ innovation
+    moved = a.means.ravel() + gain @ (b.means.ravel()[in_b] - a.means.ravel()[in_a])
+    rest = np.eye(2 * len(a.ids))
+    rest[:, in_a] -= gain
+    covariance = rest @ a.covariance @ rest.T + gain @ R @ gain.T
+    updated = MapEstimate(a.ids, moved.reshape(-1, 2), 0.5 * (covariance + covariance.T))
+    return _carried(b, updated)
+
+
+def _per_axis_pair(a: MapEstimate, b: MapEstimate) -> MapEstimate:
+    ids = np.union1d(a.ids, b.ids)
+    means = np.zeros((len(ids), 2))
+    variances = np.zeros((len(ids), 2))
+    for each in (a, b):
+        place = np.searchsorted(ids, each.ids)
+        means[place] = each.means
+        variances[place] = np.diag(each.covariance).reshape(-1, 2)
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    both = np.searchsorted(ids, a.ids[in_a])
+    of_a = np.diag(a.covariance).reshape(-1, 2)[in_a]
+    of_b = np.diag(b.covariance).reshape(-1, 2)[in_b]
+    share = of_a / (of_a + of_b)
+    means[both] = a.means[in_a] + share * (b.means[in_b] - a.means[in_a])
+    variances[both] = share * of_b
+    return MapEstimate(ids, means, np.diag(variances.ravel()))
+
+
+def _intersected_pair(a: MapEstimate, b: MapEstimate, criterion: str) -> MapEstimate:
+    in_a, in_b = _shared(a, b)
+    common = MapEstimate(a.ids[in_a[::2] // 2], np.zeros((0, 2)), np.zeros((0, 0)))
+    if len(in_a):
+        info_a = information(a.covariance[np.ix_(in_a, in_a)], "a map's common landmarks")
+        info_b = information(b.covariance[np.ix_(in_b, in_b)], "a map's common landmarks")
+        omega = _least(lambda w: _size(w * info_a + (1.0 - w) * info_b, criterion))
+        spread = information(omega * info_a + (1.0 - omega) * info_b, "the intersection")
+        mean = spread @ (
+            omega * (info_a @ a.means.ravel()[in_a])
+            + (1.0 - omega) * (info_b @ b.means.ravel()[in_b])
+        )
+        common = MapEstimate(common.ids, mean.reshape(-1, 2), spread)
+    return _carried(b, _carried(a, common))
+
+
+def _size(metric: Float[np.ndarray, "n n"], criterion: str) -> float:
+    """Trace of C, or ln det C, of the covariance C = metric⁻¹."""
+    if criterion == "trace":
+        return float(np.trace(information(metric, "the intersection")))
+    factor = cholesky_factor(metric, "the intersection")
+    return float(-2.0 * np.log(np.diag(factor)).sum())
+
+
+def _least(size: Callable[[float], float]) -> float:
+    """ω in [0, 1] of the least size by golden section; size is convex in ω."""
+    low, high = 0.0, 1.0
+    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    at_left, at_right = size(left), size(right)
+    for _ in range(SEARCH_STEPS):
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - GOLDEN * (high - low)
+            at_left = size(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + GOLDEN * (high - low)
+            at_right = size(right)
+    return 0.5 * (low + high)

@@ -1,0 +1,118 @@
+"""A robot's pose in the team's map: the broadcast prior times the robot's own later submaps.
+
+The prior (the joint marginal of the robot's last joined end pose and the landmarks) and the submaps
+that are not in it are independent, so their product is exact, up to linearisation. The result is
+for display and control; it never enters anything that the robot sends for fusion.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from team.estimation.gaussian import information
+from team.estimation.geometry import compose, transformed, wrapped
+from team.estimation.submap import LocalMap
+from team.estimation.submap_factor import submap_normal
+
+ITERATIONS = 3
+Values = Float[np.ndarray, " _"]
+
+
+class RobotPrior(NamedTuple):
+    """A robot's last joined end pose and landmarks: joint covariance of (x, y, θ, x₁, y₁, …).
+
+    In the frame of the robot's island [m, rad]; ids ascending. A row of zeros is a known constant.
+    """
+
+    pose: Float[np.ndarray, "3"]
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+class _Link(NamedTuple):
+    """A submap of the chain as a factor: where its nodes lie in the state, and its Gaussian."""
+
+    at: Int64[np.ndarray, " nodes"]
+    span: Int64[np.ndarray, " m"]
+    mean: Values
+    information: Float[np.ndarray, "n n"]
+
+
+def team_pose(
+    prior: RobotPrior, pending: Sequence[LocalMap], open_window: LocalMap | None
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """N(pose, covariance) of the robot now, in the prior's frame.
+
+    pending: the robot's submaps behind the prior's pose, in order; open_window: the Gaussian of the
+    window in progress. Three Gauss-Newton iterations over the poses of the chain and the landmarks
+    that it sees; of the prior only their marginal is used, which is exact.
+    """
+    chain = [*pending, *([] if open_window is None else [open_window])]
+    if not chain:
+        return prior.pose, prior.covariance[:3, :3]
+    seen = np.unique(np.concatenate([local.ids for local in chain]))
+    index = np.flatnonzero(np.isin(prior.ids, seen))
+    kept = np.concatenate([np.arange(3), *(3 + 2 * k + np.arange(2) for k in index)])
+    covariance = prior.covariance[np.ix_(kept, kept)]
+    free = np.diag(covariance) > 0.0
+    metric = np.zeros_like(covariance)
+    metric[np.ix_(free, free)] = information(covariance[np.ix_(free, free)], "the team's prior")
+    mean = np.concatenate([prior.pose, prior.means[index].ravel()])
+    state, links = _chained(mean, prior.ids[index], chain)
+    unknown = np.concatenate([free, np.ones(len(state) - len(free), dtype=np.bool_)])
+    for _ in range(ITERATIONS):
+        hessian, gradient = _normal(state, mean, metric, links)
+        state[unknown] -= np.linalg.solve(hessian[np.ix_(unknown, unknown)], gradient[unknown])
+    hessian, _ = _normal(state, mean, metric, links)
+    spread = np.zeros_like(hessian)
+    spread[np.ix_(unknown, unknown)] = information(
+        hessian[np.ix_(unknown, unknown)], "the information of the team's pose"
+    )
+    last = int(links[-1].at[1])
+    pose = state[last : last + 3].copy()
+    pose[2] = wrapped(pose[2])
+    return pose, spread[last : last + 3, last : last + 3]
+
+
+def _chained(
+    mean: Values, ids: UInt32[np.ndarray, " _"], chain: Sequence[LocalMap]
+) -> tuple[Values, list[_Link]]:
+    """The state (prior pose, prior landmarks, then what each submap adds) and the factors."""
+    place = {id_: 3 + 2 * k for k, id_ in enumerate(ids.tolist())}
+    parts, length = [mean], len(mean)
+    start, pose = 0, mean[:3]
+    links = []
+    for local in chain:
+        end = length
+        parts.append(compose(pose, local.end_pose))
+        length += 3
+        for id_, point in zip(local.ids.tolist(), local.landmarks, strict=True):
+            if id_ not in place:
+                place[id_] = length
+                parts.append(transformed(pose, point))
+                length += 2
+        at = np.array([start, end, *(place[id_] for id_ in local.ids.tolist())], dtype=np.int64)
+        sizes = [3, 3, *([2] * len(local.ids))]
+        span = np.concatenate([np.arange(a, a + k) for a, k in zip(at, sizes, strict=True)])
+        links.append(_Link(at, span, local.mean, information(local.covariance, "a submap")))
+        start, pose = end, compose(pose, local.end_pose)
+    return np.concatenate(parts), links
+
+
+def _normal(
+    state: Values, mean: Values, metric: Float[np.ndarray, "p p"], links: Sequence[_Link]
+) -> tuple[Float[np.ndarray, "n n"], Values]:
+    """Σ JᵀWJ and Σ JᵀWr of the prior and the chain."""
+    n, p = len(state), len(mean)
+    hessian, gradient = np.zeros((n, n)), np.zeros(n)
+    residual = state[:p] - mean
+    residual[2] = wrapped(residual[2])
+    hessian[:p, :p], gradient[:p] = metric, metric @ residual
+    for link in links:
+        own, slope, _ = submap_normal(state, link.at, link.mean, link.information)
+        hessian[np.ix_(link.span, link.span)] += own
+        gradient[link.span] += slope
+    return hessian, gradient

@@ -1,0 +1,111 @@
+"""A submap as a factor between its start pose, its end pose and its landmarks.
+
+A submap that starts at pose s, ends at pose e and sees landmarks l says, with the rotation R of the
+heading of s,
+
+    r = (Rᵀ(p_e − p_s), wrap(θ_e − θ_s), Rᵀ(l₁ − p_s), …) − mean ~ N(0, P).
+
+Seen in the map frame, r' = T r with T = blkdiag(R, 1, R, …), its Jacobian is the identity for
+(e, l₁, …) and
+
+    G = [−I | (v_y, −v_x)ᵀ] per point v = p − p_s,  [0 0 −1] for the heading
+
+for s, and its metric is M = T P⁻¹ Tᵀ. The state is additive in (x, y, θ).
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation.compiled import compiled
+from team.estimation.geometry import wrapped
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+
+
+@compiled
+def submap_residual(
+    state: Values, at: Indices, mean: Values
+) -> tuple[Values, Float[np.ndarray, "n 2"]]:
+    """The residual r' in the map frame, and v = p − p_s of each point (end pose first).
+
+    at: first number in `state` of the start pose, of the end pose and of each landmark.
+    """
+    start, end = at[0], at[1]
+    c, s = math.cos(state[start + 2]), math.sin(state[start + 2])
+    residual = np.empty(len(mean))
+    offsets = np.empty((len(at) - 1, 2))
+    for point in range(len(at) - 1):
+        row = 0 if point == 0 else 2 * point + 1
+        offsets[point, 0] = state[at[point + 1]] - state[start]
+        offsets[point, 1] = state[at[point + 1] + 1] - state[start + 1]
+        residual[row] = offsets[point, 0] - (c * mean[row] - s * mean[row + 1])
+        residual[row + 1] = offsets[point, 1] - (s * mean[row] + c * mean[row + 1])
+    residual[2] = wrapped(state[end + 2] - state[start + 2] - mean[2])
+    return residual, offsets
+
+
+@compiled
+def rotated_information(
+    information: Float[np.ndarray, "n n"], heading: float
+) -> Float[np.ndarray, "n n"]:
+    """M = T P⁻¹ Tᵀ: the metric of a submap, turned into the map frame."""
+    c, s = math.cos(heading), math.sin(heading)
+    turned = information.copy()
+    n = len(information)
+    row = 0
+    while row < n:
+        for k in range(n):
+            a, b = turned[row, k], turned[row + 1, k]
+            turned[row, k] = c * a - s * b
+            turned[row + 1, k] = s * a + c * b
+        row += 3 if row == 0 else 2
+    row = 0
+    while row < n:
+        for k in range(n):
+            a, b = turned[k, row], turned[k, row + 1]
+            turned[k, row] = c * a - s * b
+            turned[k, row + 1] = s * a + c * b
+        row += 3 if row == 0 else 2
+    return turned
+
+
+@compiled
+def submap_normal(
+    state: Values, at: Indices, mean: Values, information: Float[np.ndarray, "n n"]
+) -> tuple[Float[np.ndarray, "m m"], Values, float]:
+    """JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r of one submap over (start pose, end pose, landmarks)."""
+    n = len(mean)
+    residual, offsets = submap_residual(state, at, mean)
+    metric = rotated_information(information, state[at[0] + 2])
+    jacobian = np.zeros((n, 3))
+    for point in range(len(at) - 1):
+        row = 0 if point == 0 else 2 * point + 1
+        jacobian[row, 0] = -1.0
+        jacobian[row + 1, 1] = -1.0
+        jacobian[row, 2] = offsets[point, 1]
+        jacobian[row + 1, 2] = -offsets[point, 0]
+    jacobian[2, 2] = -1.0
+    hessian = np.zeros((n + 3, n + 3))
+    gradient = np.zeros(n + 3)
+    chi2 = 0.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            hessian[i + 3, j + 3] = metric[i, j]
+            total += metric[i, j] * residual[j]
+        gradient[i + 3] = total
+        chi2 += residual[i] * total
+        for a in range(3):
+            gradient[a] += jacobian[i, a] * total
+        for j in range(n):
+            for a in range(3):
+                hessian[a, j + 3] += jacobian[i, a] * metric[i, j]
+    for j in range(n):
+        for a in range(3):
+            hessian[j + 3, a] = hessian[a, j + 3]
+            for b in range(3):
+                hessian[a, b] += hessian[a, j + 3] * jacobian[j, b]
+    return hessian, gradient, chi2
