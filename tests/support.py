@@ -145,9 +145,7 @@ def examples() -> Iterator[m.Message]:
         True, two, means, packed(spd(4)), 12.5, 14, ("bravo: 1 shared landmark, 2 needed",),
     )  # fmt: skip
     yield m.Prior(9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)))
-    yield m.Trajectory(
-        9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3))
-    )
+    yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))
     yield m.Progress(9_000, "central", "alpha", 1, 128, 6)
     yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposed("in a submap", 200),))
     yield m.End(9_000, (m.StreamEnd("alpha", 1, 200),), ("gap of 3 s",))

@@ -16,9 +16,10 @@ from typing import IO, NamedTuple, Self
 
 from mcap.writer import Writer
 
-from team.recording.schemas import schema_of, tag_of
+from team.recording.schemas import schema_of
 from team.wire.bus import Sample
 from team.wire.channels import channel_of
+from team.wire.messages import tag_of
 
 METADATA = "teamslam"
 FLUSH_S = 0.5

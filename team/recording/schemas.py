@@ -1,7 +1,7 @@
 """JSON Schemas of the messages, so that a log explains itself to any MCAP viewer.
 
-A schema describes the MessagePack array position by position. Fields of MCAP's `jsonschema` that
-say `contentEncoding: base64` travel as MessagePack `bin`: little-endian numbers, see docs/wire.md.
+A schema describes the MessagePack array position by position. Fields that say
+`contentEncoding: base64` travel as MessagePack `bin`: little-endian numbers, see docs/wire.md.
 """
 
 import json
@@ -9,11 +9,6 @@ import json
 import msgspec
 
 from team.wire.messages import Message
-
-
-def tag_of(message: type[Message]) -> str:
-    """The message's tag, "name/version"."""
-    return str(message.__struct_config__.tag)
 
 
 def schema_of(message: type[Message]) -> bytes:

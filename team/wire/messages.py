@@ -352,7 +352,7 @@ class Status(Message, frozen=True, array_like=True, gc=False, tag="status/1"):
 
     node: Text
     state: Text
-    figures: dict[str, float]
+    figures: dict[str, Real]
     warnings: tuple[Text, ...] = ()
 
 
@@ -388,8 +388,14 @@ def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: 
         return
     check_finite(covariance, "covariance", 3 * n)
     a, b, c = floats(covariance, "covariance").reshape(n, 3).T
-    if not np.all((a > 0.0) & (c > 0.0) & (a * c - b * b > 0.0)):
+    root = np.sqrt(np.maximum(a, 0.0)) * np.sqrt(np.maximum(c, 0.0))  # a·c could overflow
+    if not np.all(np.abs(b) < root):
         raise ValueError("not positive definite: covariance")
+
+
+def tag_of(message: type[Message]) -> str:
+    """A message's tag, "name/version"."""
+    return str(message.__struct_config__.tag)
 
 
 def _by_tag(base: type[Message]) -> dict[str, type[Message]]:

@@ -1,0 +1,237 @@
+"""The door: golden bytes, round trips, and what hostile bytes come to."""
+
+import contextlib
+import json
+import struct
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded
+from tests.support import ROOT, examples, odometry, packed, spd, submap
+
+EXAMPLES = {m.tag_of(type(message)): message for message in examples()}
+GOLDEN = json.loads((ROOT / "tests/golden/messages.json").read_text())
+finite = st.floats(-1e300, 1e300)
+stamps = st.integers(-(2**62), 2**62 - 1)
+counts = st.integers(0, 2**63 - 1)
+names = st.from_regex(r"[a-z][a-z0-9_]{0,31}", fullmatch=True)
+
+
+def reason_of(payload: bytes, expected: type[m.Message] | None = None) -> str:
+    with pytest.raises(WireError) as caught:
+        decoded(payload, expected)
+    return caught.value.reason
+
+
+def fields_of(message: m.Message) -> list[object]:
+    return msgpack.unpackb(encoded(message))
+
+
+@pytest.mark.parametrize("tag", sorted(m.BY_TAG))
+def test_each_message_has_its_golden_bytes(tag: str) -> None:
+    assert encoded(EXAMPLES[tag]).hex() == GOLDEN[tag]
+
+
+@pytest.mark.parametrize("tag", sorted(GOLDEN))
+def test_golden_bytes_are_still_understood(tag: str) -> None:
+    assert decoded(bytes.fromhex(GOLDEN[tag])) == EXAMPLES[tag]
+
+
+@pytest.mark.parametrize("tag", sorted(m.BY_TAG))
+def test_plain_msgpack_reads_the_tag_and_the_stamp_first(tag: str) -> None:
+    assert fields_of(EXAMPLES[tag])[:2] == [tag, EXAMPLES[tag].stamp_ns]
+
+
+@pytest.mark.parametrize("tag", sorted(m.BY_TAG))
+def test_appended_fields_are_ignored(tag: str) -> None:
+    longer = msgpack.packb([*fields_of(EXAMPLES[tag]), "a later field", 7])
+    assert decoded(longer) == EXAMPLES[tag]
+
+
+@settings(deadline=None)
+@given(stamps, names, counts, counts, st.integers(0, 2**62 - 1), finite, finite)
+def test_odometry_comes_back_as_it_went(
+    stamp: int, robot: str, epoch: int, reading: int, duration: int, forward: float, rate: float
+) -> None:
+    message = m.Odometry(stamp, robot, epoch, reading, duration, forward, rate)
+    assert decoded(encoded(message), m.Odometry) == message
+
+
+@settings(deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 2**32 - 1), st.floats(0, 1e300), st.floats(-float(np.pi), float(np.pi))
+        )
+    )
+)
+def test_observations_come_back_as_they_went(seen: list[tuple[int, float, float]]) -> None:
+    ids, ranges, bearings = zip(*seen, strict=True) if seen else ((), (), ())
+    message = m.Observations(
+        5, "alpha", 0, 1, from_ids(ids), from_floats(ranges), from_floats(bearings)
+    )
+    assert decoded(encoded(message), m.Observations) == message
+
+
+@settings(deadline=None)
+@given(st.sets(st.integers(0, 2**32 - 1), max_size=6), st.integers(0, 2**32))
+def test_submaps_come_back_as_they_went(ids: set[int], seed: int) -> None:
+    n = 3 + 2 * len(ids)
+    root = np.random.default_rng(seed).normal(size=(n, n))
+    message = m.Submap(
+        20, "alpha", 0, 1, 2, 3, 10, b"configur",
+        from_ids(sorted(ids)), from_floats(root[0]), packed(root @ root.T + np.eye(n)),
+    )  # fmt: skip
+    assert decoded(encoded(message), m.Submap) == message
+
+
+@settings(deadline=None)
+@given(
+    st.text(max_size=50),
+    st.dictionaries(st.text(max_size=20), finite, max_size=5),
+    st.lists(st.text(max_size=50), max_size=3),
+)
+def test_statuses_come_back_as_they_went(
+    state: str, figures: dict[str, float], warnings: list[str]
+) -> None:
+    message = m.Status(0, "central", state, figures, tuple(warnings))
+    assert decoded(encoded(message), m.Status) == message
+
+
+def with_fields(message: m.Message, **values: object) -> bytes:
+    fields = fields_of(message)
+    for name, value in values.items():
+        fields[1 + type(message).__struct_fields__.index(name)] = value
+    return msgpack.packb(fields)
+
+
+def indefinite(n: int) -> bytes:
+    return packed(spd(n) - 5.0 * np.eye(n))
+
+
+NAN, INF = struct.pack("<d", float("nan")), struct.pack("<d", float("inf"))
+POSE = EXAMPLES["pose/1"]
+SUBMAP = EXAMPLES["submap/1"]
+SEEN = EXAMPLES["observations/1"]
+MAP = EXAMPLES["map/1"]
+HUGE = [1.0, 1.7e308, 0.0, -1.7e308, 1.0, 0.0, 0.0, 0.0, 1.0]
+SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
+
+
+@pytest.mark.parametrize(
+    ("reason", "payload", "expected"),
+    [
+        ("wrong tag", b"\xc0", None),
+        ("wrong tag", b"\x90", None),
+        ("wrong tag", msgpack.packb([7, 0]), None),
+        ("wrong tag", msgpack.packb({"tag": "submap/1"}), None),
+        ("wrong tag", msgpack.packb(["elsewhere/1", 0]), None),
+        ("wrong tag", encoded(SUBMAP), m.Odometry),
+        ("wrong version", msgpack.packb(["submap/2", 0]), m.Submap),
+        ("wrong version", msgpack.packb(["submap/2", 0]), None),
+        ("truncated", b"", None),
+        ("truncated", encoded(SUBMAP)[:-1], None),
+        ("truncated", b"\xdc", None),
+        ("trailing bytes", encoded(SUBMAP) + b"\x00", None),
+        ("wrong length", with_fields(SUBMAP, mean=b"\x00" * 8), None),
+        ("wrong length", with_fields(SUBMAP, mean=b"\x00" * 7), None),
+        ("wrong length", with_fields(SUBMAP, covariance=b""), None),
+        ("wrong length", with_fields(SEEN, ranges=b"\x00" * 24), None),
+        ("not finite", with_fields(SUBMAP, mean=NAN * 7), None),
+        ("not finite", with_fields(SEEN, ranges=INF * 2), None),
+        ("not symmetric", with_fields(POSE, covariance=from_floats(SKEW)), None),
+        ("not positive definite", with_fields(SUBMAP, covariance=indefinite(7)), None),
+        ("not positive definite", with_fields(POSE, covariance=from_floats(-spd(3))), None),
+        (
+            "not positive definite",
+            with_fields(MAP, covariance=from_floats([1.0, 1.0, 1.0] * 2)),
+            None,
+        ),
+        ("not positive definite", with_fields(MAP, covariance=from_floats([1e300] * 6)), None),
+        ("not positive definite", with_fields(MAP, covariance=from_floats([-1.0, 0, 1] * 2)), None),
+        ("not symmetric", with_fields(POSE, covariance=from_floats(HUGE)), None),
+        ("not ascending", with_fields(SUBMAP, ids=from_ids([7, 7])), None),
+        ("out of bounds", with_fields(SEEN, bearings=from_floats([4.0, 0.0])), None),
+        ("out of bounds", with_fields(SEEN, ranges=from_floats([-1.0, 0.0])), None),
+        ("out of bounds", with_fields(SUBMAP, start_ns=2**40), None),
+        ("too large", b"\xdd\x7f\xff\xff\xff" + b"\x00" * 100, None),
+        ("too large", with_fields(SUBMAP, ids=from_ids(range(4096)), mean=bytes(8 * 8195)), None),
+        ("too deep", b"\x91" * 100_000, None),
+        ("damaged", b"\xc1", None),
+        ("damaged", b"\x91\xa1\xff", None),
+        ("wrong field", with_fields(SUBMAP, robot="Not A Name"), None),
+        ("wrong field", with_fields(SUBMAP, epoch=-1), None),
+        ("wrong field", with_fields(SUBMAP, epoch=1.5), None),
+        ("wrong field", with_fields(SUBMAP, mean=[0.0]), None),
+        ("wrong field", with_fields(SUBMAP, stamp_ns=2**62), None),
+        ("wrong field", with_fields(EXAMPLES["status/1"], figures={"x": float("nan")}), None),
+        ("wrong field", with_fields(EXAMPLES["odometry/1"], forward=float("nan")), None),
+        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-1]), None),
+    ],
+)
+def test_an_unsound_payload_is_refused_for_its_reason(
+    reason: str, payload: bytes, expected: type[m.Message] | None
+) -> None:
+    assert reason_of(payload, expected) == reason
+
+
+def test_a_payload_beyond_the_limit_is_refused_unread() -> None:
+    assert reason_of(b"\x91" * (LARGEST_PAYLOAD + 1)) == "too large"
+
+
+def test_an_error_names_the_field() -> None:
+    with pytest.raises(WireError, match=r"not ascending: Submap\.ids"):
+        decoded(with_fields(SUBMAP, ids=from_ids([7, 4])))
+
+
+@settings(deadline=None, max_examples=1500)
+@given(
+    st.sampled_from(sorted(EXAMPLES)),
+    st.lists(
+        st.tuples(
+            st.floats(0, 1, exclude_max=True), st.sampled_from("fird"), st.binary(max_size=9)
+        ),
+        min_size=1,
+        max_size=4,
+    ),
+)
+@example("pose/1", [(0.9, "f", b"\x7f")])
+def test_mutated_payloads_give_a_message_or_a_wire_error(
+    tag: str, mutations: list[tuple[float, str, bytes]]
+) -> None:
+    payload = bytearray(encoded(EXAMPLES[tag]))
+    for where, how, data in mutations:
+        i = int(where * len(payload))
+        if how == "f":  # flip bits
+            payload[i : i + 1] = bytes(b ^ (data[0] if data else 1) for b in payload[i : i + 1])
+        elif how == "i":  # insert
+            payload[i:i] = data
+        elif how == "r":  # replace
+            payload[i : i + len(data)] = data
+        else:  # drop
+            del payload[i : i + len(data)]
+    with contextlib.suppress(WireError):
+        message = decoded(bytes(payload))
+        assert decoded(encoded(message)) == message
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=200))
+def test_noise_is_never_a_message(payload: bytes) -> None:
+    with pytest.raises(WireError):
+        decoded(payload)
+
+
+def test_the_examples_cover_every_message() -> None:
+    assert set(EXAMPLES) == set(m.BY_TAG) == set(GOLDEN)
+
+
+def test_equal_messages_have_equal_bytes() -> None:
+    assert encoded(submap(3)) == encoded(submap(3)) != encoded(submap(4))
+    assert encoded(odometry(3)) != encoded(odometry(4))
