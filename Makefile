@@ -9,7 +9,8 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# The build of an editable install warns of folders named like its packages: here they are them.
+PIP := PYTHONWARNINGS=ignore $(BIN)/python -m pip --disable-pip-version-check --quiet
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 # One BLAS thread per process: same bits everywhere, and robots do not take each other's cores.
