@@ -10,14 +10,14 @@
 VENV := .venv
 BIN := $(VENV)/bin
 # The build of an editable install warns of folders named like its packages: here they are them.
-PIP := PYTHONWARNINGS=ignore $(BIN)/python -m pip --disable-pip-version-check --quiet
+PIP := PYTHONWARNINGS=ignore PIP_BUILD_CONSTRAINT=constraints.txt \
+  $(BIN)/python -m pip --disable-pip-version-check --quiet
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 # One BLAS thread per process: same bits everywhere, and robots do not take each other's cores.
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
-export PIP_BUILD_CONSTRAINT := $(abspath constraints.txt)
 
 .DEFAULT_GOAL := run
 .NOTPARALLEL:
