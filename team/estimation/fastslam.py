@@ -5,7 +5,7 @@ particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -177,6 +177,7 @@ def stepped(
         increment.mean,
         L,
         generator.standard_normal((count, 3)),
+        known,
         slots,
         first,
         np.column_stack((ranges, bearings)),
@@ -196,13 +197,8 @@ def propagated(
 ) -> Particles:
     """Motion without readings: pose ∘ mean ∘ Exp(xi), weights and landmarks as they were."""
     nothing = np.empty(0)
-    return stepped(
-        particles,
-        increment,
-        Sensor(),
-        np.empty(0, np.uint32),
-        nothing,
-        nothing,
-        "fastslam1",
-        generator,
-    )[0]
+    ids = np.empty(0, np.uint32)
+    moved, _ = stepped(
+        particles, increment, Sensor(), ids, nothing, nothing, "fastslam1", generator
+    )
+    return replace(moved, log_weights=particles.log_weights)

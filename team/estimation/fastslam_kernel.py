@@ -154,6 +154,7 @@ def step(
     motion: Float[np.ndarray, "3"],
     L: Float[np.ndarray, "3 3"],
     normals: Float[np.ndarray, "M 3"],
+    known: int,
     slots: Int64[np.ndarray, " n"],
     first: Bool[np.ndarray, " n"],
     readings: Float[np.ndarray, "n 2"],
@@ -173,7 +174,9 @@ def step(
 
         log p(z | pose, landmarks marginalised) + log N(ε; 0, I) − log N(ε; m, A Aᵀ).
 
-    A first sight has a flat prior and adds nothing. The last four arrays are written in place.
+    Slots below `known` hold landmarks of earlier steps. A first sight has a flat prior and adds
+    nothing; a second reading of it in the same step updates it, but has no part in the proposal.
+    The last four arrays are written in place.
     Thrun et al. 2005, section 13.5-13.8; Montemerlo 2003, chapter 4.
     """
     noise_mean, root = np.empty(3), np.empty((3, 3))
@@ -184,7 +187,7 @@ def step(
         root[0, 0] = root[1, 1] = root[2, 2] = 1.0
         log_weight = 0.0
         for k in range(len(slots) if improved else 0):
-            if not first[k]:
+            if slots[k] < known:
                 pose = _moved_by_noise(origin, L, (noise_mean[0], noise_mean[1], noise_mean[2]))
                 log_weight += _condition_noise_on_reading(
                     noise_mean,

@@ -211,7 +211,8 @@ def moments(
     count, n = len(poses), 3 + 2 * means.shape[1]
     deviations = np.empty((count, n))
     deviations[:, :3] = poses
-    deviations[:, 3:] = means.reshape(count, n - 3)
+    deviations[:, 3::2] = means[:, :, 0]
+    deviations[:, 4::2] = means[:, :, 1]
     mean = np.zeros(n)
     sine, cosine = 0.0, 0.0
     for i in range(count):

@@ -1,0 +1,183 @@
+"""Motion and sensor models against central differences, samples and their limits."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team.config import MotionModel, MotionNoise, Sensor
+from team.estimation import models
+from team.estimation.geometry import compose, exponential, inverse, logarithm
+from team.estimation.models import Increment, increment_of
+from team.estimation.randomness import generator
+
+quick = settings(deadline=None, max_examples=60)
+turns = st.floats(-2.5, 2.5)
+distances = st.floats(0.1, 5.0)
+NOISES = {
+    "forward": MotionNoise(per_s=0.03),
+    "turn": MotionNoise(per_s=0.05),
+    "final_turn": MotionNoise(per_s=0.02),
+    "lateral": MotionNoise(per_s=0.01),
+}
+SIGMAS = np.array([0.03, 0.05, 0.02, 0.01])
+
+
+def driven(kind, distance, turn, final_turn, lateral):
+    """The end of the motion, by small straight steps for the arc: nothing of the model is used."""
+    if kind == "turn-then-drive":
+        end = np.array([distance * np.cos(turn), distance * np.sin(turn), turn])
+    else:
+        middles = turn * (np.arange(4000) + 0.5) / 4000
+        end = np.array([distance * np.cos(middles).mean(), distance * np.sin(middles).mean(), turn])
+    return compose(end, np.array([0.0, lateral, final_turn]))
+
+
+@pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
+@quick
+@given(distance=distances, turn=turns)
+def test_the_motions_covariance_is_that_of_central_differences(kind, distance, turn):
+    increment = increment_of(MotionModel(kind=kind, **NOISES), 1.0, distance, turn)
+    np.testing.assert_allclose(increment.mean, driven(kind, distance, turn, 0.0, 0.0), atol=1e-6)
+    J = np.empty((3, 4))
+    for column in range(4):
+        offset = 1e-4 * (np.arange(4) == column)
+        ahead, behind = (
+            logarithm(
+                compose(
+                    inverse(increment.mean),
+                    driven(kind, distance + s * offset[0], turn + s * offset[1], *(s * offset[2:])),
+                )
+            )
+            for s in (1.0, -1.0)
+        )
+        J[:, column] = (ahead - behind) / 2e-4
+    np.testing.assert_allclose(increment.covariance, (J * SIGMAS**2) @ J.T, atol=1e-7)
+
+
+@quick
+@given(distance=distances, turn=st.floats(-2e-3, 2e-3))
+def test_the_arc_goes_over_into_the_straight_line(distance, turn):
+    model = MotionModel(kind="velocity", **NOISES)
+    bent, straight = (increment_of(model, 1.0, distance, t) for t in (turn, 0.0))
+    np.testing.assert_allclose(bent.mean, [distance, distance * turn / 2, turn], atol=1e-5)
+    np.testing.assert_allclose(bent.covariance, straight.covariance, atol=5e-5)
+    outside, inside = (increment_of(model, 1.0, distance, t) for t in (1.0001e-3, 0.9999e-3))
+    np.testing.assert_allclose(outside.covariance, inside.covariance, atol=1e-9)
+    np.testing.assert_allclose(outside.mean, inside.mean, atol=2e-6)
+
+
+def test_a_density_of_noise_does_not_depend_on_the_rate_of_the_odometry():
+    model = MotionModel(kind="velocity", forward=MotionNoise(0.02, 0.03, 0.1), turn=NOISES["turn"])
+    whole = increment_of(model, 2.0, 0.4, 0.3)
+    parts = Increment.identity()
+    for _ in range(200):
+        parts = parts.then(increment_of(model, 0.01, 0.4, 0.3))
+    np.testing.assert_allclose(parts.mean, whole.mean, atol=1e-12)
+    np.testing.assert_allclose(parts.covariance[2, 2], whole.covariance[2, 2], rtol=1e-9)
+    # White noise along the way moves the end less than one constant error of the same variance.
+    np.testing.assert_allclose(parts.covariance[0, 0], whole.covariance[0, 0], rtol=0.1)
+
+
+def test_composed_motion_has_the_covariance_of_composed_samples():
+    rng = np.random.default_rng(3)
+    L = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [-0.01, 0.005, 0.02]])
+    a = Increment(np.array([1.0, 0.5, 0.7]), L @ L.T)
+    b = Increment(np.array([2.0, -0.3, -1.1]), 0.5 * L @ L.T)
+    both = a.then(b)
+    ends = np.array(
+        [
+            logarithm(
+                compose(
+                    inverse(both.mean),
+                    compose(
+                        compose(a.mean, exponential(L @ rng.standard_normal(3))),
+                        compose(b.mean, exponential(np.sqrt(0.5) * L @ rng.standard_normal(3))),
+                    ),
+                )
+            )
+            for _ in range(20000)
+        ]
+    )
+    scale = np.sqrt(np.outer(np.diag(both.covariance), np.diag(both.covariance)))
+    assert np.abs((np.cov(ends.T) - both.covariance) / scale).max() < 0.05
+
+
+@quick
+@given(st.lists(st.tuples(distances, turns), min_size=3, max_size=3))
+def test_composition_of_increments_is_associative_with_a_neutral_element(motions):
+    model = MotionModel(kind="velocity", **NOISES)
+    a, b, c = (increment_of(model, 0.3, *motion) for motion in motions)
+    left, right = a.then(b).then(c), a.then(b.then(c))
+    np.testing.assert_allclose(left.mean, right.mean, atol=1e-12)
+    np.testing.assert_allclose(left.covariance, right.covariance, atol=1e-12)
+    np.testing.assert_array_equal(left.covariance, left.covariance.T)
+    for same in (a.then(Increment.identity()), Increment.identity().then(a)):
+        np.testing.assert_allclose(same.mean, a.mean, atol=1e-15)
+        np.testing.assert_allclose(same.covariance, a.covariance, atol=1e-15)
+
+
+def test_scales_come_before_the_limit_of_the_yaw_rate():
+    model = MotionModel(forward_scale=1.1, yaw_scale=0.5, yaw_rate_limit=0.4)
+    np.testing.assert_allclose(increment_of(model, 2.0, 1.0, 0.6).mean[2], 0.6)
+    np.testing.assert_allclose(increment_of(model, 2.0, 1.0, -3.0).mean[2], -0.8)
+    np.testing.assert_allclose(increment_of(model, 2.0, 1.0, 0.0).mean, [2.2, 0.0, 0.0])
+
+
+@quick
+@given(
+    st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.1, 3.1), st.floats(1.0, 20.0), turns
+)
+def test_the_sensors_jacobians_are_those_of_central_differences(x, y, theta, distance, bearing):
+    pose = np.array([x, y, theta])
+    landmark = models.located(pose, distance, bearing)
+    np.testing.assert_allclose(models.predicted(pose, landmark), (distance, bearing), atol=1e-9)
+    for column in range(3):
+        xi = 1e-6 * (np.arange(3) == column)
+        ahead = models.predicted(compose(pose, exponential(xi)), landmark)
+        behind = models.predicted(compose(pose, exponential(-xi)), landmark)
+        numeric = np.subtract(ahead, behind) / 2e-6
+        np.testing.assert_allclose(
+            models.pose_jacobian(distance, bearing)[:, column], numeric, atol=1e-6
+        )
+    for column in range(2):
+        shift = 1e-6 * (np.arange(2) == column)
+        ahead = models.predicted(pose, landmark + shift)
+        behind = models.predicted(pose, landmark - shift)
+        numeric = np.subtract(ahead, behind) / 2e-6
+        np.testing.assert_allclose(
+            models.landmark_jacobian(distance, theta + bearing)[:, column], numeric, atol=1e-6
+        )
+
+
+def test_calibration_takes_back_what_the_sensor_does():
+    sensor = Sensor(range_offset=0.05, range_scale=0.97, bearing_offset=0.3)
+    distances, bearings = np.array([1.0, 4.0]), np.array([-3.0, 3.1])
+    ranges, corrected = models.corrected(sensor, 0.97 * distances + 0.05, bearings + 0.3)
+    np.testing.assert_allclose(ranges, distances)
+    np.testing.assert_allclose(corrected, bearings)
+
+
+def test_readings_outside_the_sensors_reach_and_broken_ones_are_not_acceptable():
+    sensor = Sensor(min_range=0.5, max_range=10.0, field_of_view=np.pi, range_offset=0.6)
+    ranges = np.array([1.0, 0.55, 0.2, 11.0, 1.0, 1.0, np.nan, 1.0])
+    bearings = np.array([1.5, 0.0, 0.0, 0.0, 1.7, -2.0, 0.0, np.nan])
+    np.testing.assert_array_equal(models.acceptable(sensor, ranges, bearings), [True] + [False] * 7)
+
+
+def test_an_axis_reading_of_a_whole_turn_is_in_the_narrowest_view():
+    sensor = Sensor(field_of_view=0.1)
+    seen = models.acceptable(sensor, np.ones(3), np.array([2.0 * np.pi, -2.0 * np.pi, np.pi]))
+    np.testing.assert_array_equal(seen, [True, True, False])
+
+
+def test_the_ranges_noise_grows_with_the_predicted_range():
+    sensor = Sensor(range_sigma=0.3, range_sigma_per_m=0.04, bearing_sigma=0.02)
+    np.testing.assert_allclose(models.noise(sensor, 10.0), (0.25, 0.0004))
+
+
+def test_each_window_has_random_numbers_of_its_own_that_come_again():
+    keys = [(1, "r1", 0, 0), (2, "r1", 0, 0), (1, "r2", 0, 0), (1, "r1", 1, 0), (1, "r1", 0, 1)]
+    draws = [generator(*key).standard_normal(4).tobytes() for key in keys]
+    assert len(set(draws)) == len(keys)
+    assert generator(*keys[3]).standard_normal(4).tobytes() == draws[3]
