@@ -12,7 +12,7 @@ Users write TOML; processes hand the resolved scenario on as JSON (`dumps`, `loa
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -217,7 +217,7 @@ def _checked_count(count: object) -> int:
     return count
 
 
-def _counted(robots: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
+def _counted(robots: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
     """So many robots: the first ones as they are, further ones after their pattern in turn."""
     _checked_count(count)
     taken = {robot.get("id") for robot in robots}

@@ -28,7 +28,7 @@ def check_fields(value: object, declared: Any, at: str) -> None:
             raise ScenarioError(f"expected one of {known}, got {value!r} at {at}")
     elif isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"expected a finite number, got {value} at {at}")
-    elif isinstance(value, list):
+    elif isinstance(value, list | tuple):
         part_type = get_args(declared)[0] if get_origin(declared) is tuple else object
         for i, part in enumerate(value):
             check_fields(part, part_type, f"{at}[{i}]")

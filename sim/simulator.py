@@ -76,9 +76,10 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
     normals = generator(seed, robot.id, "slip").standard_normal((world.steps, 2))
 
     def slip(k: int, step: Step) -> tuple[float, float]:
-        final_turn = deviation(motion.final_turn, world.step_s, *step) * normals[k, 0]
-        lateral = deviation(motion.lateral, world.step_s, *step) * normals[k, 1]
-        return float(final_turn), float(lateral)
+        seconds, steps = np.array([world.step_s]), np.array([step])
+        final_turn = deviation(motion.final_turn, seconds, steps) * normals[k, 0]
+        lateral = deviation(motion.lateral, seconds, steps) * normals[k, 1]
+        return final_turn.item(), lateral.item()
 
     return driven(start, chain([second], way_points), limits, motion.kind, world.steps, slip)
 
@@ -97,17 +98,11 @@ def _random_way_points(
 
 
 def deviation(
-    noise: MotionNoise,
-    seconds: float | Float[np.ndarray, " K"],
-    distance: float | Float[np.ndarray, " K"],
-    turn: float | Float[np.ndarray, " K"],
-) -> Float[np.ndarray, "*K"]:
-    """σ = √(per_s² t + per_m² |distance| + per_rad² |turn|) of one noise over one step."""
-    return np.sqrt(
-        noise.per_s**2 * seconds
-        + noise.per_m**2 * np.abs(distance)
-        + noise.per_rad**2 * np.abs(turn)
-    )
+    noise: MotionNoise, seconds: Float[np.ndarray, " K"], steps: Float[np.ndarray, "K 2"]
+) -> Float[np.ndarray, " K"]:
+    """σ = √(per_s² t + per_m² |distance| + per_rad² |turn|) of one noise in each step."""
+    distance, turn = np.abs(steps).T
+    return np.sqrt(noise.per_s**2 * seconds + noise.per_m**2 * distance + noise.per_rad**2 * turn)
 
 
 def _odometry(
@@ -119,9 +114,8 @@ def _odometry(
     """(distance + noise)/t/forward_scale and (turn + noise)/t/yaw_scale of each true step."""
     duration_ns = np.diff(stamps_ns)
     seconds = duration_ns * 1e-9
-    distance, turn = steps.T
-    told_distance = distance + deviation(motion.forward, seconds, distance, turn) * normals[:, 0]
-    told_turn = turn + deviation(motion.turn, seconds, distance, turn) * normals[:, 1]
+    told_distance = steps[:, 0] + deviation(motion.forward, seconds, steps) * normals[:, 0]
+    told_turn = steps[:, 1] + deviation(motion.turn, seconds, steps) * normals[:, 1]
     return Intervals(
         end_ns=stamps_ns[1:],
         duration_ns=duration_ns,
