@@ -57,7 +57,7 @@ class _Token:
     sample: zenoh.Sample
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class _Question:
     query: zenoh.Query
     answer: Answer
@@ -240,12 +240,9 @@ class ZenohBus:
         payloads: list[bytes] = []
         for reply in replies:
             if reply.ok is None:
-                told = (
-                    ""
-                    if reply.err is None
-                    else reply.err.payload.to_bytes().decode("utf-8", "replace")
-                )
-                raise BusError(f"{key}: {told or 'no answer'} (waited at most {timeout_s} s)")
+                told = b"no answer" if reply.err is None else reply.err.payload.to_bytes()
+                text = told.decode("utf-8", "replace")
+                raise BusError(f"{key}: {text} (waited at most {timeout_s} s)")
             payloads.append(reply.ok.payload.to_bytes())
         return payloads
 
@@ -290,7 +287,7 @@ def _reply(question: _Question) -> None:
     with query:
         try:
             for payload in question.answer(request):
-                query.reply(query.key_expr, payload, congestion_control=_BLOCK)
+                query.reply(query.key_expr, payload)  # blocks as its query does
         except ValueError as error:  # the request is not sound: its sender is told
             query.reply_err(str(error))
 

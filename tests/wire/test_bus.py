@@ -1,0 +1,222 @@
+"""What every bus must do: the same tests for the bus in memory and for the bus over Zenoh."""
+
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.bus import Bus, BusError, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from team.wire.codec import decoded, encoded
+from team.wire.zenoh_bus import ZenohBus, router
+from tests.support import odometry, received, submap, wait_until
+
+Joined = Callable[[], Bus]
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with router() as bound:
+        yield bound
+
+
+@pytest.fixture(params=["memory", "zenoh"])
+def joined(request: pytest.FixtureRequest) -> Iterator[Joined]:
+    """Each call joins one more bus to the same team."""
+    with ExitStack() as stack:
+        if request.param == "memory":
+            network = MemoryNetwork()
+            yield lambda: MemoryBus(network)
+        else:
+            endpoint = request.getfixturevalue("endpoint")
+            team = f"t{abs(hash(request.node.name))}"
+            yield lambda: stack.enter_context(ZenohBus(team, endpoint))
+
+
+def send(bus: Bus, *messages: tuple[c.Channel, str, m.Message]) -> None:
+    for message in messages:
+        bus.publish(Outgoing(*message))
+
+
+def until_heard(source: Bus, sink: Bus) -> None:
+    """Return when the subscriptions of `sink` have reached `source`: odometry flows."""
+    sink.subscribe(c.ODOMETRY, "probe")
+
+    def heard() -> bool:
+        send(source, (c.ODOMETRY, "probe", odometry(0, "probe")))
+        return bool(sink.receive(0.02))
+
+    wait_until(heard)
+    while sink.receive(0.05):
+        pass
+
+
+def test_what_is_published_arrives_with_its_stamps_and_counter(joined: Joined) -> None:
+    robot, centre = joined(), joined()
+    centre.subscribe(c.SUBMAP)
+    send(robot, (c.SUBMAP, "alpha", submap(0)), (c.SUBMAP, "alpha", submap(1)))
+    first, second = received(centre, 2)
+    assert opened(first) == (c.SUBMAP, "alpha", submap(0))
+    assert (first.key, first.stamp_ns, first.counter) == ("robot/alpha/submap", 1_000_000, 0)
+    assert (second.payload, second.counter) == (encoded(submap(1)), 1)
+
+
+def test_a_bus_does_not_receive_what_it_publishes(joined: Joined) -> None:
+    robot, other = joined(), joined()
+    robot.subscribe(c.SUBMAP)
+    send(robot, (c.SUBMAP, "alpha", submap(0)))
+    send(other, (c.SUBMAP, "bravo", submap(1, "bravo")))
+    assert [sample.key for sample in received(robot, 1)] == ["robot/bravo/submap"]
+
+
+def test_a_subscription_by_name_hears_that_robot_only(joined: Joined) -> None:
+    source, sink = joined(), joined()
+    sink.subscribe(c.SUBMAP, "bravo")
+    send(source, (c.SUBMAP, "alpha", submap(0)), (c.SUBMAP, "bravo", submap(1, "bravo")))
+    assert [sample.key for sample in received(sink, 1)] == ["robot/bravo/submap"]
+    assert sink.receive(0.0) == []
+
+
+def test_a_node_channel_hears_nodes_of_any_depth(joined: Joined) -> None:
+    source, sink = joined(), joined()
+    sink.subscribe(c.STATUS)
+    for node in ("central", "robot/alpha"):
+        send(source, (c.STATUS, node, m.Status(0, node, "running", {})))
+    assert {sample.key for sample in received(sink, 2)} == {"central/status", "robot/alpha/status"}
+
+
+def test_subscribing_twice_delivers_once(joined: Joined) -> None:
+    source, sink = joined(), joined()
+    for name in ("*", "alpha", "*"):
+        sink.subscribe(c.SUBMAP, name)
+    send(source, *[(c.SUBMAP, "alpha", submap(i)) for i in range(3)])
+    assert [sample.counter for sample in received(sink, 3)] == [0, 1, 2]
+    assert sink.receive(0.1) == []
+
+
+def test_a_late_joiner_gets_every_message_of_an_all_channel(joined: Joined) -> None:
+    source = joined()
+    send(source, *[(c.SUBMAP, "alpha", submap(i)) for i in range(600)])
+    late = joined()
+    late.subscribe(c.SUBMAP)
+    assert [sample.counter for sample in received(late, 600)] == list(range(600))
+
+
+def test_a_late_joiner_gets_the_newest_message_of_a_latest_channel(joined: Joined) -> None:
+    source = joined()
+    for i in range(5):
+        send(source, (c.WORLD_CONFIG, "", m.Configured(i, "world", 0, b"configur", "{}")))
+    late = joined()
+    late.subscribe(c.WORLD_CONFIG)
+    assert [sample.counter for sample in received(late, 1)] == [4]
+
+
+def test_a_late_joiner_gets_nothing_of_a_stream(joined: Joined) -> None:
+    source, late = joined(), joined()
+    send(source, (c.ODOMETRY, "alpha", odometry(0)))
+    late.subscribe(c.ODOMETRY, "alpha")
+    until_heard(source, late)
+    send(source, (c.ODOMETRY, "alpha", odometry(1)))
+    assert [sample.counter for sample in received(late, 1)] == [1]
+
+
+def test_order_holds_across_keys_and_deliveries(joined: Joined) -> None:
+    source, sink = joined(), joined()
+    for channel in (c.SUBMAP, c.ROBOT_PROGRESS, c.ODOMETRY):
+        sink.subscribe(channel, "alpha")
+    until_heard(source, sink)
+    for i in range(300):
+        progress = m.Progress(i, "robot/alpha", "alpha", 0, i, 0)
+        send(
+            source,
+            (c.ODOMETRY, "alpha", odometry(i)),
+            (c.SUBMAP, "alpha", submap(i)),
+            (c.ROBOT_PROGRESS, "alpha", progress),
+        )
+    keys = ["robot/alpha/odometry", "robot/alpha/submap", "robot/alpha/progress"]
+    arrived = received(sink, 900)
+    assert [(sample.key, sample.counter) for sample in arrived] == [
+        (key, i) for i in range(300) for key in keys
+    ]
+
+
+def test_a_raw_sample_keeps_its_bytes_and_stamps(joined: Joined) -> None:
+    source, sink = joined(), joined()
+    sink.subscribe(c.SUBMAP)
+    sample = Sample("robot/alpha/submap", b"not even msgpack", -7, 1_234, 99)
+    source.publish_raw(sample)
+    assert received(sink, 1) == [sample]
+
+
+def test_a_question_gets_all_its_answers_in_order(joined: Joined) -> None:
+    centre, robot = joined(), joined()
+
+    def answer(request: bytes) -> Iterable[bytes]:
+        wanted = decoded(request, m.SubmapsWanted)
+        return [encoded(submap(i, wanted.robot)) for i in range(300)]
+
+    centre.answer(c.SUBMAPS, "", answer)
+    got = asked(robot, centre, c.SUBMAPS, "", m.SubmapsWanted(0, "bravo"))
+    assert got == [encoded(submap(i, "bravo")) for i in range(300)]
+
+
+def test_one_answer_can_serve_every_name(joined: Joined) -> None:
+    world, robot = joined(), joined()
+    world.answer(c.READINGS, "*", lambda request: [request])
+    wanted = m.ReadingsWanted(0, "bravo", 0, 1, 2)
+    assert asked(robot, world, c.READINGS, "bravo", wanted) == [encoded(wanted)]
+
+
+def test_a_question_that_nobody_answers_has_no_answers(joined: Joined) -> None:
+    assert joined().ask(c.SUBMAPS, "", m.SubmapsWanted(0, "alpha"), 5.0) == []
+
+
+def test_an_answer_that_fails_is_told_to_the_asker(joined: Joined) -> None:
+    centre, robot = joined(), joined()
+
+    def answer(request: bytes) -> Iterable[bytes]:
+        raise ValueError("no such robot")
+
+    centre.answer(c.SUBMAPS, "", answer)
+    with pytest.raises(BusError, match="central/submaps: no such robot"):
+        asked(robot, centre, c.SUBMAPS, "", m.SubmapsWanted(0, "nobody"))
+
+
+def asked(
+    asker: Bus, answerer: Bus, channel: c.Channel, name: str, request: m.Message
+) -> list[bytes]:
+    """Ask while another thread runs the answering bus; again until its declaration is known."""
+    done = threading.Event()
+
+    def serve() -> None:
+        while not done.is_set():
+            answerer.receive(0.01)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    replies: list[bytes] = []
+    try:
+        wait_until(lambda: bool(replies.extend(asker.ask(channel, name, request, 5.0)) or replies))
+    finally:
+        done.set()
+        thread.join()
+    return replies
+
+
+def test_tokens_are_seen_as_they_appear_and_go_and_never_ones_own(joined: Joined) -> None:
+    early, watcher = joined(), joined()
+    early.declare_alive("world")
+    watcher.declare_alive("central")
+    watcher.watch_alive()
+    late = joined()
+    late.declare_alive("robot/alpha")
+    seen = [opened(sample)[2] for sample in received(watcher, 2)]
+    late.close()
+    seen += [opened(sample)[2] for sample in received(watcher, 1)]
+    assert seen == [
+        m.Liveliness(0, "world", True),
+        m.Liveliness(0, "robot/alpha", True),
+        m.Liveliness(0, "robot/alpha", False),
+    ]

@@ -1,0 +1,56 @@
+"""The table of channels, and the door that compares a message with its key."""
+
+import pytest
+
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample, opened
+from team.wire.codec import WireError, encoded
+from tests.support import odometry, submap
+
+
+def sample(key: str, message: m.Message) -> Sample:
+    return Sample(key, encoded(message), message.stamp_ns, 0, 0)
+
+
+@pytest.mark.parametrize("channel", c.CHANNELS, ids=lambda channel: channel.name)
+def test_every_key_leads_back_to_its_channel_and_name(channel: c.Channel) -> None:
+    name = (
+        "robot/alpha"
+        if "{node}" in channel.template
+        else "alpha"
+        if "{" in channel.template
+        else ""
+    )
+    if channel in c.QUERIES:
+        assert c.channel_of(channel.key(name)) is None
+    else:
+        assert c.channel_of(channel.key(name)) == (channel, name)
+
+
+def test_no_two_channels_share_a_name_or_a_key() -> None:
+    assert len({channel.name for channel in c.CHANNELS}) == len(c.CHANNELS)
+    assert len({channel.template for channel in c.CHANNELS}) == len(c.CHANNELS)
+
+
+def test_a_message_is_opened_with_its_channel_and_robot() -> None:
+    assert opened(sample("robot/alpha/submap", submap(3))) == (c.SUBMAP, "alpha", submap(3))
+
+
+def test_a_key_that_no_channel_has_is_refused() -> None:
+    with pytest.raises(WireError, match="no channel has the key 'robot/alpha/gossip'"):
+        opened(sample("robot/alpha/gossip", submap(0)))
+
+
+def test_a_robots_message_on_another_robots_key_is_refused() -> None:
+    with pytest.raises(WireError, match="a message of 'alpha' on the key 'robot/bravo/submap'"):
+        opened(sample("robot/bravo/submap", submap(0, "alpha")))
+
+
+def test_a_message_on_another_channels_key_is_refused() -> None:
+    with pytest.raises(WireError, match="wrong tag: 'odometry/1' where 'submap/1' belongs"):
+        opened(sample("robot/alpha/submap", odometry(0)))
+
+
+def test_an_outgoing_message_knows_its_key() -> None:
+    assert Outgoing(c.SUBMAP, "alpha", submap(0)).key == "robot/alpha/submap"

@@ -1,0 +1,251 @@
+"""What only the real bus can do: lose its link, its peer, its process; and the router."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.bus import BusError, Outgoing, Sample, opened
+from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
+from team.wire.zenoh_bus import ZenohBus, router
+from tests.support import ROOT, Link, odometry, received, submap, wait_until
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    with router() as bound:
+        yield bound
+
+
+def flowing(source: ZenohBus, sink: ZenohBus, *channels: c.Channel) -> None:
+    """Subscribe and return when publications of `source` reach `sink`."""
+    for channel in (*channels, c.SIGHTINGS):
+        sink.subscribe(channel)
+    probe = Sample("robot/probe/sightings", b"", 0, 0, 0)
+
+    def heard() -> bool:
+        source.publish_raw(probe)
+        return bool(sink.receive(0.02))
+
+    wait_until(heard)
+    while sink.receive(0.1):
+        pass
+
+
+def progress(i: int) -> Outgoing:
+    return Outgoing(c.ROBOT_PROGRESS, "alpha", m.Progress(i, "robot/alpha", "alpha", 0, i, 0))
+
+
+def counters(samples: list[Sample], key: str) -> list[int]:
+    return [sample.counter for sample in samples if sample.key == key]
+
+
+def test_nothing_is_lost_or_reordered_at_full_speed(endpoint: str) -> None:
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
+        flowing(source, sink, c.ODOMETRY)
+        for i in range(5_000):
+            source.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
+        arrived = received(sink, 5_000)
+    assert [decoded(sample.payload, m.Odometry) for sample in arrived] == [
+        odometry(i) for i in range(5_000)
+    ]
+
+
+def test_what_was_published_before_close_arrives(endpoint: str) -> None:
+    source = ZenohBus("t", endpoint)
+    with ZenohBus("t", endpoint) as sink:
+        flowing(source, sink, c.ODOMETRY)
+        for i in range(5_000):
+            source.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
+        source.close()
+        assert counters(received(sink, 5_000), "robot/alpha/odometry") == list(range(5_000))
+
+
+@pytest.mark.parametrize("behind", ["source", "sink"])
+def test_a_cut_link_loses_nothing_but_streams(endpoint: str, behind: str) -> None:
+    with (
+        Link(endpoint) as link,
+        ZenohBus("t", link.endpoint if behind == "source" else endpoint) as source,
+        ZenohBus("t", link.endpoint if behind == "sink" else endpoint) as sink,
+    ):
+        flowing(source, sink, c.SUBMAP, c.ROBOT_PROGRESS)
+        for i in range(100):
+            if i == 50:
+                arrived = received(sink, 100)
+                link.cut()
+            source.publish(Outgoing(c.SUBMAP, "alpha", submap(i)))
+            source.publish(progress(i))
+        source.publish(Outgoing(c.SUBMAP, "bravo", submap(0, "bravo")))  # a publisher of the cut
+        link.mend()
+        arrived += received(sink, 101)
+    assert counters(arrived, "robot/alpha/submap") == list(range(100))
+    assert counters(arrived, "robot/alpha/progress") == list(range(100))
+    assert counters(arrived, "robot/bravo/submap") == [0]
+
+
+def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None:
+    with (
+        Link(endpoint) as link,
+        ZenohBus("t", link.endpoint) as source,
+        ZenohBus("t", endpoint) as sink,
+    ):
+        flowing(source, sink, c.FINAL_MAP, c.ROBOT_DONE)
+        link.cut()
+        source.publish(Outgoing(c.ROBOT_DONE, "alpha", m.Done(0, "alpha", 0, 9, 9, 1, ())))
+        link.mend()
+        assert [sample.key for sample in received(sink, 1)] == ["robot/alpha/done"]
+
+
+def test_a_killed_process_loses_its_token(endpoint: str) -> None:
+    program = (
+        "import sys; from team.wire.zenoh_bus import ZenohBus\n"
+        f"bus = ZenohBus('t', {endpoint!r}); bus.declare_alive('robot/alpha')\n"
+        "print('ready', flush=True); sys.stdin.read()"
+    )
+    with ZenohBus("t", endpoint) as watcher, python(program) as child:
+        watcher.watch_alive()
+        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(0, "robot/alpha", True)
+        child.kill()
+        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(0, "robot/alpha", False)
+
+
+def python(program: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_a_process_that_dies_of_an_exception_ends(endpoint: str) -> None:
+    program = (
+        "from team.wire import channels as c\n"
+        "from team.wire.zenoh_bus import ZenohBus\n"
+        f"bus = ZenohBus('t', {endpoint!r})\n"
+        "for channel in c.CHANNELS: bus.subscribe(channel)\n"
+        "bus.answer(c.SUBMAPS, '', lambda request: []); bus.watch_alive()\n"
+        "print('ready', flush=True)\n"
+        "while not bus.receive(1.0): pass\n"
+        "raise RuntimeError('of an exception')"
+    )
+    with ZenohBus("t", endpoint) as source, python(program) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "ready\n"
+        end = time.monotonic() + 30.0
+        while child.poll() is None and time.monotonic() < end:  # traffic while it goes down
+            source.publish(Outgoing(c.ODOMETRY, "alpha", odometry(0)))
+        gone = child.poll()
+        child.kill()
+        assert child.stderr is not None
+        told = child.stderr.read()
+    assert gone == 1
+    assert told.endswith("RuntimeError: of an exception\n")
+
+
+def test_nobody_at_the_endpoint_is_an_error_that_says_what_to_do() -> None:
+    with router() as free:
+        pass
+    with pytest.raises(BusError, match=f"no router answers at {free}.*start `teamslam router`"):
+        ZenohBus("t", free, patience_s=0.3)
+
+
+def test_a_client_waits_for_a_router_that_starts_later() -> None:
+    with router() as free:
+        pass
+    joined: list[ZenohBus] = []
+    thread = threading.Thread(target=lambda: joined.append(ZenohBus("t", free)))
+    thread.start()
+    with router(free):
+        thread.join()
+        joined[0].close()
+
+
+def test_a_taken_port_is_an_error_that_names_it(endpoint: str) -> None:
+    with pytest.raises(BusError, match=f"can not listen at {endpoint}"), router(endpoint):
+        pass
+
+
+def test_teams_do_not_hear_each_other(endpoint: str) -> None:
+    with ZenohBus("a", endpoint) as a, ZenohBus("b", endpoint) as b, ZenohBus("a", endpoint) as own:
+        own.subscribe(c.SUBMAP)
+        b.publish(Outgoing(c.SUBMAP, "bravo", submap(0, "bravo")))
+        a.publish(Outgoing(c.SUBMAP, "alpha", submap(0)))
+        assert [sample.key for sample in received(own, 1)] == ["robot/alpha/submap"]
+
+
+def test_an_answer_that_never_comes_is_an_error(endpoint: str) -> None:
+    with ZenohBus("t", endpoint) as silent, ZenohBus("t", endpoint) as asker:
+        silent.answer(c.SUBMAPS, "", lambda request: [])
+
+        def timed_out() -> bool:
+            try:
+                asker.ask(c.SUBMAPS, "", m.SubmapsWanted(0, "alpha"), 0.2)
+            except BusError as error:
+                return "team/t/central/submaps" in str(error)
+            return False  # its declaration is still on its way
+
+        wait_until(timed_out)
+
+
+def test_a_payload_beyond_the_limit_is_not_sent(endpoint: str) -> None:
+    with ZenohBus("t", endpoint) as bus, pytest.raises(BusError, match="split the map"):
+        bus.publish_raw(Sample("robot/alpha/submap", bytes(LARGEST_PAYLOAD + 1), 0, 0, 0))
+
+
+def test_the_largest_payload_arrives(endpoint: str) -> None:
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
+        flowing(source, sink, c.FUSED_MAP)
+        source.publish_raw(Sample("central/map", bytes(LARGEST_PAYLOAD), 0, 0, 0))
+        assert [len(sample.payload) for sample in received(sink, 1)] == [LARGEST_PAYLOAD]
+
+
+def test_a_publication_without_its_attachment_is_dropped_and_logged(
+    endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = zenoh.Config.from_json5(
+        f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, '
+        "scouting: {multicast: {enabled: false}}}"
+    )
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
+        flowing(source, sink, c.ODOMETRY)
+        with zenoh.open(config) as stranger:
+            stranger.put("team/t/robot/alpha/odometry", encoded(odometry(0)))
+        wait_until(lambda: sink.receive(0.02) == [] and bool(caplog.records))
+    assert "team/t/robot/alpha/odometry: dropped" in caplog.text
+
+
+def test_receive_waits_for_the_first_and_no_longer(endpoint: str) -> None:
+    with ZenohBus("t", endpoint) as bus:
+        before = time.monotonic()
+        assert bus.receive(0.05) == []
+        assert time.monotonic() - before >= 0.05
+
+
+def test_close_wakes_a_receiver_and_ends_the_bus(endpoint: str) -> None:
+    bus = ZenohBus("t", endpoint)
+    got: list[list[Sample]] = []
+    thread = threading.Thread(target=lambda: got.append(bus.receive(60.0)))
+    thread.start()
+    bus.close()
+    thread.join(10.0)
+    bus.close()
+    assert not thread.is_alive()
+    for act in (bus.receive, lambda: bus.subscribe(c.SUBMAP), lambda: bus.publish(progress(0))):
+        with pytest.raises(BusError, match="closed"):
+            act()
+
+
+def test_a_subscription_to_all_after_one_by_name_is_refused(endpoint: str) -> None:
+    with ZenohBus("t", endpoint) as bus:
+        bus.subscribe(c.SUBMAP, "alpha")
+        with pytest.raises(BusError, match="deliver twice"):
+            bus.subscribe(c.SUBMAP)
