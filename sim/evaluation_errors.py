@@ -1,0 +1,177 @@
+"""Errors against the truth: positions as distances, headings on the circle, NEES, alignment."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation.alignment import NEEDED, procrustes
+from team.estimation.consistency import chi2_interval, nees
+
+TRUTH_GAP_NS = 1_000_000_000
+"""Truth is interpolated between samples that are at most this far apart."""
+BAND = 0.95
+
+
+@dataclass(frozen=True)
+class Path:
+    """Poses (x [m], y [m], theta [rad]) by stamp, ascending; the true path or an estimated one."""
+
+    stamps_ns: Int64[np.ndarray, " K"]
+    poses: Float[np.ndarray, "K 3"]
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Estimate − truth of the K poses that have truth, in (x [m], y [m], theta [rad]).
+
+    sigmas: what the estimator says of each. nees: eᵀ P⁻¹ e, 3 degrees of freedom each.
+    """
+
+    stamps_ns: Int64[np.ndarray, " K"]
+    errors: Float[np.ndarray, "K 3"]
+    sigmas: Float[np.ndarray, "K 3"]
+    nees: Float[np.ndarray, " K"]
+
+    @property
+    def position_rmse_m(self) -> float:
+        """√(mean of the squared distances) [m]."""
+        return rms(np.hypot(self.errors[:, 0], self.errors[:, 1]))
+
+    @property
+    def heading_rmse_rad(self) -> float:
+        """√(mean of the squared heading errors) [rad]."""
+        return rms(self.errors[:, 2])
+
+    @property
+    def nees_per_dof(self) -> float:
+        """The mean of NEES/3; 1 where the covariances are right."""
+        return float(self.nees.mean()) / 3.0
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """A map against the true positions of the same landmarks.
+
+    rmse_m, aligned_rmse_m: 2-D distances, as the map lies and after truth_from_map, the rigid
+    motion of least squares (None below two landmarks). nees_per_dof: of the joint covariance, in
+    the frame as the map lies; `band` is where a single run of 2L degrees of freedom lies in 95 %.
+    """
+
+    count: int
+    rmse_m: float
+    aligned_rmse_m: float | None
+    truth_from_map: Float[np.ndarray, "3"] | None
+    nees_per_dof: float
+    band: tuple[float, float]
+
+    @property
+    def in_band(self) -> bool:
+        """Whether this run's NEES lies in its band."""
+        return self.band[0] <= self.nees_per_dof <= self.band[1]
+
+
+def rms(values: Float[np.ndarray, " n"]) -> float:
+    """√(mean of squares)."""
+    return float(np.sqrt(np.mean(values * values)))
+
+
+def on_circle(angles: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """The same directions in (−π, π]."""
+    wrapped: Float[np.ndarray, "*n"] = angles + 2.0 * np.pi * np.floor(
+        (np.pi - angles) / (2.0 * np.pi)
+    )
+    return wrapped
+
+
+def map_errors(
+    means: Float[np.ndarray, "L 2"],
+    covariance: Float[np.ndarray, "m m"],
+    truth: Float[np.ndarray, "L 2"],
+) -> MapErrors:
+    """The errors of L ≥ 1 landmarks with their joint 2L × 2L covariance."""
+    count = len(means)
+    difference = means - truth
+    truth_from_map = rigid_alignment(truth, means)
+    return MapErrors(
+        count,
+        rms(np.hypot(difference[:, 0], difference[:, 1])),
+        None if truth_from_map is None else distance_rmse(moved(truth_from_map, means), truth),
+        truth_from_map,
+        nees(difference.ravel(), covariance) / (2 * count),
+        chi2_interval(2 * count, BAND, 1),
+    )
+
+
+def rigid_alignment(
+    truth: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "3"] | None:
+    """truth_from_points of least squares, without scale (Kabsch 1976; Umeyama 1991).
+
+    None where it is not determined: fewer than two points, or all in one place.
+    """
+    if len(points) < NEEDED or np.ptp(points, axis=0).max() == 0.0:
+        return None
+    return procrustes(truth, points, np.ones(len(points)))
+
+
+def moved(
+    a_from_b: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """The points of b in a."""
+    c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
+    turned: Float[np.ndarray, "n 2"] = points @ np.array([[c, s], [-s, c]])
+    turned += a_from_b[:2]
+    return turned
+
+
+def distance_rmse(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> float:
+    """RMS of the distances between points of the same row [m]."""
+    difference = a - b
+    return rms(np.hypot(difference[:, 0], difference[:, 1]))
+
+
+def interpolated(
+    truth: Path, stamps_ns: Int64[np.ndarray, " K"]
+) -> tuple[Float[np.ndarray, "K 3"], Bool[np.ndarray, " K"]]:
+    """The true poses at the stamps, and which of them are known (the others are zero).
+
+    Positions linearly, headings along the shorter arc; never beyond the truth's ends, nor inside a
+    gap of more than TRUTH_GAP_NS. A stamp that is the truth's own is always known.
+    """
+    poses = np.zeros((len(stamps_ns), 3))
+    if not len(truth.stamps_ns):
+        return poses, np.zeros(len(stamps_ns), dtype=bool)
+    last = len(truth.stamps_ns) - 1
+    after = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns, side="left"), 0, last)
+    before = np.maximum(after - 1, 0)
+    exact = truth.stamps_ns[after] == stamps_ns
+    gap_ns = truth.stamps_ns[after] - truth.stamps_ns[before]
+    inside = (stamps_ns >= truth.stamps_ns[before]) & (stamps_ns <= truth.stamps_ns[after])
+    known: Bool[np.ndarray, " K"] = exact | (inside & (gap_ns <= TRUTH_GAP_NS))
+    elapsed_ns = stamps_ns - truth.stamps_ns[before]
+    share = np.where(exact, 1.0, elapsed_ns / np.maximum(gap_ns, 1))
+    step = truth.poses[after] - truth.poses[before]
+    step[:, 2] = on_circle(step[:, 2])
+    poses[known] = (truth.poses[before] + share[:, np.newaxis] * step)[known]
+    poses[:, 2] = on_circle(poses[:, 2])
+    return poses, known
+
+
+def pose_errors(
+    path: Path, covariances: Float[np.ndarray, "K 3 3"], truth: Path
+) -> PoseErrors | None:
+    """The errors of a path's poses where the truth is known; None where it nowhere is."""
+    true_poses, known = interpolated(truth, path.stamps_ns)
+    if not known.any():
+        return None
+    errors = path.poses[known] - true_poses[known]
+    errors[:, 2] = on_circle(errors[:, 2])
+    P = covariances[known]
+    whitened = np.linalg.solve(np.linalg.cholesky(P), errors[:, :, np.newaxis])[:, :, 0]
+    return PoseErrors(
+        path.stamps_ns[known],
+        errors,
+        np.sqrt(np.diagonal(P, axis1=1, axis2=2)),
+        np.einsum("ki,ki->k", whitened, whitened),
+    )

@@ -1,0 +1,138 @@
+"""One pass over a log's samples: what an evaluation needs of them, and no more.
+
+Most of a log is sensor readings; of those only the head (robot, epoch, reading) is decoded, to be
+counted. Everything else that matters goes through the one door, `opened`.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.channels import Channel, channel_of
+from team.wire.codec import WireError
+
+_SENSORS = frozenset(channel.name for channel in ch.SENSORS)
+_LATEST = frozenset(
+    channel.name for channel in (ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END)
+)
+_KEPT = frozenset(
+    channel.name
+    for channel in (ch.TRUTH, ch.TRAJECTORY, ch.OWN_POSE, ch.TEAM_POSE, ch.SUBMAP, ch.ROBOT_DONE)
+)
+_OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE))
+
+
+class _Head(msgspec.Struct, array_like=True, gc=False):
+    """The first fields of every reading; what follows is skipped."""
+
+    tag: str
+    stamp_ns: int
+    robot: str
+    epoch: int
+    reading: int
+
+
+_HEAD = msgspec.msgpack.Decoder(_Head)
+
+
+@dataclass
+class Traffic:
+    """Messages and payload bytes of one key."""
+
+    messages: int = 0
+    bytes: int = 0
+
+
+@dataclass
+class Readings:
+    """The readings of one robot on its sensor channels, each (epoch, reading) once."""
+
+    all: set[tuple[int, int]] = field(default_factory=set)
+    odometry: set[tuple[int, int]] = field(default_factory=set)
+
+
+@dataclass
+class Collected:
+    """What a log holds, by channel and robot; `kept` still as payloads, decoded when asked for.
+
+    unsound: samples that are no sound message of their channel; they count as traffic only.
+    """
+
+    traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
+    readings: dict[str, Readings] = field(default_factory=lambda: defaultdict(Readings))
+    latest: dict[str, Sample] = field(default_factory=dict)
+    kept: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
+    unsound: int = 0
+
+    @property
+    def robots(self) -> list[str]:
+        """The robots that any reading or truth is of, by name."""
+        names = set(self.readings)
+        for key in self.traffic:
+            found = channel_of(key)
+            if found is not None and found[0].name in _OF_A_ROBOT:
+                names.add(found[1])
+        return sorted(names)
+
+    def last(self, channel: Channel) -> Sample | None:
+        """The newest sample of a channel with one key."""
+        return self.latest.get(channel.key())
+
+    def messages(self, channel: Channel, robot: str) -> list[m.Message]:
+        """The sound messages of one robot's channel, in the log's order."""
+        found = []
+        for sample in self.kept.get(channel.key(robot), []):
+            message = self.sound(sample)
+            if message is not None:
+                found.append(message)
+        return found
+
+    def sound(self, sample: Sample | None) -> m.Message | None:
+        """The sample's message; None, and counted, if it is not sound."""
+        if sample is None:
+            return None
+        try:
+            return opened(sample)[2]
+        except WireError:
+            self.unsound += 1
+            return None
+
+    def take(self, sample: Sample, channel: str, robot: str) -> None:
+        """Count one sample and keep of it what its channel (by name) asks for."""
+        traffic = self.traffic[sample.key]
+        traffic.messages += 1
+        traffic.bytes += len(sample.payload)
+        if channel in _SENSORS:
+            self._count(sample, robot, odometry=channel == ch.ODOMETRY.name)
+        elif channel in _LATEST:
+            self.latest[sample.key] = sample
+        elif channel in _KEPT:
+            self.kept[sample.key].append(sample)
+
+    def _count(self, sample: Sample, robot: str, *, odometry: bool) -> None:
+        try:
+            head = _HEAD.decode(sample.payload)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            self.unsound += 1
+            return
+        of_robot = self.readings[robot]
+        of_robot.all.add((head.epoch, head.reading))
+        if odometry:
+            of_robot.odometry.add((head.epoch, head.reading))
+
+
+def collected(samples: Iterable[Sample]) -> Collected:
+    """What the samples of a log hold."""
+    found = Collected()
+    channels: dict[str, tuple[str, str]] = {}
+    for sample in samples:
+        if sample.key not in channels:
+            known = channel_of(sample.key)
+            channels[sample.key] = ("", "") if known is None else (known[0].name, known[1])
+        found.take(sample, *channels[sample.key])
+    return found
