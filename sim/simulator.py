@@ -102,7 +102,10 @@ def deviation(
 ) -> Float[np.ndarray, " K"]:
     """σ = √(per_s² t + per_m² |distance| + per_rad² |turn|) of one noise in each step."""
     distance, turn = np.abs(steps).T
-    return np.sqrt(noise.per_s**2 * seconds + noise.per_m**2 * distance + noise.per_rad**2 * turn)
+    per_s, per_m, per_rad = noise.per_s, noise.per_m, noise.per_rad
+    variance = per_s**2 * seconds + per_m**2 * distance + per_rad**2 * turn
+    sigma: Float[np.ndarray, " K"] = np.sqrt(variance)
+    return sigma
 
 
 def _odometry(
