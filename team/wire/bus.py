@@ -127,6 +127,7 @@ class MemoryBus:
         self._network = network
         self._arrived: deque[Sample] = deque()
         self._wanted: list[tuple[Channel, str]] = []
+        self._known: dict[str, bool] = {}
         self._counters: dict[str, int] = defaultdict(int)
         network.buses.append(self)
 
@@ -146,10 +147,18 @@ class MemoryBus:
         for key, kept in self._network.kept.items():
             if _is_of(channel, name, key) and not self._subscribed(key):
                 self._arrived.extend(sample for source, sample in kept if source is not self)
+        self._want(channel, name)
+
+    def _want(self, channel: Channel, name: str) -> None:
         self._wanted.append((channel, name))
+        self._known.clear()
 
     def _subscribed(self, key: str) -> bool:
-        return any(_is_of(channel, name, key) for channel, name in self._wanted)
+        known = self._known.get(key)
+        if known is None:
+            known = any(_is_of(channel, name, key) for channel, name in self._wanted)
+            self._known[key] = known
+        return known
 
     def offer(self, sample: Sample) -> None:
         """Take the sample if this bus subscribed to it."""
@@ -182,7 +191,7 @@ class MemoryBus:
 
     def watch_alive(self, node: str = "**") -> None:
         """Receive changes of tokens, the present ones first."""
-        self._wanted.append((ALIVE, node))
+        self._want(ALIVE, node)
         for source, sample in self._network.alive.values():
             if source is not self:
                 self.offer(sample)
@@ -207,4 +216,4 @@ class MemoryBus:
 
 def _is_of(channel: Channel, name: str, key: str) -> bool:
     owner = channel.owner(key)
-    return owner is not None and name in ("*", "**", owner)
+    return owner is not None and (owner == "" or name in ("*", "**", owner))

@@ -6,6 +6,7 @@ robot's name, `{node}` for `world`, `central`, `recorder` or `robot/<name>`.
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 from team.wire import messages as m
@@ -116,6 +117,7 @@ def robot_node(robot: str) -> str:
     return f"robot/{robot}"
 
 
+@lru_cache(maxsize=4096)
 def channel_of(key: str) -> tuple[Channel, str] | None:
     """The channel that a relative key belongs to, and the robot or node in it."""
     for channel in CHANNELS:
