@@ -10,6 +10,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import IO, NamedTuple, Self
@@ -54,14 +55,11 @@ class Recorder:
         self._closed = False
         try:
             self._file: IO[bytes] = self.path.open("xb")
+            self._writer = _begun(self._file, {**metadata, "team": team})
         except FileExistsError:
             raise RecorderError(f"{self.path} exists: choose another name or remove it") from None
         except OSError as error:
             raise RecorderError(f"{self.path}: {error.strerror}; choose another place") from error
-        self._writer = Writer(self._file)
-        self._writer.start(profile="teamslam")
-        self._writer.add_metadata(METADATA, {**metadata, "team": team})
-        _flush(self._writer)
         # A daemon: a program that dies without `close` must end, and loses half a second at most.
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
@@ -94,7 +92,6 @@ class Recorder:
             self._closed = True
             self._queue.put(None)
             self._thread.join()
-            self._file.close()
         self._check()
 
     def _check(self) -> None:
@@ -105,9 +102,9 @@ class Recorder:
 
     def _run(self) -> None:
         try:
-            self._write_all()
-            self._writer.finish()  # type: ignore[no-untyped-call] # mcap leaves out `-> None`
-            self._file.flush()
+            with self._file:
+                self._write_all()
+                self._writer.finish()  # type: ignore[no-untyped-call] # mcap leaves out `-> None`
         except Exception as error:  # raised by the next call, on the caller's thread
             self._failure = error
 
@@ -151,6 +148,20 @@ class Recorder:
             schema = schema_of(found[0].message)
             self._schemas[tag] = self._writer.register_schema(tag, "jsonschema", schema)
         return self._writer.register_channel(self._prefix + key, "msgpack", self._schemas[tag])
+
+
+def _begun(file: IO[bytes], metadata: dict[str, str]) -> Writer:
+    """A writer that has written its head and the metadata, so that a killed log has them."""
+    writer = Writer(file)
+    try:
+        writer.start(profile="teamslam")
+        writer.add_metadata(METADATA, metadata)
+        _flush(writer)
+    except OSError:
+        with suppress(OSError):  # the same error once more, from what is still buffered
+            file.close()
+        raise
+    return writer
 
 
 def _flush(writer: Writer) -> None:

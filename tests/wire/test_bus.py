@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
+from itertools import count
 
 import pytest
 
@@ -14,6 +15,7 @@ from team.wire.zenoh_bus import ZenohBus, router
 from tests.support import odometry, received, submap, wait_until
 
 Joined = Callable[[], Bus]
+TEAMS = count()
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,7 @@ def joined(request: pytest.FixtureRequest) -> Iterator[Joined]:
             yield lambda: MemoryBus(network)
         else:
             endpoint = request.getfixturevalue("endpoint")
-            team = f"t{abs(hash(request.node.name))}"
+            team = f"t{next(TEAMS)}"
             yield lambda: stack.enter_context(ZenohBus(team, endpoint))
 
 

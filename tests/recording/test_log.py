@@ -1,0 +1,384 @@
+"""Recorder, reader and repair: what goes in comes out, and what is broken is named."""
+
+import contextlib
+import hashlib
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from team.recording.provenance import kernel_fingerprint, provenance
+from team.recording.reader import LARGEST_CHUNK, DamagedChunkError, Log, LogError, open_log
+from team.recording.recorder import Recorder, RecorderError
+from team.recording.repair import repaired
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample, opened
+from team.wire.codec import encoded
+from tests.support import ROOT, examples, odometry, submap, wait_until
+
+
+def sample(channel: c.Channel, name: str, message: m.Message, counter: int = 0) -> Sample:
+    key = Outgoing(channel, name, message).key
+    return Sample(key, encoded(message), message.stamp_ns, 10**18 + counter, counter)
+
+
+def stream(count: int) -> list[Sample]:
+    """Interleaved readings and submaps of two robots."""
+    return [
+        sample(c.SUBMAP, robot, submap(i, robot), i)
+        if i % 10 == 9
+        else sample(c.ODOMETRY, robot, odometry(i, robot), i)
+        for i in range(count)
+        for robot in ("alpha", "bravo")
+    ]
+
+
+def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
+    with Recorder(path, "t", metadata) as recorder:
+        recorder.write(samples)
+    return open_log(path)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "log.mcap"
+
+
+def test_what_goes_in_comes_out_in_its_order(path: Path) -> None:
+    log = recorded(path, stream(5_000))
+    assert list(log.samples()) == stream(5_000)
+    assert log.complete
+
+
+def test_every_recorded_message_comes_back_sound(path: Path) -> None:
+    by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
+    kept = [message for message in examples() if type(message) in by_class]
+    samples = [sample(by_class[type(message)], "alpha", message) for message in kept]
+    assert [opened(one)[2] for one in recorded(path, samples).samples()] == kept
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.lists(
+        st.builds(
+            Sample,
+            st.sampled_from(["view/scene", "robot/alpha/odometry", "central/map"]),
+            st.binary(max_size=60),
+            st.integers(1, 2**62 - 1),
+            st.integers(0, 2**63 - 1),
+            st.integers(0, 2**32 - 1),
+        )
+    )
+)
+def test_any_bytes_are_kept_as_they_came(
+    tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]
+) -> None:
+    path = tmp_path_factory.mktemp("any") / "log.mcap"
+    assert list(recorded(path, samples).samples()) == samples
+
+
+def test_a_stamp_before_zero_comes_back_as_it_was(path: Path) -> None:
+    samples = [
+        sample(c.ODOMETRY, "alpha", m.Odometry(stamp, "alpha", 0, 0, 0, 0.0, 0.0))
+        for stamp in (-(2**62), -5, 0, 5)
+    ]
+    log = recorded(path, samples[::-1])
+    assert list(log.samples()) == samples[::-1]
+    assert log.in_time_order() == samples
+
+
+def test_time_order_is_stable(path: Path) -> None:
+    samples = stream(50)[::-1]
+    assert recorded(path, samples).in_time_order() == sorted(samples, key=lambda s: s.stamp_ns)
+
+
+def test_channels_can_be_selected(path: Path) -> None:
+    log = recorded(path, stream(100))
+    submaps = [one for one in stream(100) if one.key.endswith("submap")]
+    assert list(log.samples([c.SUBMAP])) == submaps
+    assert list(log.samples([])) == []
+
+
+def test_a_counter_comes_back_modulo_two_to_the_32(path: Path) -> None:
+    log = recorded(path, [Sample("robot/alpha/odometry", b"\x90", 1, 2, 2**32 + 3)])
+    assert [one.counter for one in log.samples()] == [3]
+
+
+def test_counts_are_those_of_the_log(path: Path) -> None:
+    with Recorder(path, "t", {}) as recorder:
+        recorder.write(stream(100))
+        recorder.close()
+        counts = recorder.counts()
+    assert counts == open_log(path).counts()
+    assert counts["robot/alpha/submap"].messages == 10
+    assert counts["robot/alpha/submap"].bytes == sum(
+        len(encoded(submap(i))) for i in range(9, 100, 10)
+    )
+
+
+def test_metadata_names_team_and_provenance(path: Path) -> None:
+    log = recorded(path, [], seed="7", **provenance())
+    assert log.team == "t"
+    assert log.metadata["seed"] == "7"
+    assert log.metadata["kernels"] == kernel_fingerprint()
+    for name in ("version.numpy", "version.eclipse-zenoh", "blas", "cpu.name", "git.commit"):
+        assert log.metadata[name]
+
+
+def test_another_reader_finds_keys_schemas_and_times(path: Path) -> None:
+    recorded(path, stream(20))
+    with path.open("rb") as file:
+        read = list(make_reader(file, validate_crcs=True).iter_messages(log_time_order=False))
+    assert [(channel.topic, message.data) for _, channel, message in read] == [
+        ("team/t/" + one.key, one.payload) for one in stream(20)
+    ]
+    schema, channel, message = read[0]
+    assert schema is not None
+    assert (schema.name, schema.encoding, channel.message_encoding) == (
+        "odometry/1", "jsonschema", "msgpack",
+    )  # fmt: skip
+    assert (message.log_time, message.publish_time) == (0, 10**18)
+    described = json.loads(schema.data)["$defs"]["Odometry"]
+    assert described["prefixItems"][0] == {"enum": ["odometry/1"]}
+    assert len(described["prefixItems"]) == 8
+
+
+def test_a_recorder_never_overwrites(path: Path) -> None:
+    recorded(path, stream(1))
+    with pytest.raises(RecorderError, match=r"log\.mcap exists: choose another name"):
+        Recorder(path, "t", {})
+
+
+def test_a_recorder_names_a_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(RecorderError, match="No such file or directory; choose another place"):
+        Recorder(tmp_path / "nowhere" / "log.mcap", "t", {})
+
+
+def test_a_closed_recorder_takes_nothing(path: Path) -> None:
+    recorder = Recorder(path, "t", {})
+    recorder.close()
+    with pytest.raises(RecorderError, match="is closed"):
+        recorder.write(stream(1))
+
+
+def test_a_full_disk_is_told_at_the_next_call_and_nothing_hangs(path: Path) -> None:
+    program = (
+        "import resource; from tests.recording.test_log import stream\n"
+        "from team.recording.recorder import Recorder, RecorderError\n"
+        "from tests.support import wait_until\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
+        f"recorder = Recorder({str(path)!r}, 't', {{}})\n"
+        "def failed():\n"
+        "    try: recorder.write(stream(5_000))\n"
+        "    except RecorderError as error: return 'File too large' in str(error)\n"
+        "wait_until(failed)\n"
+        "recorder.close()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1
+    assert done.stderr.rstrip().endswith("what was flushed before can be repaired")
+
+
+def test_a_disk_that_is_full_at_once_is_told_at_once(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "open", lambda self, mode: open("/dev/full", "wb"))  # noqa: SIM115 - the recorder closes it
+    with pytest.raises(RecorderError, match="No space left on device; choose another place"):
+        Recorder(path, "t", {})
+
+
+def killed(path: Path, count: int) -> Log:
+    """The log of a recorder that was killed some time after it had written `count` samples."""
+    program = (
+        "import sys, threading; from pathlib import Path\n"
+        "from team.recording.recorder import Recorder\n"
+        "from tests.recording.test_log import stream\n"
+        f"recorder = Recorder(Path({str(path)!r}), 't', {{'seed': '7'}})\n"
+        f"recorder.write(stream({count})); print('ready', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"ready\n"
+        wait_until(lambda: len(list(open_log(path).samples())) == 2 * count, what="the flush")
+        child.kill()
+    return open_log(path)
+
+
+def test_a_killed_recorders_log_is_read_and_repaired(path: Path, tmp_path: Path) -> None:
+    log = killed(path, 500)
+    assert not log.complete
+    assert list(log.samples()) == stream(500)
+    out = tmp_path / "repaired.mcap"
+    report = repaired(path, out)
+    assert report == (1_000, stream(500)[-1].stamp_ns, ())
+    again = open_log(out)
+    assert again.complete
+    assert (again.team, again.metadata) == ("t", {"seed": "7"})
+    assert list(again.samples()) == stream(500)
+
+
+def chunks_of(path: Path) -> list[tuple[int, int]]:
+    """(offset, length) of each chunk record."""
+    data = path.read_bytes()
+    found, offset = [], len(MCAP0_MAGIC)
+    while offset < len(data) - len(MCAP0_MAGIC):
+        opcode, length = struct.unpack_from("<BQ", data, offset)
+        if opcode == Opcode.CHUNK:
+            found.append((offset, 9 + length))
+        offset += 9 + length
+    return found
+
+
+@pytest.fixture(scope="module")
+def noise() -> list[Sample]:
+    """Samples that do not compress, so that they fill several chunks of a megabyte."""
+    return [
+        Sample("view/noise", hashlib.shake_128(b"%d" % i).digest(40_000), i + 1, 0, i)
+        for i in range(100)
+    ]
+
+
+def test_a_flipped_bit_is_named_and_the_other_chunks_are_saved(
+    path: Path, tmp_path: Path, noise: list[Sample]
+) -> None:
+    recorded(path, noise)
+    first, *rest = chunks_of(path)
+    data = bytearray(path.read_bytes())
+    data[first[0] + first[1] // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DamagedChunkError, match=f"damaged chunk at offset {first[0]}: .*repair"):
+        list(open_log(path).samples())
+    report = repaired(path, tmp_path / "out.mcap")
+    saved = list(open_log(tmp_path / "out.mcap").samples())
+    assert len(rest) >= 2
+    assert len(report.damaged) == 1
+    assert saved == noise[-len(saved) :]
+    assert 0 < report.messages == len(saved) < len(noise)
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.9, 0.999])
+def test_a_truncated_log_reads_up_to_its_last_whole_chunk(
+    path: Path, noise: list[Sample], part: float
+) -> None:
+    recorded(path, noise)
+    data = path.read_bytes()
+    whole = sum(offset + length <= part * len(data) for offset, length in chunks_of(path))
+    path.write_bytes(data[: int(part * len(data))])
+    log = open_log(path)
+    read = list(log.samples())
+    assert not log.complete
+    assert read == noise[: len(read)]
+    assert len(list(log.chunks())) == whole
+
+
+def test_zeros_behind_a_killed_log_are_its_end(path: Path, noise: list[Sample]) -> None:
+    recorded(path, noise)
+    path.write_bytes(path.read_bytes()[: sum(chunks_of(path)[0])] + bytes(4_096))
+    assert not open_log(path).complete
+    assert list(open_log(path).samples()) == noise[: len(list(open_log(path).samples()))] != []
+
+
+def test_repair_refuses_to_overwrite(path: Path) -> None:
+    recorded(path, stream(1))
+    with pytest.raises(RecorderError, match="exists"):
+        repaired(path, path)
+
+
+def foreign(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+
+
+def bomb(path: Path, size: int, claimed: int) -> None:
+    """A log of ours with one chunk that expands to `size` bytes and claims `claimed`."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        writer.add_metadata("teamslam", {"team": "t"})
+        packed = zstandard.compress(bytes(size))
+        head = struct.pack("<QQQII", 0, 0, claimed, 0, 4) + b"zstd" + struct.pack("<Q", len(packed))
+        file.write(struct.pack("<BQ", Opcode.CHUNK, len(head) + len(packed)) + head + packed)
+        writer.finish()
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda path: None, "not found; give the path of a log"),
+        (lambda path: path.mkdir(), "Is a directory; give the path"),
+        (lambda path: path.write_bytes(b""), "empty file; its recorder was stopped"),
+        (lambda path: path.write_bytes(b"hello, world"), "not an MCAP file; give a log"),
+        (foreign, "an MCAP file of another program"),
+        (lambda path: path.write_bytes(MCAP0_MAGIC), "an MCAP file of another program"),
+        (lambda path: bomb(path, 2**29, 2**29), f"claim to expand to {2**29}"),
+        (lambda path: bomb(path, 2**26, 2**26), f"claim to expand to {2**26}"),
+        (lambda path: bomb(path, 2**26, 1_000), "two different sizes are claimed"),
+    ],
+)
+def test_what_is_no_sound_log_is_refused_with_a_remedy(
+    path: Path, make: Callable[[Path], object], told: str
+) -> None:
+    make(path)
+    with pytest.raises(LogError, match=f"{path}: .*{told}"):
+        list(open_log(path).samples())
+
+
+def test_a_record_longer_than_any_of_ours_is_refused_unread(path: Path) -> None:
+    recorded(path, stream(1))
+    data = path.read_bytes()
+    head = data[: chunks_of(path)[0][0]]
+    with path.open("wb") as file:
+        file.write(head + struct.pack("<BQ", Opcode.CHUNK, LARGEST_CHUNK + 1))
+        file.truncate(LARGEST_CHUNK + 2**20)
+    with pytest.raises(LogError, match=f"record of {LARGEST_CHUNK + 1} bytes"):
+        list(open_log(path).samples())
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.data())
+def test_a_damaged_log_gives_samples_or_a_log_error(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "fuzzed.mcap"
+    whole = _small_log(tmp_path_factory)
+    damaged = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 4))):
+        i = data.draw(st.integers(0, len(damaged) - 1))
+        damaged[i] = data.draw(st.integers(0, 255))
+    path.write_bytes(damaged[: data.draw(st.integers(len(damaged) // 2, len(damaged)))])
+    with contextlib.suppress(LogError):
+        assert len(list(open_log(path).samples())) <= 2 * 60
+
+
+def _small_log(factory: pytest.TempPathFactory) -> bytes:
+    path = factory.getbasetemp() / "small.mcap"
+    if not path.exists():
+        recorded(path, stream(60))
+    return path.read_bytes()
+
+
+def test_reading_is_lazy(path: Path, noise: list[Sample]) -> None:
+    recorded(path, noise)
+    last = chunks_of(path)[-1]
+    data = bytearray(path.read_bytes())
+    data[last[0] + last[1] // 2] ^= 1
+    path.write_bytes(data)
+    assert list(islice(open_log(path).samples(), 3)) == noise[:3]
