@@ -166,16 +166,8 @@ class JoinRule:
                 continue
             prior = marginals.prior_for(fold, robot, epoch, chosen)
             sequence = fold.next_sequence((robot, epoch)) - 1
-            message = translate.prior_message(
-                fold.contributions[-1].end_ns,
-                robot,
-                epoch,
-                sequence,
-                digest,
-                prior.ids,
-                np.concatenate((prior.pose, prior.means.ravel())),
-                prior.covariance,
-            )
+            stamp_ns = fold.contributions[-1].end_ns
+            message = translate.prior_message(stamp_ns, robot, epoch, sequence, digest, prior)
             out.append(Outgoing(ch.PRIOR, robot, message))
         return out
 

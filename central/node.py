@@ -30,6 +30,8 @@ class _Robot:
 class CentralNode:
     """One centre for the robots of a team: `begin`, then `handle`, until `finished`."""
 
+    listens = (ch.START, ch.SUBMAP, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END)
+
     def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
         self.config = config
         self._announcement = translate.configured("central", 0, 0, config)

@@ -46,7 +46,7 @@ class SubmapSet:
     def chain(self, stream: Stream) -> list[Submap]:
         """The submaps of a stream from sequence 0 up to the first gap."""
         found = self.streams.get(stream, {})
-        chain = []
+        chain: list[Submap] = []
         while len(chain) in found:
             chain.append(found[len(chain)])
         return chain

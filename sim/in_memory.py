@@ -42,20 +42,20 @@ def run_team(scenario: Scenario, streams: WorldStreams) -> Iterator[Sample]:
     recorder.watch_alive()
     robots = {r.id: RobotNode(r) for r in scenario.robots}
     central = _Seat(network, CentralNode(scenario.central, list(robots)))
-    for channel in CENTRAL_LISTENS:
+    for channel in CentralNode.listens:
         central.bus.subscribe(channel)
     central.bus.watch_alive()
     configured = translate.configured("world", 0, 0, scenario)
     world = _Seat(
         network, WorldNode(streams, expected_nodes(list(robots), recorder=False), configured)
     )
-    for channel in WORLD_LISTENS:
+    for channel in WorldNode.listens:
         world.bus.subscribe(channel)
     world.bus.watch_alive()
     seats = [world, central]
     for name, node in robots.items():
         seat = _Seat(network, node)
-        for channel in ROBOT_LISTENS:
+        for channel in RobotNode.listens:
             seat.bus.subscribe(channel, name)
         seat.bus.watch_alive("central")
         seats.append(seat)
@@ -68,15 +68,10 @@ def run_team(scenario: Scenario, streams: WorldStreams) -> Iterator[Sample]:
     while True:
         published = world.node.publish(0.0)
         world.send(published)
-        busy = any([seat.take() for seat in seats])
+        busy = sum(seat.take() for seat in seats)
         yield from recorder.receive()
         if not busy and not published:
             return
-
-
-ROBOT_LISTENS = (*ch.SENSORS, ch.END, ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
-CENTRAL_LISTENS = (ch.START, ch.SUBMAP, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END)
-WORLD_LISTENS = (ch.ROBOT_PROGRESS, ch.RECORDER_PROGRESS, ch.FINAL_MAP)
 
 
 def final_map(samples: list[Sample]) -> m.FusedMap:

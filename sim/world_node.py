@@ -7,6 +7,7 @@ source of the streams, so it also answers for what a receiver missed.
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -113,13 +114,19 @@ class WorldNode:
         robots, indices = self.streams.order()
         self._order = deque(zip(robots.tolist(), indices.tolist(), strict=True))
         self._alive: set[str] = set()
-        self._recorded = 0
+        self._recorded: dict[str, int] = {}
         self._recorder = False
         self._published = 0
         self._began_at: float | None = None
         first = [int(x.stamps_ns[0]) for x in self.streams.streams if len(x)]
         self._first_ns = min(first, default=0)
         self.now_ns = self._first_ns
+
+    listens: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.ROBOT_PROGRESS,
+        ch.RECORDER_PROGRESS,
+        ch.FINAL_MAP,
+    )
 
     @property
     def waiting_for(self) -> list[str]:
@@ -145,7 +152,8 @@ class WorldNode:
             case m.Liveliness():
                 self._take_liveliness(message)
             case m.Progress() if message.node == "recorder":
-                self._recorded = max(self._recorded, message.readings)
+                taken = self._recorded.get(message.robot, 0)
+                self._recorded[message.robot] = max(taken, message.readings)
             case m.Progress():
                 source = self._sources.get(message.robot)
                 if source is not None and message.epoch == source.epoch:
@@ -198,7 +206,9 @@ class WorldNode:
     def _credit(self, source: _Source) -> bool:
         if source.alive and source.published - source.consumed >= CREDIT_READINGS:
             return False
-        return not self._recorder or self._published - self._recorded < CREDIT_RECORDER
+        return (
+            not self._recorder or self._published - sum(self._recorded.values()) < CREDIT_RECORDER
+        )
 
     def _truth(self, source: _Source, stamp_ns: int, batch_ns: int) -> list[Outgoing]:
         stream = source.stream

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from team.estimation.conditioning import RobotPrior
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.joining import Contribution
 from team.estimation.joining import Start as StartValue
@@ -157,14 +158,7 @@ def landmarks_of(
 
 
 def prior_message(
-    stamp_ns: int,
-    robot: str,
-    epoch: int,
-    sequence: int,
-    digest: bytes,
-    landmark_ids: UInt32[np.ndarray, " L"],
-    mean: Float[np.ndarray, " n"],
-    covariance: Matrix,
+    stamp_ns: int, robot: str, epoch: int, sequence: int, digest: bytes, prior: RobotPrior
 ) -> m.Prior:
     """The joint marginal of a robot's last fused end pose and the landmarks."""
     return m.Prior(
@@ -173,20 +167,18 @@ def prior_message(
         epoch,
         sequence,
         digest,
-        from_ids(landmark_ids),
-        from_floats(mean),
-        joint_bytes(covariance),
+        from_ids(prior.ids),
+        from_floats(np.concatenate((prior.pose, prior.means.ravel()))),
+        joint_bytes(prior.covariance),
     )
 
 
-def prior_of(message: m.Prior) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, " n"], Matrix]:
-    """(ids, mean, covariance) of a prior."""
+def prior_of(message: m.Prior) -> RobotPrior:
+    """A prior as the robot's conditioning takes it."""
     mean = floats(message.mean, "mean").astype(np.float64)
-    return (
-        ids(message.ids, "ids").astype(np.uint32),
-        mean,
-        unpacked(floats(message.covariance, "covariance"), len(mean)),
-    )
+    covariance = unpacked(floats(message.covariance, "covariance"), len(mean))
+    landmark_ids = ids(message.ids, "ids").astype(np.uint32)
+    return RobotPrior(mean[:3], landmark_ids, mean[3:].reshape(-1, 2), covariance)
 
 
 def trajectory_message(

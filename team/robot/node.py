@@ -13,7 +13,7 @@ import numpy as np
 
 from team import translate
 from team.config import RobotConfig
-from team.estimation.conditioning import team_pose
+from team.estimation.conditioning import RobotPrior, team_pose
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import absorbed
 from team.robot.inbox import Inbox
@@ -34,6 +34,8 @@ CLOUD_PARTICLES = 32
 
 class RobotNode:
     """One robot: `begin`, then `handle` for every message, until `finished`."""
+
+    listens = (*ch.SENSORS, ch.END, ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
     def __init__(self, config: RobotConfig) -> None:
         self.config = config
@@ -65,6 +67,11 @@ class RobotNode:
     def epoch(self) -> int:
         """The epoch of the stream that is being consumed."""
         return self._inbox.epoch
+
+    @property
+    def next_reading(self) -> int:
+        """The counter of the reading that is consumed next."""
+        return self._inbox.next_reading
 
     @property
     def submaps(self) -> int:
@@ -312,16 +319,16 @@ class RobotNode:
             covariance = state.pose_covariance + np.diag([1e-6, 1e-6, 1e-8])
             return self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, (state.pose, covariance))
         whole = self._hybrid.whole
-        own = (whole.mean[:3], whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance)
+        own = RobotPrior(
+            whole.mean[:3], whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance
+        )
         window = self._hybrid.open_gaussian() if self._hybrid.last_epoch_ns is not None else None
         out = self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, team_pose(own, (), window))
         prior = self._prior
         if prior is None or prior.epoch != self.epoch:
             return out
-        ids, mean, covariance = translate.prior_of(prior)
-        fused = (mean[:3], ids, mean[3:].reshape(-1, 2), covariance)
         pending = self._locals[prior.sequence + 1 :]
-        posed = team_pose(fused, pending, window)
+        posed = team_pose(translate.prior_of(prior), pending, window)
         self._pose_sigma = float(np.sqrt(posed[1][0, 0] + posed[1][1, 1]))
         return out + self._pose(ch.TEAM_POSE, stamp_ns, prior.digest, posed)
 

@@ -8,7 +8,7 @@ shell takes samples from it, decodes them at the door, and publishes what the no
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from team.wire.channels import ALIVE, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
@@ -47,6 +47,7 @@ Answer = Callable[[bytes], Iterable[bytes]]
 """Answers a query: the request's payload in, the replies' payloads out."""
 
 
+@runtime_checkable
 class Bus(Protocol):
     """What a shell needs of a bus."""
 

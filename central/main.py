@@ -1,0 +1,83 @@
+"""The central process: the node's shell; it holds back the news that a robot is lost."""
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from team.shell import WAIT_S, Shell
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Bus, Sample, opened
+
+PATIENCE_S = 3.0
+"""A robot whose token went has this long to come back before the team goes on without it."""
+FAREWELL_S = 10.0
+"""The centre leaves after the others, at most this long after its final map."""
+_LOG = logging.getLogger("teamslam")
+
+
+class CentralShell:
+    """The centre's process: subscribe, answer for its set, run, leave last."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        config: CentralConfig,
+        robots: Sequence[str],
+        stop: threading.Event,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        self._bus = bus
+        self.node = CentralNode(config, robots)
+        self._shell = Shell(bus, self.node, "central", stop)
+        self._patience_s = patience_s
+        self._lost: dict[str, tuple[float, Sample]] = {}
+        self._alive: set[str] = set()
+        self._stop = stop
+
+    def run(self) -> None:
+        """Until the final map is out and the others have gone."""
+        for channel in self.node.listens:
+            self._bus.subscribe(channel)
+        self._bus.watch_alive()
+        self._bus.answer(ch.SUBMAPS, "", self.node.answer_submaps)
+        self._shell.begin()
+        while self._shell.going:
+            self._shell.take(self._patient(self._bus.receive(WAIT_S)))
+            self._shell.take(self._given_up())
+            self._shell.report()
+        self._shell.report()
+        self._leave_last()
+
+    def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
+        """The samples, less the news of lost robots: they may come back."""
+        now = time.monotonic()
+        passed = []
+        for sample in samples:
+            if sample.key.endswith("/alive"):
+                _, node, message = opened(sample)
+                assert isinstance(message, m.Liveliness)
+                (self._alive.add if message.alive else self._alive.discard)(node)
+                self._lost.pop(node, None)
+                if not message.alive and node.startswith("robot/"):
+                    _LOG.warning("%s is lost", node)
+                    self._lost[node] = (now, sample)
+                    continue
+            passed.append(sample)
+        return passed
+
+    def _given_up(self) -> list[Sample]:
+        now = time.monotonic()
+        gone = [n for n, (since, _) in self._lost.items() if now - since >= self._patience_s]
+        return [self._lost.pop(node)[1] for node in gone]
+
+    def _leave_last(self) -> None:
+        """Robots and world leave at the final map; whoever missed it may still ask for it."""
+        deadline = time.monotonic() + FAREWELL_S
+        while not self._stop.is_set() and time.monotonic() < deadline:
+            self._patient(self._bus.receive(WAIT_S))
+            if not any(n == "world" or n.startswith("robot/") for n in self._alive):
+                return

@@ -1,0 +1,5 @@
+"""`python -m sim` is `teamslam`."""
+
+from sim.cli import main
+
+main()

@@ -1,0 +1,43 @@
+"""The world process: the node's shell, which publishes as long as there is credit."""
+
+import threading
+import time
+
+from sim.scenario import Scenario
+from sim.streams import WorldStreams
+from sim.world_node import WorldNode, expected_nodes
+from team import translate
+from team.shell import Shell
+from team.wire import channels as ch
+from team.wire.bus import Bus
+
+PACE_S = 0.002
+"""Wait when there is nothing to publish: the clock or the credit must move first."""
+
+
+def run_world(
+    bus: Bus,
+    scenario: Scenario,
+    streams: WorldStreams,
+    stop: threading.Event,
+    *,
+    speed: float,
+    recorder: bool,
+) -> None:
+    """Publish every reading of the world, then wait for the final map."""
+    robots = [robot.id for robot in scenario.robots]
+    configured = translate.configured("world", 0, 0, scenario)
+    node = WorldNode(streams, expected_nodes(robots, recorder=recorder), configured, speed)
+    shell = Shell(bus, node, "world", stop)
+    for channel in node.listens:
+        bus.subscribe(channel)
+    bus.watch_alive()
+    for robot in robots:
+        bus.answer(ch.READINGS, robot, node.readings)
+    shell.begin()
+    while shell.going:
+        out = node.publish(time.monotonic())
+        shell.publish(out)
+        shell.take(bus.receive(0.0 if out else PACE_S))
+        shell.report()
+    shell.report()

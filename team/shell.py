@@ -1,0 +1,150 @@
+"""The shell of a node: it owns the bus, the clock and the signals; the node owns the answers."""
+
+import ctypes
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from team.wire.bus import Bus, Outgoing, Sample, opened
+from team.wire.channels import STATUS
+from team.wire.codec import WireError
+from team.wire.messages import Message, Status
+
+STATUS_S = 0.5
+"""Wall time between two statuses of a node."""
+WAIT_S = 0.05
+"""How long a shell waits for input before it looks at its other duties."""
+PARENT = "TEAMSLAM_PARENT"
+"""Environment variable: the process without which this one must not live."""
+_LOG = logging.getLogger("teamslam")
+_PR_SET_PDEATHSIG = 1
+
+
+class Node(Protocol):
+    """What a shell runs: messages and time in, messages out."""
+
+    finished: bool
+
+    def begin(self) -> list[Outgoing]:
+        """What the node says first."""
+
+    def handle(self, message: Message, now_ns: int) -> list[Outgoing]:
+        """Take one message."""
+
+    def status(self) -> Status:
+        """What the node is doing, for people."""
+
+
+class Shell:
+    """Runs one node on one bus.
+
+    What fails at the door is counted, logged with its reason, and dropped.
+    """
+
+    def __init__(self, bus: Bus, node: Node, name: str, stop: threading.Event) -> None:
+        self.bus = bus
+        self.node = node
+        self._name = name
+        self._stop = stop
+        self._status_due = 0.0
+        self._refused = 0
+
+    def begin(self) -> None:
+        """Say what the node says first and declare it alive; its subscriptions are made before."""
+        self.publish(self.node.begin())
+        self.bus.declare_alive(self._name)
+        self.report()
+
+    @property
+    def going(self) -> bool:
+        """Until the node has finished or the process was told to stop."""
+        return not (self.node.finished or self._stop.is_set())
+
+    def publish(self, out: Iterable[Outgoing]) -> None:
+        """Publish what a node returned, in its order."""
+        for outgoing in out:
+            self.bus.publish(outgoing)
+
+    def take(self, samples: Iterable[Sample]) -> None:
+        """Decode at the door, hand to the node, publish its answer."""
+        for sample in samples:
+            try:
+                _, _, message = opened(sample)
+            except WireError as error:
+                self._refused += 1
+                _LOG.warning("%s: dropped %s: %s", self._name, sample.key, error)
+                continue
+            self.publish(self.node.handle(message, sample.stamp_ns))
+
+    def report(self) -> None:
+        """Publish the node's status, at most every STATUS_S."""
+        now = time.monotonic()
+        if now < self._status_due:
+            return
+        self._status_due = now + STATUS_S
+        self._publish_status()
+
+    def _publish_status(self) -> None:
+        status = self.node.status()
+        warnings = status.warnings
+        if self._refused:
+            warnings = (*warnings, f"{self._refused} messages were dropped at the door")
+        self.bus.publish(
+            Outgoing(
+                STATUS,
+                self._name,
+                Status(status.stamp_ns, status.node, status.state, status.figures, warnings),
+            )
+        )
+
+    def run(self, duty: Callable[[], None] = lambda: None) -> None:
+        """Turn after turn until the end: input, the node's answers, `duty`, status."""
+        self.begin()
+        while self.going:
+            self.take(self.bus.receive(WAIT_S))
+            duty()
+            self.report()
+        self._publish_status()
+
+
+@contextmanager
+def process(name: str) -> Iterator[threading.Event]:
+    """What every process of a team does: stop at SIGTERM and SIGINT, end when its parent dies."""
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
+    stop = threading.Event()
+    handlers = {
+        number: signal.signal(number, lambda *_: stop.set())
+        for number in (signal.SIGTERM, signal.SIGINT)
+    }
+    parent = os.environ.get(PARENT)
+    if parent is not None:
+        _tie_to(int(parent), stop)
+    try:
+        yield stop
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def _tie_to(parent: int, stop: threading.Event) -> None:
+    """Stop when the parent is gone: at once where the kernel tells (Linux), else by looking.
+
+    Whoever has not stopped by itself two seconds later is ended.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        stop.set()
+        time.sleep(2.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent watch", daemon=True).start()
