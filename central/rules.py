@@ -29,6 +29,9 @@ class MapEstimate:
     covariance: Float[np.ndarray, "n n"]
 
 
+NOTHING = MapEstimate(np.zeros(0, dtype=np.uint32), np.zeros((0, 2)), np.zeros((0, 0)))
+
+
 def kalman(maps: Sequence[MapEstimate]) -> MapEstimate:
     """Full-covariance Kalman fusion in the given order, as if the maps were independent.
 
@@ -67,7 +70,7 @@ def _one_by_one(
     pair: Callable[[MapEstimate, MapEstimate], MapEstimate], maps: Sequence[MapEstimate]
 ) -> MapEstimate:
     if not maps:
-        return MapEstimate(np.zeros(0, dtype=np.uint32), np.zeros((0, 2)), np.zeros((0, 0)))
+        return NOTHING
     fused = maps[0]
     for each in maps[1:]:
         fused = pair(fused, each)
@@ -129,7 +132,7 @@ def _per_axis_pair(a: MapEstimate, b: MapEstimate) -> MapEstimate:
 
 def _intersected_pair(a: MapEstimate, b: MapEstimate, criterion: str) -> MapEstimate:
     in_a, in_b = _shared(a, b)
-    common = MapEstimate(a.ids[in_a[::2] // 2], np.zeros((0, 2)), np.zeros((0, 0)))
+    common = NOTHING
     if len(in_a):
         info_a = information(a.covariance[np.ix_(in_a, in_a)], "a map's common landmarks")
         info_b = information(b.covariance[np.ix_(in_b, in_b)], "a map's common landmarks")
@@ -139,7 +142,7 @@ def _intersected_pair(a: MapEstimate, b: MapEstimate, criterion: str) -> MapEsti
             omega * (info_a @ a.means.ravel()[in_a])
             + (1.0 - omega) * (info_b @ b.means.ravel()[in_b])
         )
-        common = MapEstimate(common.ids, mean.reshape(-1, 2), spread)
+        common = MapEstimate(a.ids[in_a[::2] // 2], mean.reshape(-1, 2), spread)
     return _carried(b, _carried(a, common))
 
 

@@ -49,10 +49,11 @@ def carried_along(
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
     """The joint Gaussian of (own others o, everything new) after the shared part s was replaced.
 
-    The entries `shared` of N(mean, covariance) are the entries `in_new` of the new Gaussian N(m, C),
-    which replaces their marginal. The conditional of o given s stays (Jeffrey's rule): with the
-    regression K = P_os P_ss⁻¹ the others have x_o + K (m_s − x_s), P_oo − K P_so + K C_ss Kᵀ, and
-    K C_s· with everything new. Nothing shared: the two stay independent.
+    The entries `shared` of N(mean, covariance) are the entries `in_new` of the new Gaussian
+    N(m, C), which replaces their marginal. The conditional of o given s stays (Jeffrey's rule):
+    with the regression K = P_os P_ss⁻¹ the others have x_o + K (m_s − x_s),
+    P_oo − K P_so + K C_ss Kᵀ, and K C_s· with everything new. Nothing shared: both stay as they
+    are, independent.
     """
     others = np.setdiff1d(np.arange(len(mean)), shared)
     own = information(covariance[np.ix_(shared, shared)], "the part to be replaced")

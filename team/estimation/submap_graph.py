@@ -86,7 +86,8 @@ class Graph:
         sizes = self.pattern.sizes
         begin = np.repeat(self.pattern.value_start[self.pattern.column_start[:-1]], sizes)
         within = np.arange(self.offset[-1]) - np.repeat(self.offset[:-1], sizes)
-        return begin + within * (np.repeat(sizes, sizes) + 1)
+        diagonal: Indices = begin + within * (np.repeat(sizes, sizes) + 1)
+        return diagonal
 
     @property
     def unknowns(self) -> int:

@@ -66,9 +66,9 @@ def absorbed(
     means: Float[np.ndarray, "K 2"],
     covariance: Float[np.ndarray, "k k"],
 ) -> WholeMap:
-    """The fused map replaces the landmarks' marginal; pose and other landmarks follow by regression.
+    """The fused map replaces the landmarks' marginal; pose and other landmarks follow it.
 
-    Landmarks that were unknown are added. What the fused map holds of this robot's own readings is
+    They follow by regression (see `carried_along`). Landmarks that were unknown are added. What the fused map holds of this robot's own readings is
     counted again if the result is sent for fusion once more.
     """
     _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)

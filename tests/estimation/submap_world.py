@@ -55,9 +55,7 @@ def drawn(truth, covariance, rng):
     return mean
 
 
-def team(
-    seed, robots=2, submaps=8, landmarks=6, size=20.0, reach=12.0, sigmas=(0.1, 0.02, 0.2)
-):
+def team(seed, robots=2, submaps=8, landmarks=6, size=20.0, reach=12.0, sigmas=(0.1, 0.02, 0.2)):
     """sigmas: end position [m], end heading [rad], landmark [m]."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(0.0, size, (landmarks, 2))

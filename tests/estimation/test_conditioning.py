@@ -1,0 +1,109 @@
+"""The broadcast prior times the robot's own later submaps is the full join."""
+
+import numpy as np
+import pytest
+
+from team.estimation.conditioning import RobotPrior, team_pose
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.gauss_newton import JoinSettings
+from team.estimation.joining import EMPTY_FOLD, converged, folded, started
+from team.estimation.marginals import prior_for, trajectory
+from team.estimation.submap import LocalMap
+from tests.estimation.submap_world import team, wrap
+
+OPTIONS = JoinSettings(step_tolerance=1e-11)
+LINEAR = (0.1, 1e-5, 0.2)
+
+
+def joined(submaps, starts):
+    fold = EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    return converged(folded(fold, submaps, OPTIONS), OPTIONS)
+
+
+def later(world, robot, known):
+    """The submaps of the team up to each robot's `known`-th, and this robot's further ones."""
+    before = [each for each in world.submaps if each.sequence < known]
+    after = [each for each in world.submaps if each.robot == robot and each.sequence >= known]
+    return before, after
+
+
+@pytest.mark.parametrize("known", [3, 5, 7])
+@pytest.mark.parametrize("seed", range(3))
+def test_conditioning_equals_the_full_join_in_the_linear_case(seed, known):
+    world = team(seed, submaps=8, sigmas=LINEAR)
+    before, after = later(world, "r1", known)
+    prior = prior_for(joined(before, world.starts), "r1", 0)
+    locals_ = [each.local for each in after]
+    pose, covariance = team_pose(prior, locals_[:-1], locals_[-1])
+    everything = joined(before + after, world.starts)
+    path = trajectory(everything, "r1", 0)
+    sigma = np.sqrt(np.diag(path.covariances[-1]))
+    np.testing.assert_allclose(pose / sigma, path.poses[-1] / sigma, atol=2e-2)
+    np.testing.assert_allclose(
+        covariance / np.outer(sigma, sigma),
+        path.covariances[-1] / np.outer(sigma, sigma),
+        atol=1e-3,
+    )
+
+
+def test_an_open_window_is_one_more_submap():
+    world = team(4, submaps=6)
+    before, after = later(world, "r0", 4)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    one, two = (each.local for each in after)
+    for a, b in zip(team_pose(prior, [one, two], None), team_pose(prior, [one], two), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_without_later_submaps_the_prior_itself_is_the_pose():
+    world = team(5, submaps=3)
+    prior = prior_for(joined(world.submaps, world.starts), "r0", 0)
+    pose, covariance = team_pose(prior, [], None)
+    np.testing.assert_array_equal(pose, prior.pose)
+    np.testing.assert_array_equal(covariance, prior.covariance[:3, :3])
+
+
+def test_before_the_first_map_the_pose_is_composed_from_the_exact_start():
+    world = team(6, submaps=1)
+    submap = world.submaps[0]
+    nothing = np.zeros(0, np.uint32)
+    prior = RobotPrior(world.starts[0].pose, nothing, np.zeros((0, 2)), np.zeros((3, 3)))
+    pose, covariance = team_pose(prior, [], submap.local)
+    path = trajectory(joined([submap], world.starts), "r0", 0)
+    np.testing.assert_allclose(pose, path.poses[0], atol=1e-12)
+    np.testing.assert_allclose(covariance, path.covariances[0], atol=1e-12)
+
+
+def test_a_landmark_that_only_the_later_submaps_see_does_no_harm_and_ties_them():
+    prior = RobotPrior(np.zeros(3), np.zeros(0, np.uint32), np.zeros((0, 2)), 1e-4 * np.eye(3))
+    spread = np.diag([1.0, 1.0, 1e-6, 1e-4, 1e-4])
+    ids = np.array([7], np.uint32)
+    first = LocalMap(ids, np.array([1.0, 0.0, 0.0, 3.0, 1.0]), spread)
+    second = LocalMap(ids, np.array([1.5, 0.0, 0.0, 1.0, 1.0]), spread)
+    pose, covariance = team_pose(prior, [first, second], None)
+    assert pose[0] == pytest.approx(2.0 + 1.5, abs=1e-2)
+    assert covariance[0, 0] == pytest.approx(1.0, rel=1e-2)
+
+
+def test_the_team_pose_is_consistent_and_counting_a_submap_twice_is_not():
+    runs, honest, twice = 200, 0.0, 0.0
+    for seed in range(runs):
+        world = team(seed, submaps=5)
+        before, after = later(world, "r0", 4)
+        prior = prior_for(joined(before, world.starts), "r0", 0)
+        local = after[0].local
+        halved = LocalMap(local.ids, local.mean, 0.5 * local.covariance)
+        for_each = []
+        for each, p in ((local, 1.0), (halved, 0.5)):
+            told = prior._replace(covariance=p * prior.covariance)
+            pose, covariance = team_pose(told, [], each)
+            error = pose - world.paths["r0"][4]
+            error[2] = wrap(error[2])
+            for_each.append(nees(error, covariance) / 3)
+        honest += for_each[0] / runs
+        twice += for_each[1] / runs
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < honest < high
+    assert twice > high
