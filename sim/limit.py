@@ -1,0 +1,302 @@
+"""The limit: the batch MAP over all raw readings of a log, by GTSAM (the extra `limit`).
+
+One pose per observation epoch of each robot. Factors: the start poses; between consecutive poses
+the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of `increment_of`, which is GTSAM's
+`BetweenFactorPose2` with its logarithm; each accepted range and bearing, independent, with the
+sensor's noise (under a Cauchy loss where the centre's `robust_c` asks for a robust join).
+Levenberg-Marquardt starts from the joined solution, so what it finds is never worse than that.
+What it does not model: sightings of teammates, and errors of a sensor that persist.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from sim.evaluation import Evaluation, evaluate
+from sim.evaluation_errors import (
+    MapErrors,
+    Path,
+    distance_rmse,
+    interpolated,
+    map_errors,
+    pose_errors,
+)
+from sim.limit_readings import Chain, anchored, chains_of
+from team.estimation.gaussian import Matrix
+from team.estimation.geometry import Point
+from team.estimation.models import located, noise, predicted
+from team.wire.bus import Sample
+
+LATERAL_SIGMA_M = 2e-3
+"""Added to each epoch's motion: the covariance of a robot that can not slip is singular."""
+EXACT_SIGMA = 1e-6
+"""Of what is exactly known [m, rad]."""
+LARGEST_DECREMENT = 1e-3
+"""√(gᵀH⁻¹g) allowed at the optimum: how far the next Newton step goes, in standard deviations."""
+ITERATIONS = 1000
+_CHAIN = 2**32
+"""Keys of chain c are c · _CHAIN + i; a landmark's is its id."""
+
+Poses = Float[np.ndarray, "K 3"]
+
+
+class LimitError(RuntimeError):
+    """The limit can not be computed: what is missing and what to do."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The optimum. cost = Σ‖r‖² there, initial_cost at the best of the starts.
+
+    gradient_norm: of the optimum's cost, in the units of the state; newton_decrement: √(gᵀH⁻¹g).
+    paths: all poses; final_pose_nees_per_dof and position_rmse_m where there is truth.
+    left_out: robots whose place in the team's frame is not known, and why.
+    """
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Matrix
+    errors: MapErrors | None
+    cost: float
+    initial_cost: float
+    gradient_norm: float
+    newton_decrement: float
+    paths: Mapping[str, Path]
+    position_rmse_m: Mapping[str, float]
+    final_pose_nees_per_dof: Mapping[str, float]
+    robust: bool
+    left_out: tuple[str, ...]
+
+
+def batch_map(samples: Iterable[Sample]) -> Limit:
+    """The batch MAP of a log of a run under the rule `join`, from start to end.
+
+    Raises LimitError without GTSAM, without a scenario, without a joined map, or when the optimiser
+    does not come to rest.
+    """
+    gtsam = _gtsam()
+    kept = list(samples)
+    run = evaluate(kept)
+    if run.scenario is None or run.map is None:
+        raise LimitError("the log has no scenario or no final map: record a run to its end")
+    chains, anchors, left_out = _placed(chains_of(kept, run.scenario), run)
+    if not chains:
+        raise LimitError(
+            "no robot's trajectory is in the log: the batch starts from the joined solution, "
+            "so run the same scenario and seed with `--fusion join`"
+        )
+    robust_c = run.scenario.central.robust_c
+    fillings = list(
+        zip(*(anchored(c, a) for c, a in zip(chains, anchors, strict=True)), strict=True)
+    )
+    starts = [_landmarks(chains, poses, run) for poses in fillings]
+    graph = _graph(gtsam, chains, fillings[0], starts[0], robust_c)
+    initials = [
+        _values(gtsam, poses, landmarks) for poses, landmarks in zip(fillings, starts, strict=True)
+    ]
+    optima = [_optimised(gtsam, graph, initial) for initial in initials]
+    costs = [2.0 * graph.error(optimum) for optimum in optima]
+    best = int(np.argmin(costs))
+    initial_cost = min(2.0 * graph.error(initial) for initial in initials)
+    if costs[best] > initial_cost:
+        raise LimitError(f"the batch cost {costs[best]} lies above its start's, {initial_cost}")
+    linear = graph.linearize(optima[best])
+    step = linear.optimize()
+    decrement = float(np.sqrt(max(2.0 * (linear.error(step.Zero(step)) - linear.error(step)), 0.0)))
+    if decrement > LARGEST_DECREMENT:
+        raise LimitError(
+            f"the batch has not converged: the next Newton step goes {decrement:.2g} sigma, "
+            f"{LARGEST_DECREMENT:g} allowed"
+        )
+    return _limit(
+        gtsam,
+        graph,
+        optima[best],
+        chains,
+        sorted(starts[best]),
+        run,
+        cost=costs[best],
+        initial_cost=initial_cost,
+        gradient_norm=float(linear.gradientAtZero().norm()),
+        newton_decrement=decrement,
+        robust=robust_c is not None,
+        left_out=left_out,
+    )
+
+
+def _gtsam() -> Any:
+    try:
+        import gtsam
+    except ImportError:
+        raise LimitError(
+            "the batch limit needs GTSAM: python -m pip install 'teamslam[limit]'"
+        ) from None
+    return gtsam
+
+
+def _placed(
+    chains: Sequence[Chain], run: Evaluation
+) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
+    """The chains whose place is known, with the joined poses (and the start) that say it."""
+    placed, anchors, left_out = [], [], []
+    for chain in chains:
+        robot = chain.config.id
+        path = run.robots[robot].smoothed_path
+        own = (path.stamps_ns > chain.stamps_ns[0]) & (path.stamps_ns <= chain.stamps_ns[-1])
+        if not own.any():
+            left_out.append(f"{robot}: it is not in the joined map")
+            continue
+        stamps, poses = path.stamps_ns[own], path.poses[own]
+        if chain.start is not None:
+            stamps = np.concatenate((chain.stamps_ns[:1], stamps))
+            poses = np.concatenate((chain.start[np.newaxis], poses))
+        placed.append(chain)
+        anchors.append(Path(stamps, poses))
+    return placed, anchors, tuple(left_out)
+
+
+def _landmarks(
+    chains: Sequence[Chain], poses: Sequence[Poses], run: Evaluation
+) -> dict[int, Point]:
+    """Every landmark that a chain sees: where the join has it, else where it is first seen."""
+    assert run.map is not None
+    joined = dict(zip(run.map.ids.tolist(), run.map.means, strict=True))
+    found: dict[int, Point] = {}
+    for chain, path in zip(chains, poses, strict=True):
+        for pose, scan in zip(path[1:], chain.scans, strict=True):
+            for i, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+                if i not in found:
+                    found[i] = joined[i] if i in joined else located(pose, float(r), float(b))
+    return found
+
+
+def _graph(
+    gtsam: Any,
+    chains: Sequence[Chain],
+    poses: Sequence[Poses],
+    landmarks: Mapping[int, Point],
+    robust_c: float | None,
+) -> Any:
+    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
+
+    Where no start pose is known, the first chain's is held where the joined solution has it.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    floor = np.diag([EXACT_SIGMA, LATERAL_SIGMA_M, EXACT_SIGMA]) ** 2
+    anyone = any(chain.start is not None for chain in chains)
+    for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
+        first = (c + 1) * _CHAIN
+        start = chain.start if anyone or c > 0 else path[0]
+        if start is not None:
+            graph.push_back(_start_factor(gtsam, first, start, chain.start_covariance))
+        for i, increment in enumerate(chain.increments):
+            model = gtsam.noiseModel.Gaussian.Covariance(increment.covariance + floor)
+            motion = gtsam.Pose2(*increment.mean)
+            graph.push_back(gtsam.BetweenFactorPose2(first + i, first + i + 1, motion, model))
+        for i, scan in enumerate(chain.scans, 1):
+            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+                distance, _ = predicted(path[i], landmarks[landmark])
+                range_var, bearing_var = noise(chain.config.sensor, distance)
+                model = gtsam.noiseModel.Diagonal.Variances(np.array([bearing_var, range_var]))
+                if robust_c is not None:
+                    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(robust_c)
+                    model = gtsam.noiseModel.Robust.Create(loss, model)
+                graph.push_back(
+                    gtsam.BearingRangeFactor2D(first + i, landmark, gtsam.Rot2(b), r, model)
+                )
+    return graph
+
+
+def _start_factor(
+    gtsam: Any, key: int, start: Float[np.ndarray, "3"], covariance: Matrix | None
+) -> Any:
+    """The start pose; its covariance in (x, y, θ) is turned into the tangent space of the pose."""
+    if covariance is None:
+        model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
+    else:
+        turn = _tangent(start[2])
+        model = gtsam.noiseModel.Gaussian.Covariance(turn.T @ covariance @ turn)
+    return gtsam.PriorFactorPose2(key, gtsam.Pose2(*start), model)
+
+
+def _tangent(heading: float) -> Matrix:
+    """∂(x, y, θ)/∂ξ of a pose perturbed on the right, pose ∘ Exp(ξ)."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _values(gtsam: Any, poses: Sequence[Poses], landmarks: Mapping[int, Point]) -> Any:
+    values = gtsam.Values()
+    for c, path in enumerate(poses):
+        for i, pose in enumerate(path):
+            values.insert((c + 1) * _CHAIN + i, gtsam.Pose2(*pose))
+    for landmark, position in landmarks.items():
+        values.insert(landmark, np.asarray(position))
+    return values
+
+
+def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(ITERATIONS)
+    parameters.setRelativeErrorTol(1e-13)
+    parameters.setAbsoluteErrorTol(1e-11)
+    return gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters).optimize()
+
+
+def _limit(
+    gtsam: Any,
+    graph: Any,
+    optimum: Any,
+    chains: Sequence[Chain],
+    landmarks: Sequence[int],
+    run: Evaluation,
+    **figures: Any,
+) -> Limit:
+    """The optimum's map, paths and covariances, against the truth."""
+    assert run.map is not None
+    marginals = gtsam.Marginals(graph, optimum)
+    ids = np.array(landmarks, dtype=np.uint32)
+    means = np.array([optimum.atPoint2(i) for i in landmarks])
+    joint = marginals.jointMarginalCovariance(landmarks)
+    covariance = np.block([[joint.at(i, k) for k in landmarks] for i in landmarks])
+    covariance = 0.5 * (covariance + covariance.T)
+    truth = dict(
+        zip(run.map.ids[run.map.known].tolist(), run.map.truth[run.map.known], strict=True)
+    )
+    known = [k for k, i in enumerate(landmarks) if i in truth]
+    rows = np.array([2 * k + axis for k in known for axis in range(2)], dtype=np.int64)
+    paths, errors, nees = {}, {}, {}
+    for c, chain in enumerate(chains):
+        robot, last = chain.config.id, (c + 1) * _CHAIN + len(chain.increments)
+        keys = range((c + 1) * _CHAIN, last + 1)
+        poses = [optimum.atPose2(key) for key in keys]
+        path = Path(chain.stamps_ns, np.array([[p.x(), p.y(), p.theta()] for p in poses]))
+        true_path = run.robots[robot].truth
+        true_poses, seen = interpolated(true_path, path.stamps_ns)
+        paths[robot] = path
+        if seen.any():
+            errors[robot] = distance_rmse(path.poses[seen, :2], true_poses[seen, :2])
+        turn = _tangent(path.poses[-1, 2])
+        P = turn @ marginals.marginalCovariance(last) @ turn.T
+        end = pose_errors(Path(path.stamps_ns[-1:], path.poses[-1:]), P[np.newaxis], true_path)
+        if end is not None:
+            nees[robot] = end.nees_per_dof
+    return Limit(
+        ids=ids,
+        means=means,
+        covariance=covariance,
+        errors=map_errors(
+            means[known],
+            covariance[np.ix_(rows, rows)],
+            np.array([truth[landmarks[k]] for k in known]),
+        )
+        if known
+        else None,
+        paths=paths,
+        position_rmse_m=errors,
+        final_pose_nees_per_dof=nees,
+        **figures,
+    )

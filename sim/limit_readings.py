@@ -1,0 +1,141 @@
+"""From a log's raw readings to chains of poses: what the batch optimiser takes."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from sim.evaluation_errors import Path, on_circle
+from sim.scenario import Scenario
+from team import translate
+from team.config import RobotConfig
+from team.estimation.gaussian import Matrix
+from team.estimation.geometry import Pose, between, compose
+from team.estimation.models import Increment
+from team.robot.segmenter import Epoch, Segmenter
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.channels import channel_of
+
+_TAKEN = frozenset(channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS))
+
+
+class Scan(NamedTuple):
+    """What is seen from one pose: accepted and calibrated ranges [m] and bearings [rad]."""
+
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One epoch of a robot's stream: N + 1 poses, the first at the start.
+
+    increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1.
+    start: the pose that reading 0 gives (None: unknown), with its covariance (None: exact).
+    """
+
+    config: RobotConfig
+    epoch: int
+    start: Pose | None
+    start_covariance: Matrix | None
+    stamps_ns: Int64[np.ndarray, " K"]
+    increments: tuple[Increment, ...]
+    scans: tuple[Scan, ...]
+
+    @property
+    def dead_reckoned(self) -> Float[np.ndarray, "K 3"]:
+        """The poses by odometry alone, in the frame of the first."""
+        poses = [np.zeros(3)]
+        for increment in self.increments:
+            poses.append(compose(poses[-1], increment.mean))
+        return np.array(poses)
+
+
+def chains_of(samples: Iterable[Sample], scenario: Scenario) -> list[Chain]:
+    """The chains of all robots by (robot, epoch); readings in the order of their counter, once.
+
+    Raises WireError for a reading that is not sound.
+    """
+    streams: dict[tuple[str, int], dict[int, m.Reading]] = {}
+    for sample in samples:
+        found = channel_of(sample.key)
+        if found is not None and found[0].name in _TAKEN:
+            message = opened(sample)[2]
+            if isinstance(message, m.Reading):
+                stream = streams.setdefault((message.robot, message.epoch), {})
+                stream[message.reading] = message
+    configs = {robot.id: robot for robot in scenario.robots}
+    chains = [
+        _chain(configs[robot], epoch, [readings[i] for i in sorted(readings)])
+        for (robot, epoch), readings in sorted(streams.items())
+        if robot in configs
+    ]
+    return [chain for chain in chains if chain is not None]
+
+
+def _chain(config: RobotConfig, epoch: int, readings: Sequence[m.Reading]) -> Chain | None:
+    """None for a stream without odometry: it has no motion that links its poses."""
+    odometry = [reading for reading in readings if isinstance(reading, m.Odometry)]
+    if not odometry:
+        return None
+    first_ns = odometry[0].stamp_ns - odometry[0].duration_ns
+    segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
+    segmenter.begin(first_ns)
+    start: tuple[Pose | None, Matrix | None] = (None, None)
+    epochs: list[Epoch] = []
+    for reading in readings:
+        match reading:
+            case m.Start():
+                start = translate.pose_of(reading)
+            case m.Observations():
+                segmenter.observe(reading.stamp_ns, *translate.scan_of(reading))
+            case m.Odometry():
+                epochs += segmenter.drive(
+                    reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
+                )
+    last, rest = segmenter.cut(odometry[-1].stamp_ns)
+    epochs += last
+    if rest.mean.any() or rest.covariance.any():
+        none = np.empty(0)
+        nothing = np.empty(0, np.uint32)
+        epochs.append(Epoch(odometry[-1].stamp_ns, rest, nothing, none, none))
+    return Chain(
+        config,
+        epoch,
+        start[0],
+        start[1],
+        np.array([first_ns, *(e.stamp_ns for e in epochs)]),
+        tuple(e.increment for e in epochs),
+        tuple(Scan(e.ids, e.ranges, e.bearings) for e in epochs),
+    )
+
+
+def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
+    """Three ways to fill a chain's poses between known ones (at least one), by its odometry.
+
+    Onward from the anchor before each pose; back from the anchor after it; and the mean of both,
+    weighted by the time to each. Odometry between a pose and an anchor is taken to the chain's last
+    pose that is not after the anchor.
+    """
+    odometry = chain.dead_reckoned
+    at = np.searchsorted(chain.stamps_ns, anchors.stamps_ns, side="right") - 1
+    carried = [
+        np.array([compose(anchor, between(odometry[i], pose)) for pose in odometry])
+        for anchor, i in zip(anchors.poses, at, strict=True)
+    ]
+    before = np.searchsorted(anchors.stamps_ns, chain.stamps_ns, side="right") - 1
+    after = np.minimum(before + 1, len(at) - 1)
+    before = np.maximum(before, 0)
+    onward = np.array([carried[k][i] for i, k in enumerate(before)])
+    back = np.array([carried[k][i] for i, k in enumerate(after)])
+    span = anchors.stamps_ns[after] - anchors.stamps_ns[before]
+    share = np.clip((chain.stamps_ns - anchors.stamps_ns[before]) / np.maximum(span, 1), 0.0, 1.0)
+    step = back - onward
+    step[:, 2] = on_circle(step[:, 2])
+    mean = onward + share[:, np.newaxis] * step
+    return [onward, back, mean]
