@@ -7,12 +7,12 @@ import sys
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import typer
+import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
-from sim.cli_launch import app as launch_commands
-from sim.cli_logs import app as log_commands
-from sim.cli_nodes import app as node_commands
-from sim.cli_options import FAILED, WRONG_USE
+from sim.cli_launch import app as launch_commands  # noqa: E402
+from sim.cli_logs import app as log_commands  # noqa: E402
+from sim.cli_nodes import app as node_commands  # noqa: E402
+from sim.cli_options import FAILED, WRONG_USE  # noqa: E402
 
 app = typer.Typer(
     help="Multi-robot SLAM as real processes over Zenoh.",

@@ -1,0 +1,179 @@
+"""`teamslam launch` and `teamslam scenarios`."""
+
+import json
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sim.cli_options import (
+    FAILED,
+    Dataset,
+    EstimatorOption,
+    FusionOption,
+    Robots,
+    Seed,
+    SpeedText,
+    fail,
+    parsed_speed,
+    scenario_of,
+)
+from sim.scenario import Scenario, with_options
+
+if TYPE_CHECKING:
+    from sim.launch import Outcome
+
+app = typer.Typer()
+
+
+@app.command()
+def launch(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="A built-in scenario or a .toml file; utias with --dataset."),
+    ] = None,
+    dataset: Dataset = None,
+    robots: Robots = None,
+    estimator: EstimatorOption = None,
+    fusion: FusionOption = None,
+    seed: Seed = None,
+    speed: SpeedText = "max",
+    record: Annotated[
+        Path | None, typer.Option(help="The log to write; default: log.mcap in the run's folder.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result as JSON, too.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The run's folder; default: a new one below runs/."),
+    ] = None,
+    listen: Annotated[
+        str, typer.Option(help="Where the router listens; port 0: any free one.")
+    ] = "tcp/127.0.0.1:0",
+    report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
+) -> None:
+    """Launch a whole team here, watch it, and end with a report and a log.
+
+    Every robot, the world, the central computer, the recorder and the router are processes.
+    """
+    from sim.launch import Plan
+    from sim.launch import launch as launched
+    from sim.live import shown
+
+    pace = parsed_speed(speed)
+    name = scenario or ("utias" if dataset is not None else "thesis")
+    resolved = with_options(
+        scenario_of(name),
+        robots=robots,
+        seed=seed,
+        estimator=estimator,
+        fusion=fusion,
+        dataset=dataset,
+    )
+    _check_world(resolved)
+    folder = output or _new_folder(resolved)
+    log = record or folder / "log.mcap"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    _keep_earlier(log)
+    _prepare(resolved)
+    plan = Plan(resolved, folder, log, pace, listen)
+    try:
+        with shown(f"{resolved.name}, seed {resolved.seed}") as show:
+            outcome = launched(plan, show)
+    except KeyboardInterrupt:
+        fail("interrupted: every process of the team was ended", FAILED)
+    _conclude(resolved, outcome, json_file, report=report)
+
+
+@app.command()
+def scenarios() -> None:
+    """List the built-in scenarios."""
+    from sim.scenario import builtin_names, load
+
+    for name in builtin_names():
+        found = load(name)
+        typer.echo(f"{name:12} {len(found.robots)} robots, {found.estimator} with {found.fusion}")
+
+
+def _check_world(scenario: Scenario) -> None:
+    """A data set that can not be read is found before any process starts."""
+    from sim.source import streams_of
+    from sim.worlds import UtiasWorld
+
+    if isinstance(scenario.world, UtiasWorld):
+        streams_of(scenario)
+
+
+def _new_folder(scenario: Scenario) -> Path:
+    stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
+    base = Path("runs") / f"{scenario.name}-{scenario.seed}-{stamp}"
+    folder, number = base, 1
+    while folder.exists():
+        number += 1
+        folder = base.with_name(f"{base.name}-{number}")
+    return folder
+
+
+def _keep_earlier(log: Path) -> None:
+    """A log is never overwritten: an earlier one of the same name steps aside."""
+    if log.exists():
+        number = 1
+        while (aside := log.with_name(f"{log.name}.{number}")).exists():
+            number += 1
+        log.rename(aside)
+        typer.echo(f"{log} was there already: it is now {aside}", err=True)
+
+
+def _prepare(scenario: Scenario) -> None:
+    from sim.warm_up import warm_up
+
+    began = time.monotonic()
+    typer.echo("preparing the kernels (compiled once per machine) …", err=True)
+    warm_up(scenario.estimator, scenario.fusion)
+    typer.echo(f"kernels ready after {time.monotonic() - began:.1f} s", err=True)
+
+
+def _conclude(
+    scenario: Scenario, outcome: "Outcome", json_file: Path | None, *, report: bool
+) -> None:
+    """Evaluate the log, print the result, write the report; end with 1 if anything failed."""
+    from rich.console import Console
+
+    from sim.evaluation import evaluate, to_json
+    from sim.report import summary_tables, write_report
+    from team.recording.reader import LogError, open_log
+
+    console = Console()
+    extra: dict[str, Any] = {
+        "processes": {e.name: {"pid": e.pid, "exit": e.exit} for e in outcome.processes},
+        "failures": outcome.failures,
+        "log": str(outcome.log),
+        "folder": str(outcome.folder),
+        "wall_s": outcome.wall_s,
+    }
+    try:
+        log = open_log(outcome.log)
+        evaluation = evaluate(log.samples())
+    except (LogError, OSError) as error:
+        outcome.failures.append(f"the log can not be evaluated: {error}")
+        figures = extra
+    else:
+        figures = to_json(evaluation, extra)
+        for table in summary_tables(evaluation):
+            console.print(table)
+        if report:
+            paths = write_report(evaluation, outcome.folder, log.metadata, figures)
+            for path in paths:
+                console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        if evaluation.map is None:
+            outcome.failures.append("the run ended without a final map")
+    console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
+    console.print(f"{outcome.wall_s:.1f} s of wall time", highlight=False)
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    if outcome.failures:
+        fail("\n".join(outcome.failures), FAILED)

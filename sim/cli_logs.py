@@ -1,0 +1,137 @@
+"""Commands on logs: replay, report, repair, limit; and simulate, which writes a data set."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim.cli_options import (
+    FAILED,
+    WRONG_USE,
+    Robots,
+    ScenarioArgument,
+    Seed,
+    SpeedText,
+    fail,
+    parsed_speed,
+    scenario_of,
+)
+from sim.scenario import with_options
+
+LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
+
+app = typer.Typer()
+
+
+@app.command()
+def replay(
+    log: LogArgument,
+    speed: SpeedText = "1",
+    connect: Annotated[
+        str | None,
+        typer.Option(help="The router to publish at; default: one of our own.", metavar="ENDPOINT"),
+    ] = None,
+    listen: Annotated[
+        str, typer.Option(help="Where our own router listens; port 0: any free one.")
+    ] = "tcp/127.0.0.1:7447",
+    wait: Annotated[
+        float, typer.Option(help="Seconds between the router's start and the first message.")
+    ] = 1.0,
+) -> None:
+    """Publish a log's traffic again: same bytes, same order, same spacing in team time."""
+    from contextlib import nullcontext
+
+    from team.recording.reader import open_log
+    from team.recording.shell import replay as replay_samples
+    from team.shell import process
+    from team.wire.zenoh_bus import ZenohBus, router
+
+    pace = parsed_speed(speed)
+    opened = open_log(log)
+    hub = router(listen) if connect is None else nullcontext(connect)
+    with process("replay") as stop, hub as endpoint, ZenohBus(opened.team, endpoint) as bus:
+        if connect is None:
+            typer.echo(f"listening at {endpoint}", err=True)
+            stop.wait(wait)
+        count = replay_samples(bus, opened.samples(), pace, stop)
+    typer.echo(f"replayed {count} messages of {log}")
+
+
+@app.command()
+def report(
+    log: LogArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the report.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+) -> None:
+    """Pictures, tables and figures of a run, from its log alone."""
+    from rich.console import Console
+
+    from sim.evaluation import evaluate, to_json
+    from sim.report import summary_tables, write_report
+    from team.recording.reader import open_log
+
+    opened = open_log(log)
+    evaluation = evaluate(opened.samples())
+    figures = to_json(evaluation, {"log": str(log), "complete": opened.complete})
+    console = Console()
+    for table in summary_tables(evaluation):
+        console.print(table)
+    output.mkdir(parents=True, exist_ok=True)
+    for path in write_report(evaluation, output, opened.metadata, figures):
+        console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    if not opened.complete:
+        typer.echo(f"{log} is cut: `teamslam repair {log} -o FIXED.mcap` completes it", err=True)
+
+
+@app.command()
+def repair(
+    log: LogArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The new, complete log.")],
+) -> None:
+    """Complete a log whose recorder was killed: everything up to its last flush."""
+    from team.recording.repair import repaired
+
+    result = repaired(log, output)
+    until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
+    typer.echo(f"{output}: {result.messages} messages{until}")
+    for damage in result.damaged:
+        typer.echo(f"lost: {damage}", err=True)
+
+
+@app.command()
+def limit(
+    log: LogArgument,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+) -> None:
+    """The batch MAP over all raw readings of a log: the limit that a team can reach."""
+    from sim.limit import LimitError, batch_map
+    from team.recording.reader import open_log
+
+    try:
+        result = batch_map(open_log(log).samples())
+    except LimitError as error:
+        fail(str(error), FAILED)
+    figures = result.to_json()
+    typer.echo(json.dumps(figures, indent=2))
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+@app.command()
+def simulate(
+    scenario: ScenarioArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")],
+    robots: Robots = None,
+    seed: Seed = None,
+) -> None:
+    """Write a scenario's world as a data set in the UTIAS format."""
+    from sim.datasets.utias_writer import write_utias
+    from sim.source import streams_of
+
+    if output.exists() and any(output.iterdir()):
+        fail(f"{output} is not empty: give a new folder", WRONG_USE)
+    write_utias(streams_of(with_options(scenario_of(scenario), robots=robots, seed=seed)), output)
+    typer.echo(f"wrote {output}")
