@@ -158,7 +158,7 @@ def _factorised(graph: Graph, values: Values) -> sparse.Cholesky:
 def _moved(island: Island, step: Values) -> Island:
     state = island.state + step
     headings = state[island.graph.headings]
-    state[island.graph.headings] = np.pi - np.mod(np.pi - headings, 2.0 * np.pi)
+    state[island.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
     return replace(island, state=state)
 
 

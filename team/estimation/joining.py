@@ -29,6 +29,7 @@ __all__ = [
     "Stream",
     "converged",
     "folded",
+    "lean",
     "started",
 ]
 
@@ -149,6 +150,18 @@ def folded(fold: Fold, contributions: Sequence[Contribution], settings: JoinSett
         fold, contributions=(*fold.contributions, *contributions), islands=islands, home=home
     )
     return _with_merges(grown)
+
+
+def lean(fold: Fold) -> Fold:
+    """The same fold without what can be computed again from it: a checkpoint to keep.
+
+    It shares the submaps with the folds before and after it; its own are the state and the graph's
+    nodes, a hundredth of what a fold holds that was solved.
+    """
+    islands = {
+        key: replace(island, graph=replace(island.graph)) for key, island in fold.islands.items()
+    }
+    return replace(fold, islands=islands)
 
 
 def converged(fold: Fold, settings: JoinSettings) -> Fold:

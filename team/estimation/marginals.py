@@ -87,12 +87,32 @@ def landmark_blocks(fold: Fold) -> LandmarkBlocks:
 
 def prior_for(fold: Fold, robot: str, epoch: int, ids: Sequence[int] | None = None) -> RobotPrior:
     """What a robot needs to place itself: its last end pose and the landmarks, jointly."""
-    island = fold.island(robot, epoch)
+    stream = (robot, epoch)
+    return _priors_in(fold.island(robot, epoch), [stream], ids)[stream]
+
+
+def main_priors(fold: Fold, ids: Sequence[int] | None = None) -> dict[Stream, RobotPrior]:
+    """`prior_for` of every stream of the main island; the landmarks are solved for once."""
+    return _priors_in(fold.main, sorted(fold.main.graph.streams), ids)
+
+
+def _priors_in(
+    island: Island, streams: Sequence[Stream], ids: Sequence[int] | None
+) -> dict[Stream, RobotPrior]:
     chosen = sorted(island.graph.landmarks if ids is None else ids)
-    last = island.graph.streams[(robot, epoch)][-1]
-    mean, covariance = joint_marginal(island, [last, *_nodes(island, chosen)])
-    landmarks = mean[3:].reshape(-1, 2)
-    return RobotPrior(mean[:3], np.array(chosen, dtype=np.uint32), landmarks, covariance)
+    poses = [island.graph.streams[stream][-1] for stream in streams]
+    mean, covariance = joint_marginal(island, [*poses, *_nodes(island, chosen)])
+    shared = np.arange(3 * len(poses), len(mean))
+    priors = {}
+    for k, stream in enumerate(streams):
+        kept = np.concatenate([np.arange(3 * k, 3 * k + 3), shared])
+        priors[stream] = RobotPrior(
+            mean[kept[:3]],
+            np.array(chosen, dtype=np.uint32),
+            mean[shared].reshape(-1, 2),
+            covariance[np.ix_(kept, kept)],
+        )
+    return priors
 
 
 def trajectory(fold: Fold, robot: str, epoch: int) -> Trajectory:
@@ -121,8 +141,8 @@ def joint_cost(fold: Fold) -> Agreement:
     weight = island.weight
     dof = graph.dimensions - weight * explained
     submaps = tuple(
-        SubmapCost(*of, float(island.chi2[f]), float(dof[f]), float(weight[f]))
-        for f, of in enumerate(_submaps(fold))
+        SubmapCost(of.stream, of.sequence, float(chi2), float(own), float(w))
+        for (of, _), chi2, own, w in zip(graph.submaps, island.chi2, dof, weight, strict=True)
     )
     robots: dict[str, tuple[float, float]] = {}
     for robot, chi2, own in [
@@ -147,17 +167,6 @@ def _own_marginal(
     block = island.graph.pattern.diagonal_block(island.selected_covariance, node)
     fixed = bool(island.graph.fixed[node])
     return island.state[begin:end], np.zeros_like(block) if fixed else block
-
-
-def _submaps(fold: Fold) -> list[tuple[Stream, int]]:
-    """Stream and sequence of each submap of the main island, in the order of its factors."""
-    nodes = {
-        node: (stream, sequence)
-        for stream, ends in fold.main.graph.streams.items()
-        for sequence, node in enumerate(ends[1:])
-    }
-    factors = fold.main.graph.factors
-    return [nodes[node] for node in factors.member[factors.member_start[:-1] + 1].tolist()]
 
 
 def _priors(island: Island) -> list[tuple[str, float, float]]:

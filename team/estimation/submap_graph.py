@@ -29,6 +29,13 @@ class Prior(NamedTuple):
     information: Float[np.ndarray, "3 3"]
 
 
+class Joined(NamedTuple):
+    """A submap in the graph: its start node, its end node and its landmarks' nodes by id."""
+
+    contribution: Contribution
+    nodes: Indices
+
+
 @dataclass(frozen=True, eq=False)
 class Graph:
     """Nodes in the order in which they came, and what ties them.
@@ -37,14 +44,28 @@ class Graph:
     landmarks: node of each landmark id.
     offset:    first number of each node in the state; the last is the state's length.
     fixed:     nodes that are constants (exact starts, the gauge).
+    submaps:   in the order in which they were taken.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
     landmarks: Mapping[int, int]
     offset: Indices
     fixed: Bool[np.ndarray, " _"]
-    factors: Factors
+    submaps: tuple[Joined, ...]
     priors: tuple[Prior, ...]
+
+    @cached_property
+    def factors(self) -> Factors:
+        """The submaps in flat arrays, for the kernels."""
+        submaps = [each.contribution for each in self.submaps]
+        return Factors(
+            np.concatenate([np.zeros(0, np.int64), *(each.nodes for each in self.submaps)]),
+            _starts([len(each.nodes) for each in self.submaps]),
+            np.concatenate([np.zeros(0), *(each.local.mean for each in submaps)]),
+            _starts([len(each.local.mean) for each in submaps]),
+            np.concatenate([np.zeros(0), *(each.information.ravel() for each in submaps)]),
+            _starts([each.information.size for each in submaps]),
+        )
 
     @cached_property
     def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
@@ -105,21 +126,12 @@ class Graph:
         return f"landmark {ids[0]}"
 
 
-EMPTY_GRAPH = Graph(
-    {},
-    {},
-    np.zeros(1, dtype=np.int64),
-    np.zeros(0, dtype=np.bool_),
-    Factors(
-        np.zeros(0, dtype=np.int64),
-        np.zeros(1, dtype=np.int64),
-        np.zeros(0),
-        np.zeros(1, dtype=np.int64),
-        np.zeros(0),
-        np.zeros(1, dtype=np.int64),
-    ),
-    (),
-)
+EMPTY_GRAPH = Graph({}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), ())
+
+
+def _starts(lengths: Sequence[int]) -> Indices:
+    """Where pieces of these lengths begin, one behind the other; the last is the end."""
+    return np.cumsum(np.array([0, *lengths], dtype=np.int64))
 
 
 class _Growth:
@@ -160,8 +172,7 @@ def extended(
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
-    member: list[int] = []
-    members: list[int] = []
+    submaps = list(graph.submaps)
     for contribution in contributions:
         stream, local = contribution.stream, contribution.local
         if stream not in growth.streams:
@@ -177,31 +188,21 @@ def extended(
         for id_, point in zip(local.ids.tolist(), local.landmarks, strict=True):
             if id_ not in growth.landmarks:
                 growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
-        member += [start_node, end_node, *(growth.landmarks[id_] for id_ in local.ids.tolist())]
-        members.append(2 + len(local.ids))
-    factors = Factors(
-        np.concatenate([graph.factors.member, np.array(member, dtype=np.int64)]),
-        _continued(graph.factors.member_start, members),
-        np.concatenate([graph.factors.mean, *(c.local.mean for c in contributions)]),
-        _continued(graph.factors.mean_start, [len(c.local.mean) for c in contributions]),
-        np.concatenate(
-            [graph.factors.information, *(c.information.ravel() for c in contributions)]
-        ),
-        _continued(graph.factors.information_start, [c.information.size for c in contributions]),
-    )
+        seen = [growth.landmarks[id_] for id_ in local.ids.tolist()]
+        submaps.append(Joined(contribution, np.array([start_node, end_node, *seen])))
     grown = Graph(
         growth.streams,
         growth.landmarks,
         _continued(graph.offset, [len(value) for value in growth.values]),
         np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
-        factors,
+        tuple(submaps),
         tuple(priors),
     )
     return grown, np.concatenate([state, *growth.values])
 
 
 def _continued(starts: Indices, lengths: Sequence[int]) -> Indices:
-    return np.concatenate([starts, starts[-1] + np.cumsum(np.array(lengths, dtype=np.int64))])
+    return np.concatenate([starts, starts[-1] + _starts(lengths)[1:]])
 
 
 def merged(
@@ -228,15 +229,6 @@ def merged(
         value = other_state[other.offset[node] : other.offset[node + 1]]
         moved = compose if size == 3 else transformed
         values.append(moved(main_from_other, value))
-    a, b = main.factors, other.factors
-    factors = Factors(
-        np.concatenate([a.member, node_of[b.member]]),
-        _continued(a.member_start, np.diff(b.member_start).tolist()),
-        np.concatenate([a.mean, b.mean]),
-        _continued(a.mean_start, np.diff(b.mean_start).tolist()),
-        np.concatenate([a.information, b.information]),
-        _continued(a.information_start, np.diff(b.information_start).tolist()),
-    )
     streams = {
         stream: tuple(node_of[list(nodes)].tolist()) for stream, nodes in other.streams.items()
     }
@@ -246,7 +238,7 @@ def merged(
         {**landmarks, **main.landmarks},
         _continued(main.offset, [len(value) for value in values]),
         np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
-        factors,
+        (*main.submaps, *(Joined(each, node_of[nodes]) for each, nodes in other.submaps)),
         main.priors,
     )
     return graph, np.concatenate([state, *values])

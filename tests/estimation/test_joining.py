@@ -18,12 +18,14 @@ from team.estimation.joining import (
     NotCanonicalError,
     converged,
     folded,
+    lean,
     started,
 )
 from team.estimation.marginals import (
     joint_cost,
     landmark_blocks,
     landmark_map,
+    main_priors,
     prior_for,
     trajectory,
 )
@@ -145,6 +147,16 @@ def test_taking_submaps_leaves_the_fold_before_as_it_was():
     assert before.main.state.tobytes() == state.tobytes()
     assert landmark_blocks(before).covariances.tobytes() == blocks.tobytes()
     assert on.main.state.tobytes() == again.main.state.tobytes()
+
+
+def test_a_lean_fold_goes_on_to_the_same_bytes():
+    world = team(2)
+    before = joined(world.submaps[:8], world.starts)
+    landmark_map(before)
+    on, lean_on = (folded(each, world.submaps[8:], EXACTLY) for each in (before, lean(before)))
+    assert on.main.state.tobytes() == lean_on.main.state.tobytes()
+    assert landmark_map(on).covariance.tobytes() == landmark_map(lean_on).covariance.tobytes()
+    assert "posterior" not in vars(lean(before).main)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -297,6 +309,24 @@ def test_a_prior_for_some_landmarks_is_the_marginal_of_the_prior_for_all():
     np.testing.assert_allclose(
         some.covariance, everything.covariance[np.ix_(keep, keep)], rtol=1e-9
     )
+
+
+def test_the_priors_of_all_streams_together_are_the_priors_of_each():
+    world = team(9, robots=3)
+    fold = joined(world.submaps, world.starts)
+    together = main_priors(fold)
+    assert sorted(together) == [("r0", 0), ("r1", 0), ("r2", 0)]
+    for (robot, epoch), prior in together.items():
+        for one, other in zip(prior, prior_for(fold, robot, epoch), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+
+
+def test_a_known_start_stays_exactly_where_it_is():
+    world = team(9, robots=2)
+    island = converged(joined(world.submaps, world.starts), EXACTLY).main
+    for start in world.starts:
+        begin = island.graph.offset[island.graph.streams[start.stream][0]]
+        assert island.state[begin : begin + 3].tobytes() == start.pose.tobytes()
 
 
 def test_an_uncertain_start_is_composed_with_the_submap_that_leaves_it():
