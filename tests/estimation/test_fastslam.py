@@ -153,6 +153,36 @@ def test_the_second_proposal_keeps_many_more_particles_alive():
     assert min(full) > 3.0 * min(thin)
 
 
+def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
+    # The proposal is then the exact posterior of the motion, and p(z) is the same for all.
+    count, rng = 400, np.random.default_rng(8)
+    block = np.array([0.04, 0.03, 0.05])
+    known = fastslam.Particles(
+        np.zeros((count, 3)),
+        np.full(count, -np.log(count)),
+        IDS,
+        np.tile(LANDMARKS, (count, 1, 1)),
+        np.tile(block, (count, 3, 1)),
+    )
+    root = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [0.003, -0.004, 0.006]])
+    truth = moved(np.concatenate((np.zeros(3), LANDMARKS.ravel())), MOTION.mean)
+    shift = np.array([[0.1, -0.2], [0.1, 0.2], [-0.2, 0.1]])
+    z = np.array([observed(truth, k) for k in range(3)]) + shift * [1.0, 0.01]
+    after, info = fastslam.propagated_and_updated(
+        known,
+        Increment(MOTION.mean, root @ root.T),
+        SENSOR,
+        IDS,
+        z[:, 0].copy(),
+        z[:, 1].copy(),
+        "fastslam2",
+        0.5,
+        rng,
+    )
+    assert info.effective_sample_size > (1.0 - 3e-5) * count
+    assert np.std(after.poses[:, 2]) < 0.5 * np.linalg.norm(root[2])
+
+
 def test_without_noise_of_motion_both_proposals_are_the_same():
     motions, epochs = simulated(3, covariance=np.zeros((3, 3)))
     one, two = (filtered(motions, epochs, 8, p)[0] for p in ("fastslam1", "fastslam2"))

@@ -49,16 +49,16 @@ def test_a_landmark_that_is_not_read_keeps_its_exact_values():
 
 
 def test_standing_still_a_reading_updates_its_landmark_as_the_kalman_filter_does():
-    offset = KNOWN.landmarks[0] - KNOWN.pose[:2]
+    offset = KNOWN.landmarks[1] - KNOWN.pose[:2]
     r = np.hypot(*offset)
     z = np.array([r + 0.3, np.arctan2(offset[1], offset[0]) - KNOWN.pose[2] + 0.02])
-    after = stepped(KNOWN, STANDING, [2], z[:1], z[1:], particles=10)
+    after = stepped(KNOWN, STANDING, [5], z[:1], z[1:], particles=10)
     e = offset / r
     H = np.array([e, [-e[1] / r, e[0] / r]])
-    S = H @ KNOWN.covariances[0] @ H.T + np.diag([0.04, 0.0009])
-    K = np.linalg.solve(S, H @ KNOWN.covariances[0]).T
-    np.testing.assert_allclose(after.landmarks[0], KNOWN.landmarks[0] + K @ [0.3, 0.02])
-    np.testing.assert_allclose(after.covariances[0], KNOWN.covariances[0] - K @ S @ K.T, atol=1e-15)
+    S = H @ KNOWN.covariances[1] @ H.T + np.diag([0.04, 0.0009])
+    K = np.linalg.solve(S, H @ KNOWN.covariances[1]).T
+    np.testing.assert_allclose(after.landmarks[1], KNOWN.landmarks[1] + K @ [0.3, 0.02])
+    np.testing.assert_allclose(after.covariances[1], KNOWN.covariances[1] - K @ S @ K.T, atol=1e-15)
     np.testing.assert_allclose(after.pose, KNOWN.pose, atol=1e-12)
 
 
