@@ -70,6 +70,31 @@ class Limit:
     robust: bool
     left_out: tuple[str, ...]
 
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that machines read."""
+        errors = self.errors
+        return {
+            "landmarks": len(self.ids),
+            "landmark_rmse_m": None if errors is None else errors.rmse_m,
+            "landmark_rmse_aligned_m": None if errors is None else errors.aligned_rmse_m,
+            "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
+            "map_nees_in_band": None if errors is None else errors.in_band,
+            "cost": self.cost,
+            "initial_cost": self.initial_cost,
+            "gradient_norm": self.gradient_norm,
+            "newton_decrement": self.newton_decrement,
+            "robots": {
+                robot: {
+                    "poses": len(path.stamps_ns),
+                    "position_rmse_m": self.position_rmse_m.get(robot),
+                    "final_pose_nees_per_dof": self.final_pose_nees_per_dof.get(robot),
+                }
+                for robot, path in self.paths.items()
+            },
+            "robust": self.robust,
+            "left_out": list(self.left_out),
+        }
+
 
 def batch_map(samples: Iterable[Sample]) -> Limit:
     """The batch MAP of a log of a run under the rule `join`, from start to end.

@@ -1,0 +1,221 @@
+"""Pictures of a run: the map with its uncertainty, and the robots' errors within their bounds."""
+
+from collections.abc import Sequence
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from sim.evaluation import Evaluation, RobotResult
+from sim.evaluation_errors import Path
+
+if (
+    TYPE_CHECKING
+):  # Matplotlib takes half a second to import: a run that draws nothing has no use for it
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ROBOT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+"""Told apart by colour-blind people too (Okabe & Ito 2008); the seventh robot takes the first."""
+TRUTH_COLOUR = "#7a7a7a"
+MAP_COLOUR = "#111111"
+ELLIPSE_CHI2 = 5.991
+"""95 % of a Gaussian in the plane lie within this squared Mahalanobis distance."""
+DRAWN_ROBOTS = 12
+"""Rows of the error picture at the most."""
+DRAWN_POINTS = 4000
+"""Of one line; longer paths are thinned."""
+LABELLED_LANDMARKS = 60
+DPI = 120
+
+
+def map_picture(evaluation: Evaluation, path: FilePath) -> bool:
+    """Landmarks with 95 % ellipses, the truth, the paths; False where there is nothing to draw."""
+    if evaluation.map is None and not evaluation.robots:
+        return False
+    figure, axes = _figure(9.0, 9.0, 1, 1)
+    axis = axes[0][0]
+    for i, (name, robot) in enumerate(evaluation.robots.items()):
+        _draw_paths(axis, name, robot, ROBOT_COLOURS[i % len(ROBOT_COLOURS)], first=i == 0)
+    _draw_landmarks(axis, evaluation)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    axis.grid(color="#e4e4e4", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.set_title("\n".join(_title(evaluation)), fontsize=12)
+    handles, _ = axis.get_legend_handles_labels()
+    axis.legend(
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.07),
+        ncols=2 if len(handles) <= 6 else 3,
+        frameon=False,
+        fontsize=10,
+    )
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
+    """Errors of x, y and heading over team time with ±3σ; False where no robot has truth."""
+    shown = {n: r for n, r in evaluation.robots.items() if r.online or r.smoothed}
+    names = list(shown)[:DRAWN_ROBOTS]
+    if not names:
+        return False
+    start_ns = min(_first_ns(shown[name]) for name in names)
+    figure, axes = _figure(13.0, 1.0 + 2.3 * len(names), len(names), 3)
+    for row, name in enumerate(names):
+        colour = ROBOT_COLOURS[row % len(ROBOT_COLOURS)]
+        _draw_errors(axes[row], shown[name], colour, start_ns)
+        axes[row][0].set_ylabel(f"{name}\nerror [m]")
+        axes[row][2].set_ylabel("error [°]")
+    for axis, title in zip(axes[0], ("x", "y", "heading"), strict=True):
+        axis.set_title(title, fontsize=11)
+    for axis in axes[-1]:
+        axis.set_xlabel("team time [s]")
+    left_out = len(shown) - len(names)
+    more = f" · {left_out} more robots are not drawn" if left_out else ""
+    figure.suptitle(f"{_heading(evaluation)}: pose errors and what the robots believe{more}")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=10)
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def _figure(
+    width: float, height: float, rows: int, columns: int
+) -> "tuple[Figure, list[list[Axes]]]":
+    """A figure on Agg without pyplot's global state, with its axes by row and column."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=columns > 1)
+    return figure, [list(row) for row in grid]
+
+
+def _draw_paths(axis: "Axes", name: str, robot: RobotResult, colour: str, *, first: bool) -> None:
+    """The true path thin, a square at its start, and the smoothed ends of the submaps."""
+    truth, smoothed = _thinned(robot.truth), robot.smoothed_path
+    known = truth if len(truth.stamps_ns) else smoothed
+    if len(truth.stamps_ns):
+        x, y, _ = truth.poses.T
+        label = "true paths" if first else None
+        axis.plot(x, y, color=TRUTH_COLOUR, linewidth=0.7, label=label, zorder=1)
+    if len(smoothed.stamps_ns):
+        x, y, _ = smoothed.poses.T
+        axis.plot(x, y, color=colour, linewidth=0.8, alpha=0.6, zorder=2)
+        axis.plot(x, y, color=colour, linestyle="", marker="o", markersize=4.5, zorder=3)
+    if len(known.stamps_ns):
+        x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
+        axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
+    axis.plot([], [], color=colour, marker="o", label=f"{name}, ends of submaps (square: start)")
+
+
+def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
+    from matplotlib.patches import Ellipse
+
+    truth, fused = evaluation.true_landmarks, evaluation.map
+    if len(truth):
+        axis.plot(
+            *truth.T, linestyle="", marker="x", markersize=8, markeredgewidth=1.6,
+            color="#C00000", label="true landmarks", zorder=6,
+        )  # fmt: skip
+    if fused is None or not len(fused.ids):
+        return
+    axis.plot(
+        *fused.means.T, linestyle="", marker=".", markersize=6, color=MAP_COLOUR,
+        label="landmarks of the map, 95 % ellipses", zorder=7,
+    )  # fmt: skip
+    for k, mean in enumerate(fused.means):
+        block = fused.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        width, height, turn_deg = ellipse_of(block)
+        axis.add_patch(
+            Ellipse(
+                (float(mean[0]), float(mean[1])),
+                width,
+                height,
+                angle=turn_deg,
+                fill=False,
+                edgecolor=MAP_COLOUR,
+                linewidth=1.1,
+                zorder=7,
+            )
+        )
+    if len(fused.ids) <= LABELLED_LANDMARKS:
+        for landmark, mean in zip(fused.ids, fused.means, strict=True):
+            axis.annotate(
+                str(landmark), (float(mean[0]), float(mean[1])), xytext=(7, 6),
+                textcoords="offset points", fontsize=9, color=MAP_COLOUR, zorder=8,
+                bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7},
+            )  # fmt: skip
+
+
+def ellipse_of(covariance: Float[np.ndarray, "2 2"]) -> tuple[float, float, float]:
+    """Full axes [m] and the first one's direction [°] of the 95 % ellipse of a 2 × 2 covariance."""
+    variances, directions = np.linalg.eigh(covariance)
+    width, height = 2.0 * np.sqrt(ELLIPSE_CHI2 * variances[::-1])
+    turn = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+    return float(width), float(height), float(turn)
+
+
+def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_ns: int) -> None:
+    scales = (1.0, 1.0, 180.0 / np.pi)
+    for k, (axis, scale) in enumerate(zip(axes, scales, strict=True)):
+        axis.axhline(0.0, color="#bbbbbb", linewidth=0.7)
+        axis.grid(color="#eeeeee", linewidth=0.6)
+        axis.set_axisbelow(True)
+        largest = 0.0
+        if robot.online is not None:
+            kept = slice(None, None, max(1, len(robot.online.stamps_ns) // DRAWN_POINTS))
+            time_s = (robot.online.stamps_ns[kept] - start_ns) * 1e-9
+            bound = 3.0 * scale * robot.online.sigmas[kept, k]
+            error = scale * robot.online.errors[kept, k]
+            label = f"online ({robot.online_channel})"
+            axis.fill_between(
+                time_s, -bound, bound, color=colour, alpha=0.18, linewidth=0.0, label="±3σ online"
+            )
+            axis.plot(time_s, error, color=colour, linewidth=0.9, label=label)
+            largest = max(float(np.abs(error).max()), float(np.quantile(bound, 0.98)))
+        if robot.smoothed is not None:
+            time_s = (robot.smoothed.stamps_ns - start_ns) * 1e-9
+            error, sigma = scale * robot.smoothed.errors[:, k], scale * robot.smoothed.sigmas[:, k]
+            axis.errorbar(
+                time_s, error, 3.0 * sigma, color=MAP_COLOUR, linestyle="", marker=".",
+                markersize=3, elinewidth=0.6, label="smoothed, ±3σ",
+            )  # fmt: skip
+            largest = max(largest, float(np.abs(error).max()), float(np.quantile(3 * sigma, 0.98)))
+        if largest > 0.0:
+            axis.set_ylim(-1.1 * largest, 1.1 * largest)
+
+
+def _first_ns(robot: RobotResult) -> int:
+    stamps = [e.stamps_ns[0] for e in (robot.online, robot.smoothed) if e is not None]
+    return int(min(stamps + list(robot.truth.stamps_ns[:1])))
+
+
+def _thinned(path: Path) -> Path:
+    every = max(1, len(path.stamps_ns) // DRAWN_POINTS)
+    return Path(path.stamps_ns[::every], path.poses[::every])
+
+
+def _heading(evaluation: Evaluation) -> str:
+    scenario = evaluation.scenario
+    return "a run" if scenario is None else f"{scenario.name}, seed {scenario.seed}"
+
+
+def _title(evaluation: Evaluation) -> list[str]:
+    """Scenario and seed; estimator, rule and errors."""
+    scenario, fused = evaluation.scenario, evaluation.map
+    second = [] if scenario is None else [f"{scenario.estimator} + {scenario.fusion}"]
+    if fused is None:
+        second.append("no final map")
+    elif fused.errors is not None:
+        errors = fused.errors
+        text = f"landmark RMSE {errors.rmse_m:.3g} m"
+        if errors.aligned_rmse_m is not None:
+            text += f" ({errors.aligned_rmse_m:.3g} m aligned)"
+        second += [text, f"NEES/dof {errors.nees_per_dof:.3g}"]
+    return [_heading(evaluation), " · ".join(second)]
