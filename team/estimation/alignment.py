@@ -1,8 +1,8 @@
 """Where one map lies in the frame of another, from the landmarks that both know.
 
 Weighted Procrustes by singular values gives the first guess (Downs' thesis on map joining; Arun,
-Huang & Blostein 1987), Gauss-Newton in the metric of both joint covariances the rest; the χ² of
-what is left says whether the two maps agree.
+Huang & Blostein 1987), Gauss-Newton in the metric of both joint covariances the rest. Whether the
+two maps agree is asked of the joint cost, which is not linearised about a drifted map.
 """
 
 from typing import NamedTuple
@@ -23,12 +23,17 @@ class Alignment(NamedTuple):
     """a_from_b (x [m], y [m], theta [rad]) with its covariance, and χ² of the landmarks left over.
 
     dof: 2 per shared landmark less the 3 of the motion.
+    heading_sigma: how well the shape of the shared landmarks gives a heading [rad]. Unlike the
+        covariance it leaves out how far each map may be turned as a whole: with the difference's
+        covariance S and the projection Π off the rigid motions it is
+        √(tr(Π S Π)/dof / Σ‖bᵢ − b̄‖²), σ/√Σ‖bᵢ − b̄‖² for independent landmarks.
     """
 
     a_from_b: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
     chi2: float
     dof: int
+    heading_sigma: float
 
 
 def procrustes(
@@ -67,7 +72,20 @@ def aligned(
         a_from_b[2] = wrapped(a_from_b[2])
     residual, metric, jacobian = _linearised(a_from_b, in_a, covariance_a, in_b, covariance_b)
     spread = information(jacobian.T @ metric @ jacobian, "an alignment")
-    return Alignment(a_from_b, spread, float(residual @ metric @ residual), 2 * n - 3)
+    chi2 = float(residual @ metric @ residual)
+    sigma = _shape_heading_sigma(in_b, jacobian, information(metric, "the metric of an alignment"))
+    return Alignment(a_from_b, spread, chi2, 2 * n - 3, sigma)
+
+
+def _shape_heading_sigma(
+    in_b: Float[np.ndarray, "n 2"],
+    jacobian: Float[np.ndarray, "m 3"],
+    covariance: Float[np.ndarray, "m m"],
+) -> float:
+    shape = np.eye(len(jacobian)) - jacobian @ np.linalg.pinv(jacobian)
+    variance = np.trace(shape @ covariance @ shape) / (len(jacobian) - 3)
+    extent = float(((in_b - in_b.mean(axis=0)) ** 2).sum())
+    return float(np.sqrt(variance / extent))
 
 
 def _linearised(
@@ -92,23 +110,32 @@ def _linearised(
     return (in_a - turned - a_from_b[:2]).ravel(), metric, jacobian
 
 
-def refusal(
-    shared: int, alignment: Alignment | None, confidence: float, heading_sigma: float
-) -> str | None:
-    """Why two maps should not be merged, or None. `alignment` is None where `shared` is too few."""
+def refusal(shared: int, alignment: Alignment | None, heading_sigma: float) -> str | None:
+    """Why the landmarks can not place one map in the other, or None if they can.
+
+    `alignment` is None where `shared` is too few.
+    """
     if shared < NEEDED or alignment is None:
         plural = "" if shared == 1 else "s"
         return f"{shared} shared landmark{plural}, {NEEDED} needed"
-    sigma = float(np.sqrt(alignment.covariance[2, 2]))
-    if sigma > heading_sigma:
+    if alignment.heading_sigma > heading_sigma:
         return (
-            f"{shared} shared landmarks too close together: "
-            f"heading known to {sigma:.2f} rad, {heading_sigma:.2f} needed"
+            f"{shared} shared landmarks too close together for their uncertainty: "
+            f"heading to {alignment.heading_sigma:.2f} rad, {heading_sigma:.2f} needed"
         )
-    limit = float(chdtri(alignment.dof, 1.0 - confidence))
-    if alignment.chi2 > limit:
+    return None
+
+
+def disagreement(shared: int, chi2: float, confidence: float) -> str | None:
+    """Why two maps of `shared` common landmarks are not of one place, or None.
+
+    chi2: the rise of the joint cost when their landmarks are made one; χ² of 2 per landmark less
+    the 3 of the motion for maps that agree.
+    """
+    limit = float(chdtri(2 * shared - 3, 1.0 - confidence))
+    if chi2 > limit:
         return (
-            f"{shared} shared landmarks disagree: chi² {alignment.chi2:.1f} "
+            f"{shared} shared landmarks disagree: chi² {chi2:.1f} "
             f"exceeds {limit:.1f} ({100.0 * confidence:g} %)"
         )
     return None

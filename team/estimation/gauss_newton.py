@@ -36,7 +36,7 @@ class JoinSettings:
     covariance_factor: every submap's covariance is taken times this.
     max_iterations, step_tolerance: a full solve ends when no unknown moves by more [m, rad].
     alignment_confidence: quantile of the χ² test before a free island is merged.
-    alignment_heading_sigma: the shared landmarks must give the heading at least this well [rad].
+    alignment_heading_sigma: the shape of the shared landmarks must give a heading this well [rad].
     """
 
     iterations_per_tick: int = 2

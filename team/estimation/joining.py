@@ -33,6 +33,9 @@ __all__ = [
     "started",
 ]
 
+FULL_AGE = 1_000_000
+"""Iterations after which every robust scale has come to its end."""
+
 
 class NotCanonicalError(ValueError):
     """A submap is not behind the ones before it in the canonical order."""
@@ -198,11 +201,13 @@ def _with_merges(fold: Fold) -> Fold:
         shared = sorted(main.graph.landmarks.keys() & other.graph.landmarks.keys())
         found = _aligned(main, other, shared)
         settings = main.settings
-        why = alignment.refusal(
-            len(shared), found, settings.alignment_confidence, settings.alignment_heading_sigma
-        )
+        why = alignment.refusal(len(shared), found, settings.alignment_heading_sigma)
         if found is not None and why is None:
-            return _with_merges(_merged(fold, main_key, key, found))
+            merge = _merged(fold, main_key, key, found)
+            rise = _cost(merge.main) - _cost(main) - _cost(other)
+            why = alignment.disagreement(len(shared), rise, settings.alignment_confidence)
+            if why is None:
+                return _with_merges(merge)
         frame = min(other.graph.streams)
         reasons[frame] = f"{named(frame)} not joined: {why}"
     return replace(fold, reasons=reasons)
@@ -220,6 +225,11 @@ def _aligned(main: Island, other: Island, shared: list[int]) -> alignment.Alignm
     )
     in_main, in_other = (mean.reshape(-1, 2) for mean in means)
     return alignment.aligned(in_main, covariances[0], in_other, covariances[1])
+
+
+def _cost(island: Island) -> float:
+    """The cost with every robust scale at its end, so that islands can be compared."""
+    return replace(island, age=np.full_like(island.age, FULL_AGE)).cost
 
 
 def _merged(fold: Fold, main_key: Stream, key: Stream, found: alignment.Alignment) -> Fold:

@@ -135,11 +135,11 @@ def test_maps_that_disagree_are_not_merged():
 def test_landmarks_close_together_do_not_give_a_heading():
     in_a = np.array([[0.0, 0.0], [0.3, 0.0]])
     found = aligned(in_a, np.eye(4), in_a + 5.0, np.eye(4))
-    reason = refusal(2, found, 0.999, 0.3)
+    reason = refusal(2, found, 0.3)
     assert reason is not None
     assert "too close together" in reason
     apart = aligned(10.0 * in_a, 0.01 * np.eye(4), 10.0 * in_a, 0.01 * np.eye(4))
-    assert refusal(2, apart, 0.999, 0.3) is None
+    assert refusal(2, apart, 0.3) is None
 
 
 def test_an_island_that_is_not_merged_does_not_disturb_the_main_one():
