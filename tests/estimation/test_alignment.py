@@ -105,6 +105,16 @@ def test_an_aligned_stream_ends_where_one_with_a_vague_start_ends(tick):
     assert np.abs(trajectory(free, "r1", 0).poses[-1] - world.paths["r1"][-1])[:2].max() < 1.0
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_maps_that_drifted_far_are_merged_and_find_the_same_optimum(seed):
+    world = team(seed, submaps=25, landmarks=18, size=80.0, reach=20.0, sigmas=(0.3, 0.12, 1.2))
+    vague = Start("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
+    free = converged(joined(world.submaps, world.starts[:1]), OPTIONS)
+    known = converged(joined(world.submaps, [world.starts[0], vague]), OPTIONS)
+    assert not free.reasons
+    assert free.main.cost < known.main.cost + 0.1
+
+
 def test_one_shared_landmark_is_not_enough_and_the_fold_says_so():
     world = team(4, robots=2, submaps=6)
     fold = joined(seeing_only(world.submaps, "r1", [2]), world.starts[:1])
