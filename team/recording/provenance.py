@@ -16,6 +16,7 @@ _PACKAGES = ("teamslam", "numpy", "scipy", "numba", "llvmlite", "eclipse-zenoh",
 
 def provenance() -> dict[str, str]:
     """Versions, BLAS, CPU and kernels of this process, as a log's metadata carries them."""
+    cpu_features = binding.get_host_cpu_features()
     versions = {f"version.{package}": _version(package) for package in _PACKAGES}
     return {
         **versions,
@@ -23,7 +24,7 @@ def provenance() -> dict[str, str]:
         "platform": platform(),
         "blas": _blas(),
         "cpu.name": binding.get_host_cpu_name(),
-        "cpu.features": binding.get_host_cpu_features().flatten(),
+        "cpu.features": " ".join(sorted(n for n, has in cpu_features.items() if has)),
         "kernels": kernel_fingerprint(),
         "git.commit": git_commit(),
     }

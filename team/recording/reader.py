@@ -9,6 +9,7 @@ import os
 import struct
 import zlib
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -35,6 +36,8 @@ LARGEST_RATIO = 10_000
 _FRAME = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _FOOTER_SIZE = _FRAME.size + 20
+_MALFORMED = (McapError, UnicodeDecodeError, OverflowError, struct.error)
+"""What mcap raises where a record is not what its opcode says."""
 _REPAIR = "`teamslam repair` saves the rest"
 
 
@@ -100,12 +103,12 @@ class Log:
         names = None if channels is None else {channel.name for channel in channels}
         with self.path.open("rb") as file:
             # The index repeats the channels: a chunk that introduced one may be damaged.
-            keys = dict(self._channels(_index(file, self.path), names)) if self.complete else {}
+            keys = self._indexed(file, names) if self.complete else {}
             for frame in _frames(file, self.path):
                 if frame.opcode == Opcode.CHUNK:
                     try:
                         yield self._samples(frame, names, keys)
-                    except (McapError, ValueError, struct.error, zstandard.ZstdError) as error:
+                    except (*_MALFORMED, ValueError, zstandard.ZstdError) as error:
                         what = f"damaged chunk at offset {frame.offset}: {error}"
                         yield DamagedChunkError(self.path, what, _REPAIR)
                 elif frame.opcode in (Opcode.DATA_END, Opcode.FOOTER):
@@ -113,16 +116,17 @@ class Log:
         if self.complete:
             raise LogError(self.path, "ends before its own index", _REPAIR)
 
-    def _channels(
-        self, frames: Iterator[_Frame], names: set[str] | None
-    ) -> Iterator[tuple[int, str | None]]:
-        try:
-            for frame in frames:
+    def _indexed(self, file: IO[bytes], names: set[str] | None) -> dict[int, str | None]:
+        keys: dict[int, str | None] = {}
+        with suppress(LogError, *_MALFORMED):  # whole chunks introduce their channels themselves
+            for frame in _index(file, self.path):
                 if frame.opcode == Opcode.CHANNEL:
-                    channel = LogChannel.read(ReadDataStream(BytesIO(frame.body)))
-                    yield channel.id, self._key(channel.topic, names)
-        except (McapError, ValueError, struct.error) as error:
-            raise LogError(self.path, f"damaged index: {error}", _REPAIR) from None
+                    self._introduce(frame.body, names, keys)
+        return keys
+
+    def _introduce(self, body: bytes, names: set[str] | None, keys: dict[int, str | None]) -> None:
+        channel = LogChannel.read(ReadDataStream(BytesIO(body)))
+        keys[channel.id] = self._key(channel.topic, names)
 
     def _samples(
         self, frame: _Frame, names: set[str] | None, keys: dict[int, str | None]
@@ -130,7 +134,7 @@ class Log:
         samples = []
         for record in _records(_expanded(_chunk(frame.body))):
             if record.opcode == Opcode.CHANNEL:
-                keys.update(self._channels(iter([record]), names))
+                self._introduce(record.body, names, keys)
             elif record.opcode == Opcode.MESSAGE:
                 number, sequence, log_time, wall_ns = _MESSAGE.unpack_from(record.body)
                 if number not in keys:
@@ -181,7 +185,7 @@ def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
         if frame.opcode == Opcode.METADATA:
             try:
                 record = Metadata.read(ReadDataStream(BytesIO(frame.body)))
-            except (McapError, ValueError, struct.error) as error:
+            except _MALFORMED as error:
                 raise LogError(path, f"damaged metadata: {error}", "nothing can be read") from None
             if record.name == METADATA:
                 return dict(record.metadata)

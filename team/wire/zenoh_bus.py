@@ -35,13 +35,14 @@ from zenoh.handlers import Callback
 from team.wire.bus import Answer, BusError, Outgoing, Sample
 from team.wire.channels import ALIVE, Channel, channel_of
 from team.wire.codec import LARGEST_PAYLOAD, encoded
-from team.wire.messages import Liveliness, Message
+from team.wire.messages import FusedMap, Liveliness, MapEstimate, Message, Prior
 
 _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
 _BLOCK_US = 10_000_000  # that a full queue may stop a publisher before its link is closed
 _HEARTBEAT_S = 0.25
 _LATEST_KEPT = 1_024  # of a `latest` key, so that a cut of minutes recovers; 1 would recover 1
+_MAPS_KEPT = 16  # of a `latest` key of maps: a joint covariance may take megabytes
 _ALL_KEPT = 1_000_000
 _LOG = logging.getLogger(__name__)
 
@@ -123,30 +124,31 @@ class ZenohBus:
                 f"{sample.key}: {len(sample.payload)} bytes, {LARGEST_PAYLOAD} at most; "
                 "split the map or send blocks instead of the joint covariance"
             )
-        publisher = self._publishers.get(sample.key)
-        if publisher is None:
-            publisher = self._publishers[sample.key] = self._declared(sample.key)
         attachment = _ATTACHMENT.pack(sample.stamp_ns, sample.wall_ns, sample.counter)
-        publisher.put(sample.payload, attachment=attachment)
+        try:
+            publisher = self._publishers.get(sample.key)
+            if publisher is None:
+                publisher = self._publishers[sample.key] = self._declared(sample.key)
+            publisher.put(sample.payload, attachment=attachment)
+        except zenoh.ZError as error:
+            raise BusError(f"{sample.key}: not published, {error}") from error
 
     def _declared(self, key: str) -> _Publisher:
         found = channel_of(key)
-        delivery = "stream" if found is None else found[0].delivery
-        if delivery == "stream":
+        if found is None or found[0].delivery == "stream":
             return self._session.declare_publisher(
                 self._prefix + key,
                 congestion_control=_BLOCK,
                 priority=_PRIORITY,
                 reliability=_RELIABLE,
             )
-        kept = _ALL_KEPT if delivery == "all" else _LATEST_KEPT
         return ext.declare_advanced_publisher(
             self._session,
             self._prefix + key,
             congestion_control=_BLOCK,
             priority=_PRIORITY,
             reliability=_RELIABLE,
-            cache=ext.CacheConfig(max_samples=kept, replies_config=_REPLIES),
+            cache=ext.CacheConfig(max_samples=_kept(found[0]), replies_config=_REPLIES),
             # Periodic, not sporadic: a sporadic heartbeat that falls into a cut is never repeated.
             sample_miss_detection=ext.MissDetectionConfig(
                 heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
@@ -271,6 +273,12 @@ class ZenohBus:
 
 def _every(channel: Channel, name: str) -> str:
     return "**" if name == "*" and "{node}" in channel.template else name
+
+
+def _kept(channel: Channel) -> int:
+    if channel.delivery == "all":
+        return _ALL_KEPT
+    return _MAPS_KEPT if channel.message in (FusedMap, MapEstimate, Prior) else _LATEST_KEPT
 
 
 def _history(channel: Channel) -> ext.HistoryConfig:

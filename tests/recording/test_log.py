@@ -294,6 +294,19 @@ def test_zeros_behind_a_killed_log_are_its_end(path: Path, noise: list[Sample]) 
     assert list(open_log(path).samples()) == noise[: len(list(open_log(path).samples()))] != []
 
 
+def test_a_damaged_index_does_not_keep_the_samples_away(path: Path) -> None:
+    recorded(path, stream(60))
+    data = path.read_bytes()
+    end = sum(chunks_of(path)[-1])
+    footer = len(data) - 37
+    path.write_bytes(data[:end] + b"\xff" * (footer - end) + data[footer:])
+    with pytest.raises(LogError, match="ends before its own index"):
+        list(open_log(path).samples())
+    out = path.with_name("out.mcap")
+    assert repaired(path, out).messages == 120
+    assert list(open_log(out).samples()) == stream(60)
+
+
 def test_repair_refuses_to_overwrite(path: Path) -> None:
     recorded(path, stream(1))
     with pytest.raises(RecorderError, match="exists"):

@@ -89,6 +89,25 @@ def test_a_cut_link_loses_nothing_but_streams(endpoint: str, behind: str) -> Non
     assert counters(arrived, "robot/bravo/submap") == [0]
 
 
+def test_of_more_maps_than_are_kept_a_cut_link_still_gets_the_newest(endpoint: str) -> None:
+    with (
+        Link(endpoint) as link,
+        ZenohBus("t", endpoint) as source,
+        ZenohBus("t", link.endpoint) as sink,
+    ):
+        flowing(source, sink, c.FUSED_MAP)
+        for i in range(60):
+            if i == 10:
+                arrived = received(sink, 10)
+                link.cut()
+            source.publish_raw(Sample("central/map", b"map", i, 0, i))
+        link.mend()
+        wait_until(lambda: bool(arrived.extend(sink.receive(0.02)) or arrived[-1].counter == 59))
+        source.publish_raw(Sample("central/map", b"map", 60, 0, 60))
+        arrived += received(sink, 1)
+    assert counters(arrived, "central/map") == [*range(10), *range(44, 61)]
+
+
 def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None:
     with (
         Link(endpoint) as link,
