@@ -60,12 +60,12 @@ class CentralNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
-        out: list[Outgoing] = []
+        last: list[Outgoing] = []
         match message:
             case m.Start():
                 self._join.take_start(message)
             case m.Submap():
-                out += self._take_submap(message)
+                last = self._take_submap(message)
             case m.MapEstimate():
                 self._now_ns = max(self._now_ns, message.stamp_ns)
                 self._feedback.take_map(message)
@@ -80,7 +80,7 @@ class CentralNode:
                 self._take_liveliness(message)
             case _:
                 pass
-        return out + self._advance()
+        return self._advance() + last  # the credit comes after the map that it gave
 
     def _take_submap(self, submap: m.Submap) -> list[Outgoing]:
         self._now_ns = max(self._now_ns, submap.stamp_ns)

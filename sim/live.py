@@ -17,6 +17,8 @@ from team.wire import messages as m
 
 LINE_S = 5.0
 """Wall time between two plain lines."""
+PATIENCE_S = 8.0
+"""Processes start slowly on a busy machine: nobody is missed before."""
 
 
 @contextmanager
@@ -40,7 +42,7 @@ class _Lines:
 
     def show(self, watch: Watch) -> None:
         for warning in _warnings(watch):
-            if warning not in self._said and not warning.startswith("world: waiting"):
+            if warning not in self._said:
                 self._said.add(warning)
                 self._print(watch, f"warning: {warning}")
         now = time.monotonic()
@@ -60,7 +62,9 @@ class _Lines:
 
     def _print(self, watch: Watch, text: str) -> None:
         elapsed = time.monotonic() - watch.began
-        self._console.print(f"[{elapsed:6.1f} s] {text}", markup=False, highlight=False)
+        self._console.print(
+            f"[{elapsed:6.1f} s] {text}", markup=False, highlight=False, soft_wrap=True
+        )
 
 
 def _done(world: Mapping[str, float]) -> float:
@@ -69,7 +73,10 @@ def _done(world: Mapping[str, float]) -> float:
 
 
 def _warnings(watch: Watch) -> list[str]:
-    texts = [f"{node}: {w}" for node, s in sorted(watch.statuses.items()) for w in s.warnings]
+    """Failures and what the nodes warn of; that some are not there yet is none for a while."""
+    texts = []
+    if time.monotonic() - watch.began > PATIENCE_S:
+        texts = [f"{node}: {w}" for node, s in sorted(watch.statuses.items()) for w in s.warnings]
     return [*watch.failures, *texts]
 
 

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+import msgspec
+
 from team.wire.bus import Bus, Outgoing, Sample, opened
 from team.wire.channels import STATUS
 from team.wire.codec import WireError
@@ -54,6 +56,9 @@ class Shell:
         self._stop = stop
         self._status_due = 0.0
         self._refused = 0
+        self._messages = 0
+        self._bytes = 0
+        self._since = time.monotonic()
 
     def begin(self) -> None:
         """Say what the node says first and declare it alive; its subscriptions are made before."""
@@ -69,7 +74,8 @@ class Shell:
     def publish(self, out: Iterable[Outgoing]) -> None:
         """Publish what a node returned, in its order."""
         for outgoing in out:
-            self.bus.publish(outgoing)
+            self._bytes += self.bus.publish(outgoing)
+            self._messages += 1
 
     def take(self, samples: Iterable[Sample]) -> None:
         """Decode at the door, hand to the node, publish its answer."""
@@ -92,16 +98,16 @@ class Shell:
 
     def _publish_status(self) -> None:
         status = self.node.status()
+        now = time.monotonic()
+        elapsed = max(now - self._since, 1e-3)
+        rates = {"messages_per_s": self._messages / elapsed, "bytes_per_s": self._bytes / elapsed}
+        self._messages = self._bytes = 0
+        self._since = now
         warnings = status.warnings
         if self._refused:
             warnings = (*warnings, f"{self._refused} messages were dropped at the door")
-        self.bus.publish(
-            Outgoing(
-                STATUS,
-                self._name,
-                Status(status.stamp_ns, status.node, status.state, status.figures, warnings),
-            )
-        )
+        status = msgspec.structs.replace(status, figures=status.figures | rates, warnings=warnings)
+        self.bus.publish(Outgoing(STATUS, self._name, status))
 
     def run(self, duty: Callable[[], None] = lambda: None) -> None:
         """Turn after turn until the end: input, the node's answers, `duty`, status."""

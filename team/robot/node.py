@@ -24,7 +24,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 
-CREDIT_SUBMAPS = 64
+CREDIT_SUBMAPS = 4
 """A robot is at most this many submaps ahead of a living centre."""
 PROGRESS_READINGS = 64
 """A robot reports its progress at least once per this many readings."""

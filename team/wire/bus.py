@@ -51,8 +51,8 @@ Answer = Callable[[bytes], Iterable[bytes]]
 class Bus(Protocol):
     """What a shell needs of a bus."""
 
-    def publish(self, out: Outgoing) -> None:
-        """Publish; blocks, with a bound, when the receivers do not keep up."""
+    def publish(self, out: Outgoing) -> int:
+        """Publish; the payload's bytes. Blocks, with a bound, when receivers do not keep up."""
 
     def publish_raw(self, sample: Sample) -> None:
         """Publish a sample of a log again: its bytes, its stamps and its counter."""
@@ -132,12 +132,13 @@ class MemoryBus:
         self._counters: dict[str, int] = defaultdict(int)
         network.buses.append(self)
 
-    def publish(self, out: Outgoing) -> None:
+    def publish(self, out: Outgoing) -> int:
         """Encode and deliver at once; the wall clock of a memory bus is always zero."""
         counter = self._counters[out.key]
         self._counters[out.key] = counter + 1
-        stamp_ns = out.message.stamp_ns
-        self.publish_raw(Sample(out.key, encoded(out.message), stamp_ns, 0, counter))
+        payload = encoded(out.message)
+        self.publish_raw(Sample(out.key, payload, out.message.stamp_ns, 0, counter))
+        return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
         """Deliver at once, as it is."""

@@ -103,15 +103,17 @@ class ZenohBus:
             self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
             self._queue.put(None)
 
-    def publish(self, out: Outgoing) -> None:
-        """Encode and publish, stamped with this machine's wall clock.
+    def publish(self, out: Outgoing) -> int:
+        """Encode and publish, stamped with this machine's wall clock; the payload's bytes.
 
         Blocks while the link is busy; after ten seconds Zenoh gives the link up and connects anew.
         """
         counter = self._counters.get(out.key, 0)
         self._counters[out.key] = counter + 1
         stamp_ns = out.message.stamp_ns
-        self.publish_raw(Sample(out.key, encoded(out.message), stamp_ns, time.time_ns(), counter))
+        payload = encoded(out.message)
+        self.publish_raw(Sample(out.key, payload, stamp_ns, time.time_ns(), counter))
+        return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
         """Publish a sample as it is, with the delivery that the table promises for its key.
