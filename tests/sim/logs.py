@@ -1,0 +1,116 @@
+"""Logs built by hand: what a world publishes, and beside it what a team would have said."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from sim.scenario import Scenario, with_options
+from sim.simulator import simulated
+from sim.streams import WorldStreams
+from sim.world_node import WorldNode
+from sim.worlds import SimulatedWorld
+from team import translate
+from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing, Sample, opened
+from team.wire.codec import encoded
+
+STEPS = 20
+
+
+def scenario(seed: int = 1, robots: int = 1) -> Scenario:
+    """A small world of 8 landmarks and a few steps, with an accurate sensor."""
+    motion = MotionModel(
+        kind="turn-then-drive", forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02)
+    )
+    sensor = Sensor(range_sigma=0.1, bearing_sigma=0.02)
+    world = SimulatedWorld(
+        steps=STEPS,
+        size_m=20.0,
+        landmarks=((5, 6), (15, 5), (10, 11), (4, 15), (16, 16), (11, 3), (18, 10), (2, 10)),
+        paths=(((3, 3), (17, 4), (16, 14)), ((17, 17), (5, 14), (4, 4))),
+        visible_from_m=1.5,
+        visible_to_m=12.0,
+    )
+    names = tuple(RobotConfig(f"r{i}", motion, sensor) for i in range(1, robots + 1))
+    return with_options(Scenario("small", "small", world, names), seed=seed)
+
+
+def streams(of: Scenario) -> WorldStreams:
+    """The world's streams of a scenario."""
+    assert isinstance(of.world, SimulatedWorld)
+    return simulated(of.world, of.robots, of.seed)
+
+
+def samples(out: Sequence[Outgoing]) -> list[Sample]:
+    """What a recorder makes of publications."""
+    return [Sample(o.key, encoded(o.message), o.message.stamp_ns, 0, i) for i, o in enumerate(out)]
+
+
+def world_log(of: Scenario) -> list[Sample]:
+    """Everything that the world publishes, with nobody listening."""
+    node = WorldNode(streams(of), frozenset(), translate.configured("world", 0, 0, of))
+    out = node.begin()
+    while not node.ended:
+        out += node.publish(0.0)
+    return samples(out)
+
+
+def final_map(
+    ids: Sequence[int], means: np.ndarray, covariance: np.ndarray, *, joint: bool = True
+) -> Outgoing:
+    """A final map of the rule `join`."""
+    content = (
+        translate.joint_bytes(covariance)
+        if joint
+        else translate.block_bytes(translate.blocks_of(covariance))
+    )
+    message = m.FusedMap(
+        STEPS * 10**9, "join", bytes(8), "r1/1", True, False, 0, (), (), joint,
+        from_ids(ids), from_floats(means), content, 30.0, 20,
+    )  # fmt: skip
+    return Outgoing(ch.FINAL_MAP, "", message)
+
+
+def trajectory(robot: str, stamps: Sequence[int], poses: np.ndarray, sigma: float) -> Outgoing:
+    """A smoothed trajectory with the same deviation of everything."""
+    covariances = np.tile(sigma**2 * np.eye(3), (len(stamps), 1, 1))
+    message = translate.trajectory_message(
+        stamps[-1], robot, 1, bytes(8), list(stamps), poses, covariances
+    )
+    return Outgoing(ch.TRAJECTORY, robot, message)
+
+
+def joined_log(of: Scenario, deviation: float) -> list[Sample]:
+    """The world's log, and a joined map and trajectories that are off by `deviation` everywhere."""
+    world = streams(of)
+    assert world.landmarks is not None
+    out = []
+    for stream in world.streams:
+        assert stream.truth is not None
+        assert stream.truth_ns is not None
+        poses = stream.truth[5::5] + deviation * np.array([0.5, -0.5, 0.1])
+        out.append(trajectory(stream.robot, stream.truth_ns[5::5].tolist(), poses, 0.1))
+    count = len(world.landmark_ids)
+    means = world.landmarks + deviation * np.array([1.0, -1.0])
+    out.append(final_map(world.landmark_ids.tolist(), means, 0.01 * np.eye(2 * count)))
+    return world_log(of) + samples(out)
+
+
+def counted_twice(log: Sequence[Sample]) -> list[Sample]:
+    """The log with every observation in it twice, as two readings."""
+    doubled = []
+    for sample in log:
+        _, _, message = opened(sample)
+        if isinstance(message, m.Reading):
+            copies = 2 if isinstance(message, m.Observations) else 1
+            for k in range(copies):
+                again = msgspec.structs.replace(message, reading=2 * message.reading + k)
+                doubled.append(replace(sample, payload=encoded(again)))
+        else:
+            doubled.append(sample)
+    return doubled
