@@ -156,24 +156,25 @@ class JoinRule:
         )
 
     def _priors(self, fold: Fold, digest: bytes) -> list[Outgoing]:
-        out = []
+        """For the latest stream of every robot that is in the team's frame."""
+        if not fold.contributions:
+            return []
+        priors = marginals.main_priors(fold, self._best_known(fold))
         latest: dict[str, int] = {}
         for robot, epoch in fold.home:
             latest[robot] = max(latest.get(robot, 0), epoch)
-        chosen = self._best_known(fold)
-        for robot, epoch in sorted(latest.items()):
-            if fold.home[(robot, epoch)] != fold.main_key:
-                continue
-            prior = marginals.prior_for(fold, robot, epoch, chosen)
-            sequence = fold.next_sequence((robot, epoch)) - 1
-            stamp_ns = fold.contributions[-1].end_ns
-            message = translate.prior_message(stamp_ns, robot, epoch, sequence, digest, prior)
-            out.append(Outgoing(ch.PRIOR, robot, message))
+        stamp_ns = fold.contributions[-1].end_ns
+        out = []
+        for (robot, epoch), prior in sorted(priors.items()):
+            if epoch == latest[robot]:
+                sequence = fold.next_sequence((robot, epoch)) - 1
+                message = translate.prior_message(stamp_ns, robot, epoch, sequence, digest, prior)
+                out.append(Outgoing(ch.PRIOR, robot, message))
         return out
 
     @staticmethod
     def _best_known(fold: Fold) -> list[int] | None:
-        if not fold.contributions or len(fold.main.graph.landmarks) <= PRIOR_LANDMARKS:
+        if len(fold.main.graph.landmarks) <= PRIOR_LANDMARKS:
             return None
         ids, _, blocks = marginals.landmark_blocks(fold)
         order = np.argsort(blocks[:, 0, 0] + blocks[:, 1, 1], kind="stable")

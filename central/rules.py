@@ -29,6 +29,8 @@ class MapEstimate:
     covariance: Float[np.ndarray, "n n"]
 
 
+SMALLEST_VARIANCE = 1e-12
+"""m²: where re-absorbing halves the variance with every round, it stays a number (Xu: 50 rounds)."""
 NOTHING = MapEstimate(np.zeros(0, dtype=np.uint32), np.zeros((0, 2)), np.zeros((0, 0)))
 
 
@@ -126,7 +128,7 @@ def _per_axis_pair(a: MapEstimate, b: MapEstimate) -> MapEstimate:
     of_b = np.diag(b.covariance).reshape(-1, 2)[in_b]
     share = of_a / (of_a + of_b)
     means[both] = a.means[in_a] + share * (b.means[in_b] - a.means[in_a])
-    variances[both] = share * of_b
+    variances[both] = np.maximum(share * of_b, SMALLEST_VARIANCE)
     return MapEstimate(ids, means, np.diag(variances.ravel()))
 
 

@@ -9,7 +9,15 @@ from collections.abc import Mapping
 
 from central.config import CentralConfig
 from team import translate
-from team.estimation.joining import EMPTY_FOLD, Contribution, Fold, JoinSettings, folded, started
+from team.estimation.joining import (
+    EMPTY_FOLD,
+    Contribution,
+    Fold,
+    JoinSettings,
+    folded,
+    lean,
+    started,
+)
 from team.estimation.joining import Start as StartValue
 from team.wire.messages import Submap
 
@@ -68,7 +76,10 @@ class TickFold:
         for tick in self._open_ticks():
             if (tick + 1) * self._tick_ns > watermark_ns:
                 break
-            self._taken.append((tick, self._with_tick(self.fold, tick)))
+            taken_fold = self._with_tick(self.fold, tick)
+            if self._taken:
+                self._taken[-1] = (self._taken[-1][0], lean(self._taken[-1][1]))
+            self._taken.append((tick, taken_fold))
             taken = True
         return taken
 
