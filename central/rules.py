@@ -30,7 +30,7 @@ class MapEstimate:
 
 
 SMALLEST_VARIANCE = 1e-12
-"""m²: where re-absorbing halves the variance with every round, it stays a number (Xu: 50 rounds)."""
+"""m²: re-absorbing halves the variance with every round; it must stay a number."""
 NOTHING = MapEstimate(np.zeros(0, dtype=np.uint32), np.zeros((0, 2)), np.zeros((0, 0)))
 
 
