@@ -30,10 +30,11 @@ from team.estimation.geometry import Point
 from team.estimation.models import located, noise, predicted
 from team.wire.bus import Sample
 
-LATERAL_SIGMA_M = 2e-3
-"""Added to each epoch's motion: the covariance of a robot that can not slip is singular."""
-EXACT_SIGMA = 1e-6
-"""Of what is exactly known [m, rad]."""
+FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
+"""Added to each epoch's motion (forward [m], left [m], turn [rad]): the covariance of a robot that
+can not slip is singular, and that of no motion at all is zero."""
+EXACT_SIGMA = 1e-5
+"""Of a start pose that is exactly known [m, rad]."""
 LARGEST_DECREMENT = 1e-3
 """√(gᵀH⁻¹g) allowed at the optimum: how far the next Newton step goes, in standard deviations."""
 ITERATIONS = 1000
@@ -122,34 +123,48 @@ def batch_map(samples: Iterable[Sample]) -> Limit:
     initials = [
         _values(gtsam, poses, landmarks) for poses, landmarks in zip(fillings, starts, strict=True)
     ]
+    try:
+        optimum, figures = _solved(gtsam, graph, initials)
+    except RuntimeError as error:
+        if isinstance(error, LimitError):
+            raise
+        raise LimitError(f"GTSAM can not solve the batch: {str(error).strip()}") from error
+    return _limit(
+        gtsam,
+        graph,
+        optimum,
+        chains,
+        sorted(starts[0]),
+        run,
+        robust=robust_c is not None,
+        left_out=left_out,
+        **figures,
+    )
+
+
+def _solved(gtsam: Any, graph: Any, initials: Sequence[Any]) -> tuple[Any, dict[str, float]]:
+    """The best optimum from all starts, and its figures; raises LimitError if it is none."""
     optima = [_optimised(gtsam, graph, initial) for initial in initials]
     costs = [2.0 * graph.error(optimum) for optimum in optima]
-    best = int(np.argmin(costs))
     initial_cost = min(2.0 * graph.error(initial) for initial in initials)
+    best = int(np.argmin(costs))
     if costs[best] > initial_cost:
         raise LimitError(f"the batch cost {costs[best]} lies above its start's, {initial_cost}")
     linear = graph.linearize(optima[best])
     step = linear.optimize()
-    decrement = float(np.sqrt(max(2.0 * (linear.error(step.Zero(step)) - linear.error(step)), 0.0)))
+    gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
+    decrement = float(np.sqrt(max(2.0 * gain, 0.0)))
     if decrement > LARGEST_DECREMENT:
         raise LimitError(
             f"the batch has not converged: the next Newton step goes {decrement:.2g} sigma, "
             f"{LARGEST_DECREMENT:g} allowed"
         )
-    return _limit(
-        gtsam,
-        graph,
-        optima[best],
-        chains,
-        sorted(starts[best]),
-        run,
-        cost=costs[best],
-        initial_cost=initial_cost,
-        gradient_norm=float(linear.gradientAtZero().norm()),
-        newton_decrement=decrement,
-        robust=robust_c is not None,
-        left_out=left_out,
-    )
+    return optima[best], {
+        "cost": costs[best],
+        "initial_cost": initial_cost,
+        "gradient_norm": float(linear.gradientAtZero().norm()),
+        "newton_decrement": decrement,
+    }
 
 
 def _gtsam() -> Any:
@@ -210,7 +225,7 @@ def _graph(
     Where no start pose is known, the first chain's is held where the joined solution has it.
     """
     graph = gtsam.NonlinearFactorGraph()
-    floor = np.diag([EXACT_SIGMA, LATERAL_SIGMA_M, EXACT_SIGMA]) ** 2
+    floor = np.diag(FLOOR_SIGMAS) ** 2
     anyone = any(chain.start is not None for chain in chains)
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
         first = (c + 1) * _CHAIN

@@ -129,8 +129,8 @@ def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
         for anchor, i in zip(anchors.poses, at, strict=True)
     ]
     before = np.searchsorted(anchors.stamps_ns, chain.stamps_ns, side="right") - 1
-    after = np.minimum(before + 1, len(at) - 1)
-    before = np.maximum(before, 0)
+    after = np.searchsorted(anchors.stamps_ns, chain.stamps_ns, side="left")
+    before, after = np.maximum(before, 0), np.minimum(after, len(at) - 1)
     onward = np.array([carried[k][i] for i, k in enumerate(before)])
     back = np.array([carried[k][i] for i, k in enumerate(after)])
     span = anchors.stamps_ns[after] - anchors.stamps_ns[before]

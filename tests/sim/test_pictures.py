@@ -1,0 +1,102 @@
+"""Pictures and the report: drawn where there is something to draw, self-contained, readable."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from sim.evaluation import Evaluation, evaluate, to_json
+from sim.pictures import ELLIPSE_CHI2, ellipse_of, error_picture, map_picture
+from sim.report import summary_tables, write_report
+from team.wire import channels as ch
+from tests.sim.logs import joined_log, scenario, world_log
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def run() -> Evaluation:
+    return evaluate(joined_log(scenario(robots=2), 0.1))
+
+
+@settings(deadline=None, max_examples=50)
+@given(a=st.floats(0.1, 5.0), b=st.floats(0.1, 5.0), share=st.floats(-0.95, 0.95))
+def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(
+    a: float, b: float, share: float
+) -> None:
+    P = np.array([[a, share * np.sqrt(a * b)], [share * np.sqrt(a * b), b]])
+    width, height, turn_deg = ellipse_of(P)
+    turn = np.radians(turn_deg)
+    ends = (
+        0.5 * width * np.array([np.cos(turn), np.sin(turn)]),
+        0.5 * height * np.array([-np.sin(turn), np.cos(turn)]),
+    )
+    for end in ends:
+        assert end @ np.linalg.solve(P, end) == pytest.approx(ELLIPSE_CHI2, rel=1e-6)
+    assert width >= height
+
+
+def test_both_pictures_are_drawn(run: Evaluation, tmp_path: Path) -> None:
+    assert map_picture(run, tmp_path / "map.png")
+    assert error_picture(run, tmp_path / "errors.png")
+    assert (tmp_path / "map.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "errors.png").read_bytes().startswith(PNG)
+
+
+def test_the_same_run_draws_the_same_bytes(run: Evaluation, tmp_path: Path) -> None:
+    pictures = []
+    for name in ("a.png", "b.png"):
+        map_picture(run, tmp_path / name)
+        pictures.append((tmp_path / name).read_bytes())
+    assert pictures[0] == pictures[1]
+
+
+def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path: Path) -> None:
+    hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
+    blind = evaluate([s for s in joined_log(scenario(), 0.1) if s.key not in hidden])
+    assert map_picture(blind, tmp_path / "map.png")
+    assert not error_picture(blind, tmp_path / "errors.png")
+    assert not (tmp_path / "errors.png").exists()
+
+
+def test_an_empty_run_draws_nothing(tmp_path: Path) -> None:
+    assert not map_picture(evaluate([]), tmp_path / "map.png")
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(run: Evaluation, tmp_path: Path) -> None:
+    paths = write_report(run, tmp_path / "new", {"seed": "1"}, to_json(run))
+    assert [path.name for path in paths] == ["report.html", "report.json", "map.png", "errors.png"]
+    page = paths[0].read_text("utf-8")
+    assert page.count("data:image/png;base64,") == 2
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert json.loads(paths[1].read_text("utf-8"))["landmarks"] == 8
+
+
+def test_what_a_log_says_can_not_become_markup(run: Evaluation, tmp_path: Path) -> None:
+    hostile = replace(run, notes=("<script>alert(1)</script> [red]x[/nothing]",))
+    page = write_report(hostile, tmp_path, {"commit": "<b>"}, {})[0].read_text("utf-8")
+    assert "<script>" not in page
+    assert "<td>&lt;b&gt;</td>" in page
+
+
+def test_a_run_that_was_cut_is_reported(tmp_path: Path) -> None:
+    cut = evaluate(world_log(scenario())[:30])
+    page = write_report(cut, tmp_path, {}, to_json(cut))[0].read_text("utf-8")
+    assert "did not come to its end" in page
+
+
+def test_the_tables_fit_a_terminal_of_80_columns_and_name_their_units(run: Evaluation) -> None:
+    console = Console(width=80, record=True, force_terminal=False)
+    tables = summary_tables(run)
+    for table in tables:
+        assert console.measure(table).maximum <= 80
+        console.print(table)
+    text = console.export_text()
+    for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2"):
+        assert words in text
