@@ -65,6 +65,10 @@ def world(
     recorder: Annotated[
         bool, typer.Option(help="Wait for a recorder before the first reading.")
     ] = True,
+    cache: Annotated[
+        int | None,
+        typer.Option(help="Readings per robot that can be asked for again; default: all.", min=0),
+    ] = None,
     robots: Robots = None,
     seed: Seed = None,
     dataset: Dataset = None,
@@ -79,7 +83,7 @@ def world(
     resolved = _scenario(scenario, robots, seed, None, None, dataset)
     streams = streams_of(resolved)
     with process("world") as stop, ZenohBus(resolved.team, connect) as bus:
-        run_world(bus, resolved, streams, stop, speed=pace, recorder=recorder)
+        run_world(bus, resolved, streams, stop, speed=pace, recorder=recorder, cache=cache)
 
 
 @app.command()

@@ -23,11 +23,12 @@ def run_world(
     *,
     speed: float,
     recorder: bool,
+    cache: int | None = None,
 ) -> None:
     """Publish every reading of the world, then wait for the final map."""
     robots = [robot.id for robot in scenario.robots]
     configured = translate.configured("world", 0, 0, scenario)
-    node = WorldNode(streams, expected_nodes(robots, recorder=recorder), configured, speed)
+    node = WorldNode(streams, expected_nodes(robots, recorder=recorder), configured, speed, cache)
     shell = Shell(bus, node, "world", stop)
     for channel in node.listens:
         bus.subscribe(channel)

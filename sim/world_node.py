@@ -52,6 +52,8 @@ class _Source:
         """The reading at `index` of the whole stream, as this epoch counts it."""
         robot, epoch, reading = self.stream.robot, self.epoch, index - self.base
         stamp_ns = int(self.stream.stamps_ns[index])
+        if reading == 0 and epoch > FIRST_EPOCH:
+            return m.Start(stamp_ns, robot, epoch, 0, b"", b"")
         kind = self.stream.kinds[index]
         if kind == s.ODOMETRY:
             o = self.stream.odometry(index)
@@ -98,13 +100,16 @@ class WorldNode:
     """`begin`, then `publish` again and again until `ended`; `handle` for what comes in.
 
     expected: the nodes that must be alive before the first reading. speed: team seconds per second
-    of the shell's clock; infinite for as fast as credit allows.
+    of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's last
+    readings can be asked for again; None: all. Who asks for older ones gets a new epoch instead: a
+    start at an unknown pose, and readings that count from there.
     """
 
     streams: WorldStreams
     expected: frozenset[str]
     scenario: m.Configured
     speed: float = float("inf")
+    cache: int | None = None
     ended: bool = field(default=False, init=False)
     finished: bool = field(default=False, init=False)
 
@@ -118,6 +123,7 @@ class WorldNode:
         self._recorder = False
         self._published = 0
         self._began_at: float | None = None
+        self._starts: list[Outgoing] = []
         first = [int(x.stamps_ns[0]) for x in self.streams.streams if len(x)]
         self._first_ns = min(first, default=0)
         self.now_ns = self._first_ns
@@ -172,12 +178,15 @@ class WorldNode:
 
     def publish(self, clock_s: float) -> list[Outgoing]:
         """The next readings, at most BATCH: as many as pace and credit allow at `clock_s`."""
-        if self.ended or (self._began_at is None and not self.expected <= self._alive):
+        if self.ended:  # a new epoch may begin after the end; it has its own last counters
+            out, self._starts = self._starts, []
+            return [*out, Outgoing(ch.END, "", self._end())] if out else []
+        if self._began_at is None and not self.expected <= self._alive:
             return []
         if self._began_at is None:
             self._began_at = clock_s
         horizon = self._horizon_ns(clock_s)
-        out: list[Outgoing] = []
+        out, self._starts = self._starts, []
         while self._order and len(out) < BATCH:
             robot, index = self._order[0]
             source = self._sources[self._names[robot]]
@@ -242,9 +251,20 @@ class WorldNode:
         source = self._sources.get(wanted.robot)
         if source is None or wanted.epoch not in (0, source.epoch):
             return []
+        if self.cache is not None and wanted.first < source.counter - self.cache:
+            self._begin_epoch(source)
+            return []
         last = source.counter - 1 if wanted.last < 0 else min(wanted.last, source.counter - 1)
         last = min(last, wanted.first + ANSWER - 1)
         return [encoded(source.message(source.base + i)) for i in range(wanted.first, last + 1)]
+
+    def _begin_epoch(self, source: _Source) -> None:
+        """The stream can not be continued where the robot is: it begins anew at a free pose."""
+        source.epoch += 1
+        source.base = source.published - 1
+        source.consumed = source.base
+        start = source.message(source.base)
+        self._starts.append(Outgoing(ch.START, source.stream.robot, start))
 
     def status(self) -> m.Status:
         """How far the world is, for people."""
