@@ -24,24 +24,14 @@ from sim.evaluation_errors import (
     map_errors,
     pose_errors,
 )
+from sim.limit_graph import factor_graph, landmark_starts, pose_key, tangent, values_of
 from sim.limit_readings import Chain, anchored, chains_of
 from team.estimation.gaussian import Matrix
-from team.estimation.geometry import Point
-from team.estimation.models import located, noise, predicted
 from team.wire.bus import Sample
 
-FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
-"""Added to each epoch's motion (forward [m], left [m], turn [rad]): the covariance of a robot that
-can not slip is singular, and that of no motion at all is zero."""
-EXACT_SIGMA = 1e-5
-"""Of a start pose that is exactly known [m, rad]."""
 LARGEST_DECREMENT = 1e-3
 """√(gᵀH⁻¹g) allowed at the optimum: how far the next Newton step goes, in standard deviations."""
 ITERATIONS = 1000
-_CHAIN = 2**32
-"""Keys of chain c are c · _CHAIN + i; a landmark's is its id."""
-
-Poses = Float[np.ndarray, "K 3"]
 
 
 class LimitError(RuntimeError):
@@ -118,10 +108,11 @@ def batch_map(samples: Iterable[Sample]) -> Limit:
     fillings = list(
         zip(*(anchored(c, a) for c, a in zip(chains, anchors, strict=True)), strict=True)
     )
-    starts = [_landmarks(chains, poses, run) for poses in fillings]
-    graph = _graph(gtsam, chains, fillings[0], starts[0], robust_c)
+    starts = [landmark_starts(chains, poses, run.map) for poses in fillings]
+    graph = factor_graph(gtsam, chains, fillings[0], starts[0], robust_c)
     initials = [
-        _values(gtsam, poses, landmarks) for poses, landmarks in zip(fillings, starts, strict=True)
+        values_of(gtsam, poses, landmarks)
+        for poses, landmarks in zip(fillings, starts, strict=True)
     ]
     try:
         optimum, figures = _solved(gtsam, graph, initials)
@@ -198,86 +189,6 @@ def _placed(
     return placed, anchors, tuple(left_out)
 
 
-def _landmarks(
-    chains: Sequence[Chain], poses: Sequence[Poses], run: Evaluation
-) -> dict[int, Point]:
-    """Every landmark that a chain sees: where the join has it, else where it is first seen."""
-    assert run.map is not None
-    joined = dict(zip(run.map.ids.tolist(), run.map.means, strict=True))
-    found: dict[int, Point] = {}
-    for chain, path in zip(chains, poses, strict=True):
-        for pose, scan in zip(path[1:], chain.scans, strict=True):
-            for i, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
-                if i not in found:
-                    found[i] = joined[i] if i in joined else located(pose, float(r), float(b))
-    return found
-
-
-def _graph(
-    gtsam: Any,
-    chains: Sequence[Chain],
-    poses: Sequence[Poses],
-    landmarks: Mapping[int, Point],
-    robust_c: float | None,
-) -> Any:
-    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
-
-    Where no start pose is known, the first chain's is held where the joined solution has it.
-    """
-    graph = gtsam.NonlinearFactorGraph()
-    floor = np.diag(FLOOR_SIGMAS) ** 2
-    anyone = any(chain.start is not None for chain in chains)
-    for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
-        first = (c + 1) * _CHAIN
-        start = chain.start if anyone or c > 0 else path[0]
-        if start is not None:
-            graph.push_back(_start_factor(gtsam, first, start, chain.start_covariance))
-        for i, increment in enumerate(chain.increments):
-            model = gtsam.noiseModel.Gaussian.Covariance(increment.covariance + floor)
-            motion = gtsam.Pose2(*increment.mean)
-            graph.push_back(gtsam.BetweenFactorPose2(first + i, first + i + 1, motion, model))
-        for i, scan in enumerate(chain.scans, 1):
-            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
-                distance, _ = predicted(path[i], landmarks[landmark])
-                range_var, bearing_var = noise(chain.config.sensor, distance)
-                model = gtsam.noiseModel.Diagonal.Variances(np.array([bearing_var, range_var]))
-                if robust_c is not None:
-                    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(robust_c)
-                    model = gtsam.noiseModel.Robust.Create(loss, model)
-                graph.push_back(
-                    gtsam.BearingRangeFactor2D(first + i, landmark, gtsam.Rot2(b), r, model)
-                )
-    return graph
-
-
-def _start_factor(
-    gtsam: Any, key: int, start: Float[np.ndarray, "3"], covariance: Matrix | None
-) -> Any:
-    """The start pose; its covariance in (x, y, θ) is turned into the tangent space of the pose."""
-    if covariance is None:
-        model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
-    else:
-        turn = _tangent(start[2])
-        model = gtsam.noiseModel.Gaussian.Covariance(turn.T @ covariance @ turn)
-    return gtsam.PriorFactorPose2(key, gtsam.Pose2(*start), model)
-
-
-def _tangent(heading: float) -> Matrix:
-    """∂(x, y, θ)/∂ξ of a pose perturbed on the right, pose ∘ Exp(ξ)."""
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _values(gtsam: Any, poses: Sequence[Poses], landmarks: Mapping[int, Point]) -> Any:
-    values = gtsam.Values()
-    for c, path in enumerate(poses):
-        for i, pose in enumerate(path):
-            values.insert((c + 1) * _CHAIN + i, gtsam.Pose2(*pose))
-    for landmark, position in landmarks.items():
-        values.insert(landmark, np.asarray(position))
-    return values
-
-
 def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(ITERATIONS)
@@ -310,8 +221,8 @@ def _limit(
     rows = np.array([2 * k + axis for k in known for axis in range(2)], dtype=np.int64)
     paths, errors, nees = {}, {}, {}
     for c, chain in enumerate(chains):
-        robot, last = chain.config.id, (c + 1) * _CHAIN + len(chain.increments)
-        keys = range((c + 1) * _CHAIN, last + 1)
+        robot, last = chain.config.id, pose_key(c, len(chain.increments))
+        keys = range(pose_key(c, 0), last + 1)
         poses = [optimum.atPose2(key) for key in keys]
         path = Path(chain.stamps_ns, np.array([[p.x(), p.y(), p.theta()] for p in poses]))
         true_path = run.robots[robot].truth
@@ -319,7 +230,7 @@ def _limit(
         paths[robot] = path
         if seen.any():
             errors[robot] = distance_rmse(path.poses[seen, :2], true_poses[seen, :2])
-        turn = _tangent(path.poses[-1, 2])
+        turn = tangent(path.poses[-1, 2])
         P = turn @ marginals.marginalCovariance(last) @ turn.T
         end = pose_errors(Path(path.stamps_ns[-1:], path.poses[-1:]), P[np.newaxis], true_path)
         if end is not None:

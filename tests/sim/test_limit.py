@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from sim.evaluation_errors import Path
-from sim.limit import FLOOR_SIGMAS, Limit, LimitError, _graph, _tangent, batch_map
+from sim.limit import Limit, LimitError, batch_map
+from sim.limit_graph import FLOOR_SIGMAS, factor_graph, tangent, values_of
 from sim.limit_readings import Chain, Scan, anchored, chains_of
 from sim.scenario import Scenario
 from team.config import MotionModel, MotionNoise, RobotConfig
@@ -49,10 +50,8 @@ def test_the_odometry_factor_is_the_increments_gaussian(
     xi = np.array([forward, left, turn])
     poses = np.array([[1.0, 2.0, 0.5], compose(np.array([1.0, 2.0, 0.5]), increment.mean)])
     poses[1] = compose(poses[1], exponential(xi))
-    graph = _graph(gtsam, [replace(chain, start=poses[0])], [poses], {}, None)
-    values = gtsam.Values()
-    for i, pose in enumerate(poses):
-        values.insert(2**32 + i, gtsam.Pose2(*pose))
+    graph = factor_graph(gtsam, [replace(chain, start=poses[0])], [poses], {}, None)
+    values = values_of(gtsam, [poses], {})
     P = increment.covariance + np.diag(FLOOR_SIGMAS) ** 2
     assert 2.0 * graph.error(values) == pytest.approx(xi @ np.linalg.solve(P, xi), rel=1e-6)
 
@@ -65,7 +64,7 @@ def test_the_tangent_of_a_pose_is_the_derivative_of_a_perturbation(heading: floa
         (compose(pose, exponential(step * e)) - compose(pose, exponential(-step * e))) / (2 * step)
         for e in np.eye(3)
     ]
-    np.testing.assert_allclose(_tangent(heading), np.array(columns).T, atol=1e-8)
+    np.testing.assert_allclose(tangent(heading), np.array(columns).T, atol=1e-8)
 
 
 def test_a_chain_has_the_readings_in_order_each_once() -> None:
