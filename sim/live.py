@@ -84,18 +84,23 @@ def _view(title: str, watch: Watch) -> Group:
     elapsed = time.monotonic() - watch.began
     world = watch.statuses.get("world")
     head = Text(f"{title}   {elapsed:.1f} s", style="bold")
-    parts: list[Text | Table | ProgressBar] = [head]
+    parts: list[Text | Table] = [head]
     if world is not None:
-        parts.append(ProgressBar(total=1.0, completed=_done(world.figures), width=60))
+        bar = Table.grid(padding=(0, 2))
+        bar.add_row(
+            ProgressBar(total=1.0, completed=_done(world.figures), width=50),
+            f"{_done(world.figures):.0%}",
+            f"team time {world.figures.get('team_time_s', 0.0):,.0f} s",
+        )
+        parts.append(bar)
         parts.append(
             Text(
-                f"team time {world.figures.get('team_time_s', 0.0):.0f} s, "
                 f"{world.figures.get('readings', 0.0):,.0f} of "
                 f"{world.figures.get('of', 0.0):,.0f} readings, world {world.state}"
             )
         )
     parts.append(_robots(watch.statuses))
-    parts.append(Text(_map_line(watch.fused, watch.statuses.get("central"))))
+    parts.append(Text(_map_line(watch)))
     parts += [Text(w, style="yellow") for w in _warnings(watch)[-4:]]
     return Group(*parts)
 
@@ -105,7 +110,7 @@ _COLUMNS = (
     ("submaps", "submaps", "{:.0f}"),
     ("particles", "particles", "{:.0f}"),
     ("landmarks", "landmarks", "{:.0f}"),
-    ("pose_sigma_m", "pose σ [m]", "{:.2f}"),
+    ("pose_sigma_m", r"pose σ \[m]", "{:.2f}"),
     ("messages_per_s", "msg/s", "{:,.0f}"),
     ("bytes_per_s", "B/s", "{:,.0f}"),
 )
@@ -127,12 +132,13 @@ def _robots(statuses: Mapping[str, m.Status]) -> Table:
     return table
 
 
-def _map_line(fused: m.FusedMap | None, central: m.Status | None) -> str:
+def _map_line(watch: Watch) -> str:
+    fused, central, world = watch.fused, watch.statuses.get("central"), watch.statuses.get("world")
     if fused is None:
         return "no fused map yet"
     figures = {} if central is None else central.figures
+    behind = "" if world is None else f", {1e-9 * (world.stamp_ns - fused.stamp_ns):.0f} s behind"
     return (
-        f"team map by {fused.rule} at {fused.stamp_ns * 1e-9:.0f} s: "
-        f"{len(fused.ids) // 4} landmarks from {figures.get('submaps', 0.0):.0f} submaps, "
-        f"{figures.get('broadcasts', 0.0):.0f} broadcasts"
+        f"team map by {fused.rule}{behind}: {len(fused.ids) // 4} landmarks from "
+        f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} broadcasts"
     )

@@ -1,3 +1,0 @@
-"""Moved to `team.config`."""
-
-from team.config import *  # noqa: F403 - removed with the last import of it
