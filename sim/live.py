@@ -137,8 +137,8 @@ def _map_line(watch: Watch) -> str:
     if fused is None:
         return "no fused map yet"
     figures = {} if central is None else central.figures
-    behind = "" if world is None else f", {1e-9 * (world.stamp_ns - fused.stamp_ns):.0f} s behind"
+    lag_s = 0.0 if world is None else max(0.0, 1e-9 * (world.stamp_ns - fused.stamp_ns))
     return (
-        f"team map by {fused.rule}{behind}: {len(fused.ids) // 4} landmarks from "
-        f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} broadcasts"
+        f"team map by {fused.rule}, {lag_s:.0f} s behind: {len(fused.ids) // 4} landmarks from "
+        f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} maps sent"
     )
