@@ -1,0 +1,139 @@
+"""Real processes under test: started, watched, ended by their ids, and none of them left.
+
+Every process works in its test's own folder, and so does whatever it starts: so what a killed
+parent leaves behind is found by its working folder.
+"""
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+PROGRAM = (sys.executable, "-P", "-m", "sim")
+_PROC = Path("/proc")
+
+
+async def until(condition: Callable[[], object], what: str, timeout_s: float = 60.0) -> None:
+    """Return as soon as the condition holds; fail when it does not within the time."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, f"not within {timeout_s:g} s: {what}"
+        await asyncio.sleep(0.005)
+
+
+class Process:
+    """One process that a test started; what it says goes into a file."""
+
+    def __init__(self, name: str, process: asyncio.subprocess.Process, output: Path) -> None:
+        self.name = name
+        self.output = output
+        self._process = process
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def exit(self) -> int | None:
+        """Its status, negative for a signal; None while it runs."""
+        return self._process.returncode
+
+    def said(self) -> str:
+        return self.output.read_text("utf-8", "replace")
+
+    def signal(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
+
+    async def says(self, text: str) -> None:
+        """Return when it has said this; fail when it ends before."""
+        await until(lambda: text in self.said() or self.exit is not None, f"{self.name}: {text}")
+        assert text in self.said(), f"{self.name} ended with {self.exit}:\n{self.said()}"
+
+    async def ended(self, timeout_s: float = 90.0) -> int:
+        """Its exit status, once it has ended by itself."""
+        try:
+            return await asyncio.wait_for(self._process.wait(), timeout_s)
+        except TimeoutError:
+            pytest.fail(f"{self.name} has not ended within {timeout_s:g} s:\n{self.said()}")
+
+    async def end(self) -> None:
+        """End it, whatever it is doing."""
+        if self.exit is None:
+            self._process.kill()
+        await self._process.wait()
+
+
+class Processes:
+    """The processes of one test; they work in `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+        self._started: list[Process] = []
+
+    async def run(self, name: str, command: Sequence[str | Path]) -> Process:
+        """Start a command."""
+        output = self.folder / f"{name}.said"
+        with output.open("wb") as file:
+            process = await asyncio.create_subprocess_exec(
+                *command,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=file,
+                stderr=asyncio.subprocess.STDOUT,
+                cwd=self.folder,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
+            )
+        started = Process(name, process, output)
+        self._started.append(started)
+        return started
+
+    async def start(self, *arguments: str | Path, name: str = "") -> Process:
+        """Start `teamslam` with these arguments."""
+        number = len(self._started)
+        return await self.run(name or f"{number}-{arguments[0]}", [*PROGRAM, *arguments])
+
+    async def router(self) -> str:
+        """Start a router; its endpoint."""
+        process = await self.start("router", "--listen", "tcp/127.0.0.1:0")
+        await process.says("listening at tcp/127.0.0.1:")
+        await process.says("\n")
+        return process.said().split()[-1]
+
+    def alive(self) -> dict[int, list[str]]:
+        """The command line of every living process of this test, by id."""
+        found = {}
+        for entry in _PROC.iterdir():
+            if entry.name.isdigit():
+                # Not ours to look at, or it has ended: a zombie has no working folder either.
+                with contextlib.suppress(PermissionError, FileNotFoundError, ProcessLookupError):
+                    if (entry / "cwd").readlink().is_relative_to(self.folder):
+                        command = (entry / "cmdline").read_bytes().decode()
+                        found[int(entry.name)] = command.rstrip("\0").split("\0")
+        return found
+
+    def pid(self, *words: str) -> int:
+        """The id of the one living process whose command line has all these words."""
+        (pid,) = [pid for pid, line in self.alive().items() if set(words) <= set(line)]
+        return pid
+
+    async def none_left(self, timeout_s: float = 10.0) -> None:
+        """Return when no process of this test lives."""
+        try:
+            await until(lambda: not self.alive(), "no process is left", timeout_s)
+        except AssertionError:
+            pytest.fail(f"left behind: {self.alive()}")
+
+    async def close(self) -> None:
+        """End all by their ids; fail when what they had started outlives them."""
+        for process in reversed(self._started):
+            await process.end()
+        try:
+            await self.none_left()
+        finally:
+            for pid in self.alive():
+                os.kill(pid, signal.SIGKILL)

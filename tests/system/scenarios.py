@@ -1,0 +1,35 @@
+"""Short worlds for the system tests, and what a team in one process makes of them."""
+
+import hashlib
+from pathlib import Path
+
+from sim.in_memory import run_team
+from sim.scenario import load
+from sim.source import streams_of
+from team.wire.channels import FINAL_MAP
+
+STEPS = 60
+
+
+def short(folder: Path, base: str = "thesis", steps: int = STEPS, more: str = "") -> Path:
+    """A scenario file: `base` with fewer steps; `more`: further lines at its top."""
+    path = folder / "short.toml"
+    path.write_text(f'base = "{base}"\n{more}\n[world]\nsteps = {steps}\n')
+    return path
+
+
+def final_map(samples: "list[tuple[str, bytes]]") -> bytes:
+    """The bytes of the one final map among (key, payload)."""
+    (payload,) = [payload for key, payload in samples if key == FINAL_MAP.key()]
+    return payload
+
+
+def map_in_memory(scenario: Path) -> bytes:
+    """The bytes of the final map that the same nodes send on the bus in memory."""
+    resolved = load(scenario)
+    samples = run_team(resolved, streams_of(resolved))
+    return final_map([(sample.key, sample.payload) for sample in samples])
+
+
+def sha256(payload: bytes) -> str:
+    return hashlib.sha256(payload).hexdigest()

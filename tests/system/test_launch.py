@@ -1,0 +1,126 @@
+"""`teamslam launch`: one command, and a whole team of processes maps a place and ends by itself."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sim.scenario import load
+from team.recording.reader import open_log
+from team.wire import channels as ch
+from team.wire.bus import opened
+from team.wire.messages import Configured
+from tests.system.conftest import Launched
+from tests.system.processes import Processes
+from tests.system.scenarios import STEPS, final_map, map_in_memory, sha256, short
+
+FIGURES = (
+    "landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof", "joint_cost_per_dof",
+    "landmarks", "final_map_digest", "log", "wall_s",
+)  # fmt: skip
+ROBOT_FIGURES = (
+    "steps", "readings_published", "readings_consumed", "position_rmse_m", "heading_rmse_rad",
+    "pose_nees_per_dof", "uplink_bytes", "submaps",
+)  # fmt: skip
+
+
+def test_a_launch_ends_by_itself_with_every_process_at_status_zero(launched: Launched) -> None:
+    assert launched.exit == 0, launched.said
+    processes = launched.result["processes"]
+    assert {name: process["exit"] for name, process in processes.items()} == dict.fromkeys(
+        ["router", "recorder", "central", "robot-r1", "robot-r2", "world"], 0
+    )
+    assert len({process["pid"] for process in processes.values()}) == len(processes)
+    assert launched.result["failures"] == []
+
+
+def test_the_json_of_a_launch_has_every_figure(launched: Launched) -> None:
+    result = launched.result
+    assert {name for name in FIGURES if result.get(name) is None} == set()
+    assert sorted(result["robots"]) == ["r1", "r2"]
+    for robot in result["robots"].values():
+        assert {name for name in ROBOT_FIGURES if robot.get(name) is None} == set()
+        assert robot["steps"] == STEPS
+    for key in ("robot/r1/odometry", "robot/r2/submap", "central/final"):
+        assert set(result["channels"][key]) == {"messages", "bytes"}
+        assert result["channels"][key]["messages"] > 0
+
+
+def test_every_published_reading_is_consumed_once(launched: Launched) -> None:
+    for name, robot in launched.result["robots"].items():
+        assert robot["readings_published"] == robot["readings_consumed"] > 2 * STEPS
+        assert robot["readings_used_once"]
+        sent = sum(
+            launched.result["channels"].get(channel.key(name), {"messages": 0})["messages"]
+            for channel in ch.SENSORS
+        )
+        assert sent == robot["readings_published"], "the log has each reading once"
+
+
+def test_the_log_of_a_launch_is_complete_and_says_what_ran(launched: Launched) -> None:
+    log = open_log(launched.log)
+    assert log.complete
+    assert log.metadata["seed"] == "1"
+    announced = [opened(sample)[2] for sample in log.samples([ch.WORLD_CONFIG])]
+    assert [type(message) for message in announced] == [Configured]
+    assert {key: count.messages for key, count in log.counts().items()} == {
+        key: traffic["messages"] for key, traffic in launched.result["channels"].items()
+    }
+
+
+def test_a_launch_tells_its_result_and_where_log_report_and_pictures_are(
+    launched: Launched,
+) -> None:
+    assert f"log   {launched.log}" in launched.said
+    assert "landmark RMSE" in launched.said
+    written = [line[6:] for line in launched.said.splitlines() if line.startswith("wrote ")]
+    assert {Path(path).suffix for path in written} >= {".png"}
+    assert all(Path(path).stat().st_size > 0 for path in written)
+
+
+def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(
+    launched: Launched,
+) -> None:
+    samples = open_log(launched.log).samples()
+    payload = final_map([(sample.key, sample.payload) for sample in samples])
+    assert payload == map_in_memory(launched.scenario)
+    assert launched.result["final_map_sha256"] == sha256(payload)
+
+
+async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, object]:
+    """Launch at full speed without a report; the JSON."""
+    process = await team.start(
+        *("launch", scenario, "--speed", "max", "--no-report", "--output", "run"),
+        *("--json", "result.json", *options),
+    )
+    assert await process.ended() == 0, process.said()
+    await team.none_left(0.0)
+    result: dict[str, object] = json.loads((team.folder / "result.json").read_text())
+    return result
+
+
+async def test_two_launches_with_one_seed_end_with_the_same_bytes(
+    launched: Launched, team: Processes
+) -> None:
+    again = await launch(team, launched.scenario)
+    assert again["final_map_sha256"] == launched.result["final_map_sha256"]
+
+
+async def test_another_seed_gives_another_map(launched: Launched, team: Processes) -> None:
+    other = await launch(team, launched.scenario, "--seed", "2")
+    assert other["seed"] == 2
+    assert other["final_map_sha256"] != launched.result["final_map_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "rule"),
+    [("hybrid-thesis", "kalman-per-axis"), ("hybrid", "covariance-intersection")],
+)
+async def test_a_rule_that_feeds_the_map_back_ends_with_the_bytes_of_a_team_in_memory(
+    estimator: str, rule: str, team: Processes
+) -> None:
+    scenario = short(team.folder, more=f'estimator = "{estimator}"\nfusion = "{rule}"', steps=30)
+    assert load(scenario).fusion == rule
+    result = await launch(team, scenario)
+    assert (result["estimator"], result["fusion"]) == (estimator, rule)
+    assert result["final_map_sha256"] == sha256(map_in_memory(scenario))
