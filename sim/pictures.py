@@ -45,11 +45,13 @@ def map_picture(evaluation: Evaluation, path: FilePath) -> bool:
     axis.grid(color="#e4e4e4", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.set_title("\n".join(_title(evaluation)), fontsize=12)
+    axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
+    axis.plot([], [], color=TRUTH_COLOUR, marker="s", markersize=9, linestyle="", label="starts")
     handles, _ = axis.get_legend_handles_labels()
     axis.legend(
         loc="upper center",
         bbox_to_anchor=(0.5, -0.07),
-        ncols=2 if len(handles) <= 6 else 3,
+        ncols=min(4, -(-len(handles) // 2)),
         frameon=False,
         fontsize=10,
     )
@@ -111,7 +113,7 @@ def _draw_paths(axis: "Axes", name: str, robot: RobotResult, colour: str, *, fir
     if len(known.stamps_ns):
         x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
         axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
-    axis.plot([], [], color=colour, marker="o", label=f"{name}, ends of submaps (square: start)")
+    axis.plot([], [], color=colour, marker="o", label=name)
 
 
 def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
@@ -145,12 +147,35 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
             )
         )
     if len(fused.ids) <= LABELLED_LANDMARKS:
-        for landmark, mean in zip(fused.ids, fused.means, strict=True):
+        for landmark, mean, offset in zip(
+            fused.ids, fused.means, label_offsets(fused.means), strict=True
+        ):
             axis.annotate(
-                str(landmark), (float(mean[0]), float(mean[1])), xytext=(7, 6),
-                textcoords="offset points", fontsize=9, color=MAP_COLOUR, zorder=8,
-                bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7},
-            )  # fmt: skip
+                str(landmark),
+                (float(mean[0]), float(mean[1])),
+                xytext=(float(offset[0]), float(offset[1])),
+                textcoords="offset points",
+                ha="center",
+                va="center",
+                fontsize=9,
+                color=MAP_COLOUR,
+                zorder=8,
+            )
+
+
+def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
+    """Where each point's label goes [points of type]: away from its neighbours.
+
+    Neighbours are the points within a twentieth of the map's extent; alone, to the upper right.
+    """
+    reach = max(float(np.ptp(points, axis=0).max()) / 20.0, 1e-9)
+    offsets = np.empty_like(points)
+    for i, point in enumerate(points):
+        near = np.hypot(*(points - point).T) <= reach
+        away = point - points[near].mean(axis=0)
+        length = float(np.hypot(*away))
+        offsets[i] = 18.0 * away / length if length > 0.0 else (11.0, 9.0)
+    return offsets
 
 
 def ellipse_of(covariance: Float[np.ndarray, "2 2"]) -> tuple[float, float, float]:
