@@ -4,7 +4,8 @@
 
 Runs each seed (in one process on the bus in memory, or with --processes as `teamslam launch`), the
 batch MAP over the raw readings of its log, and holds the figures against the goals; exit status 1
-if one is missed. Without GTSAM, or for a rule without trajectories, the batch is left out.
+if one is missed. Under a rule without trajectories the batch starts from what `join` makes of the
+same readings. Without GTSAM it is left out.
 """
 
 import argparse
@@ -77,13 +78,16 @@ class Run:
     batch_final_pose_nees_per_dof: float | None = None
 
 
-def run_of(name: str, seed: int, samples: Sequence[Sample]) -> Run:
-    """The figures of one log, with the batch over its readings where that can be had."""
+def run_of(name: str, seed: int, samples: Sequence[Sample], joined: Sequence[Sample]) -> Run:
+    """The figures of one log, with the batch over the same readings where that can be had.
+
+    joined: a log of the same readings under the rule `join`.
+    """
     evaluation = evaluate(samples)
     if evaluation.map is None or evaluation.map.errors is None:
         raise RuntimeError(f"{name}, seed {seed}: the run left no map that could be judged")
     try:
-        limit: Limit | None = batch_map(samples)
+        limit: Limit | None = batch_map(joined)
     except LimitError as error:
         print(f"{name}, seed {seed}: no batch: {error}", file=sys.stderr)
         limit = None
@@ -178,6 +182,11 @@ def in_memory(scenario: Scenario) -> list[Sample]:
     return list(run_team(scenario, streams_of(scenario)))
 
 
+def joining(scenario: Scenario) -> Scenario:
+    """The same world, robots and seed under the default estimator and rule."""
+    return with_options(scenario, estimator="hybrid", fusion="join")
+
+
 def launched(name: str, scenario: Scenario) -> list[Sample]:
     """One run as real processes; its log."""
     with tempfile.TemporaryDirectory() as folder:
@@ -256,7 +265,8 @@ def main() -> int:
             )
             scenario = tuned(scenario, options.window_s, options.particles)
             samples = launched(name, scenario) if options.processes else in_memory(scenario)
-            run = run_of(name, seed, samples)
+            joined = samples if scenario.fusion == "join" else in_memory(joining(scenario))
+            run = run_of(name, seed, samples, joined)
             runs[name].append(run)
             batch = "–" if run.batch_rmse_m is None else f"{run.batch_rmse_m:.3f}"
             print(

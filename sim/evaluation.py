@@ -76,6 +76,7 @@ class RobotResult:
     truth: Path
     smoothed_path: Path
     smoothed: PoseErrors | None
+    online_path: Path
     online: PoseErrors | None
     online_channel: str | None
     final_pose_nees_per_dof: float | None
@@ -254,6 +255,7 @@ def _robot_result(
         log.truth,
         log.smoothed,
         smoothed,
+        log.online,
         pose_errors(log.online, log.online_covariances, log.truth),
         log.online_channel,
         float(smoothed.nees[-1]) / 3.0 if smoothed is not None and ends_known else None,

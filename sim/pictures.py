@@ -45,7 +45,8 @@ def map_picture(evaluation: Evaluation, path: FilePath) -> bool:
     axis.grid(color="#e4e4e4", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.set_title("\n".join(_title(evaluation)), fontsize=12)
-    axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
+    if any(len(robot.smoothed_path.stamps_ns) for robot in evaluation.robots.values()):
+        axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
     axis.plot([], [], color=TRUTH_COLOUR, marker="s", markersize=9, linestyle="", label="starts")
     handles, _ = axis.get_legend_handles_labels()
     axis.legend(
@@ -99,21 +100,24 @@ def _figure(
 
 
 def _draw_paths(axis: "Axes", name: str, robot: RobotResult, colour: str, *, first: bool) -> None:
-    """The true path thin, a square at its start, and the smoothed ends of the submaps."""
+    """The true path thin, a square at its start; the smoothed ends of submaps, or else online."""
     truth, smoothed = _thinned(robot.truth), robot.smoothed_path
     known = truth if len(truth.stamps_ns) else smoothed
     if len(truth.stamps_ns):
         x, y, _ = truth.poses.T
         label = "true paths" if first else None
         axis.plot(x, y, color=TRUTH_COLOUR, linewidth=0.7, label=label, zorder=1)
+    if len(known.stamps_ns):
+        x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
+        axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
     if len(smoothed.stamps_ns):
         x, y, _ = smoothed.poses.T
         axis.plot(x, y, color=colour, linewidth=0.8, alpha=0.6, zorder=2)
         axis.plot(x, y, color=colour, linestyle="", marker="o", markersize=4.5, zorder=3)
-    if len(known.stamps_ns):
-        x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
-        axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
-    axis.plot([], [], color=colour, marker="o", label=name)
+        axis.plot([], [], color=colour, marker="o", label=name)
+    else:
+        x, y, _ = _thinned(robot.online_path).poses.T
+        axis.plot(x, y, color=colour, linewidth=1.0, zorder=3, label=f"{name}, online")
 
 
 def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:

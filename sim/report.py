@@ -30,7 +30,7 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     team = Table(title=Text(_title(evaluation)), show_header=False)
     for name, value in _team_rows(evaluation):
         team.add_row(Text(name), Text(value))
-    robots = Table(caption="errors of the smoothed poses; a step is one odometry interval")
+    robots = Table(caption=_ROBOT_NOTE)
     for heading in _ROBOT_HEADINGS:
         robots.add_column(Text(heading), justify="left" if heading == "robot" else "right")
     for name, robot in evaluation.robots.items():
@@ -76,7 +76,7 @@ def _page(evaluation: Evaluation, pictures: Sequence[Path], provenance: Mapping[
         *(f"<p>{_image(path)}</p>" for path in pictures),
         "<h2>Robots</h2>",
         _html_table(_ROBOT_HEADINGS, robots),
-        "<p>Errors of the smoothed poses. A step is one odometry interval.</p>",
+        f"<p>{_ROBOT_NOTE}</p>",
         "<h2>What became of the readings</h2>",
         _html_table(("robot", "disposition", "readings"), _ledger_rows(evaluation)),
         *(f"<p>{escape(note)}</p>" for note in notes),
@@ -122,23 +122,24 @@ def _team_rows(evaluation: Evaluation) -> Rows:
         rows.append(("landmark errors", "can not be computed: no true landmarks"))
     else:
         low, high = errors.band
-        kind = "joint covariance" if fused.joint else "without correlations"
+        kind = "joint" if fused.joint else "blocks only"
         verdict = "in" if errors.in_band else "outside"
         rows += [
             ("landmark RMSE", f"{errors.rmse_m:.3f} m"),
-            ("after rigid alignment", _with_unit(errors.aligned_rmse_m, ".3f", " m")),
+            ("after rigid alignment", _shown(errors.aligned_rmse_m, ".3f", " m")),
             (
                 "map NEES per dof",
                 f"{errors.nees_per_dof:.4g}, {verdict} 95 % of {low:.2f}…{high:.2f} ({kind})",
             ),
         ]
-    rows.append(("joint cost per dof", _with_unit(fused.cost_per_dof, ".3f", "")))
+    rows.append(("joint cost per dof", _shown(fused.cost_per_dof, ".3f", "")))
     rows.append(("final map", f"{fused.digest}, frame {fused.frame or '–'}"))
     if evaluation.unsound:
         rows.append(("unsound messages", str(evaluation.unsound)))
     return rows
 
 
+_ROBOT_NOTE = "a step is one odometry interval; errors of smoothed poses, * of online ones"
 _ROBOT_HEADINGS = (
     "robot", "steps", "readings\nused/sent", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
@@ -146,17 +147,18 @@ _ROBOT_HEADINGS = (
 
 
 def _robot_row(name: str, robot: RobotResult) -> tuple[str, ...]:
-    used, smoothed = robot.consumption, robot.smoothed
+    used = robot.consumption
+    errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
     consumed = "–" if used.consumed is None else str(used.consumed)
     return (
         name,
         str(used.steps),
         f"{consumed}/{used.published}",
         str(used.submaps),
-        _with_unit(None if smoothed is None else smoothed.position_rmse_m, ".3f", ""),
-        _with_unit(None if smoothed is None else degrees(smoothed.heading_rmse_rad), ".2f", ""),
-        _with_unit(None if smoothed is None else smoothed.nees_per_dof, ".3g", ""),
-        _with_unit(robot.uplink_bytes_per_step, ".1f", ""),
+        _shown(None if errors is None else errors.position_rmse_m, ".3f", mark),
+        _shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
+        _shown(None if errors is None else errors.nees_per_dof, ".3g", mark),
+        _shown(robot.uplink_bytes_per_step, ".1f", ""),
     )
 
 
@@ -168,5 +170,5 @@ def _ledger_rows(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     ]
 
 
-def _with_unit(value: float | None, form: str, unit: str) -> str:
+def _shown(value: float | None, form: str, unit: str) -> str:
     return "–" if value is None else f"{value:{form}}{unit}"

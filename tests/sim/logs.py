@@ -85,6 +85,16 @@ def trajectory(robot: str, stamps: Sequence[int], poses: np.ndarray, sigma: floa
     return Outgoing(ch.TRAJECTORY, robot, message)
 
 
+def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoing]:
+    """What robot r1 said of its pose at the end of each step, with unit covariance."""
+    ends = streams(of).streams[0].intervals.end_ns.tolist()
+    unit = from_floats(np.eye(3))
+    return [
+        Outgoing(channel, "r1", m.PoseEstimate(t, "r1", 1, 0, bytes(8), from_floats(p), unit))
+        for t, p in zip(ends, poses, strict=True)
+    ]
+
+
 def joined_log(of: Scenario, deviation: float) -> list[Sample]:
     """The world's log, and a joined map and trajectories that are off by `deviation` everywhere."""
     world = streams(of)

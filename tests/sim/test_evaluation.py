@@ -16,7 +16,16 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample
-from tests.sim.logs import final_map, joined_log, samples, scenario, streams, trajectory, world_log
+from tests.sim.logs import (
+    final_map,
+    joined_log,
+    online,
+    samples,
+    scenario,
+    streams,
+    trajectory,
+    world_log,
+)
 from tests.support import spd
 
 SECOND = 10**9
@@ -42,14 +51,6 @@ def submap(sequence: int, first: int, last: int) -> Outgoing:
         from_ids([]), from_floats(np.zeros(3)), joint_bytes(np.eye(3)),
     )  # fmt: skip
     return Outgoing(ch.SUBMAP, "r1", message)
-
-
-def online(channel: ch.Channel, poses: np.ndarray, every: list[int]) -> list[Outgoing]:
-    identity = from_floats(np.eye(3))
-    return [
-        Outgoing(channel, "r1", m.PoseEstimate(t, "r1", 1, 0, bytes(8), from_floats(p), identity))
-        for t, p in zip(every, poses, strict=True)
-    ]
 
 
 def test_truth_is_interpolated_along_the_shorter_arc() -> None:
@@ -218,9 +219,8 @@ def test_the_own_pose_counts_only_where_there_is_no_team_pose() -> None:
     stream = streams(of).streams[0]
     assert stream.truth is not None
     assert stream.truth_ns is not None
-    every = stream.truth_ns.tolist()
-    own = online(ch.OWN_POSE, stream.truth + np.array([3.0, 4.0, 0.0]), every)
-    team = online(ch.TEAM_POSE, stream.truth + np.array([0.0, 1.0, 0.0]), every)
+    own = online(ch.OWN_POSE, stream.truth[1:] + np.array([3.0, 4.0, 0.0]), of)
+    team = online(ch.TEAM_POSE, stream.truth[1:] + np.array([0.0, 1.0, 0.0]), of)
     alone = evaluate(world_log(of) + samples(own)).robots["r1"]
     both = evaluate(world_log(of) + samples([*own, *team])).robots["r1"]
     assert alone.online is not None

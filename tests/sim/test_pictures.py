@@ -12,10 +12,16 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from sim.evaluation import Evaluation, evaluate, to_json
-from sim.pictures import ELLIPSE_CHI2, ellipse_of, error_picture, map_picture
+from sim.pictures import (
+    ELLIPSE_CHI2,
+    ellipse_of,
+    error_picture,
+    label_offsets,
+    map_picture,
+)
 from sim.report import summary_tables, write_report
 from team.wire import channels as ch
-from tests.sim.logs import joined_log, scenario, world_log
+from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -100,3 +106,21 @@ def test_the_tables_fit_a_terminal_of_80_columns_and_name_their_units(run: Evalu
     text = console.export_text()
     for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2"):
         assert words in text
+
+
+def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
+    of = scenario()
+    truth = streams(of).streams[0].truth
+    assert truth is not None
+    said = online(ch.OWN_POSE, truth[1:] + np.array([3.0, 4.0, 0.0]), of)
+    console = Console(width=80, record=True, force_terminal=False)
+    console.print(summary_tables(evaluate(world_log(of) + samples(said)))[1])
+    assert "5.000*" in console.export_text()
+
+
+def test_labels_point_away_from_their_neighbours() -> None:
+    points = np.array([[0.0, 0.0], [0.1, 0.0], [50.0, 50.0]])
+    left, right, alone = label_offsets(points)
+    assert left[0] < 0.0 < right[0]
+    assert left[1] == right[1] == 0.0
+    assert (alone > 0.0).all()
