@@ -52,7 +52,7 @@ def router(
     from team.shell import process
     from team.wire.zenoh_bus import router as zenoh_router
 
-    with process("router") as stop, zenoh_router(listen) as endpoint:
+    with process("router", endless=True) as stop, zenoh_router(listen) as endpoint:
         typer.echo(f"listening at {endpoint}")
         stop.wait()
 
@@ -161,6 +161,6 @@ def record(
         "scenario": dumps(resolved),
     }
     expected = ["world", "central", *(robot_node(r.id) for r in resolved.robots)]
-    with process("recorder") as stop, ZenohBus(resolved.team, connect) as bus:
+    with process("recorder", endless=True) as stop, ZenohBus(resolved.team, connect) as bus:
         recorder = Recorder(output, resolved.team, metadata)
         record_until_end(bus, recorder, expected, stop=stop)

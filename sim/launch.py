@@ -1,7 +1,8 @@
 """`teamslam launch`: the whole team as processes, watched until its final map is there."""
 
+import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,8 @@ from team.wire.zenoh_bus import ZenohBus
 
 ROUTER_PATIENCE_S = 20.0
 """The router must say where it listens within this time; a busy machine starts Python slowly."""
+REFUSED = 2
+"""The exit status of a command that can not do what it was asked for."""
 TURN_S = 0.1
 _ESSENTIAL = ("router", "world", "central", "recorder")
 
@@ -72,15 +75,16 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     """Start router, recorder, world, centre and robots; return when all have ended.
 
     `show` is called again and again with what is known. A robot that dies is named and the others
-    go on; when the router, the world, the centre or the recorder dies, the run ends. Raises
-    LaunchError when the router does not come up. An interrupt ends every process.
+    go on, unless the world still waits for it; when the router, the world, the centre or the
+    recorder dies, the run ends. Raises BusError when the router can not listen there, LaunchError
+    when it does not come up. SIGINT and SIGTERM end every process and raise KeyboardInterrupt.
     """
     began = time.monotonic()
     plan.folder.mkdir(parents=True, exist_ok=True)
     resolved = plan.folder / "scenario.json"
     resolved.write_text(dumps(plan.scenario))
     watch = Watch(began=began)
-    with _children() as children:
+    with _interruptible(), _children() as children:
         endpoint = _start_router(plan, children)
         with ZenohBus(plan.scenario.team, endpoint) as bus:
             bus.subscribe(ch.STATUS)
@@ -93,9 +97,21 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     failures = watch.failures + [
         _failure(e)
         for e in ended
-        if e.exit != 0 and not any(f.startswith(f"{e.name} ") for f in watch.failures)
+        if e.exit != 0
+        and not e.asked
+        and not any(f.startswith(f"{e.name} ") for f in watch.failures)
     ]
     return Outcome(plan.log, plan.folder, time.monotonic() - began, ended, failures)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM interrupts as Ctrl-C does, so that the log is completed."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -116,7 +132,9 @@ def _start_router(plan: Plan, children: list[Child]) -> str:
             if line.startswith("listening at "):
                 return line.removeprefix("listening at ").strip()
         if router.exit is not None:
-            raise LaunchError("\n".join(router.last_lines()) or "the router ended at once")
+            said = "\n".join(router.last_lines()).removeprefix("error: ")
+            refused = BusError if router.exit == REFUSED else LaunchError
+            raise refused(said or f"the router {router.ended().how}")
         time.sleep(0.02)
     raise LaunchError(f"the router did not come up within {ROUTER_PATIENCE_S:g} s")
 
@@ -137,7 +155,7 @@ def _supervise(
     children: Sequence[Child], bus: Bus, watch: Watch, show: Callable[[Watch], None]
 ) -> None:
     """Until every process but the router has ended, or an essential one has failed."""
-    named: set[str] = set()
+    named: dict[str, m.Status | None] = {}  # a process that died -> the world's status then
     while True:
         try:
             watch.take(bus)
@@ -147,16 +165,23 @@ def _supervise(
         for child in children:
             if child.exit in (None, 0) or child.name in named:
                 continue
-            named.add(child.name)
+            named[child.name] = watch.statuses.get("world")
             watch.failures.append(_failure(child.ended()))
             if child.name in _ESSENTIAL:
                 return
+        if _waits_in_vain(watch.statuses.get("world"), named.values()):
+            return
         if children[0].exit is not None:
             watch.failures.append("router ended before the team did")
             return
         show(watch)
         if all(child.exit is not None for child in children[1:]):
             return
+
+
+def _waits_in_vain(world: m.Status | None, then: Iterable[m.Status | None]) -> bool:
+    """Whether the world says, after a death, that it still waits for everyone to be there."""
+    return world is not None and world.state == "waiting" and any(world is not s for s in then)
 
 
 def _failure(ended: Ended) -> str:

@@ -30,12 +30,16 @@ _ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Ended:
-    """How a process ended: its exit status (negative: the signal that ended it), its last lines."""
+    """How a process ended: its exit status (negative: the signal that ended it), its last lines.
+
+    asked: we had asked it to stop, and it did.
+    """
 
     name: str
     pid: int
     exit: int
     last_lines: tuple[str, ...]
+    asked: bool
 
     @property
     def how(self) -> str:
@@ -50,6 +54,7 @@ class Child:
 
     def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
         self.name = name
+        self._asked = False
         self.output = folder / f"{name}.log"
         # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
         command = [sys.executable, "-P", "-m", "sim", *arguments]
@@ -76,6 +81,7 @@ class Child:
     def stop(self) -> None:
         """Ask it to stop."""
         if self.exit is None:
+            self._asked = True
             self._process.terminate()
 
     def end(self, deadline: float) -> Ended:
@@ -92,7 +98,8 @@ class Child:
         """How it ended; call when it has."""
         status = self.exit
         assert status is not None
-        return Ended(self.name, self.pid, status, self.last_lines())
+        asked = self._asked and status != -signal.SIGKILL
+        return Ended(self.name, self.pid, status, self.last_lines(), asked)
 
     def last_lines(self) -> tuple[str, ...]:
         """The end of what it printed."""

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Protocol
 
 import msgspec
@@ -120,14 +121,21 @@ class Shell:
 
 
 @contextmanager
-def process(name: str) -> Iterator[threading.Event]:
-    """What every process of a team does: stop at SIGTERM and SIGINT, end when its parent dies."""
+def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
+    """What every process of a team does: stop at SIGTERM and SIGINT, end when its parent dies.
+
+    One that was told to stop has not done its work, so it ends with status 128 + the signal's
+    number; one that is `endless` works until it is told to stop, and ends with 0.
+    """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
     stop = threading.Event()
-    handlers = {
-        number: signal.signal(number, lambda *_: stop.set())
-        for number in (signal.SIGTERM, signal.SIGINT)
-    }
+    told: list[int] = []
+
+    def take(number: int, _: FrameType | None) -> None:
+        told.append(number)
+        stop.set()
+
+    handlers = {number: signal.signal(number, take) for number in (signal.SIGTERM, signal.SIGINT)}
     parent = os.environ.get(PARENT)
     if parent is not None:
         _tie_to(int(parent), stop)
@@ -136,6 +144,8 @@ def process(name: str) -> Iterator[threading.Event]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
+    if told and not endless:
+        sys.exit(128 + told[0])
 
 
 def _tie_to(parent: int, stop: threading.Event) -> None:

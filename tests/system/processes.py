@@ -116,9 +116,16 @@ class Processes:
                         found[int(entry.name)] = command.rstrip("\0").split("\0")
         return found
 
-    def pid(self, *words: str) -> int:
-        """The id of the one living process whose command line has all these words."""
-        (pid,) = [pid for pid, line in self.alive().items() if set(words) <= set(line)]
+    async def pid(self, *words: str) -> int:
+        """The id of the one process whose command line has all these words, once it lives."""
+
+        def found() -> list[int]:
+            # Before it has become the program that it is to be, a child looks as its parent.
+            lines = self.alive().items()
+            return [pid for pid, line in lines if {"sim", *words} <= set(line)]
+
+        await until(found, f"a process `{' '.join(words)}`")
+        (pid,) = found()
         return pid
 
     async def none_left(self, timeout_s: float = 10.0) -> None:

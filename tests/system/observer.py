@@ -1,0 +1,53 @@
+"""A bystander on a running team's bus: what has been published so far."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from team.wire.channels import Channel
+from team.wire.zenoh_bus import ZenohBus
+from tests.system.processes import until
+
+
+class Observer:
+    """Counts what is published on some channels; a context manager."""
+
+    def __init__(self, endpoint: str, channels: Sequence[Channel], team: str = "short") -> None:
+        self._bus = ZenohBus(team, endpoint)
+        self._counts: dict[str, int] = {}
+        for channel in channels:
+            self._bus.subscribe(channel)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bus.close()
+
+    def count(self, channel: Channel, name: str = "") -> int:
+        """How many messages of the channel's key have come by now."""
+        for sample in self._bus.receive():
+            self._counts[sample.key] = self._counts.get(sample.key, 0) + 1
+        return self._counts.get(channel.key(name), 0)
+
+    async def sees(self, number: int, channel: Channel, name: str = "") -> None:
+        """Return when so many messages of the key have come."""
+        what = f"{number} messages of {channel.key(name)}"
+        await until(lambda: self.count(channel, name) >= number, what)
+
+
+async def endpoint_of(folder: Path) -> str:
+    """Where the router of the launch listens whose run's folder this is."""
+    said = folder / "router.log"
+    spoken = re.compile(r"^listening at (\S+)$", re.MULTILINE)
+    await until(lambda: said.exists() and spoken.search(said.read_text()), "the router listens")
+    found = spoken.search(said.read_text())
+    assert found is not None
+    return found[1]
