@@ -164,6 +164,8 @@ def _conclude(
         figures = to_json(evaluation, extra)
         for table in summary_tables(evaluation):
             console.print(table)
+        for note in evaluation.notes:
+            console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         if report:
             paths = write_report(evaluation, outcome.folder, log.metadata, figures)
             for path in paths:

@@ -77,6 +77,8 @@ def report(
     console = Console()
     for table in summary_tables(evaluation):
         console.print(table)
+    for note in evaluation.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     output.mkdir(parents=True, exist_ok=True)
     for path in write_report(evaluation, output, opened.metadata, figures):
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)

@@ -1,0 +1,212 @@
+"""What a user may get wrong: exit status 2, one clear message, no traceback, nothing left running.
+
+And what looks wrong but works: a data set without ground truth, a robot without odometry.
+"""
+
+import asyncio
+import json
+import shutil
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sim.datasets.utias_writer import write_utias
+from sim.scenario import load
+from sim.source import streams_of
+from tests.support import ROOT
+from tests.system.conftest import Launched
+from tests.system.processes import Process, Processes
+from tests.system.scenarios import short
+
+WRONG_USE = 2
+
+
+def told(process: Process) -> str:
+    """The one message of a command that was used wrongly."""
+    assert "Traceback" not in process.said()
+    assert process.exit == WRONG_USE, process.said()
+    errors = [line for line in process.said().splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, process.said()
+    return errors[0]
+
+
+async def refused(team: Processes, *arguments: str | Path) -> str:
+    """Run a command that can not do what it is asked for; its message."""
+    process = await team.start(*arguments)
+    await process.ended()
+    await team.none_left(0.0)
+    return told(process)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["launch", "atlantis"], ["atlantis: no such scenario", "thesis", "waypoints"]),
+        (["launch", "thesis", "--robots", "0"], ["0 robots: a team has 1 to 100"]),
+        (["launch", "thesis", "--robots", "1000"], ["1000 robots: a team has 1 to 100"]),
+        (
+            ["launch", "thesis", "--estimator", "hybrid-thesis"],
+            ["hybrid-thesis can not feed the rule join", "valid:", "kalman-per-axis"],
+        ),
+        (["launch", "thesis", "--fusion", "mean"], ["'mean' at fusion", "covariance-intersection"]),
+        (["launch", "thesis", "--speed", "banana"], ["--speed banana", "positive number, or max"]),
+        (["launch", "thesis", "--speed", "-1"], ["--speed -1", "positive number, or max"]),
+        (["launch", "--dataset", "nowhere.zip"], ["nowhere.zip: no such file or folder"]),
+        (["launch", "thesis", "--dataset", "x.zip"], ["takes no data set", "utias"]),
+        (["launch", "utias"], ["no data set given", "--dataset"]),
+        (["robot", "thesis", "r9"], ["thesis has no robot 'r9'", "r1, r2"]),
+        (["replay", "nowhere.mcap"], ["nowhere.mcap: not found"]),
+        (["report", "nowhere.mcap", "-o", "out"], ["nowhere.mcap: not found"]),
+        (["router", "--listen", "banana"], ["can not listen at banana"]),
+        (["router", "--listen", "tcp/203.0.113.1:7447"], ["can not listen", "not this machine's"]),
+    ],
+)
+async def test_wrong_use_is_told_with_what_to_do(
+    arguments: list[str], parts: list[str], team: Processes
+) -> None:
+    message = await refused(team, *arguments)
+    assert [part for part in parts if part not in message] == [], message
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ('base = "thesis"\nrobotcount = 2', ["unknown field `robotcount`", "robot_count"]),
+        ('base = "thesis"\n[world]\nsteps = "many"', ["world.steps", "int", "str"]),
+        ('base = "thesis"\n[defaults.sensor]\nrange_sigma = -1', ["range_sigma"]),
+        ('base = "thesis"\nseed = nan', ["seed"]),
+        ("steps =", ["not valid TOML"]),
+    ],
+)
+async def test_a_mistake_in_a_scenario_is_told_with_its_file_and_field(
+    text: str, parts: list[str], team: Processes
+) -> None:
+    (team.folder / "mine.toml").write_text(text)
+    message = await refused(team, "launch", "mine.toml")
+    assert [part for part in ["mine.toml: ", *parts] if part not in message] == [], message
+
+
+@pytest.fixture
+def dataset(team: Processes) -> Path:
+    """A small data set of three robots."""
+    folder = team.folder / "MRCLAM_Dataset0"
+    write_utias(streams_of(load(short(team.folder, "waypoints", 40))), folder)
+    return folder
+
+
+async def test_a_file_that_is_no_zip_is_told(team: Processes) -> None:
+    (team.folder / "set.zip").write_bytes(b"PK\3\4 and no more")
+    message = await refused(team, "launch", "--dataset", "set.zip")
+    assert "set.zip: not a zip, or a damaged one" in message
+
+
+async def test_a_damaged_line_of_a_data_set_is_told_with_file_and_line(
+    dataset: Path, team: Processes
+) -> None:
+    path = dataset / "Robot2_Odometry.dat"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:9], "1.0  fast  0.0", *lines[10:]]))
+    message = await refused(team, "launch", "--dataset", dataset, "--robots", "3")
+    assert "Robot2_Odometry.dat, line 10: " in message
+    assert "'fast' is not a number" in message
+
+
+async def launch(team: Processes, dataset: Path) -> tuple[Process, dict[str, object]]:
+    process = await team.start(
+        *("launch", "--dataset", dataset, "--robots", "3", "--speed", "max"),
+        *("--output", "run", "--json", "result.json"),
+    )
+    assert await process.ended() == 0, process.said()
+    await team.none_left(0.0)
+    return process, json.loads((team.folder / "result.json").read_text())
+
+
+async def test_a_data_set_without_ground_truth_works_and_says_what_can_not_be_computed(
+    dataset: Path, team: Processes
+) -> None:
+    for path in dataset.glob("*Groundtruth.dat"):
+        path.unlink()
+    process, result = await launch(team, dataset)
+    assert "note: no landmark ground truth: the map's error can not be computed" in process.said()
+    assert isinstance(result["landmarks"], int)
+    assert result["landmarks"] > 0
+    for figure in ("landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof"):
+        assert result[figure] is None
+    assert isinstance(result["robots"], dict)
+    for robot in result["robots"].values():
+        assert robot["position_rmse_m"] is None
+        assert robot["readings_consumed"] == robot["readings_published"] > 0
+
+
+async def test_a_robot_without_odometry_is_told_and_the_others_run(
+    dataset: Path, team: Processes
+) -> None:
+    (dataset / "Robot2_Odometry.dat").unlink()
+    process, result = await launch(team, dataset)
+    assert "note: r2: no odometry" in process.said()
+    assert isinstance(result["robots"], dict)
+    steps = {name: robot["steps"] for name, robot in result["robots"].items()}
+    assert steps["r2"] == 0
+    assert min(steps["r1"], steps["r3"]) > 0
+    for robot in result["robots"].values():
+        assert robot["readings_consumed"] == robot["readings_published"] > 0
+
+
+async def test_a_port_that_is_taken_is_told(team: Processes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        for command in (["router"], ["launch", "thesis", "--output", "run"]):
+            message = await refused(team, *command, "--listen", endpoint)
+            assert f"can not listen at {endpoint}: the port is taken" in message
+
+
+async def test_a_router_that_is_not_there_is_told(team: Processes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+    commands = (["robot", "thesis", "r1"], ["central", "thesis"], ["world", "thesis"])
+    recorder = ["record", "thesis", "--output", "log.mcap"]
+    processes = [
+        await team.start(*command, "--connect", endpoint) for command in (*commands, recorder)
+    ]
+    await asyncio.gather(*(process.ended() for process in processes))
+    for process in processes:
+        assert f"no router answers at {endpoint}" in told(process)
+
+
+def _empty(path: Path, log: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _foreign(path: Path, log: Path) -> None:
+    shutil.copy(ROOT / "README.md", path)
+
+
+@pytest.mark.parametrize("command", ["replay", "report", "repair", "limit"])
+@pytest.mark.parametrize(("made", "what"), [(_empty, "empty file"), (_foreign, "not an MCAP file")])
+async def test_what_is_no_log_is_told(
+    command: str, made: Callable[[Path, Path], None], what: str, team: Processes, launched: Launched
+) -> None:
+    path = team.folder / "mine.mcap"
+    made(path, launched.log)
+    output = ["--output", "out"] if command in ("report", "repair") else []
+    message = await refused(team, command, path, *output)
+    assert f"mine.mcap: {what}" in message
+
+
+async def test_a_log_that_is_cut_is_reported_with_a_hint_and_completed_by_repair(
+    team: Processes, launched: Launched
+) -> None:
+    cut = team.folder / "cut.mcap"
+    whole = launched.log.read_bytes()
+    cut.write_bytes(whole[: len(whole) * 3 // 4])
+    report = await team.start("report", cut, "--output", "out", "--json", "figures.json")
+    assert await report.ended() == 0, report.said()
+    assert f"{cut} is cut: `teamslam repair {cut}" in report.said()
+    assert json.loads((team.folder / "figures.json").read_text())["complete"] is False
+    repair = await team.start("repair", cut, "--output", "fixed.mcap")
+    assert await repair.ended() == 0, repair.said()
+    again = await team.start("report", "fixed.mcap", "--output", "out2")
+    assert await again.ended() == 0, again.said()
+    assert "repair" not in again.said()
