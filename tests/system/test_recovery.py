@@ -1,0 +1,100 @@
+"""What is lost on the way comes back: the map is that of a run in which nothing was lost."""
+
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from team.recording.reader import open_log
+from team.wire import channels as ch
+from tests.support import Link
+from tests.system.observer import Observer
+from tests.system.processes import Process, Processes
+from tests.system.scenarios import final_map, map_in_memory, short
+
+PATIENCE_S = "60"
+"""Of the centre with a robot that is away: longer than any of these tests."""
+
+
+@dataclass
+class Team:
+    """A team of single processes, started by hand."""
+
+    scenario: Path
+    endpoint: str
+    robots: dict[str, Process]
+    others: list[Process]
+    log: Path
+
+    async def ends_well(self) -> None:
+        """Every process ends with 0, the robots that are listed by now included."""
+        for process in (*self.robots.values(), *self.others):
+            assert await process.ended() == 0, process.said()
+
+    def final_map(self) -> bytes:
+        log = open_log(self.log)
+        assert log.complete
+        return final_map([(sample.key, sample.payload) for sample in log.samples()])
+
+
+async def assembled(team: Processes, speed: str, r1_connects: str = "") -> Team:
+    """Recorder, centre, robots and world around a router; r1 may reach it by another way."""
+    scenario = short(team.folder)
+    endpoint = await team.router()
+    there = ["--connect", endpoint]
+    log = team.folder / "log.mcap"
+    others = [
+        await team.start("record", scenario, *there, "--output", log, name="recorder"),
+        await team.start("central", scenario, *there, "--patience", PATIENCE_S),
+        await team.start("world", scenario, *there, "--speed", speed),
+    ]
+    robots = {"r2": await team.start("robot", scenario, "r2", *there, name="r2")}
+    return Team(scenario, endpoint, robots, others, log)
+
+
+async def robot(team: Processes, found: Team, endpoint: str, name: str) -> Process:
+    """Start the robot r1."""
+    return await team.start("robot", found.scenario, "r1", "--connect", endpoint, name=name)
+
+
+@pytest.mark.parametrize("submaps", [0, 2])
+async def test_a_robot_that_is_killed_and_started_again_changes_no_bit_of_the_map(
+    submaps: int, team: Processes
+) -> None:
+    found = await assembled(team, "15")
+    first = await robot(team, found, found.endpoint, "r1")
+    with Observer(found.endpoint, [ch.SUBMAP, ch.ODOMETRY]) as seen:
+        await seen.sees(3, ch.ODOMETRY, "r1")
+        await seen.sees(submaps, ch.SUBMAP, "r1")
+        first.signal(signal.SIGKILL)
+        assert await first.ended() == -signal.SIGKILL
+    found.robots["r1"] = await robot(team, found, found.endpoint, "r1-again")
+    await found.ends_well()
+    resumed = "resumed after submap" in found.robots["r1"].said()
+    assert resumed == (submaps > 0)
+    assert "robot/r1 is lost" in found.others[1].said()
+    assert found.final_map() == map_in_memory(found.scenario)
+
+
+@pytest.mark.parametrize("cut_for", ["some readings", "the rest of the run"])
+async def test_readings_that_a_cut_link_loses_are_asked_for_at_their_source(
+    cut_for: str, team: Processes
+) -> None:
+    found = await assembled(team, "15")
+    with (
+        Link(found.endpoint) as link,
+        Observer(found.endpoint, [ch.SUBMAP, ch.ODOMETRY, ch.END]) as seen,
+    ):
+        found.robots["r1"] = await robot(team, found, link.endpoint, "r1")
+        await seen.sees(1, ch.SUBMAP, "r1")
+        link.cut()
+        passed = seen.count(ch.ODOMETRY, "r1")
+        if cut_for == "some readings":
+            await seen.sees(passed + 10, ch.ODOMETRY, "r1")
+        else:
+            await seen.sees(1, ch.END)
+        link.mend()
+        await found.ends_well()
+    assert "are missing: asked for" in found.robots["r1"].said()
+    assert found.final_map() == map_in_memory(found.scenario)
