@@ -17,12 +17,15 @@ class Inbox:
         self.next_reading = 0
         self._waiting: dict[int, Reading] = {}
         self._later: dict[int, dict[int, Reading]] = {}
+        self._received = 0
 
     def resume(self, epoch: int, next_reading: int) -> None:
         """Everything before `next_reading` of `epoch` has been consumed in an earlier life."""
         self.epoch = epoch
         self.next_reading = next_reading
-        self._waiting = {n: r for n, r in self._waiting.items() if n >= next_reading}
+        waiting = self._later.pop(epoch, {}) | self._waiting
+        self._waiting = {n: r for n, r in waiting.items() if r.epoch == epoch and n >= next_reading}
+        self._forget(epoch)
 
     def put(self, reading: Reading) -> None:
         """Take a reading, in any order."""
@@ -44,13 +47,37 @@ class Inbox:
                 return
             self.epoch, self.next_reading = following, 0
             self._waiting = self._later.pop(following)
+            self._forget(following)
+
+    def _forget(self, epoch: int) -> None:
+        """Nothing of this epoch or an earlier one can become its turn any more."""
+        self._received = 0
+        self._later = {e: readings for e, readings in self._later.items() if e > epoch}
 
     @property
-    def gap(self) -> tuple[int, int] | None:
-        """First and last reading that are missing before the earliest one that waits."""
-        if not self._waiting or self.next_reading in self._waiting:
+    def received(self) -> int:
+        """The count of readings of this epoch that are here without a gap, consumed or not."""
+        self._received = max(self._received, self.next_reading)
+        while self._received in self._waiting:
+            self._received += 1
+        return self._received
+
+    @property
+    def gap(self) -> tuple[int, int, int] | None:
+        """Epoch, first and last reading that are missing before the earliest one that waits.
+
+        Of a later epoch that is its beginning, when nothing else of this one is here.
+        """
+        if self._waiting:
+            first = min(self._waiting)
+            return (
+                None if first <= self.next_reading else (self.epoch, self.next_reading, first - 1)
+            )
+        if not self._later:
             return None
-        return self.next_reading, min(self._waiting) - 1
+        following = min(self._later)
+        first = min(self._later[following])
+        return (following, 0, first - 1) if first else None
 
     @property
     def waiting(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 from team import translate
 from team.config import RobotConfig
 from team.estimation.conditioning import RobotPrior, team_pose
+from team.estimation.gaussian import NotACovarianceError
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import absorbed
 from team.robot.inbox import Inbox
@@ -46,16 +47,23 @@ class RobotNode:
         self._thesis = ThesisMember(config, 0)
         self._locals: list[LocalMap] = []
         self._prior: m.Prior | None = None
+        self._epoch = 0
+        self._consumed = 0
+        self._steps = 0
         self._ledger: Counter[str] = Counter()
+        self._ended: list[m.Done] = []
         self._end: m.StreamEnd | None = None
-        self._centre_alive = False
+        self._centre_alive: bool | None = None
         self._acknowledged = 0
+        self._credited = 0
         self._exchange = 0
         self._awaited = 0
         self._exchange_ns: int | None = None
+        self._map_ns: int | None = None
         self._pose_ns: int | None = None
         self._reported = 0
         self._now_ns = 0
+        self._passed_ns = 0
         self._done = False
         self.steps = 0
         self.finished = False
@@ -83,12 +91,14 @@ class RobotNode:
         gap = self._inbox.gap
         if gap is not None:
             return self._wanted(*gap)
-        if self._end is not None and not self._complete and not self._inbox.waiting:
-            return self._wanted(self._inbox.next_reading, self._end.readings - 1)
-        return None
+        end = self._end
+        if end is None or self._complete or self._inbox.waiting or end.epoch < self.epoch:
+            return None
+        first = self._inbox.next_reading if end.epoch == self.epoch else 0
+        return self._wanted(end.epoch, first, end.readings - 1)
 
-    def _wanted(self, first: int, last: int) -> m.ReadingsWanted:
-        return m.ReadingsWanted(self._now_ns, self.robot, self.epoch, first, last)
+    def _wanted(self, epoch: int, first: int, last: int) -> m.ReadingsWanted:
+        return m.ReadingsWanted(self._now_ns, self.robot, epoch, first, last)
 
     def begin(self) -> list[Outgoing]:
         """What the node says first: its configuration."""
@@ -114,9 +124,9 @@ class RobotNode:
                 )
             )
         last = submaps[-1]
-        self._ledger["in a submap"] = last.last_reading + 1
+        self._ledger["in a submap"] = self._consumed = last.last_reading + 1
         self._acknowledged = len(submaps)
-        self._now_ns = last.stamp_ns
+        self._now_ns = self._passed_ns = last.stamp_ns
         self._inbox.resume(last.epoch, last.last_reading + 1)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
@@ -129,9 +139,11 @@ class RobotNode:
             case m.FusedMap():
                 return self._take_fused(message) + self._go_on()
             case m.Progress():
-                self._acknowledged = max(self._acknowledged, message.submaps)
+                if message.epoch == self._epoch:
+                    self._acknowledged = max(self._acknowledged, message.submaps)
             case m.Liveliness():
-                self._centre_alive = message.alive
+                if message.node == "central":
+                    self._centre_alive = message.alive
             case m.End():
                 self._take_end(message)
             case _:
@@ -166,33 +178,52 @@ class RobotNode:
             out += self._take(reading)
         if not self._done and not self._blocked and self._complete:
             out += self._finish()
-        return out
+        return out + self._credit()
 
     @property
     def _blocked(self) -> bool:
-        if not self._centre_alive:
-            return False
-        ahead = self.submaps - self._acknowledged
-        return self._awaited > self._exchange or (
-            self.config.fusion == "join" and ahead > CREDIT_SUBMAPS
-        )
+        """Waits for the centre: for its answer under a rule with feedback, else for its credit.
+
+        A centre that was never heard of gives no credit, but may still answer: lockstep does not
+        depend on whose token arrives first.
+        """
+        if self._feedback:
+            return self._awaited > self._exchange and self._centre_alive is not False
+        return bool(self._centre_alive) and self.submaps - self._acknowledged > CREDIT_SUBMAPS
+
+    def _credit(self) -> list[Outgoing]:
+        """A robot that waits for an exchange reports what it has received, not what it has used.
+
+        Else the world would wait for it, and with the world whoever it waits for: a teammate that
+        needs more readings for its map, or the end.
+        """
+        if not (self._feedback and self._blocked):
+            return []
+        if self._inbox.received - max(self._credited, self._consumed) < PROGRESS_READINGS:
+            return []
+        self._credited = self._inbox.received
+        return [self._progress()]
 
     @property
     def _complete(self) -> bool:
-        return (
-            self._end is not None
-            and self._inbox.epoch == self._end.epoch
-            and self._inbox.next_reading >= self._end.readings
+        end = self._end
+        return end is not None and (
+            end.readings == 0
+            or (self._inbox.epoch == end.epoch and self._inbox.next_reading >= end.readings)
         )
 
     def _take(self, reading: m.Reading) -> list[Outgoing]:
-        self._now_ns = max(self._now_ns, reading.stamp_ns)
         out: list[Outgoing] = []
+        if isinstance(reading, m.Start):
+            out += self._leave_epoch()
+            self._begin_epoch(reading)
+        self._consumed = reading.reading + 1
+        self._now_ns = max(self._now_ns, reading.stamp_ns)
+        # What was seen at a stamp comes before the odometry that ends there, and may end a window.
+        ahead = 0 if isinstance(reading, m.Odometry) else 1
+        self._passed_ns = max(self._passed_ns, reading.stamp_ns - ahead)
         match reading:
             case m.Start():
-                if self._locals or self.steps:
-                    out += self._close_epoch()
-                self._begin_epoch(reading)
                 self._ledger["start pose"] += 1
             case m.Odometry():
                 out += self._drive(reading)
@@ -214,9 +245,12 @@ class RobotNode:
         self._thesis = ThesisMember(self.config, start.epoch)
         self._thesis.start(pose)
         self._locals = []
-        self._acknowledged = 0
+        self._ledger = Counter()
+        self._epoch, self._consumed, self._steps = start.epoch, 0, 0
+        self._acknowledged = self._credited = 0
         self._prior = None
         self._now_ns = max(self._now_ns, start.stamp_ns)
+        self._passed_ns = start.stamp_ns - 1
 
     def _observe(self, reading: m.Observations) -> None:
         member = self._thesis if self._thesis_rule else self._hybrid
@@ -225,7 +259,12 @@ class RobotNode:
         self._ledger[self._used if reason is None else f"rejected: {reason}"] += 1
 
     def _drive(self, reading: m.Odometry) -> list[Outgoing]:
+        self._steps += 1
         self.steps += 1
+        if reading.duration_ns == 0:
+            self._hybrid.consumed(reading.reading)
+            self._ledger["rejected: odometry over no time"] += 1
+            return []
         self._ledger[self._used] += 1
         motion = (reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate)
         if self._thesis_rule:
@@ -245,6 +284,10 @@ class RobotNode:
         return self.config.estimator == "hybrid-thesis"
 
     @property
+    def _feedback(self) -> bool:
+        return self.config.fusion != "join"
+
+    @property
     def _used(self) -> str:
         return "in the running map" if self._thesis_rule else "in a submap"
 
@@ -254,7 +297,7 @@ class RobotNode:
         self._locals.append(closed.local)
         submap = translate.submap_message(
             self.robot,
-            self.epoch,
+            self._epoch,
             closed.sequence,
             (closed.first_reading, closed.last_reading),
             (closed.start_ns, closed.end_ns),
@@ -266,21 +309,28 @@ class RobotNode:
         out += self._exchanged(closed.end_ns)
         return [*out, self._progress()]
 
-    def _exchanged(self, stamp_ns: int, *, last: bool = False) -> list[Outgoing]:
+    def _exchanged(self, stamp_ns: int) -> list[Outgoing]:
         """The own map: for viewers under `join`, and the exchange itself under the other rules."""
-        feedback = self.config.fusion != "join"
-        if feedback:
-            since = None if self._exchange_ns is None else stamp_ns - self._exchange_ns
-            if not last and since is not None and since < self.config.exchange_s * 1e9:
-                return []
-            self._exchange_ns = stamp_ns
-            self._awaited = self._exchange + 1
+        self._map_ns = stamp_ns
+        if not self._feedback:
+            return self._own_map(stamp_ns)
+        since = None if self._exchange_ns is None else stamp_ns - self._exchange_ns
+        if since is not None and since < self.config.exchange_s * 1e9:
+            return []
+        return self._exchange_map(stamp_ns)
+
+    def _exchange_map(self, stamp_ns: int) -> list[Outgoing]:
+        self._exchange_ns = stamp_ns
+        self._awaited = self._exchange + 1
+        return self._own_map(stamp_ns)
+
+    def _own_map(self, stamp_ns: int) -> list[Outgoing]:
         ids, means, covariance = self._own_landmarks()
-        joint = feedback and not self._thesis_rule
+        joint = self._feedback and not self._thesis_rule
         estimate = m.MapEstimate(
             stamp_ns,
             self.robot,
-            self.epoch,
+            self._epoch,
             self._thesis.epochs if self._thesis_rule else self._hybrid.sequence,
             self._awaited,
             joint,
@@ -319,16 +369,18 @@ class RobotNode:
             covariance = state.pose_covariance + np.diag([1e-6, 1e-6, 1e-8])
             return self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, (state.pose, covariance))
         whole = self._hybrid.whole
-        own = RobotPrior(
-            whole.mean[:3], whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance
-        )
+        own = RobotPrior(whole.mean[:3], whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance)
         window = self._hybrid.open_gaussian() if self._hybrid.last_epoch_ns is not None else None
         out = self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, team_pose(own, (), window))
         prior = self._prior
-        if prior is None or prior.epoch != self.epoch:
+        if prior is None or prior.epoch != self._epoch:
             return out
-        pending = self._locals[prior.sequence + 1 :]
-        posed = team_pose(translate.prior_of(prior), pending, window)
+        pending = self._locals[max(prior.sequence + 1, 0) :]
+        try:
+            posed = team_pose(translate.prior_of(prior), pending, window)
+        except (NotACovarianceError, np.linalg.LinAlgError) as error:
+            self.warnings.append(f"no team pose from the fused map: {error}")
+            return out
         self._pose_sigma = float(np.sqrt(posed[1][0, 0] + posed[1][1, 1]))
         return out + self._pose(ch.TEAM_POSE, stamp_ns, prior.digest, posed)
 
@@ -340,7 +392,7 @@ class RobotNode:
         pose: tuple[np.ndarray, np.ndarray],
     ) -> list[Outgoing]:
         message = translate.pose_message(
-            stamp_ns, self.robot, self.epoch, self._hybrid.sequence, digest, *pose
+            stamp_ns, self.robot, self._epoch, self._hybrid.sequence, digest, *pose
         )
         return [Outgoing(channel, self.robot, message)]
 
@@ -350,11 +402,11 @@ class RobotNode:
             ch.ROBOT_PROGRESS,
             self.robot,
             m.Progress(
-                self._now_ns,
+                self._passed_ns,
                 ch.robot_node(self.robot),
                 self.robot,
-                self.epoch,
-                self._inbox.next_reading,
+                self._epoch,
+                max(self._consumed, self._credited),
                 self.submaps,
             ),
         )
@@ -365,7 +417,7 @@ class RobotNode:
         if fused.final:
             self.finished = True
             return []
-        if self.config.fusion == "join" or fused.exchange <= self._exchange:
+        if not self._feedback or fused.exchange <= self._exchange:
             return []
         self._exchange = fused.exchange
         ids, means = translate.landmarks_of(fused)
@@ -394,17 +446,32 @@ class RobotNode:
             self._ledger["rejected: no odometry covers it"] += uncovered
         return out
 
-    def _finish(self) -> list[Outgoing]:
-        self._done = True
+    def _leave_epoch(self) -> list[Outgoing]:
+        """A later epoch begins: close what is open of this one, if there is one."""
+        if not self._consumed:
+            return []
+        self._passed_ns = self._now_ns
         out = self._close_epoch()
-        ledger = tuple(m.Disposed(k, n) for k, n in sorted(self._ledger.items()) if n)
-        done = m.Done(
+        self._ended.append(self._epoch_done())
+        return [*out, self._progress()]
+
+    def _finish(self) -> list[Outgoing]:
+        """The last epoch's `Done` goes first: with it the centre may conclude."""
+        self._done = True
+        self._passed_ns = self._now_ns
+        out = self._close_epoch()
+        if self._feedback and self._map_ns is not None and self._map_ns != self._exchange_ns:
+            out += self._exchange_map(self._map_ns)
+        dones = [self._epoch_done(), *self._ended]
+        return [*out, self._progress(), *(Outgoing(ch.ROBOT_DONE, self.robot, d) for d in dones)]
+
+    def _epoch_done(self) -> m.Done:
+        return m.Done(
             self._now_ns,
             self.robot,
-            self.epoch,
-            self._inbox.next_reading,
-            self.steps,
+            self._epoch,
+            self._consumed,
+            self._steps,
             self.submaps,
-            ledger,
+            tuple(m.Disposed(k, n) for k, n in sorted(self._ledger.items()) if n),
         )
-        return [*out, self._progress(), Outgoing(ch.ROBOT_DONE, self.robot, done)]
