@@ -34,7 +34,9 @@ class JoinRule:
         self._ticks = TickFold(config)
         self._starts: dict[Stream, m.Start] = {}
         self._entered: dict[Stream, int] = {}
+        self._refusals: dict[Stream, set[int]] = {}
         self._broadcast_ns: int | None = None
+        self._quiet_ns: int | None = None
         self.cost: tuple[float, float] = (0.0, 0.0)
         self.landmarks = 0
         self.warnings: list[str] = []
@@ -50,14 +52,25 @@ class JoinRule:
             self._enter((start.robot, start.epoch))
 
     def take_submap(self, submap: m.Submap) -> int:
-        """Admit a submap; how many of its stream are there without a gap."""
+        """Admit a submap; how many of its stream have been dealt with."""
         stream = (submap.robot, submap.epoch)
         reason = self._set.admit(submap)
         if reason is not None:
             self.refused += 1
             self.warnings.append(f"refused: {reason}")
+            self._refusals.setdefault(stream, set()).add(submap.sequence)
         self._enter(stream)
-        return self._set.count(stream)
+        return self._dealt_with(stream, self._set.count(stream))
+
+    def _dealt_with(self, stream: Stream, count: int) -> int:
+        """`count`, unless the next one was refused: then nobody need wait for it.
+
+        What follows the refused one can not enter the map; it counts as far as it has come.
+        """
+        refused = self._refusals.get(stream, set())
+        if count not in refused:
+            return count
+        return max(*refused, *self._set.streams[stream], count) + 1
 
     def _enter(self, stream: Stream) -> None:
         """Hand the fold what now is there without a gap."""
@@ -74,8 +87,8 @@ class JoinRule:
         return sorted(self._set.streams)
 
     def count(self, stream: Stream) -> int:
-        """How many submaps of a stream are in the fold's reach."""
-        return self._entered.get(stream, 0)
+        """How many submaps of a stream are in the fold's reach, or will never be."""
+        return self._dealt_with(stream, self._entered.get(stream, 0))
 
     def submaps(self, robot: str) -> list[m.Submap]:
         """What is in the set of the latest epoch of one robot."""
@@ -93,10 +106,12 @@ class JoinRule:
         due = since is None or since >= self._config.broadcast_s * 1e9
         if taken and due:
             return self._broadcast(self._ticks.fold, "closed", newest_ns)
-        stalled = since is not None and since >= 3e9 * max(
-            self._config.broadcast_s, self._config.tick_s
-        )
-        if stalled and self._entered:
+        if not any(self._entered.values()):
+            return []
+        if self._quiet_ns is None:
+            self._quiet_ns = newest_ns
+        patience_s = 3.0 * max(self._config.broadcast_s, self._config.tick_s)
+        if newest_ns - self._quiet_ns >= patience_s * 1e9:
             return self._broadcast(self._ticks.provisional(), "provisional", newest_ns)
         return []
 
@@ -108,8 +123,15 @@ class JoinRule:
             fold = converged(fold, self._ticks.settings)
         return self._broadcast(fold, "final", newest_ns)
 
+    def retold(self, tail: Tail) -> list[Outgoing]:
+        """What a map of everything that is here says, whatever the watermark: law 2, for reruns."""
+        if tail == "final":
+            return self.conclude(0)
+        self._ticks.take_until(float("inf"))
+        return self._broadcast(self._ticks.fold, tail, 0)
+
     def _broadcast(self, fold: Fold, tail: Tail, now_ns: int) -> list[Outgoing]:
-        self._broadcast_ns = now_ns
+        self._broadcast_ns = self._quiet_ns = now_ns
         digest = self._ticks.digest(fold, self._digest, tail.encode())
         fused = self._fused(fold, tail, digest)
         if tail == "final":

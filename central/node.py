@@ -73,7 +73,7 @@ class CentralNode:
                 self._robots[message.robot].progress = message
                 self._now_ns = max(self._now_ns, message.stamp_ns)
             case m.Done() if message.robot in self._robots:
-                self._robots[message.robot].done = message
+                self._take_done(message)
             case m.End():
                 self._end = message
             case m.Liveliness():
@@ -87,6 +87,12 @@ class CentralNode:
         count = self._join.take_submap(submap)
         progress = m.Progress(self._now_ns, "central", submap.robot, submap.epoch, 0, count)
         return [Outgoing(ch.CENTRAL_PROGRESS, submap.robot, progress)]
+
+    def _take_done(self, done: m.Done) -> None:
+        """A robot's last word is that of its last epoch, in whichever order they come."""
+        robot = self._robots[done.robot]
+        if robot.done is None or robot.done.epoch <= done.epoch:
+            robot.done = done
 
     def _take_liveliness(self, message: m.Liveliness) -> None:
         kind, _, name = message.node.partition("/")
@@ -121,7 +127,8 @@ class CentralNode:
         robot = self._robots[name]
         if robot.done is not None and self._is_last_epoch(name, robot.done.epoch):
             stream = (name, robot.done.epoch)
-            return self.feedback or self._join.count(stream) >= robot.done.submaps
+            if self.feedback or self._join.count(stream) >= robot.done.submaps:
+                return True
         return robot.seen and not robot.alive
 
     def _is_last_epoch(self, name: str, epoch: int) -> bool:

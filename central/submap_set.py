@@ -21,24 +21,29 @@ class SubmapSet:
     def admit(self, submap: Submap) -> str | None:
         """Take a submap; the reason if it is refused. One that is in the set already is accepted.
 
-        The neighbours in sequence bound the readings: law 1 says that each is used once.
+        The nearest ones in sequence bound the readings: law 1 says that each is used once.
         """
         stream = self.streams.setdefault((submap.robot, submap.epoch), {})
         name = f"submap {submap.sequence} of {submap.robot}, epoch {submap.epoch}"
         there = stream.get(submap.sequence)
         if there is not None:
             return None if there == submap else f"{name} differs from the one in the set"
-        for sequence in (submap.sequence - 1, submap.sequence + 1):
-            other = stream.get(sequence)
-            if other is None:
+        before = max((s for s in stream if s < submap.sequence), default=None)
+        after = min((s for s in stream if s > submap.sequence), default=None)
+        for sequence in (before, after):
+            if sequence is None:
                 continue
+            other = stream[sequence]
             first, second = sorted((submap, other), key=lambda s: s.sequence)
             if second.first_reading <= first.last_reading:
                 return (
                     f"{name} uses readings {submap.first_reading}-{submap.last_reading}, which "
                     f"overlap submap {sequence}'s {other.first_reading}-{other.last_reading}"
                 )
-            if second.first_reading != first.last_reading + 1 or second.start_ns != first.stamp_ns:
+            adjacent = second.sequence == first.sequence + 1
+            ends, begins = first.last_reading + 1, second.first_reading
+            continues = (ends, first.stamp_ns) == (begins, second.start_ns)
+            if not (continues if adjacent else first.stamp_ns <= second.start_ns):
                 return f"{name} does not continue submap {sequence}"
         stream[submap.sequence] = submap
         return None
