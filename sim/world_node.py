@@ -119,8 +119,9 @@ class WorldNode:
         robots, indices = self.streams.order()
         self._order = deque(zip(robots.tolist(), indices.tolist(), strict=True))
         self._alive: set[str] = set()
-        self._recorded: dict[str, int] = {}
+        self._recorded: dict[tuple[str, int], int] = {}
         self._recorder = False
+        self._unrecorded = 0
         self._published = 0
         self._began_at: float | None = None
         self._starts: list[Outgoing] = []
@@ -158,8 +159,8 @@ class WorldNode:
             case m.Liveliness():
                 self._take_liveliness(message)
             case m.Progress() if message.node == "recorder":
-                taken = self._recorded.get(message.robot, 0)
-                self._recorded[message.robot] = max(taken, message.readings)
+                stream = (message.robot, message.epoch)
+                self._recorded[stream] = max(self._recorded.get(stream, 0), message.readings)
             case m.Progress():
                 source = self._sources.get(message.robot)
                 if source is not None and message.epoch == source.epoch:
@@ -172,6 +173,8 @@ class WorldNode:
 
     def _take_liveliness(self, message: m.Liveliness) -> None:
         (self._alive.add if message.alive else self._alive.discard)(message.node)
+        if not self._recorder and "recorder" in self._alive:  # it counts from zero, from here on
+            self._recorded, self._unrecorded = {}, self._published
         self._recorder = "recorder" in self._alive
         for name, source in self._sources.items():
             source.alive = ch.robot_node(name) in self._alive
@@ -210,14 +213,15 @@ class WorldNode:
 
     def _horizon_ns(self, clock_s: float) -> float:
         assert self._began_at is not None
+        if self.speed == float("inf"):
+            return self.speed  # at the first look no time has passed: 0 · ∞ is not a number
         return self._first_ns + (clock_s - self._began_at) * self.speed * 1e9
 
     def _credit(self, source: _Source) -> bool:
         if source.alive and source.published - source.consumed >= CREDIT_READINGS:
             return False
-        return (
-            not self._recorder or self._published - sum(self._recorded.values()) < CREDIT_RECORDER
-        )
+        ahead = self._published - self._unrecorded - sum(self._recorded.values())
+        return not self._recorder or ahead < CREDIT_RECORDER
 
     def _truth(self, source: _Source, stamp_ns: int, batch_ns: int) -> list[Outgoing]:
         stream = source.stream
