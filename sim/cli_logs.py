@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,9 @@ from sim.cli_options import (
     scenario_of,
 )
 from sim.scenario import with_options
+
+if TYPE_CHECKING:
+    from team.recording.reader import Log
 
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
 
@@ -56,6 +59,7 @@ def replay(
             stop.wait(wait)
         count = replay_samples(bus, opened.samples(), pace, stop)
     typer.echo(f"replayed {count} messages of {log}")
+    _hint_if_cut(opened)
 
 
 @app.command()
@@ -84,8 +88,7 @@ def report(
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=2) + "\n")
-    if not opened.complete:
-        typer.echo(f"{log} is cut: `teamslam repair {log} -o FIXED.mcap` completes it", err=True)
+    _hint_if_cut(opened)
 
 
 @app.command()
@@ -137,3 +140,9 @@ def simulate(
         fail(f"{output} is not empty: give a new folder", WRONG_USE)
     write_utias(streams_of(with_options(scenario_of(scenario), robots=robots, seed=seed)), output)
     typer.echo(f"wrote {output}")
+
+
+def _hint_if_cut(log: "Log") -> None:
+    if not log.complete:
+        remedy = f"`teamslam repair {log.path} -o FIXED.mcap` completes it"
+        typer.echo(f"{log.path} is cut: {remedy}", err=True)

@@ -1,0 +1,90 @@
+"""`teamslam replay`: a log's traffic again, into a program that knows nothing of us."""
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import zenoh
+
+from team.recording.reader import open_log
+from team.wire.bus import Sample
+from team.wire.zenoh_bus import ZenohBus
+from tests.system.conftest import Launched
+from tests.system.processes import Processes, until
+
+Arrived = list[tuple[str, bytes, bytes]]
+"""(key, payload, attachment) in the order of arrival."""
+ATTACHMENT = struct.Struct("<qqq")
+
+
+@contextmanager
+def plain_subscriber(endpoint: str) -> Iterator[Arrived]:
+    """What a foreign Zenoh session gets of everything there is."""
+    config = zenoh.Config.from_json5(
+        f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, '
+        "scouting: {multicast: {enabled: false}}, "
+        "transport: {shared_memory: {enabled: false}}}"
+    )
+    arrived: Arrived = []
+
+    def take(sample: zenoh.Sample) -> None:
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        arrived.append((str(sample.key_expr), sample.payload.to_bytes(), attachment))
+
+    with zenoh.open(config) as session:
+        session.declare_subscriber("team/**", zenoh.handlers.Callback(take, indirect=False))
+        yield arrived
+
+
+def recorded(launched: Launched) -> Arrived:
+    """What must arrive: each message of the log, in its order."""
+    return [
+        (
+            f"team/short/{sample.key}",
+            sample.payload,
+            ATTACHMENT.pack(sample.stamp_ns, sample.wall_ns, sample.counter),
+        )
+        for sample in open_log(launched.log).samples()
+    ]
+
+
+@pytest.mark.parametrize("speed", ["max", "20"])
+async def test_a_replay_arrives_byte_by_byte_in_the_order_of_the_log(
+    speed: str, launched: Launched, team: Processes
+) -> None:
+    endpoint = await team.router()
+    expected = recorded(launched)
+    with plain_subscriber(endpoint) as arrived, ZenohBus("probe", endpoint) as probe:
+
+        def heard() -> bool:
+            probe.publish_raw(Sample("robot/probe/sightings", b"", 0, 0, 0))
+            return bool(arrived)
+
+        await until(heard, "the subscriber hears")
+        replay = await team.start("replay", launched.log, "--speed", speed, "--connect", endpoint)
+        assert await replay.ended() == 0, replay.said()
+        assert f"replayed {len(expected)} messages" in replay.said()
+
+        def played() -> Arrived:
+            return [one for one in arrived if not one[0].startswith("team/probe/")]
+
+        await until(lambda: len(played()) >= len(expected), "all has arrived")
+        assert played() == expected
+
+
+async def test_a_replay_can_be_its_own_router_and_waits_for_who_listens(
+    launched: Launched, team: Processes
+) -> None:
+    replay = await team.start(
+        *("replay", launched.log, "--speed", "max"),
+        *("--listen", "tcp/127.0.0.1:0", "--wait", "3"),
+    )
+    await replay.says("listening at tcp/")
+    await replay.says("\n")
+    endpoint = replay.said().split()[2]
+    expected = recorded(launched)
+    with plain_subscriber(endpoint) as arrived:
+        assert await replay.ended() == 0, replay.said()
+        await until(lambda: len(arrived) >= len(expected), "all has arrived")
+    assert arrived == expected
