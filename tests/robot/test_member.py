@@ -1,0 +1,141 @@
+"""The member: windows that depend on their own readings alone, and the thesis' running state."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team import translate
+from team.robot.member import HybridMember
+from team.robot.thesis_member import ThesisMember
+from team.wire import messages as m
+from tests.teams import config, published, stream
+
+READINGS = published(stream("r1", 12, off_ns=300_000_000))
+
+
+def fed(member, readings):
+    closed = []
+    for reading in readings:
+        member.consumed(reading.reading)
+        if isinstance(reading, m.Observations):
+            member.observe(reading.stamp_ns, translate.scan_of(reading))
+        if isinstance(reading, m.Odometry):
+            window = member.drive(
+                reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
+            )
+            closed += [] if window is None else [window]
+    return closed
+
+
+def begun():
+    member = HybridMember(config(), 1)
+    member.start(np.zeros(3), None)
+    return member
+
+
+def same(a, b):
+    return (
+        (a.sequence, a.first_reading, a.last_reading, a.start_ns, a.end_ns)
+        == (b.sequence, b.first_reading, b.last_reading, b.start_ns, b.end_ns)
+        and a.local.ids.tobytes() == b.local.ids.tobytes()
+        and a.local.mean.tobytes() == b.local.mean.tobytes()
+        and a.local.covariance.tobytes() == b.local.covariance.tobytes()
+    )
+
+
+def test_windows_are_contiguous_in_readings_and_time():
+    member = begun()
+    closed = fed(member, READINGS)
+    last, uncovered = member.finish()
+    assert uncovered == 0
+    assert last is None, "the last window ended with the last odometry"
+    assert [w.sequence for w in closed] == [0, 1, 2, 3]
+    assert closed[0].first_reading == 0
+    assert closed[-1].last_reading == len(READINGS) - 1
+    for before, after in pairwise(closed):
+        assert after.first_reading == before.last_reading + 1
+        assert after.start_ns == before.end_ns
+
+
+@settings(deadline=None, max_examples=12)
+@given(st.integers(0, 3), st.integers(1, 3))
+def test_a_member_that_takes_over_earlier_windows_goes_on_byte_for_byte(taken, looks):
+    whole = fed(begun(), READINGS)
+    member = begun()
+    for closed in whole[:taken]:
+        member.resume(closed)
+    for _ in range(looks):
+        member.open_gaussian()
+    first = whole[taken - 1].last_reading + 1 if taken else 0
+    again = fed(member, READINGS[first:])
+    assert len(again) == len(whole) - taken
+    assert all(same(a, b) for a, b in zip(again, whole[taken:], strict=True))
+    assert member.whole.mean.tobytes() == _whole_of(READINGS).mean.tobytes()
+
+
+def _whole_of(readings):
+    member = begun()
+    fed(member, readings)
+    return member.whole
+
+
+def test_a_window_does_not_depend_on_what_was_read_before_it():
+    other = [
+        m.Odometry(r.stamp_ns, r.robot, r.epoch, r.reading, r.duration_ns, 2 * r.forward, 0.5)
+        if isinstance(r, m.Odometry) and r.stamp_ns <= 3_000_000_000
+        else r
+        for r in READINGS
+    ]
+    one, two = fed(begun(), READINGS), fed(begun(), other)
+    assert not same(one[0], two[0])
+    assert all(same(a, b) for a, b in zip(one[1:], two[1:], strict=True))
+
+
+@pytest.mark.parametrize("other", [HybridMember(config(seed=2), 1), HybridMember(config("r2"), 1)])
+def test_a_window_depends_on_its_seed_and_its_robot(other):
+    assert not same(fed(other, READINGS)[0], fed(begun(), READINGS)[0])
+
+
+def test_a_window_depends_on_its_epoch():
+    assert not same(fed(HybridMember(config(), 2), READINGS)[0], fed(begun(), READINGS)[0])
+
+
+def test_what_no_odometry_covers_is_counted_at_the_end():
+    readings = published(stream("r1", 4, beyond=3))
+    member = begun()
+    closed = fed(member, readings)
+    last, uncovered = member.finish()
+    assert uncovered == 3
+    assert last.last_reading == readings[-1].reading
+    assert last.first_reading == closed[-1].last_reading + 1
+    assert last.end_ns == 4_000_000_000
+
+
+def test_a_member_without_odometry_has_no_window_and_covers_nothing():
+    readings = published(stream("r1", 4, drives=False))
+    member = begun()
+    assert fed(member, readings) == []
+    last, uncovered = member.finish()
+    assert last is None
+    assert uncovered == sum(isinstance(r, m.Observations) for r in readings)
+
+
+def test_the_thesis_member_starts_where_it_is_told_and_replaces_what_it_absorbs():
+    member = ThesisMember(config(), 1)
+    member.start(np.array([1.0, 2.0, 0.5]))
+    np.testing.assert_array_equal(member.state.pose, [1.0, 2.0, 0.5])
+    for reading in READINGS[1:]:
+        if isinstance(reading, m.Observations):
+            member.observe(reading.stamp_ns, translate.scan_of(reading))
+        if isinstance(reading, m.Odometry):
+            member.drive(reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate)
+    assert member.epochs == sum(isinstance(r, m.Observations) for r in READINGS)
+    assert len(member.state.ids) > 0
+    ids = member.state.ids[:1]
+    member.absorb(ids, np.array([[50.0, 60.0]]), 4.0 * np.eye(2)[None])
+    where = int(np.flatnonzero(member.state.ids == ids[0])[0])
+    np.testing.assert_array_equal(member.state.landmarks[where], [50.0, 60.0])
+    np.testing.assert_array_equal(member.state.covariances[where], 4.0 * np.eye(2))

@@ -1,0 +1,348 @@
+"""The robot's node: what it sends for fusion hangs on its own readings alone."""
+
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team import translate
+from team.robot import node as robot_node
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
+from tests.support import packed, spd
+from tests.teams import config, driven, of, published, stream
+
+STREAM = stream("r1", 12, off_ns=300_000_000)
+READINGS = published(STREAM)
+END = m.End(12_000_000_000, (m.StreamEnd("r1", 1, len(READINGS)),))
+CENTRE = m.Liveliness(0, "central", True)
+
+
+def payloads(out, channel=ch.SUBMAP):
+    return [encoded(message) for message in of(out, channel)]
+
+
+LONELY = payloads(driven(RobotNode(config()), READINGS))
+
+
+def prior(sequence=0, epoch=1, scale=1.0, at=0.0, ids=(1, 2)):
+    n = 3 + 2 * len(ids)
+    return m.Prior(
+        0, "r1", epoch, sequence, b"whatever", from_ids(ids),
+        from_floats(np.full(n, at)), packed(scale * spd(n)),
+    )  # fmt: skip
+
+
+def fused(ids=(1, 2), at=0.0, *, final=False, exchange=0):
+    return m.FusedMap(
+        0, "join", b"whatever", "r1/1", final, False, exchange, (), (), True, from_ids(ids),
+        from_floats(np.full(2 * len(ids), at)), packed(spd(2 * len(ids))), 0.0, 0,
+    )  # fmt: skip
+
+
+garbage = st.one_of(
+    st.builds(
+        prior,
+        st.integers(-2, 20),
+        st.integers(0, 2),
+        st.sampled_from([1e-12, 1e-3, 1.0, 1e6]),
+        st.floats(-1e6, 1e6),
+        st.sampled_from([(), (1,), (1, 2, 3), (900, 901)]),
+    ),
+    st.builds(fused, st.sampled_from([(), (1, 2), (77,)]), st.floats(-1e9, 1e9)),
+    st.just(CENTRE),
+    st.just(m.Liveliness(0, "central", False)),
+    st.builds(lambda n: m.Progress(0, "central", "r1", 1, 0, n), st.integers(0, 100)),
+)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.lists(st.tuples(st.integers(0, len(READINGS) - 1), garbage), max_size=8))
+def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections):
+    node, out = RobotNode(config()), []
+    for i, reading in enumerate(READINGS):
+        out += node.handle(reading, 0)
+        for at, message in interjections:
+            out += node.handle(message, 0) if at == i else []
+    out += node.handle(END, 0)
+    out += node.handle(m.Liveliness(0, "central", False), 0)
+    assert payloads(out) == LONELY
+    assert len(of(out, ch.ROBOT_DONE)) == 1
+
+
+def test_the_prior_does_change_the_team_pose():
+    """The mutant's other half: the garbage above is really used, where it may be."""
+    poses = []
+    for at in (0.0, 3.0):
+        node = RobotNode(config())
+        out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
+        out += node.handle(prior(at=at), 0)
+        out += [o for r in READINGS[10:] for o in node.handle(r, 0)]
+        poses.append(payloads(out, ch.TEAM_POSE))
+    assert len(poses[0]) == len(poses[1]) > 0
+    assert poses[0] != poses[1]
+
+
+def test_a_prior_that_can_not_be_solved_is_a_warning_and_the_robot_goes_on():
+    node = RobotNode(config())
+    flat = msgspec.structs.replace(prior(), covariance=packed(np.ones((7, 7))))
+    out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
+    out += node.handle(flat, 0)
+    out += driven(node, READINGS[10:])
+    assert payloads(out) == LONELY
+    assert not of(out, ch.TEAM_POSE)
+    assert "no team pose" in node.warnings[0]
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.permutations(range(len(READINGS))), st.lists(st.integers(0, len(READINGS) - 1)))
+def test_any_order_of_arrival_and_duplicates_give_the_same_submaps(order, again):
+    node = RobotNode(config())
+    out = [o for i in [*order, *again] for o in node.handle(READINGS[i], 0)]
+    assert payloads(out + node.handle(END, 0)) == LONELY
+
+
+def test_run_twice_everything_it_says_is_equal():
+    one, two = (
+        [encoded(o.message) for o in [*node.begin(), *driven(node, READINGS)]]
+        for node in (RobotNode(config()), RobotNode(config()))
+    )
+    assert one == two
+
+
+STREAMS = {
+    "observations at the ends of intervals": stream("r1", 11),
+    "observations between odometry stamps": stream("r1", 11, off_ns=400_000_000),
+    "observations beyond the odometry": stream("r1", 10, beyond=4),
+    "nothing but observations": stream("r1", 5, drives=False),
+    "little seen": stream("r1", 13, seen_every=5),
+    "a free start": stream("r1", 8, known=False),
+    "quick odometry": stream("r1", 40, step_ns=50_000_000),
+}
+
+
+@pytest.mark.parametrize("name", STREAMS)
+@pytest.mark.parametrize("keyframe_s", [0.0, 0.7])
+@pytest.mark.parametrize("estimator", ["hybrid", "hybrid-thesis"])
+def test_every_reading_has_one_disposition(name, keyframe_s, estimator):
+    readings = published(STREAMS[name])
+    front_end = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
+    fusion = "join" if estimator == "hybrid" else "kalman-per-axis"
+    node = RobotNode(config(front_end=front_end, estimator=estimator, fusion=fusion))
+    node.handle(m.Liveliness(0, "central", False), 0)
+    out = driven(node, readings)
+    (done,) = of(out, ch.ROBOT_DONE)
+    assert done.readings == len(readings)
+    assert sum(entry.readings for entry in done.ledger) == len(readings)
+    assert all(entry.readings > 0 for entry in done.ledger)
+    assert done.steps == sum(isinstance(r, m.Odometry) for r in readings)
+    used = [e.readings for e in done.ledger if e.disposition.startswith("in ")]
+    uncovered = [e.readings for e in done.ledger if "no odometry" in e.disposition]
+    assert (name in ("observations beyond the odometry", "nothing but observations")) == bool(
+        uncovered
+    )
+    submaps = of(out, ch.SUBMAP)
+    assert done.submaps == len(submaps)
+    if estimator == "hybrid" and submaps:
+        assert submaps[0].first_reading == 0
+        for before, after in pairwise(submaps):
+            assert after.first_reading == before.last_reading + 1
+            assert after.start_ns == before.stamp_ns
+        inside = sum(s.last_reading - s.first_reading + 1 for s in submaps)
+        rejected = sum(e.readings for e in done.ledger if e.disposition.startswith("rejected"))
+        assert sum(used) + 1 <= inside <= sum(used) + 1 + rejected
+
+
+@pytest.mark.parametrize("taken", [1, 2, 3])
+@pytest.mark.parametrize("name", ["observations between odometry stamps", "quick odometry"])
+def test_a_robot_that_was_started_again_sends_the_same_following_submaps(name, taken):
+    readings = published(STREAMS[name])
+    front_end = msgspec.structs.replace(config().front_end, keyframe_s=0.3, window_s=0.6)
+    whole = of(driven(RobotNode(config(front_end=front_end)), readings), ch.SUBMAP)
+    node = RobotNode(config(front_end=front_end))
+    node.resume(readings[0], whole[:taken])
+    assert node.next_reading == whole[taken - 1].last_reading + 1
+    out = driven(node, readings)
+    assert payloads(out) == [encoded(each) for each in whole[taken:]]
+    (done,) = of(out, ch.ROBOT_DONE)
+    assert sum(e.readings for e in done.ledger) == done.readings == len(readings)
+
+
+def test_submaps_and_maps_name_the_configuration_that_was_announced():
+    node = RobotNode(config())
+    (announced,) = of(node.begin(), ch.ROBOT_CONFIG)
+    assert announced.digest == translate.digest_of(announced.configuration.encode())
+    submaps = of(driven(node, READINGS), ch.SUBMAP)
+    assert {each.config for each in submaps} == {announced.digest}
+    (other,) = of(RobotNode(config(seed=2)).begin(), ch.ROBOT_CONFIG)
+    assert other.digest != announced.digest
+
+
+def test_everything_it_sends_passes_the_door():
+    node = RobotNode(config())
+    out = [*node.begin(), *node.handle(CENTRE, 0)]
+    for reading in READINGS:
+        out += node.handle(reading, 0)
+        out += node.handle(prior(), 0)
+    out += node.handle(END, 0)
+    for o in out:
+        assert decoded(encoded(o.message), o.channel.message) == o.message
+    assert {o.channel for o in out} >= {ch.SUBMAP, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE}
+
+
+def test_progress_never_passes_a_window_that_may_still_end(monkeypatch):
+    """At a progress's stamp every submap that ends there or before has been sent."""
+    monkeypatch.setattr(robot_node, "PROGRESS_READINGS", 1)
+    node, passed = RobotNode(config()), -1
+    for reading in published(stream("r1", 12)):
+        for o in node.handle(reading, 0):
+            if o.channel is ch.ROBOT_PROGRESS:
+                passed = max(passed, o.message.stamp_ns)
+            if o.channel is ch.SUBMAP:
+                assert o.message.stamp_ns > passed
+    assert passed == 12_000_000_000
+
+
+def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeypatch):
+    monkeypatch.setattr(robot_node, "CREDIT_SUBMAPS", 1)
+    node = RobotNode(config())
+    node.handle(CENTRE, 0)
+    out = [o for r in READINGS for o in node.handle(r, 0)] + node.handle(END, 0)
+    assert len(of(out, ch.SUBMAP)) == 2
+    out += node.handle(m.Progress(0, "central", "r1", 7, 0, 9), 0)
+    assert len(of(out, ch.SUBMAP)) == 2, "credit of another epoch is none"
+    out += node.handle(m.Progress(0, "central", "r1", 1, 0, 1), 0)
+    assert len(of(out, ch.SUBMAP)) == 3
+    out += node.handle(m.Liveliness(0, "robot/r2", False), 0)
+    assert len(of(out, ch.SUBMAP)) == 3, "another node's token is not the centre's"
+    out += node.handle(m.Liveliness(0, "central", False), 0)
+    assert payloads(out) == LONELY
+    assert len(of(out, ch.ROBOT_DONE)) == 1
+
+
+def test_missing_readings_are_asked_for():
+    node = RobotNode(config())
+    assert node.wanted() is None
+    node.handle(READINGS[3], 0)
+    assert node.wanted() == m.ReadingsWanted(0, "r1", 1, 0, 2), "the very first ones too"
+    for reading in READINGS[:3]:
+        node.handle(reading, 0)
+    assert node.wanted() is None
+    node.handle(READINGS[8], 0)
+    wanted = node.wanted()
+    assert (wanted.epoch, wanted.first, wanted.last) == (1, 4, 7)
+    for reading in READINGS[4:8]:
+        node.handle(reading, 0)
+    node.handle(END, 0)
+    wanted = node.wanted()
+    assert (wanted.epoch, wanted.first, wanted.last) == (1, 9, len(READINGS) - 1)
+    for reading in READINGS[9:]:
+        node.handle(reading, 0)
+    assert node.wanted() is None
+
+
+def test_a_stream_that_was_missed_entirely_is_asked_for_at_its_end():
+    node = RobotNode(config())
+    node.handle(END, 0)
+    wanted = node.wanted()
+    assert (wanted.epoch, wanted.first, wanted.last) == (1, 0, len(READINGS) - 1)
+
+
+def test_a_new_epoch_closes_the_old_one_under_its_own_name():
+    node = RobotNode(config())
+    out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
+    second = [msgspec.structs.replace(r, epoch=2, reading=r.reading - 15) for r in READINGS[15:]]
+    second[0] = m.Start(second[0].stamp_ns, "r1", 2, 0, b"", b"")
+    out += [o for r in second for o in node.handle(r, 0)]
+    ends = (m.StreamEnd("r1", 2, len(second)),)
+    out += node.handle(m.End(0, ends), 0)
+    submaps = of(out, ch.SUBMAP)
+    names = [(s.epoch, s.sequence) for s in submaps]
+    assert names == [(1, 0), (1, 1), *((2, k) for k in range(len(names) - 2))]
+    assert len(names) > 2
+    assert submaps[1].last_reading == 9
+    assert next(s for s in submaps if s.epoch == 2).first_reading == 0
+    last, first = of(out, ch.ROBOT_DONE)
+    assert (last.epoch, first.epoch) == (2, 1)
+    assert (first.readings, last.readings) == (10, len(second))
+    for done in (first, last):
+        assert sum(e.readings for e in done.ledger) == done.readings
+    for progress in of(out, ch.ROBOT_PROGRESS):
+        assert progress.submaps <= sum(s.epoch == progress.epoch for s in submaps)
+
+
+def feedback(**options):
+    return RobotNode(config(fusion="kalman", **options))
+
+
+def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
+    node = feedback()
+    out = [o for r in READINGS for o in node.handle(r, 0)] + node.handle(END, 0)
+    assert [x.exchange for x in of(out, ch.OWN_MAP)] == [1]
+    before = node.next_reading
+    assert node.handle(fused(exchange=0), 0) == []
+    assert node.next_reading == before, "an old answer is none"
+    for number in range(1, 5):
+        out += node.handle(fused(ids=(1, 2), at=2.0, exchange=number), 0)
+    assert [x.exchange for x in of(out, ch.OWN_MAP)] == [1, 2, 3, 4]
+    assert len(of(out, ch.ROBOT_DONE)) == 1
+
+
+def test_waiting_for_an_exchange_a_robot_reports_what_it_has_received(monkeypatch):
+    """Else the world waits for it, and it for a teammate that waits for the world."""
+    monkeypatch.setattr(robot_node, "PROGRESS_READINGS", 4)
+    node = feedback()
+    out = [o for r in READINGS for o in node.handle(r, 0)]
+    assert node.next_reading < len(READINGS) - 10
+    reported = max(p.readings for p in of(out, ch.ROBOT_PROGRESS))
+    assert len(READINGS) - 4 < reported <= len(READINGS)
+
+
+def test_under_feedback_the_last_map_is_sent_whether_or_not_an_exchange_is_due():
+    for estimator, fusion in (("hybrid", "kalman"), ("hybrid-thesis", "kalman-per-axis")):
+        node = RobotNode(config(estimator=estimator, fusion=fusion, exchange_s=1e6))
+        node.handle(m.Liveliness(0, "central", False), 0)
+        maps = of(driven(node, READINGS), ch.OWN_MAP)
+        assert len(maps) == 2
+        assert maps[-1].stamp_ns > maps[0].stamp_ns
+
+
+def test_under_feedback_a_lost_centre_is_not_waited_for():
+    node = feedback()
+    out = [o for r in READINGS for o in node.handle(r, 0)] + node.handle(END, 0)
+    assert not of(out, ch.ROBOT_DONE)
+    out += node.handle(m.Liveliness(0, "central", False), 0)
+    assert len(of(out, ch.ROBOT_DONE)) == 1
+
+
+def test_the_final_map_ends_it():
+    node = RobotNode(config())
+    driven(node, READINGS)
+    assert not node.finished
+    node.handle(fused(final=True), 0)
+    assert node.finished
+
+
+def test_its_status_says_what_it_is_doing():
+    node = RobotNode(config())
+    assert node.status().state == "waiting"
+    for reading in READINGS[:9]:
+        node.handle(reading, 0)
+    status = node.status()
+    assert status.state == "mapping"
+    assert status.figures["readings"] == 9.0
+    assert status.figures["steps"] == sum(isinstance(r, m.Odometry) for r in READINGS[:9])
+    driven(node, READINGS[9:])
+    assert node.status().state == "done"
+
+
+def test_out_of_its_messages_none_is_on_another_robots_key():
+    out: list[Outgoing] = driven(RobotNode(config()), READINGS)
+    assert {o.name for o in out} == {"r1"}

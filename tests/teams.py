@@ -1,0 +1,232 @@
+"""Tiny teams of nodes, and a network between them that delivers in any order it likes."""
+
+import random
+from collections import defaultdict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from sim.streams import Detections, Intervals, RobotStream, StartPose, WorldStreams, robot_stream
+from sim.world_node import WorldNode, expected_nodes
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
+
+LANDMARKS = np.array([[5.0, 3.0], [9.0, -2.0], [14.0, 4.0], [20.0, -3.0], [3.0, -4.0]])
+STEP_NS = 1_000_000_000
+
+
+def config(name: str = "r1", **options: object) -> RobotConfig:
+    """A robot with few particles and windows of 3 s."""
+    motion = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02))
+    base = RobotConfig(
+        name,
+        motion,
+        Sensor(range_sigma=0.1, bearing_sigma=0.02),
+        FrontEnd(particles=8, window_s=3.0),
+    )
+    return msgspec.structs.replace(base, **options)
+
+
+def stream(
+    robot: str,
+    steps: int,
+    *,
+    seed: int = 0,
+    step_ns: int = STEP_NS,
+    seen_every: int = 1,
+    off_ns: int = 0,
+    beyond: int = 0,
+    drives: bool = True,
+    known: bool = True,
+    y: float = 0.0,
+) -> RobotStream:
+    """A robot that drives along the x axis and sees what is near.
+
+    off_ns: observations come so long before the end of their interval. beyond: so many more come
+    after the last odometry.
+    """
+    rng = np.random.default_rng([seed, steps, *robot.encode()])
+    ends = step_ns * np.arange(1, steps + 1)
+    poses = np.column_stack([1.0 * np.arange(1, steps + 1), np.full(steps, y), np.zeros(steps)])
+    none = np.zeros(0)
+    count = steps if drives else 0
+    intervals = Intervals(
+        ends[:count],
+        np.full(count, step_ns),
+        1e9 / step_ns + 0.05 * rng.normal(size=count),
+        0.02 * rng.normal(size=count),
+    )
+    at = [*range(seen_every - 1, steps, seen_every)]
+    stamps = [int(ends[k]) - off_ns for k in at]
+    at += [steps - 1] * beyond
+    stamps += [int(ends[-1]) + (i + 1) * step_ns for i in range(beyond)]
+    offsets, ids, ranges, bearings = [0], [], [], []
+    for k in at:
+        offset = LANDMARKS - poses[k, :2] + [1e-9 * off_ns, 0.0]
+        distance = np.hypot(*offset.T)
+        for i in np.flatnonzero(distance < 8.0):
+            ids.append(i + 1)
+            ranges.append(distance[i] + 0.1 * rng.normal())
+            bearings.append(np.arctan2(offset[i, 1], offset[i, 0]) + 0.02 * rng.normal())
+        offsets.append(len(ids))
+    wrapped = np.pi - (np.pi - np.array(bearings)) % (2.0 * np.pi) if ids else none
+    seen = Detections(
+        np.array(stamps, dtype=np.int64),
+        np.array(offsets, dtype=np.int64),
+        np.array(ids, dtype=np.uint32),
+        np.abs(np.array(ranges)),
+        wrapped,
+    )
+    met_at = ends[2:3]
+    met = Detections(
+        met_at,
+        np.arange(len(met_at) + 1, dtype=np.int64),
+        np.zeros(len(met_at), np.uint32),
+        np.full(len(met_at), 4.0),
+        np.zeros(len(met_at)),
+    )
+    start = StartPose(np.array([0.0, y, 0.0]), None) if known else None
+    return robot_stream(robot, 0, start, intervals, seen, met, ("r9",), ends, poses)
+
+
+def world_of(*streams: RobotStream) -> WorldStreams:
+    ids = np.arange(1, len(LANDMARKS) + 1, dtype=np.uint32)
+    return WorldStreams(streams, ids, LANDMARKS, "a test")
+
+
+def published(each: RobotStream) -> list[m.Reading]:
+    """The readings of one stream as the world publishes them."""
+    world = WorldNode(world_of(each), frozenset(), m.Configured(0, "world", 0, bytes(8), "{}"))
+    out: list[Outgoing] = []
+    while not world.ended:
+        out += world.publish(0.0)
+    return [o.message for o in out if isinstance(o.message, m.Reading)]
+
+
+def driven(node: RobotNode, readings: Sequence[m.Message], *, end: bool = True) -> list[Outgoing]:
+    """What a robot says to these readings, without a centre; `end` with the last counter."""
+    out = [o for reading in readings for o in node.handle(reading, 0)]
+    if end:
+        last = readings[-1]
+        ends = (m.StreamEnd(node.robot, last.epoch, last.reading + 1),)
+        out += node.handle(m.End(last.stamp_ns, ends), 0)
+    return out
+
+
+def of(out: Sequence[Outgoing], channel: ch.Channel) -> list[m.Message]:
+    return [o.message for o in out if o.channel is channel]
+
+
+def submaps_of(each: RobotStream, **options: object) -> list[m.Submap]:
+    """What a lonely robot sends for fusion."""
+    return of(driven(RobotNode(config(each.robot, **options)), published(each)), ch.SUBMAP)
+
+
+@dataclass
+class Team:
+    """World, robots and centre, joined by one queue per receiver and key.
+
+    Each key keeps its order, as Zenoh promises; between keys and receivers `rng` decides.
+    """
+
+    streams: WorldStreams
+    configs: Sequence[RobotConfig]
+    rng: random.Random
+    central: CentralConfig = field(default_factory=CentralConfig)
+    queues: dict[tuple[str, str], deque[m.Message]] = field(default_factory=dict)
+    sent: dict[str, list[m.Message]] = field(default_factory=lambda: defaultdict(list))
+
+    def __post_init__(self) -> None:
+        names = [c.id for c in self.configs]
+        rule = msgspec.structs.replace(self.central, fusion=self.configs[0].fusion)
+        announced = m.Configured(0, "world", 0, bytes(8), "{}")
+        self.world = WorldNode(self.streams, expected_nodes(names, recorder=False), announced)
+        self.centre = CentralNode(rule, names)
+        self.robots = {c.id: RobotNode(c) for c in self.configs}
+        self.nodes = {"world": self.world, "central": self.centre}
+        self.nodes |= {ch.robot_node(name): node for name, node in self.robots.items()}
+        for name in list(self.nodes):
+            self.token(name, alive=True)
+            self.send(name, self.nodes[name].begin())
+
+    def token(self, node: str, *, alive: bool) -> None:
+        for to in self.nodes:
+            if to != node and (to in ("world", "central") or node == "central"):
+                key = ch.ALIVE.key(node)
+                self.queues.setdefault((to, key), deque()).append(m.Liveliness(0, node, alive))
+
+    def send(self, source: str, out: Sequence[Outgoing]) -> None:
+        for o in out:
+            self.sent[o.key].append(o.message)
+            for to, node in self.nodes.items():
+                mine = not to.startswith("robot/") or o.name in ("", node.robot)
+                if to != source and o.channel in node.listens and mine:
+                    self.queues.setdefault((to, o.key), deque()).append(o.message)
+
+    def kill(self, robot: str) -> None:
+        """The process is gone, and so is its token; what it has sent is on its way."""
+        node = ch.robot_node(robot)
+        del self.nodes[node]
+        self.queues = {k: q for k, q in self.queues.items() if k[0] != node}
+        self.token(node, alive=False)
+
+    def resume(self, robot: RobotConfig) -> None:
+        """The process is there again: it takes over the submaps that the centre has."""
+        name, node = ch.robot_node(robot.id), RobotNode(robot)
+        self.nodes[name] = self.robots[robot.id] = node
+        submaps = self.centre._join.submaps(robot.id)
+        start = self.centre._join.start(robot.id, submaps[0].epoch) if submaps else None
+        if start is not None:
+            node.resume(start, submaps)
+        self.queues[(name, "central/alive")] = deque([m.Liveliness(0, "central", True)])
+        latest = [self.sent[c.key()][-1:] for c in (ch.END, ch.FUSED_MAP, ch.FINAL_MAP)]
+        self.queues[(name, "latest")] = deque(x for kept in latest for x in kept)
+        self.token(name, alive=True)
+        self.send(name, node.begin())
+
+    def step(self) -> bool:
+        """One delivery, or one look of the world; False when nothing is left to do."""
+        ready = [key for key, queue in self.queues.items() if queue]
+        if not ready or self.rng.random() < 0.2:
+            out = self.world.publish(0.0)
+            self.send("world", out)
+            if out or ready:
+                return True
+            return self.mend()
+        to, key = self.rng.choice(ready)
+        message = self.queues[(to, key)].popleft()
+        self.send(to, self.nodes[to].handle(message, 0))
+        return True
+
+    def mend(self) -> bool:
+        """Robots ask their source for what they miss, as their shells do."""
+        found = False
+        for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
+            wanted = node.wanted()
+            if wanted is None and not node.finished and not node._inbox.waiting:
+                wanted = m.ReadingsWanted(0, node.robot, node.epoch, node.next_reading, -1)
+            if wanted is None:
+                continue
+            for reply in self.world.readings(encoded(wanted)):
+                found = True
+                self.send(name, node.handle(decoded(reply), 0))
+        return found
+
+    def run(self, limit: int = 100_000) -> None:
+        for _ in range(limit):
+            if not self.step():
+                return
+        raise AssertionError("the team does not come to rest")
+
+    @property
+    def final(self) -> m.FusedMap:
+        (final,) = self.sent[ch.FINAL_MAP.key()]
+        return final
