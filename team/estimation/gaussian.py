@@ -1,11 +1,31 @@
 """Gaussians as (mean, covariance), and the checks and packings of covariance matrices."""
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt32
 from scipy.linalg.lapack import dpotri
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
+
+
+class PoseGaussian(NamedTuple):
+    """N(mean, covariance) of a pose (x [m], y [m], theta [rad]) in the map frame."""
+
+    mean: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"]
+
+
+class LandmarkGaussian(NamedTuple):
+    """The joint Gaussian of the landmarks by ascending id: (x₁, y₁, x₂, …) in the map frame [m]."""
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+NO_LANDMARKS = LandmarkGaussian(np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 0)))
 
 
 class NotACovarianceError(ValueError):

@@ -1,0 +1,55 @@
+"""Dead reckoning: the odometry alone, composed on SE(2).
+
+pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound and no reading takes any of
+it back. Thrun et al. 2005, chapter 5; Ma & Ma, section VI-A, take it as what SLAM is held against.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import Sensor
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
+from team.estimation.geometry import Pose
+from team.estimation.models import Increment
+
+
+@dataclass(frozen=True)
+class DeadReckoning:
+    """map_from_robot = mean ∘ Exp(ξ), ξ ~ N(0, covariance) in (forward, left, turn).
+
+    In these coordinates the pose stays near a Gaussian where its position is bent to a banana.
+    """
+
+    pose: Increment
+
+
+def begun(pose: Pose) -> DeadReckoning:
+    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    return DeadReckoning(Increment(pose, np.zeros((3, 3))))
+
+
+def stepped(
+    state: DeadReckoning,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> DeadReckoning:
+    """The pose composed with the increment; the readings are not used."""
+    return DeadReckoning(state.pose.then(increment))
+
+
+def pose_gaussian(state: DeadReckoning) -> PoseGaussian:
+    """In the coordinates (x, y, theta), to first order: P = G C Gᵀ with G = blkdiag(R(θ), 1)."""
+    c, s = np.cos(state.pose.mean[2]), np.sin(state.pose.mean[2])
+    G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    P = G @ state.pose.covariance @ G.T
+    return PoseGaussian(state.pose.mean, 0.5 * (P + P.T))
+
+
+def landmark_gaussian(state: DeadReckoning) -> LandmarkGaussian:
+    """It knows no landmark."""
+    return NO_LANDMARKS
