@@ -13,6 +13,7 @@ from sim.cli_launch import app as launch_commands  # noqa: E402
 from sim.cli_logs import app as log_commands  # noqa: E402
 from sim.cli_nodes import app as node_commands  # noqa: E402
 from sim.cli_options import FAILED, WRONG_USE  # noqa: E402
+from sim.cli_rerun import app as rerun_commands  # noqa: E402
 
 app = typer.Typer(
     help="Multi-robot SLAM as real processes over Zenoh.",
@@ -21,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _part in (launch_commands, node_commands, log_commands):
+for _part in (launch_commands, node_commands, log_commands, rerun_commands):
     app.add_typer(_part)
 
 

@@ -1,0 +1,91 @@
+"""The centre's messages again: each recorded map from the set that it names."""
+
+from collections.abc import Iterator, Mapping
+
+import msgspec
+
+from central.config import CentralConfig
+from central.feedback_rule import FeedbackRule
+from central.join_rule import JoinRule, Tail
+from sim.rerun_log import Identity, Recorded, Stream, identity
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+
+def retold_centre(log: Recorded) -> dict[Identity, m.Message]:
+    """What the sets that the recorded maps name give, under the names of these inputs."""
+    maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
+    finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
+    if not maps and not finals:
+        return {}
+    config, digest = log.central_config()
+    retell = _joined if config.fusion == "join" else _exchanged
+    found: dict[Identity, m.Message] = {}
+    for out in retell(log, config, digest, [*maps, *finals]):
+        found.setdefault(identity(out.key, out.message), out.message)
+    return found
+
+
+def _joined(
+    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """Each map from its own version vector; a set that grows keeps the fold that there is.
+
+    Which submaps lie behind a gap is what the centre knew when it spoke: it says so in the map.
+    """
+    starts = {s: r.get(0) for s, r in log.readings.items()}
+    submaps = log.submaps()
+    rule = JoinRule(config, digest)
+    inside: dict[Stream, int] = {}
+    for fused in maps:
+        vector = {(x.robot, x.epoch): x.sequence for x in fused.members}
+        if not _complete(vector, submaps):
+            continue
+        if any(vector.get(stream, -1) < sequence for stream, sequence in inside.items()):
+            rule, inside = JoinRule(config, digest), {}
+        for stream, sequence in sorted(vector.items()):
+            start = starts.get(stream)
+            if isinstance(start, m.Start):
+                rule.take_start(start)
+            for k in range(inside.get(stream, -1) + 1, sequence + 1):
+                rule.take_submap(submaps[stream][k])
+        inside = vector
+        for out in rule.retold(_tail(fused)):
+            message = out.message
+            if isinstance(message, m.FusedMap):
+                message = msgspec.structs.replace(message, missing=fused.missing)
+            yield Outgoing(out.channel, out.name, message)
+
+
+def _tail(fused: m.FusedMap) -> Tail:
+    return "final" if fused.final else "provisional" if fused.provisional else "closed"
+
+
+def _complete(
+    vector: Mapping[Stream, int], submaps: Mapping[Stream, Mapping[int, m.Submap]]
+) -> bool:
+    return all(
+        k in submaps.get(stream, {}) for stream, last in vector.items() for k in range(last + 1)
+    )
+
+
+def _exchanged(
+    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """Each round from the maps that it names; the rounds follow one another."""
+    own = {
+        (x.exchange, x.robot, x.epoch, x.sequence): x
+        for x in log.of(ch.OWN_MAP)
+        if isinstance(x, m.MapEstimate)
+    }
+    rule = FeedbackRule(config, digest)
+    for fused in sorted(maps, key=lambda f: (f.final, f.exchange)):
+        if fused.final:
+            yield from rule.conclude(fused.stamp_ns)
+            continue
+        for member in fused.members:
+            named = (fused.exchange, member.robot, member.epoch, member.sequence)
+            if named in own:
+                rule.take_map(own[named])
+        yield from rule.advance(lambda _robot, _round: False, [])

@@ -1,0 +1,153 @@
+"""A log as what it is to whoever computes it again: inputs, and messages that name them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import msgspec
+
+from central.config import CentralConfig
+from team.config import RobotConfig
+from team.recording.reader import Log
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.codec import WireError
+
+Stream = tuple[str, int]
+"""(robot, epoch)."""
+T = TypeVar("T")
+Identity = tuple[object, ...]
+"""A message's key and the names of its inputs."""
+
+
+class RerunError(ValueError):
+    """A log that can not be computed again: what it lacks."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """A recorded message that can be computed again, as its sample and decoded."""
+
+    sample: Sample
+    channel: ch.Channel
+    message: m.Message
+
+
+@dataclass
+class Recorded:
+    """Everything in a log that is an input or an output of a node; each reading once.
+
+    readings: by (robot, epoch) and counter. configured: the last announcement of each node.
+    unsound: samples that no node would have let in.
+    """
+
+    readings: dict[Stream, dict[int, m.Reading]] = field(default_factory=dict)
+    configured: dict[str, m.Configured] = field(default_factory=dict)
+    said: list[Said] = field(default_factory=list)
+    unsound: int = 0
+
+    def take(self, sample: Sample) -> None:
+        """File one sample."""
+        try:
+            channel, _, message = opened(sample)
+        except WireError:
+            self.unsound += 1
+            return
+        if isinstance(message, m.Reading):
+            stream = self.readings.setdefault((message.robot, message.epoch), {})
+            stream.setdefault(message.reading, message)
+        elif isinstance(message, m.Configured):
+            self.configured[message.node] = message
+        elif channel.recomputable:
+            self.said.append(Said(sample, channel, message))
+
+    def of(self, channel: ch.Channel) -> list[m.Message]:
+        """The recorded messages of a channel, in the order of the log."""
+        return [said.message for said in self.said if said.channel is channel]
+
+    @property
+    def robots(self) -> list[str]:
+        """Every robot that the log has readings or messages of, by name."""
+        names = {robot for robot, _ in self.readings}
+        names |= {s.message.robot for s in self.said if isinstance(s.message, m.Submap | m.Done)}
+        return sorted(names)
+
+    def epochs(self, robot: str) -> list[int]:
+        """The epochs of a robot that there are readings of, in order."""
+        return sorted(epoch for name, epoch in self.readings if name == robot)
+
+    def submaps(self) -> Mapping[Stream, dict[int, m.Submap]]:
+        """The recorded submaps by stream and sequence."""
+        found: dict[Stream, dict[int, m.Submap]] = {}
+        for submap in self.of(ch.SUBMAP):
+            assert isinstance(submap, m.Submap)
+            found.setdefault((submap.robot, submap.epoch), {})[submap.sequence] = submap
+        return found
+
+    def robot_config(self, robot: str) -> tuple[RobotConfig, bytes]:
+        """The configuration that a robot announced, and its digest; raises RerunError."""
+        announced = self._announced(ch.robot_node(robot))
+        what = f"the configuration of {robot}"
+        return _parsed(announced.configuration, RobotConfig, what), announced.digest
+
+    def central_config(self) -> tuple[CentralConfig, bytes]:
+        """The centre's configuration and its digest; raises RerunError."""
+        announced = self._announced("central")
+        what = "the centre's configuration"
+        return _parsed(announced.configuration, CentralConfig, what), announced.digest
+
+    def _announced(self, node: str) -> m.Configured:
+        if node not in self.configured:
+            raise RerunError(
+                f"the log has no configuration of {node}: nothing of it can be computed"
+            )
+        return self.configured[node]
+
+
+def _parsed(text: str, kind: type[T], what: str) -> T:
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except msgspec.DecodeError as error:
+        raise RerunError(f"{what} is not one of this version: {error}") from None
+
+
+INPUTS = tuple(
+    channel
+    for channel in ch.CHANNELS
+    if channel.recomputable or channel in (*ch.SENSORS, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
+)
+"""The channels that a verification reads."""
+
+
+def recorded(log: Log) -> Recorded:
+    """One pass over a log."""
+    found = Recorded()
+    for sample in log.samples(INPUTS):
+        found.take(sample)
+    return found
+
+
+def identity(key: str, message: m.Message) -> Identity:
+    """The names by which a message says what it was computed from, under its key."""
+    match message:
+        case m.Submap():
+            names: Identity = (
+                message.epoch,
+                message.sequence,
+                message.first_reading,
+                message.last_reading,
+            )
+        case m.MapEstimate():
+            names = (message.epoch, message.stamp_ns, message.sequence, message.exchange)
+        case m.PoseEstimate():
+            names = (message.epoch, message.stamp_ns, message.sequence, message.map_digest)
+        case m.Done():
+            names = (message.epoch, message.readings, message.steps)
+        case m.Prior() | m.Trajectory():
+            names = (message.epoch, message.digest)
+        case m.FusedMap():
+            names = (message.exchange, message.provisional, message.members)
+        case _:
+            names = (message.stamp_ns,)
+    return (key, *names)
