@@ -1,0 +1,77 @@
+"""The set of submaps: a union; what does not fit is refused, says why, and changes nothing."""
+
+import copy
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.submap_set import SubmapSet
+from team.wire import messages as m
+from tests.support import submap
+
+CHAIN = [submap(i) for i in range(6)]
+BOTH = [*CHAIN, *(submap(i, "bravo") for i in range(4))]
+
+
+def put(*submaps):
+    found = SubmapSet()
+    for each in submaps:
+        assert found.admit(each) is None
+    return found
+
+
+@settings(deadline=None)
+@given(st.permutations(BOTH * 2))
+def test_any_order_with_duplicates_gives_the_same_set(order):
+    found, expected = put(*order), put(*BOTH)
+    assert found.streams == expected.streams
+    for stream in expected.streams:
+        assert found.chain(stream) == expected.chain(stream)
+        assert found.count(stream) == len(expected.streams[stream])
+    assert found.missing() == ()
+
+
+@settings(deadline=None)
+@given(st.sets(st.integers(0, 5)))
+def test_a_gap_holds_back_the_chain_and_is_listed(here):
+    found = put(*(CHAIN[i] for i in here))
+    first = next(i for i in range(7) if i not in here)
+    assert found.count(("alpha", 0)) == first
+    assert found.chain(("alpha", 0)) == CHAIN[:first]
+    behind = any(i > first for i in here)
+    assert found.missing() == ((m.Member("alpha", 0, first),) if behind else ())
+
+
+def changed(i, **fields):
+    return msgspec.structs.replace(CHAIN[i], **fields)
+
+
+@pytest.mark.parametrize(
+    ("there", "new", "reason"),
+    [
+        ([0, 1], changed(1, mean=CHAIN[0].covariance[: 8 * 7]), "differs from the one in the set"),
+        ([0], changed(1, first_reading=9), "overlap submap 0's 0-9"),
+        ([1], changed(0, last_reading=10), "overlap submap 1's 10-19"),
+        ([0], changed(1, first_reading=11), "does not continue submap 0"),
+        ([0], changed(1, start_ns=999_999), "does not continue submap 0"),
+        ([0], changed(3, first_reading=5), "overlap submap 0's 0-9"),
+        ([4], changed(1, last_reading=45), "overlap submap 4's 40-49"),
+        ([4], changed(1, stamp_ns=4_500_000), "does not continue submap 4"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_reason_and_changes_nothing(there, new, reason):
+    found = put(*(CHAIN[i] for i in there))
+    before = copy.deepcopy(found.streams)
+    said = found.admit(new)
+    assert reason in said
+    assert f"submap {new.sequence} of alpha" in said
+    assert found.streams == before
+    assert found.admit(CHAIN[there[0]]) is None, "what is in stays in"
+
+
+def test_another_epoch_is_another_stream():
+    second = [msgspec.structs.replace(each, epoch=1) for each in CHAIN[:2]]
+    found = put(*CHAIN, *second)
+    assert (found.count(("alpha", 0)), found.count(("alpha", 1))) == (6, 2)

@@ -1,0 +1,145 @@
+"""The fold by ticks: the same for any order of arrival, final behind the watermark."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.config import CentralConfig
+from central.tick_fold import TickFold
+from team import translate
+from team.estimation.joining import EMPTY_FOLD, folded, started
+from team.wire.codec import encoded
+from tests.teams import stream, submaps_of
+
+CONFIG = CentralConfig(tick_s=4.0)
+SUBMAPS = {name: submaps_of(stream(name, 15, y=y)) for name, y in (("r1", 0.0), ("r2", 1.0))}
+ALL = [each for submaps in SUBMAPS.values() for each in submaps]
+
+
+def fresh(config=CONFIG):
+    ticks = TickFold(config)
+    for name, y in (("r1", 0.0), ("r2", 1.0)):
+        ticks.know_start(translate.StartValue(name, 1, np.array([0.0, y, 0.0]), None))
+    return ticks
+
+
+def add(ticks, submap):
+    ticks.add(submap, translate.digest_of(encoded(submap)))
+
+
+def bits(fold):
+    parts = [fold.main.state.tobytes(), *(str(c.key).encode() for c in fold.contributions)]
+    return b"".join(parts)
+
+
+def straight():
+    ticks = fresh()
+    for each in ALL:
+        add(ticks, each)
+    ticks.take_until(float("inf"))
+    return ticks
+
+
+EXPECTED = bits(straight().fold)
+
+
+@settings(deadline=None, max_examples=12)
+@given(st.permutations(range(len(ALL))), st.data())
+def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(order, data):
+    """A stream's own submaps come in sequence: the set hands on what has no gap."""
+    ticks = fresh()
+    waiting = {name: list(submaps) for name, submaps in SUBMAPS.items()}
+    for i in order:
+        add(ticks, waiting[ALL[i].robot].pop(0))
+        if data.draw(st.booleans()):
+            ticks.take_until(data.draw(st.sampled_from([0.0, 4e9, 8e9, 13e9, float("inf")])))
+    ticks.take_until(float("inf"))
+    assert bits(ticks.fold) == EXPECTED
+
+
+def test_a_late_submap_rolls_back_to_before_its_tick_and_no_further():
+    ticks = fresh()
+    for each in SUBMAPS["r1"]:
+        add(ticks, each)
+    assert ticks.take_until(12e9)
+    before = [bits(fold) for _, fold in ticks._taken]
+    add(ticks, SUBMAPS["r2"][0])
+    assert ticks._taken == []
+    for each in SUBMAPS["r2"][1:]:
+        add(ticks, each)
+    ticks.take_until(float("inf"))
+    assert bits(ticks.fold) == EXPECTED
+    assert bits(ticks._taken[0][1]) != before[0]
+    kept = [fold for _, fold in ticks._taken]
+    add(ticks, SUBMAPS["r2"][-1])
+    assert [fold for _, fold in ticks._taken] == kept[:-1], "earlier checkpoints stay as they are"
+
+
+def test_a_tick_is_taken_when_the_watermark_has_reached_its_end():
+    ticks = fresh()
+    for each in ALL:
+        add(ticks, each)
+    assert not ticks.take_until(4e9 - 1)
+    assert ticks.take_until(4e9)
+    assert not ticks.take_until(4e9)
+    assert {c.end_ns for c in ticks.fold.contributions} == {3_000_000_000}
+    ticks.take_until(8e9)
+    assert [c.end_ns // 10**9 for c in ticks.fold.contributions] == [3, 3, 6, 6]
+
+
+@pytest.mark.parametrize("tick_s", [3.0, 1.5])
+def test_a_submap_that_ends_where_a_tick_ends_is_in_it(tick_s):
+    ticks = fresh(CentralConfig(tick_s=tick_s))
+    add(ticks, SUBMAPS["r1"][0])
+    assert ticks.take_until(3e9)
+    assert len(ticks.fold.contributions) == 1
+
+
+def test_the_provisional_fold_holds_everything_and_leaves_the_final_one_alone():
+    ticks = fresh()
+    for each in ALL:
+        add(ticks, each)
+    ticks.take_until(4e9)
+    before = bits(ticks.fold)
+    assert bits(ticks.provisional()) == EXPECTED
+    assert bits(ticks.fold) == before
+
+
+def test_the_fold_by_ticks_is_the_fold_of_the_joined_submaps():
+    fold_by_hand = EMPTY_FOLD
+    contributions = sorted((translate.contribution_of(x) for x in ALL), key=lambda c: c.key)
+    for name, y in (("r1", 0.0), ("r2", 1.0)):
+        fold_by_hand = started(
+            fold_by_hand, translate.StartValue(name, 1, np.array([0.0, y, 0.0]), None)
+        )
+    for tick in range(4):
+        part = [c for c in contributions if (c.end_ns - 1) // 4_000_000_000 == tick]
+        fold_by_hand = folded(fold_by_hand, part, fresh().settings)
+    assert bits(fold_by_hand) == EXPECTED
+
+
+def test_the_digest_changes_with_any_member_any_start_and_what_else_is_named():
+    whole = straight()
+    digests = {whole.digest(whole.fold, b"x"), whole.digest(whole.fold, b"y")}
+    for left_out in (SUBMAPS["r1"][-1], SUBMAPS["r2"][-1]):
+        ticks = fresh()
+        for each in ALL:
+            if each is not left_out:
+                add(ticks, each)
+        ticks.take_until(float("inf"))
+        digests.add(ticks.digest(ticks.fold, b"x"))
+    moved = straight()
+    moved.know_start(translate.StartValue("r1", 1, np.array([0.0, 0.0, 1e-9]), None))
+    digests.add(moved.digest(moved.fold, b"x"))
+    vague = straight()
+    vague.know_start(translate.StartValue("r1", 1, np.zeros(3), np.eye(3)))
+    digests.add(vague.digest(vague.fold, b"x"))
+    assert len(digests) == 6
+    assert straight().digest(straight().fold, b"x") in digests
+
+
+def test_the_version_vector_names_the_last_sequence_of_each_stream():
+    ticks = straight()
+    last = {(name, 1): submaps[-1].sequence for name, submaps in SUBMAPS.items()}
+    assert ticks.members(ticks.fold) == last
