@@ -1,0 +1,177 @@
+"""The rule `join`: when it broadcasts, what it says of its set, and what it refuses."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.config import CentralConfig
+from central.join_rule import JoinRule
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import decoded, encoded
+from tests.teams import of, published, stream, submaps_of
+
+CONFIG = CentralConfig(tick_s=3.0, broadcast_s=6.0)
+STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
+SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
+ALL = [submap for submaps in SUBMAPS.values() for submap in submaps]
+END_NS = 15_000_000_000
+
+
+def rule(config=CONFIG, starts=("r1", "r2")):
+    found = JoinRule(config, b"settings")
+    for name in starts:
+        found.take_start(STARTS[name])
+    return found
+
+
+def whole(config=CONFIG):
+    found = rule(config)
+    for submap in ALL:
+        found.take_submap(submap)
+    return found
+
+
+def final(found):
+    return of(found.conclude(END_NS), ch.FINAL_MAP)[0]
+
+
+def test_submaps_wait_for_the_start_of_their_stream():
+    found = rule(starts=("r2",))
+    for submap in SUBMAPS["r1"]:
+        found.take_submap(submap)
+    assert found.count(("r1", 1)) == 0
+    found.take_start(STARTS["r1"])
+    assert found.count(("r1", 1)) == len(SUBMAPS["r1"])
+    for submap in SUBMAPS["r2"]:
+        found.take_submap(submap)
+    assert encoded(final(found)) == encoded(final(whole()))
+
+
+def test_a_second_start_of_the_same_stream_says_nothing_new():
+    found = whole()
+    found.take_start(msgspec.structs.replace(STARTS["r1"], pose=b""))
+    assert encoded(final(found)) == encoded(final(whole()))
+
+
+def test_broadcasts_lie_so_far_apart_and_name_their_set():
+    found, maps, priors = rule(), [], []
+    for k in range(5):
+        for name in ("r1", "r2"):
+            found.take_submap(SUBMAPS[name][k])
+        now_ns = (k + 1) * 3_000_000_000
+        out = found.advance(now_ns, now_ns)
+        maps += of(out, ch.FUSED_MAP)
+        priors += of(out, ch.PRIOR)
+    assert [each.stamp_ns // 10**9 for each in maps] == [3, 9, 15]
+    for each in maps:
+        last = each.stamp_ns // 3_000_000_000 - 1
+        assert each.members == (m.Member("r1", 1, last), m.Member("r2", 1, last))
+        assert (each.final, each.provisional, each.frame) == (False, False, "r1/1")
+    assert {p.digest for p in priors} == {each.digest for each in maps}
+    assert len({each.digest for each in maps}) == 3
+    assert [(p.robot, p.sequence) for p in priors[:2]] == [("r1", 0), ("r2", 0)]
+    for each in [*maps, *priors]:
+        assert decoded(encoded(each)) == each
+
+
+def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_one():
+    found = rule()
+    out = []
+    for submap in SUBMAPS["r1"]:
+        found.take_submap(submap)
+        out += of(found.advance(float("-inf"), submap.stamp_ns), ch.FUSED_MAP)
+    assert not out, "not before three broadcasts would have been due"
+    late_ns = SUBMAPS["r1"][0].stamp_ns + 18_000_000_000
+    (fused,) = of(found.advance(float("-inf"), late_ns), ch.FUSED_MAP)
+    assert fused.provisional
+    assert fused.members == (m.Member("r1", 1, 4),)
+    assert found.advance(float("-inf"), late_ns + 1) == []
+    assert encoded(final(_completed(found))) == encoded(final(whole())), "it leaves no trace"
+
+
+def _completed(found):
+    for submap in SUBMAPS["r2"]:
+        found.take_submap(submap)
+    return found
+
+
+def test_nothing_is_broadcast_before_there_is_anything():
+    assert rule().advance(float("-inf"), 10**18) == []
+
+
+def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
+    found = rule()
+    for name, submaps in SUBMAPS.items():
+        for submap in submaps:
+            if (name, submap.sequence) != ("r2", 2):
+                found.take_submap(submap)
+    assert found.count(("r2", 1)) == 2
+    fused = final(found)
+    assert fused.missing == (m.Member("r2", 1, 2),)
+    assert fused.members == (m.Member("r1", 1, 4), m.Member("r2", 1, 1))
+
+
+def test_a_refused_submap_changes_no_bit_and_says_why():
+    found = rule()
+    for submap in ALL:
+        found.take_submap(submap)
+        other = msgspec.structs.replace(submap, mean=submap.mean[:-8] + bytes(8))
+        assert found.take_submap(other) == submap.sequence + 1
+    assert found.refused == 10
+    assert "differs" in found.warnings[-1]
+    assert encoded(final(found)) == encoded(final(whole()))
+
+
+def test_nobody_need_wait_for_what_was_refused_and_what_follows_it():
+    found = rule()
+    found.take_submap(SUBMAPS["r1"][0])
+    torn = msgspec.structs.replace(SUBMAPS["r1"][1], first_reading=0)
+    assert found.take_submap(torn) == 2
+    assert found.take_submap(SUBMAPS["r1"][2]) == 3
+    assert found.count(("r1", 1)) == 3
+    assert [each.sequence for each in found.submaps("r1")] == [0]
+    assert final(found).members == (m.Member("r1", 1, 0),)
+    assert found.take_submap(SUBMAPS["r1"][1]) == 3, "the right one may still come"
+    assert [each.sequence for each in found.submaps("r1")] == [0, 1, 2]
+
+
+def test_the_digest_names_the_set_and_the_settings():
+    one = final(whole())
+    assert final(whole()).digest == one.digest
+    other = JoinRule(CONFIG, b"other set")
+    less = rule()
+    for name, submaps in SUBMAPS.items():
+        other.take_start(STARTS[name])
+        for submap in submaps:
+            other.take_submap(submap)
+            if submap.sequence < 4 or name == "r1":
+                less.take_submap(submap)
+    assert len({one.digest, final(other).digest, final(less).digest}) == 3
+
+
+def test_the_final_map_comes_with_the_paths_and_its_cost():
+    found = whole()
+    out = found.conclude(END_NS)
+    fused = out[-1].message
+    assert fused.final
+    assert fused.joint
+    assert fused.dof > 0
+    assert found.cost == pytest.approx((fused.chi2, fused.dof))
+    paths = {t.robot: translate.trajectory_of(t) for t in of(out, ch.TRAJECTORY)}
+    assert sorted(paths) == ["r1", "r2"]
+    for name, (stamps_ns, poses) in paths.items():
+        assert stamps_ns.tolist() == [s.stamp_ns for s in SUBMAPS[name]]
+        assert np.abs(poses[-1, :2] - STREAMS[name].truth[-1, :2]).max() < 2.0
+    ids, means = translate.landmarks_of(fused)
+    assert len(ids) >= 4
+    assert np.isfinite(means).all()
+
+
+def test_without_a_submap_the_final_map_is_empty():
+    (only,) = rule().conclude(0)
+    fused = only.message
+    assert (fused.final, fused.ids, fused.members, fused.frame) == (True, b"", (), "")
+    assert decoded(encoded(fused)) == fused

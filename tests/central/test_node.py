@@ -1,0 +1,251 @@
+"""The centre's node: the watermark, who is waited for, and one final map."""
+
+import msgspec
+import pytest
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import WireError, decoded, encoded
+from tests.teams import of, published, stream, submaps_of
+
+CONFIG = CentralConfig(tick_s=3.0, broadcast_s=3.0)
+STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
+SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
+END = m.End(0, tuple(m.StreamEnd(n, 1, len(s)) for n, s in STREAMS.items()))
+
+
+def alive(name, *, here=True):
+    return m.Liveliness(0, f"robot/{name}", here)
+
+
+def progress(name, stamp_s, submaps, epoch=1):
+    return m.Progress(round(stamp_s * 1e9), f"robot/{name}", name, epoch, 0, submaps)
+
+
+def done(name, submaps=4, epoch=1):
+    return m.Done(12_000_000_000, name, epoch, 31, 12, submaps, ())
+
+
+class Centre:
+    """A centre and everything that it has said."""
+
+    def __init__(self, config=CONFIG, robots=("r1", "r2")):
+        self.node = CentralNode(config, robots)
+        self.said = self.node.begin()
+
+    def hears(self, *messages):
+        out = [o for message in messages for o in self.node.handle(message, 0)]
+        self.said += out
+        return out
+
+    @property
+    def maps(self):
+        return of(self.said, ch.FUSED_MAP)
+
+    @property
+    def final(self):
+        (final,) = of(self.said, ch.FINAL_MAP)
+        return final
+
+
+def joined(*, robots=("r1", "r2"), config=CONFIG):
+    """A centre with robots alive and started."""
+    centre = Centre(config)
+    centre.hears(*(STARTS[r] for r in robots), *(alive(r) for r in robots))
+    return centre
+
+
+def test_it_announces_the_configuration_that_its_maps_hang_on():
+    (one,) = of(Centre().said, ch.CENTRAL_CONFIG)
+    (other,) = of(Centre(CentralConfig(tick_s=4.0)).said, ch.CENTRAL_CONFIG)
+    assert one.digest == translate.digest_of(one.configuration.encode())
+    assert one.digest != other.digest
+
+
+def test_a_tick_closes_when_every_live_robot_has_passed_it():
+    centre = joined()
+    centre.hears(SUBMAPS["r1"][0], progress("r1", 3, 1))
+    assert centre.maps == [], "r2 has said nothing yet"
+    centre.hears(SUBMAPS["r2"][0], progress("r2", 2.9, 1))
+    assert centre.maps == []
+    centre.hears(progress("r2", 3, 1))
+    (fused,) = centre.maps
+    assert (fused.provisional, fused.members) == (
+        False,
+        (m.Member("r1", 1, 0), m.Member("r2", 1, 0)),
+    )
+
+
+def test_a_robot_that_is_lost_is_not_waited_for():
+    centre = joined()
+    centre.hears(SUBMAPS["r1"][0], progress("r1", 3, 1))
+    centre.hears(alive("r2", here=False))
+    assert centre.maps[0].members == (m.Member("r1", 1, 0),)
+    centre.hears(alive("r2"), SUBMAPS["r1"][1], progress("r1", 6, 2))
+    assert len(centre.maps) == 1, "come back, it is waited for again"
+
+
+def test_submaps_that_are_announced_but_not_here_hold_the_watermark():
+    centre = joined(robots=("r1",))
+    centre.hears(STARTS["r2"], alive("r2"), alive("r2", here=False))
+    centre.hears(progress("r1", 9, 3), SUBMAPS["r1"][0], SUBMAPS["r1"][2])
+    assert centre.maps == []
+    centre.hears(SUBMAPS["r1"][1])
+    assert centre.maps[0].members == (m.Member("r1", 1, 2),)
+
+
+def test_a_submap_is_acknowledged_after_the_map_that_it_gave():
+    centre = joined(robots=("r1",))
+    centre.hears(alive("r2"), alive("r2", here=False), progress("r1", 3, 1))
+    out = centre.hears(SUBMAPS["r1"][0])
+    assert [o.channel.name for o in out] == ["fused_map", "prior", "central_progress"]
+    assert out[-1].message.submaps == 1
+    (again,) = centre.hears(SUBMAPS["r1"][0])
+    assert again.message.submaps == 1
+
+
+def test_behind_the_watermark_no_later_map_takes_anything_back():
+    centre = joined()
+    for k in range(4):
+        for name in ("r1", "r2"):
+            centre.hears(SUBMAPS[name][k], progress(name, 3 * (k + 1), k + 1))
+    before = {}
+    for fused in centre.maps:
+        now = {(x.robot, x.epoch): x.sequence for x in fused.members}
+        assert all(now[stream] >= last for stream, last in before.items())
+        before = now
+    assert len(centre.maps) == 4
+
+
+def everything():
+    return [
+        *(x for name in SUBMAPS for x in (STARTS[name], alive(name), *SUBMAPS[name])),
+        END,
+        done("r1"),
+        done("r2"),
+    ]
+
+
+def test_the_final_map_comes_once_when_everybody_is_done_and_everything_is_here():
+    messages = everything()
+    for last in (END, done("r2"), SUBMAPS["r2"][3], SUBMAPS["r1"][0], STARTS["r1"]):
+        centre = Centre()
+        centre.hears(*(x for x in messages if x != last))
+        assert not centre.node.finished
+        centre.hears(last)
+        assert centre.node.finished
+        assert centre.node.final == centre.final
+        centre.hears(*messages, alive("r1", here=False))
+        assert centre.final.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 3))
+
+
+def test_a_robot_that_was_never_there_is_waited_for():
+    centre = joined(robots=("r1",))
+    centre.hears(*SUBMAPS["r1"], done("r1"), END)
+    assert not centre.node.finished
+
+
+def test_a_robot_that_is_lost_at_the_end_leaves_what_it_has_sent():
+    centre = joined()
+    centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"][:2], done("r1"), END)
+    assert not centre.node.finished
+    centre.hears(alive("r2", here=False))
+    assert centre.final.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 1))
+
+
+def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_does_not_hold_up_the_team():
+    centre = joined()
+    centre.hears(*SUBMAPS["r1"], SUBMAPS["r2"][0], SUBMAPS["r2"][2], done("r1"), done("r2"), END)
+    assert not centre.node.finished
+    centre.hears(alive("r2", here=False))
+    assert centre.final.missing == (m.Member("r2", 1, 1),)
+
+
+def test_a_refused_submap_does_not_hold_up_the_team():
+    centre = joined()
+    torn = msgspec.structs.replace(SUBMAPS["r2"][1], first_reading=0)
+    out = centre.hears(SUBMAPS["r2"][0], torn, *SUBMAPS["r2"][2:])
+    acknowledged = [o.message.submaps for o in out if o.channel is ch.CENTRAL_PROGRESS]
+    assert acknowledged == [1, 2, 3, 4], "the robot has its credit"
+    centre.hears(*SUBMAPS["r1"], done("r1"), done("r2"), END)
+    assert centre.final.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 0))
+    assert centre.node.status().figures["refused"] == 1.0
+    assert "overlap" in centre.node.warnings[0]
+
+
+def test_the_last_word_of_an_earlier_epoch_is_not_the_last():
+    centre = joined()
+    end = msgspec.structs.replace(END, streams=(END.streams[0], m.StreamEnd("r2", 2, 9)))
+    centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), end, done("r2"))
+    assert not centre.node.finished
+    second = [msgspec.structs.replace(x, epoch=2) for x in SUBMAPS["r2"][:2]]
+    start = m.Start(0, "r2", 2, 0, b"", b"")
+    centre.hears(start, *second, done("r2", 2, epoch=2))
+    assert centre.node.finished
+    again = joined()
+    again.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), done("r2", 2, epoch=2), done("r2"), end)
+    assert not again.node.finished, "in whichever order they come"
+    again.hears(start, *second)
+    assert encoded(again.final) == encoded(centre.final)
+
+
+def test_the_submaps_of_a_robot_are_given_to_its_next_life():
+    centre = joined()
+    centre.hears(SUBMAPS["r1"][0], SUBMAPS["r1"][1], SUBMAPS["r1"][3])
+
+    def answer(robot):
+        request = encoded(m.SubmapsWanted(0, robot))
+        return [decoded(reply) for reply in centre.node.answer_submaps(request)]
+
+    assert answer("r1") == [STARTS["r1"], *SUBMAPS["r1"][:2]]
+    assert answer("r2") == answer("r9") == []
+    with pytest.raises(WireError):
+        centre.node.answer_submaps(b"\x93nonsense")
+
+
+def test_what_is_not_of_the_team_changes_nothing():
+    centre = joined()
+    assert centre.hears(progress("r9", 3, 1), done("r9"), m.Liveliness(0, "recorder", True)) == []
+
+
+FEEDBACK = CentralConfig(fusion="kalman-per-axis")
+
+
+def estimate(robot, number):
+    return m.MapEstimate(number, robot, 1, number, number, False, b"", b"", b"")
+
+
+def exchanges(centre):
+    return [fused.exchange for fused in centre.maps]
+
+
+def test_under_feedback_a_round_waits_for_every_live_robot():
+    centre = joined(config=FEEDBACK)
+    centre.hears(estimate("r1", 1))
+    assert exchanges(centre) == []
+    centre.hears(estimate("r2", 1))
+    assert exchanges(centre) == [1]
+
+
+@pytest.mark.parametrize("news", [alive("r2", here=False), done("r2", 0)])
+def test_under_feedback_a_robot_that_dies_or_ends_early_is_waited_for_no_longer(news):
+    centre = joined(config=FEEDBACK)
+    centre.hears(estimate("r1", 1))
+    centre.hears(news)
+    assert exchanges(centre) == [1]
+    centre.hears(estimate("r1", 2), END, done("r1", 0))
+    assert exchanges(centre) == [1, 2]
+    assert centre.final.exchange == 2
+
+
+def test_under_feedback_all_open_rounds_are_fused_before_the_end():
+    centre = joined(config=FEEDBACK)
+    centre.hears(estimate("r1", 1), estimate("r1", 2), END, done("r1", 0))
+    assert exchanges(centre) == []
+    centre.hears(done("r2", 0))
+    assert exchanges(centre) == [1, 2]
+    assert centre.final.exchange == 2
