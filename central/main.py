@@ -49,7 +49,7 @@ class CentralShell:
             self._shell.take(self._patient(self._bus.receive(WAIT_S)))
             self._shell.take(self._given_up())
             self._shell.report()
-        self._shell.report()
+        self._shell.report(last=True)
         self._leave_last()
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
@@ -62,7 +62,8 @@ class CentralShell:
                 assert isinstance(message, m.Liveliness)
                 (self._alive.add if message.alive else self._alive.discard)(node)
                 self._lost.pop(node, None)
-                if not message.alive and node.startswith("robot/"):
+                left = node.startswith("robot/") and not message.alive
+                if left and not self.node.finished:
                     _LOG.warning("%s is lost", node)
                     self._lost[node] = (now, sample)
                     continue

@@ -10,6 +10,7 @@ import typer
 
 from sim.cli_options import (
     FAILED,
+    WRONG_USE,
     Dataset,
     EstimatorOption,
     FusionOption,
@@ -84,7 +85,8 @@ def launch(
         with shown(f"{resolved.name}, seed {resolved.seed}") as show:
             outcome = launched(plan, show)
     except KeyboardInterrupt:
-        fail("interrupted: every process of the team was ended", FAILED)
+        kept = f"; {log} holds what was recorded" if log.exists() else ""
+        fail(f"interrupted: every process of the team was ended{kept}", FAILED)
     _conclude(resolved, outcome, json_file, report=report)
 
 
@@ -119,6 +121,8 @@ def _new_folder(scenario: Scenario) -> Path:
 
 def _keep_earlier(log: Path) -> None:
     """A log is never overwritten: an earlier one of the same name steps aside."""
+    if log.exists() and not log.is_file():
+        fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
         number = 1
         while (aside := log.with_name(f"{log.name}.{number}")).exists():

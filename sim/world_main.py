@@ -41,4 +41,4 @@ def run_world(
         shell.publish(out)
         shell.take(bus.receive(0.0 if out else PACE_S))
         shell.report()
-    shell.report()
+    shell.report(last=True)

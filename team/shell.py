@@ -89,13 +89,12 @@ class Shell:
                 continue
             self.publish(self.node.handle(message, sample.stamp_ns))
 
-    def report(self) -> None:
-        """Publish the node's status, at most every STATUS_S."""
+    def report(self, *, last: bool = False) -> None:
+        """Publish the node's status, at most every STATUS_S; the last one in any case."""
         now = time.monotonic()
-        if now < self._status_due:
-            return
-        self._status_due = now + STATUS_S
-        self._publish_status()
+        if last or now >= self._status_due:
+            self._status_due = now + STATUS_S
+            self._publish_status()
 
     def _publish_status(self) -> None:
         status = self.node.status()
@@ -117,7 +116,7 @@ class Shell:
             self.take(self.bus.receive(WAIT_S))
             duty()
             self.report()
-        self._publish_status()
+        self.report(last=True)
 
 
 @contextmanager

@@ -5,13 +5,17 @@ parent leaves behind is found by its working folder.
 """
 
 import asyncio
+import codecs
 import contextlib
 import os
 import signal
 import sys
+import termios
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Self
 
 import pytest
 
@@ -69,6 +73,31 @@ class Process:
         await self._process.wait()
 
 
+class Terminal:
+    """A terminal of 200 columns: `end` is for the process, `shown` is what it has written there."""
+
+    def __init__(self) -> None:
+        self._mine, self.end = os.openpty()
+        termios.tcsetwinsize(self.end, (50, 200))
+        self.shown = ""
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self.end)
+        self._reader.join()
+        os.close(self._mine)
+
+    def _read(self) -> None:
+        decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        with contextlib.suppress(OSError):  # how a terminal says that nobody holds its other end
+            while written := os.read(self._mine, 65_536):
+                self.shown += decoder.decode(written)
+
+
 class Processes:
     """The processes of one test; they work in `folder`."""
 
@@ -76,15 +105,17 @@ class Processes:
         self.folder = folder.resolve()
         self._started: list[Process] = []
 
-    async def run(self, name: str, command: Sequence[str | Path]) -> Process:
-        """Start a command."""
+    async def run(
+        self, name: str, command: Sequence[str | Path], errors: int = asyncio.subprocess.STDOUT
+    ) -> Process:
+        """Start a command; `errors`: where its standard error goes."""
         output = self.folder / f"{name}.said"
         with output.open("wb") as file:
             process = await asyncio.create_subprocess_exec(
                 *command,
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=file,
-                stderr=asyncio.subprocess.STDOUT,
+                stderr=errors,
                 cwd=self.folder,
                 env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
             )

@@ -57,6 +57,7 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
         (["launch", "thesis", "--dataset", "x.zip"], ["takes no data set", "utias"]),
         (["launch", "utias"], ["no data set given", "--dataset"]),
         (["robot", "thesis", "r9"], ["thesis has no robot 'r9'", "r1, r2"]),
+        (["launch", "thesis", "--record", "/dev/null"], ["/dev/null: not a regular file"]),
         (["replay", "nowhere.mcap"], ["nowhere.mcap: not found"]),
         (["report", "nowhere.mcap", "-o", "out"], ["nowhere.mcap: not found"]),
         (["router", "--listen", "banana"], ["can not listen at banana"]),

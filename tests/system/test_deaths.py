@@ -138,6 +138,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
     assert await launch.ended(20.0) == 1
     await team.none_left(0.0)
     assert "interrupted: every process of the team was ended" in launch.said()
+    assert f"{folder / 'log.mcap'} holds what was recorded" in launch.said()
     assert "Traceback" not in launch.said()
     assert open_log(folder / "log.mcap").complete
     assert submaps_in(folder / "log.mcap") > 0

@@ -11,7 +11,7 @@ from team.wire import channels as ch
 from team.wire.bus import opened
 from team.wire.messages import Configured
 from tests.system.conftest import Launched
-from tests.system.processes import Processes
+from tests.system.processes import PROGRAM, Processes, Terminal
 from tests.system.scenarios import STEPS, final_map, map_in_memory, sha256, short
 
 FIGURES = (
@@ -124,3 +124,17 @@ async def test_a_rule_that_feeds_the_map_back_ends_with_the_bytes_of_a_team_in_m
     result = await launch(team, scenario)
     assert (result["estimator"], result["fusion"]) == (estimator, rule)
     assert result["final_map_sha256"] == sha256(map_in_memory(scenario))
+
+
+async def test_a_terminal_shows_a_live_table_of_the_robots(team: Processes) -> None:
+    terminal = Terminal()
+    with terminal:
+        launch = await team.run(
+            "launch",
+            [*PROGRAM, "launch", short(team.folder), "--speed", "20", "--no-report", "-o", "run"],
+            errors=terminal.end,
+        )
+        assert await launch.ended() == 0
+    for text in ("short, seed 1", "pose σ [m]", "mapping", "team map by join", "world ended"):
+        assert text in terminal.shown, terminal.shown
+    assert "Traceback" not in terminal.shown

@@ -73,7 +73,7 @@ async def test_a_robot_that_is_killed_and_started_again_changes_no_bit_of_the_ma
     await found.ends_well()
     resumed = "resumed after submap" in found.robots["r1"].said()
     assert resumed == (submaps > 0)
-    assert "robot/r1 is lost" in found.others[1].said()
+    assert found.others[1].said() == "central: robot/r1 is lost\n"
     assert found.final_map() == map_in_memory(found.scenario)
 
 
