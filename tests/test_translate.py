@@ -1,0 +1,152 @@
+"""Estimation values to messages and back: nothing is lost, nothing is added."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team import translate
+from team.config import RobotConfig
+from team.estimation.conditioning import RobotPrior
+from team.estimation.submap import LocalMap
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.codec import decoded, encoded
+from tests.estimation.submap_world import correlated
+
+
+def local_map(ids, seed):
+    rng = np.random.default_rng(seed)
+    n = 3 + 2 * len(ids)
+    return LocalMap(
+        np.array(sorted(ids), np.uint32), rng.normal(size=n), correlated(np.ones(n), rng)
+    )
+
+
+def over_the_wire(message):
+    return decoded(encoded(message), type(message))
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sets(st.integers(0, 2**32 - 1), max_size=6), st.integers(0, 99))
+def test_a_submap_survives_the_wire_bit_for_bit(ids, seed):
+    local = local_map(ids, seed)
+    message = translate.submap_message("r1", 2, 5, (10, 19), (1_000, 2_000), b"settings", local)
+    there = over_the_wire(message)
+    found = translate.local_map_of(there)
+    assert found.ids.tobytes() == local.ids.tobytes()
+    assert found.mean.tobytes() == local.mean.tobytes()
+    assert found.covariance.tobytes() == local.covariance.tobytes()
+    again = translate.submap_message("r1", 2, 5, (10, 19), (1_000, 2_000), b"settings", found)
+    assert encoded(again) == encoded(message)
+    assert (there.first_reading, there.last_reading) == (10, 19)
+    assert (there.start_ns, there.stamp_ns) == (1_000, 2_000)
+    assert translate.contribution_of(there).key == (2_000, "r1", 2, 5)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.sets(st.integers(1, 50), max_size=5), st.integers(0, 99))
+def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
+    local = local_map(ids, seed)
+    prior = RobotPrior(local.end_pose, local.ids, local.landmarks, local.covariance)
+    there = over_the_wire(translate.prior_message(7, "r1", 1, 3, b"its name", prior))
+    found = translate.prior_of(there)
+    for value, expected in zip(found, prior, strict=True):
+        assert value.tobytes() == np.ascontiguousarray(expected).tobytes()
+    assert (there.sequence, there.digest) == (3, b"its name")
+
+
+@pytest.mark.parametrize("covariance", [None, np.diag([0.25, 0.5, 0.125])])
+def test_a_start_is_known_exactly_or_with_a_covariance(covariance):
+    spread = b"" if covariance is None else from_floats(covariance)
+    start = translate.start_of(m.Start(0, "r1", 1, 0, from_floats([1.0, 2.0, 3.0]), spread))
+    np.testing.assert_array_equal(start.pose, [1.0, 2.0, 3.0])
+    np.testing.assert_equal(start.covariance, covariance)
+    assert start.stream == ("r1", 1)
+
+
+def test_an_unknown_start_is_none():
+    unknown = m.Start(0, "r1", 1, 0, b"", b"")
+    assert translate.start_of(unknown) is None
+    assert translate.pose_of(unknown) == (None, None)
+
+
+def estimate(covariance, *, joint):
+    return m.MapEstimate(
+        0, "r1", 1, 0, 0, joint, from_ids([3, 9]), from_floats(np.arange(4.0)), covariance
+    )
+
+
+def test_a_map_carries_its_joint_covariance_or_the_blocks_of_it():
+    joint = correlated(np.array([1.0, 2.0, 3.0, 4.0]), np.random.default_rng(1))
+    whole = over_the_wire(estimate(translate.joint_bytes(joint), joint=True))
+    np.testing.assert_array_equal(translate.landmark_covariance_of(whole), joint)
+    blocks = translate.blocks_of(joint)
+    np.testing.assert_array_equal(blocks[1], joint[2:, 2:])
+    parts = over_the_wire(estimate(translate.block_bytes(blocks), joint=False))
+    found = translate.landmark_covariance_of(parts)
+    np.testing.assert_array_equal(translate.blocks_of(found), blocks)
+    assert not found[:2, 2:].any()
+    ids, means = translate.landmarks_of(whole)
+    assert ids.tolist() == [3, 9]
+    np.testing.assert_array_equal(means, [[0.0, 1.0], [2.0, 3.0]])
+
+
+def test_a_map_without_landmarks_has_an_empty_covariance():
+    empty = np.zeros((0, 0))
+    assert translate.blocks_of(empty).shape == (0, 2, 2)
+    assert translate.joint_bytes(empty) == b""
+    assert translate.block_bytes(translate.blocks_of(empty)) == b""
+
+
+def test_a_pose_passes_the_door_although_rounding_made_it_skew():
+    covariance = np.diag([1.0, 2.0, 3.0])
+    covariance[0, 1] = 1e-17
+    message = translate.pose_message(1, "r1", 1, 2, translate.NO_MAP, np.zeros(3), covariance)
+    assert over_the_wire(message) == message
+
+
+def test_a_trajectory_comes_back_with_its_stamps():
+    poses = np.arange(6.0).reshape(2, 3)
+    covariances = np.stack([np.eye(3), 2.0 * np.eye(3)])
+    message = over_the_wire(
+        translate.trajectory_message(20, "r1", 1, bytes(8), [10, 20], poses, covariances)
+    )
+    stamps_ns, found = translate.trajectory_of(message)
+    assert stamps_ns.tolist() == [10, 20]
+    np.testing.assert_array_equal(found, poses)
+
+
+def test_the_digest_is_that_of_the_announced_text_and_tells_its_parts_apart():
+    announced = translate.configured("robot/r1", 0, 0, RobotConfig("r1"))
+    text = announced.configuration.encode()
+    by_hand = hashlib.blake2b(len(text).to_bytes(8, "little") + text, digest_size=8).digest()
+    assert announced.digest == by_hand
+    assert translate.digest_of(b"ab", b"c") != translate.digest_of(b"a", b"bc")
+    assert translate.digest_of(b"a", b"") != translate.digest_of(b"a")
+
+
+def test_every_field_of_a_configuration_changes_its_digest():
+    base = RobotConfig("r1")
+    others = [
+        RobotConfig("r2"),
+        RobotConfig("r1", seed=2),
+        RobotConfig("r1", pose_s=1.0),
+        RobotConfig("r1", exchange_s=1.0),
+        RobotConfig("r1", fusion="kalman"),
+        RobotConfig("r1", estimator="hybrid-thesis"),
+    ]
+    digests = {translate.configured("x", 0, 0, each).digest for each in (base, *others)}
+    assert len(digests) == 1 + len(others)
+
+
+def test_a_scan_is_in_the_machines_byte_order_and_writable_by_nobody_elses_hand():
+    message = m.Observations(
+        0, "r1", 1, 1, from_ids([4, 2]), from_floats([1.5, 2.5]), from_floats([0.5, -0.5])
+    )
+    ids, ranges, bearings = translate.scan_of(message)
+    assert (ids.tolist(), ranges.tolist(), bearings.tolist()) == ([4, 2], [1.5, 2.5], [0.5, -0.5])
+    ranges[0] = 9.0
+    assert translate.scan_of(message)[1][0] == 1.5
