@@ -13,6 +13,7 @@ from msgspec import Meta
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
+Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 
 Estimator = Literal["hybrid", "hybrid-thesis"]
 FusionRule = Literal["join", "kalman", "kalman-per-axis", "covariance-intersection"]
@@ -51,6 +52,9 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Range sigma at a predicted range r is hypot(range_sigma, range_sigma_per_m · r); the predicted
     range is used, not the measured one (else maps shrink: Peelle's puzzle).
     Readings outside [min_range, max_range] or more than field_of_view/2 from the axis are rejected.
+    range_white and bearing_white are the shares of the two variances that are independent from
+    reading to reading; the rest is one error per landmark, constant within a window (a camera that
+    mismeasures a marker does so again a moment later).
     """
 
     range_sigma: Positive = 0.1
@@ -62,6 +66,8 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     range_offset: float = 0.0
     range_scale: Positive = 1.0
     bearing_offset: float = 0.0
+    range_white: Share = 1.0
+    bearing_white: Share = 1.0
 
 
 class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -8,6 +8,7 @@ bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -26,6 +27,16 @@ POSE_JITTER = (1e-6, 1e-6, 1e-8)
 
 SOLVED = 1e-6
 """A Gauss-Newton step of squared Mahalanobis length below this changes nothing that matters."""
+
+
+class Noise(NamedTuple):
+    """Variances of a reading, and the share of each that is white: the rest is constant."""
+
+    range_variance: float
+    range_per_m2: float
+    range_white: float
+    bearing_variance: float
+    bearing_white: float
 
 
 @dataclass(frozen=True)
@@ -124,9 +135,13 @@ def gaussian(window: Window) -> LocalMap:
         np.searchsorted(slots[by_slot], np.arange(len(ids) + 1)),
         window.epochs[by_slot],
         window.readings[by_slot],
-        window.sensor.range_sigma**2,
-        window.sensor.range_sigma_per_m**2,
-        window.sensor.bearing_sigma**2,
+        Noise(
+            window.sensor.range_sigma**2,
+            window.sensor.range_sigma_per_m**2,
+            window.sensor.range_white,
+            window.sensor.bearing_sigma**2,
+            window.sensor.bearing_white,
+        ),
     )
     mean, covariance = moments(particles.poses, np.exp(particles.log_weights), means, covariances)
     covariance[np.arange(3), np.arange(3)] += POSE_JITTER
@@ -142,16 +157,17 @@ def landmarks_along_paths(
     bounds: Int64[np.ndarray, " L+1"],
     epochs: Int64[np.ndarray, " N"],
     readings: Float[np.ndarray, "N 2"],
-    range_variance: float,
-    range_variance_per_m2: float,
-    bearing_variance: float,
+    noise: Noise,
 ) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
     """Each landmark of each particle by Gauss-Newton over its readings, given the particle's path.
 
-    Minimises Σ ‖z − h(path, landmark)‖² in R⁻¹ from the EKF's mean with at most three steps, each
-    kept only if the cost falls; the covariance is (Σ Hᵀ R⁻¹ H)⁻¹ at the result, (xx, xy, yy). R is
-    that of the range predicted at the start. Readings bounds[l] to bounds[l + 1] belong to landmark
-    l. Where no evaluation is finite the EKF's mean and covariance stay.
+    Minimises Σ ‖z − h(path, landmark) − b‖² in R⁻¹ plus ‖b‖² in B⁻¹ from the EKF's mean with at
+    most three steps, each kept only if the cost falls. R is the white part of the noise, of the
+    range predicted at the start; b ~ N(0, B) is the landmark's constant error, B the rest of the
+    variances (of the last reading's range), eliminated by Schur's complement: with D = Σ R⁻¹ + B⁻¹
+    and C = Σ Hᵀ R⁻¹ the covariance is (Σ Hᵀ R⁻¹ H − C D⁻¹ Cᵀ)⁻¹ at the result, (xx, xy, yy).
+    Readings bounds[l] to bounds[l + 1] belong to landmark l. Where no evaluation is finite the
+    EKF's mean and covariance stay.
     """
     means, covariances = starts.copy(), start_covariances.copy()
     range_information = np.empty(len(readings))
@@ -161,19 +177,21 @@ def landmarks_along_paths(
             least = np.inf
             for iteration in range(4):
                 cost, gx, gy, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                rx, ry, bx, by = 0.0, 0.0, 0.0, 0.0
+                range_sum, bearing_sum, range_weight, bearing_weight = 0.0, 0.0, 0.0, 0.0
+                total = 0.0
                 for k in range(bounds[landmark], bounds[landmark + 1]):
                     pose = paths[epochs[k], i]
                     dx, dy = x - pose[0], y - pose[1]
                     distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
+                    total = noise.range_variance + noise.range_per_m2 * distance * distance
                     if iteration == 0:
-                        range_information[k] = 1.0 / (
-                            range_variance + range_variance_per_m2 * distance * distance
-                        )
+                        range_information[k] = 1.0 / (noise.range_white * total)
                     ex, ey = dx / distance, dy / distance
                     of_range = readings[k, 0] - distance
                     of_bearing = wrapped(readings[k, 1] + pose[2] - math.atan2(dy, dx))
                     wr = range_information[k]
-                    wb = 1.0 / bearing_variance
+                    wb = 1.0 / (noise.bearing_white * noise.bearing_variance)
                     cost += wr * of_range * of_range + wb * of_bearing * of_bearing
                     wr_r, wb_b = wr * of_range, wb * of_bearing / distance
                     gx += wr_r * ex - wb_b * ey
@@ -182,6 +200,21 @@ def landmarks_along_paths(
                     xx += wr * ex * ex + wt * ey * ey
                     xy += (wr - wt) * ex * ey
                     yy += wr * ey * ey + wt * ex * ex
+                    rx, ry = rx + wr * ex, ry + wr * ey
+                    bx, by = bx - wb * ey / distance, by + wb * ex / distance
+                    range_sum, range_weight = range_sum + wr_r, range_weight + wr
+                    bearing_sum, bearing_weight = bearing_sum + wb * of_bearing, bearing_weight + wb
+                if noise.range_white < 1.0:
+                    share = 1.0 / (range_weight + 1.0 / ((1.0 - noise.range_white) * total))
+                    cost -= share * range_sum * range_sum
+                    gx, gy = gx - share * range_sum * rx, gy - share * range_sum * ry
+                    xx, xy, yy = xx - share * rx * rx, xy - share * rx * ry, yy - share * ry * ry
+                if noise.bearing_white < 1.0:
+                    constant = (1.0 - noise.bearing_white) * noise.bearing_variance
+                    share = 1.0 / (bearing_weight + 1.0 / constant)
+                    cost -= share * bearing_sum * bearing_sum
+                    gx, gy = gx - share * bearing_sum * bx, gy - share * bearing_sum * by
+                    xx, xy, yy = xx - share * bx * bx, xy - share * bx * by, yy - share * by * by
                 determinant = xx * yy - xy * xy
                 if not (cost < least and determinant > 0.0):
                     break
