@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
+OFFENDERS = 20
+"""Offenders that are printed; the JSON file has all."""
+
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
 
@@ -88,3 +91,38 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
         f"{result.span_s / elapsed_s:.0f} × real time",
         highlight=False,
     )
+
+
+@app.command(name="verify-ledger")
+def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
+    """Prove that each reading of a log was used once: its disposition, its submap, its maps."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from sim.ledger import ledger
+    from sim.rerun_log import RerunError, recorded
+    from team.recording.reader import open_log
+
+    try:
+        found = ledger(recorded(open_log(log)))
+    except RerunError as error:
+        fail(f"{log}: {error}", FAILED)
+    robots = sorted({robot for robot, _ in found.entries})
+    table = Table("disposition")
+    for robot in [*robots, "all"]:
+        table.add_column(robot, justify="right")
+    of_robots = [found.totals(robot) for robot in robots]
+    for disposition, count in found.totals().items():
+        counts = [*(totals.get(disposition, 0) for totals in of_robots), count]
+        table.add_row(disposition, *(f"{n:,}" for n in counts))
+    console = Console()
+    console.print(table)
+    used = sum(1 for maps in found.maps.values() if maps)
+    console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
+    if json_file is not None:
+        json_file.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+    for offender in found.offenders[:OFFENDERS]:
+        typer.secho(offender, fg="red", err=True)
+    if found.offenders:
+        fail(f"{len(found.offenders)} offenders against the ledger", FAILED)
+    console.print(found.statement(), highlight=False, soft_wrap=True)

@@ -39,12 +39,17 @@ class Recorded:
     """Everything in a log that is an input or an output of a node; each reading once.
 
     readings: by (robot, epoch) and counter. configured: the last announcement of each node.
+    contradicted: readings that the log has twice with different content. reported: how many
+    readings a robot had consumed by its own word. published: how many the world says there are.
     unsound: samples that no node would have let in.
     """
 
     readings: dict[Stream, dict[int, m.Reading]] = field(default_factory=dict)
     configured: dict[str, m.Configured] = field(default_factory=dict)
     said: list[Said] = field(default_factory=list)
+    contradicted: list[m.Reading] = field(default_factory=list)
+    reported: dict[Stream, int] = field(default_factory=dict)
+    published: dict[Stream, int] = field(default_factory=dict)
     unsound: int = 0
 
     def take(self, sample: Sample) -> None:
@@ -54,13 +59,22 @@ class Recorded:
         except WireError:
             self.unsound += 1
             return
-        if isinstance(message, m.Reading):
-            stream = self.readings.setdefault((message.robot, message.epoch), {})
-            stream.setdefault(message.reading, message)
-        elif isinstance(message, m.Configured):
-            self.configured[message.node] = message
-        elif channel.recomputable:
-            self.said.append(Said(sample, channel, message))
+        match message:
+            case m.Reading():
+                stream = self.readings.setdefault((message.robot, message.epoch), {})
+                if stream.setdefault(message.reading, message) != message:
+                    self.contradicted.append(message)
+            case m.Configured():
+                self.configured[message.node] = message
+            case m.Progress():
+                consumed = self.reported.get((message.robot, message.epoch), 0)
+                self.reported[message.robot, message.epoch] = max(consumed, message.readings)
+            case m.End():
+                self.published |= {(s.robot, s.epoch): s.readings for s in message.streams}
+            case _ if channel.recomputable:
+                self.said.append(Said(sample, channel, message))
+            case _:
+                pass
 
     def of(self, channel: ch.Channel) -> list[m.Message]:
         """The recorded messages of a channel, in the order of the log."""
@@ -115,9 +129,10 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
 INPUTS = tuple(
     channel
     for channel in ch.CHANNELS
-    if channel.recomputable or channel in (*ch.SENSORS, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
+    if channel.recomputable
+    or channel in (*ch.SENSORS, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END)
 )
-"""The channels that a verification reads."""
+"""The channels whose samples are filed."""
 
 
 def recorded(log: Log) -> Recorded:

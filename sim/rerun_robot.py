@@ -1,5 +1,6 @@
 """One robot's messages again: its node over its recorded readings."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import takewhile
 
@@ -36,6 +37,12 @@ class RetoldRobot(RobotNode):
             self._pose_ns, self._prior = None, prior
             out += super()._poses(stamp_ns)
         return out
+
+    def took(self, message: m.Message) -> Counter[str]:
+        """Take a reading or the end; the dispositions that it gave, how many of each."""
+        before = Counter[str]() if isinstance(message, m.Start) else Counter(self._ledger)
+        self.handle(message, 0)
+        return self._ledger - before
 
 
 Born = Callable[[], RetoldRobot]
@@ -159,3 +166,23 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
             if isinstance(each.message, m.MapEstimate):
                 centre = m.Liveliness(0, "central", each.message.exchange in fused)
                 inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
+
+
+def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
+    """What the robot's node does with each recorded reading of an epoch, in its own words.
+
+    Without a centre nothing holds it up. Scans that no odometry covers are known at the end only.
+    """
+    config, digest = log.robot_config(robot)
+    node = RetoldRobot(config, digest, {})
+    node.handle(m.Liveliness(0, "central", False), 0)
+    readings = log.readings.get((robot, epoch), {})
+    said: dict[int, str] = {}
+    for counter in takewhile(readings.__contains__, range(len(readings))):
+        said[counter] = next(iter(node.took(readings[counter])), "lost")
+    if said and (robot, epoch) in log.published:
+        end = m.StreamEnd(robot, epoch, len(said))
+        for reason, count in node.took(m.End(0, (end,))).items():
+            scans = [n for n in said if isinstance(readings[n], m.Observations)]
+            said |= dict.fromkeys(scans[-count:], reason)
+    return said
