@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 
 from central.config import CentralConfig
+from central.monitor import NOTHING, finding
 from central.submap_set import Stream, SubmapSet
 from central.tick_fold import TickFold
 from team import translate
@@ -37,7 +38,7 @@ class JoinRule:
         self._refusals: dict[Stream, set[int]] = {}
         self._broadcast_ns: int | None = None
         self._quiet_ns: int | None = None
-        self.cost: tuple[float, float] = (0.0, 0.0)
+        self.finding = NOTHING
         self.landmarks = 0
         self.warnings: list[str] = []
         self.refused = 0
@@ -141,10 +142,10 @@ class JoinRule:
 
     def _fused(self, fold: Fold, tail: Tail, digest: bytes) -> m.FusedMap:
         chi2 = dof = 0.0
-        if fold.contributions and tail == "final":
+        if fold.contributions:
             agreement = marginals.joint_cost(fold)
             chi2, dof = agreement.chi2, agreement.dof
-            self.cost = (chi2, dof)
+            self.finding = finding(agreement)
         joint = False
         if not fold.contributions:
             ids, means, covariance = np.empty(0, np.uint32), np.empty((0, 2)), b""

@@ -166,7 +166,6 @@ class CentralNode:
 
     def status(self) -> m.Status:
         """What the centre is doing, for people."""
-        chi2, dof = self._join.cost
         figures = {
             "broadcasts": float(self._broadcasts),
             "submaps": float(sum(self._join.count(s) for s in self._join.streams)),
@@ -174,7 +173,7 @@ class CentralNode:
             "team_time_s": self._now_ns * 1e-9,
             "refused": float(self._join.refused),
         }
-        if dof > 0:
-            figures["joint_cost_per_dof"] = chi2 / dof
+        found = self._join.finding
         state = "done" if self.finished else "joining"
-        return m.Status(self._now_ns, "central", state, figures, tuple(self.warnings[-3:]))
+        warnings = (*found.warnings, *self.warnings[-3:])
+        return m.Status(self._now_ns, "central", state, figures | found.figures, warnings)

@@ -105,6 +105,7 @@ class Evaluation:
     channels: Mapping[str, Traffic]
     notes: tuple[str, ...]
     unsound: int
+    cost_by_robot: Mapping[str, float]
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
@@ -134,7 +135,17 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         {key: log.traffic[key] for key in sorted(log.traffic)},
         end.notes if isinstance(end, m.End) else (),
         log.unsound,
+        _cost_by_robot(log),
     )
+
+
+def _cost_by_robot(log: Collected) -> dict[str, float]:
+    """The centre's last word on each robot's joint cost per degree of freedom."""
+    status = log.sound(log.latest.get(ch.STATUS.key("central")))
+    if not isinstance(status, m.Status):
+        return {}
+    name = "joint_cost_per_dof."
+    return {k.removeprefix(name): v for k, v in status.figures.items() if k.startswith(name)}
 
 
 def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -155,6 +166,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "map_nees_in_band": None if errors is None else errors.in_band,
         "map_covariance": None if fused is None else "joint" if fused.joint else "blocks",
         "joint_cost_per_dof": None if fused is None else fused.cost_per_dof,
+        "joint_cost_per_dof_by_robot": dict(evaluation.cost_by_robot),
         "final_map_digest": None if fused is None else fused.digest,
         "final_map_sha256": None if fused is None else fused.payload_sha256,
         "final_map_frame": None if fused is None else fused.frame,

@@ -18,7 +18,8 @@ from team.wire.codec import WireError
 
 _SENSORS = frozenset(channel.name for channel in ch.SENSORS)
 _LATEST = frozenset(
-    channel.name for channel in (ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END)
+    channel.name
+    for channel in (ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END, ch.STATUS)
 )
 _KEPT = frozenset(
     channel.name

@@ -149,11 +149,13 @@ _ROBOT_HEADINGS = (
 def _robot_row(name: str, robot: RobotResult) -> tuple[str, ...]:
     used = robot.consumption
     errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
-    consumed = "–" if used.consumed is None else str(used.consumed)
+    readings = f"all {used.published}"
+    if used.consumed != used.published:
+        readings = f"{'–' if used.consumed is None else used.consumed}/{used.published}"
     return (
         name,
         str(used.steps),
-        f"{consumed}/{used.published}",
+        readings,
         str(used.submaps),
         _shown(None if errors is None else errors.position_rmse_m, ".3f", mark),
         _shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),

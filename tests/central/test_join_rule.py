@@ -159,7 +159,9 @@ def test_the_final_map_comes_with_the_paths_and_its_cost():
     assert fused.final
     assert fused.joint
     assert fused.dof > 0
-    assert found.cost == pytest.approx((fused.chi2, fused.dof))
+    assert found.finding.figures["joint_cost_per_dof"] == pytest.approx(
+        fused.chi2 / fused.dof, rel=0.05
+    )
     paths = {t.robot: translate.trajectory_of(t) for t in of(out, ch.TRAJECTORY)}
     assert sorted(paths) == ["r1", "r2"]
     for name, (stamps_ns, poses) in paths.items():
