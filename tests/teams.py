@@ -171,12 +171,17 @@ class Team:
                 if to != source and o.channel in node.listens and mine:
                     self.queues.setdefault((to, o.key), deque()).append(o.message)
 
-    def kill(self, robot: str) -> None:
-        """The process is gone, and so is its token; what it has sent is on its way."""
+    def kill(self, robot: str, *, patience: bool = False) -> None:
+        """The process is gone, and so is its token; what it has sent is on its way.
+
+        patience: the centre's shell holds the news back, since the robot may come again.
+        """
         node = ch.robot_node(robot)
         del self.nodes[node]
         self.queues = {k: q for k, q in self.queues.items() if k[0] != node}
         self.token(node, alive=False)
+        if patience:
+            self.queues[("central", ch.ALIVE.key(node))].pop()
 
     def resume(self, robot: RobotConfig) -> None:
         """The process is there again: it takes over the submaps that the centre has."""

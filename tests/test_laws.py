@@ -1,0 +1,384 @@
+"""The four laws of the design, held against whole teams.
+
+1 a reading is used once; 2 a map is a pure function of a set of submaps; 3 every message names its
+inputs; 4 a node does no I/O and reads no clock.
+"""
+
+import ast
+import random
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sim.world_node
+import team.robot.node
+from central.config import CentralConfig
+from central.node import CentralNode
+from sim.datasets.utias_writer import write_utias
+from sim.in_memory import final_map, run_team
+from sim.scenario import load, with_options
+from sim.source import streams_of
+from sim.world_node import WorldNode
+from team import translate
+from team.robot.node import RobotNode
+from team.robot.pairs import PAIRS
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import opened
+from team.wire.codec import encoded
+from tests.support import ROOT
+from tests.teams import Team, config, driven, of, published, stream, world_of
+
+NODES = (WorldNode, RobotNode, CentralNode)
+CENTRE = CentralConfig(tick_s=3.0, broadcast_s=3.0)
+PAIR = world_of(stream("r1", 12, off_ns=300_000_000), stream("r2", 10, y=1.0, seen_every=2))
+
+
+def team_of(streams, rng, **options):
+    configs = [config(each.robot, pose_s=1e6, **options) for each in streams.streams]
+    return Team(streams, configs, rng, CENTRE)
+
+
+@pytest.fixture
+def scarce(monkeypatch):
+    """Little credit and small portions, so that everybody waits for somebody."""
+    monkeypatch.setattr(sim.world_node, "CREDIT_READINGS", 16)
+    monkeypatch.setattr(sim.world_node, "BATCH", 5)
+    monkeypatch.setattr(team.robot.node, "PROGRESS_READINGS", 4)
+    monkeypatch.setattr(team.robot.node, "CREDIT_SUBMAPS", 1)
+
+
+# Law 1.
+
+
+def assert_each_reading_once(samples):
+    """Submaps part each robot's readings, and its ledger adds up to what was published."""
+    messages = [opened(sample) for sample in samples]
+    counted = {}
+    for _, name, message in messages:
+        if isinstance(message, m.Reading):
+            counted.setdefault(name, set()).add((message.epoch, message.reading))
+    submaps = {name: [] for name in counted}
+    for _, name, message in messages:
+        if isinstance(message, m.Submap):
+            submaps[name].append(message)
+    dones = [message for _, _, message in messages if isinstance(message, m.Done)]
+    assert sorted(done.robot for done in dones) == sorted(counted)
+    for done in dones:
+        assert done.readings == len(counted[done.robot])
+        assert sum(entry.readings for entry in done.ledger) == done.readings
+        mine = submaps[done.robot]
+        assert [each.sequence for each in mine] == list(range(done.submaps))
+        assert mine[0].first_reading == 0
+        for before, after in pairwise(mine):
+            assert (after.first_reading, after.start_ns) == (
+                before.last_reading + 1,
+                before.stamp_ns,
+            )
+        outside = done.readings - mine[-1].last_reading - 1
+        rejected = [e.readings for e in done.ledger if e.disposition.startswith("rejected")]
+        assert 0 <= outside <= sum(rejected)
+
+
+@pytest.fixture(scope="module")
+def utias(tmp_path_factory):
+    """Three robots of a UTIAS data set, with keyframes, observed between the odometry's stamps."""
+    folder = tmp_path_factory.mktemp("utias") / "MRCLAM_Dataset0"
+    scenario = load("waypoints")
+    world = msgspec.structs.replace(scenario.world, steps=45)
+    write_utias(streams_of(msgspec.structs.replace(scenario, world=world)), folder)
+    return with_options(load("utias"), dataset=folder, robots=3)
+
+
+def thesis(steps=45):
+    scenario = load("thesis")
+    world = msgspec.structs.replace(scenario.world, steps=steps)
+    return msgspec.structs.replace(scenario, world=world)
+
+
+def test_a_simulated_teams_readings_are_each_used_once():
+    scenario = thesis()
+    assert_each_reading_once(run_team(scenario, streams_of(scenario)))
+
+
+def test_a_data_sets_readings_are_each_used_once(utias):
+    streams = streams_of(utias)
+    samples = list(run_team(utias, streams))
+    assert_each_reading_once(samples)
+    ends = {int(t) for each in streams.streams for t in each.intervals.end_ns}
+    seen = {int(t) for each in streams.streams for t in each.landmark_detections.stamps_ns}
+    assert seen - ends, "some are between the stamps of the odometry"
+    assert len(final_map(samples).ids) > 0
+
+
+def test_a_robots_submaps_are_the_same_bytes_without_a_centre(utias):
+    for scenario in (thesis(), utias):
+        streams = streams_of(scenario)
+        samples = list(run_team(scenario, streams))
+        for robot, each in zip(scenario.robots, streams.streams, strict=True):
+            key = ch.SUBMAP.key(robot.id)
+            in_team = [sample.payload for sample in samples if sample.key == key]
+            alone = of(driven(RobotNode(robot), published(each)), ch.SUBMAP)
+            assert in_team == [encoded(submap) for submap in alone]
+            assert len(alone) >= 4
+
+
+def test_a_rule_with_feedback_breaks_law_1_and_this_can_be_seen():
+    """The mutant: what the centre sends does change what such a robot publishes for fusion."""
+    robot = config(fusion="kalman")
+    readings = published(PAIR.streams[0])
+    maps = []
+    for shift in (0.0, 1.0):
+        node, out = RobotNode(robot), []
+        for reading in readings:
+            new = node.handle(reading, 0)
+            while new:
+                out += new
+                new = [
+                    answer
+                    for x in of(new, ch.OWN_MAP)
+                    for answer in node.handle(_answer(x, shift), 0)
+                ]
+        maps.append([encoded(x) for x in of(out, ch.OWN_MAP)])
+    assert maps[0][0] == maps[1][0]
+    assert maps[0][1:] != maps[1][1:]
+
+
+def _answer(estimate, shift):
+    means = translate.landmarks_of(estimate)[1]
+    return m.FusedMap(
+        0, "kalman", bytes(8), "", False, False, estimate.exchange, (), (), True, estimate.ids,
+        (means + shift).tobytes(), estimate.covariance, 0.0, 0,
+    )  # fmt: skip
+
+
+# Law 2.
+
+
+EXPECTED = {}
+
+
+def expected_final(streams=PAIR):
+    """The final map of a team that nothing happens to."""
+    if not EXPECTED:
+        calm = team_of(streams, random.Random(0))
+        calm.run()
+        EXPECTED["bytes"] = encoded(calm.final)
+    return EXPECTED["bytes"]
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32))
+def test_the_final_map_is_the_same_bytes_for_any_interleaving(seed):
+    team = team_of(PAIR, random.Random(seed))
+    team.run()
+    assert encoded(team.final) == expected_final()
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32), st.integers(0, 150), st.sampled_from(["r1", "r2"]))
+def test_a_robot_that_dies_and_comes_back_changes_no_bit_of_it(seed, when, victim):
+    team = team_of(PAIR, random.Random(seed))
+    for _ in range(when):
+        team.step()
+    if not team.robots[victim].finished:
+        team.kill(victim, patience=True)
+        for _ in range(seed % 40):
+            team.step()
+        team.resume(team.robots[victim].config)
+    team.run()
+    assert encoded(team.final) == expected_final()
+    assert team.robots[victim].finished
+
+
+MESSAGES = [
+    *(published(each)[0] for each in PAIR.streams),
+    *(
+        o.message
+        for each in PAIR.streams
+        for o in driven(RobotNode(config(each.robot, pose_s=1e6)), published(each))
+        if o.channel in (ch.SUBMAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
+    ),
+    m.End(12_000_000_000, tuple(m.StreamEnd(x.robot, 1, len(x)) for x in PAIR.streams)),
+    *(m.Liveliness(0, ch.robot_node(x.robot), True) for x in PAIR.streams),
+]
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.permutations(range(len(MESSAGES))),
+    st.lists(st.tuples(st.integers(0, len(MESSAGES) - 1), st.integers(0, 60)), max_size=10),
+)
+def test_the_centre_gives_the_same_map_for_any_order_duplicates_and_delays(order, again):
+    """Duplicates of submaps and progress come at any time, also long after or before."""
+    heard = [MESSAGES[i] for i in order]
+    for i, at in again:
+        if isinstance(MESSAGES[i], m.Submap | m.Progress):
+            heard.insert(at, MESSAGES[i])
+    node, out = CentralNode(CENTRE, ["r1", "r2"]), []
+    for message in heard:
+        out += node.handle(message, 0)
+    (final,) = of(out, ch.FINAL_MAP)
+    assert encoded(final) == expected_final()
+
+
+def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_map():
+    node, out = CentralNode(CENTRE, ["r1", "r2"]), []
+    late = [x for x in MESSAGES if isinstance(x, m.Submap) and x.robot == "r2"]
+    lost = m.Liveliness(0, "robot/r2", False)
+    first = [x for x in MESSAGES if getattr(x, "robot", "r1") != "r2" and not isinstance(x, m.End)]
+    first.sort(key=lambda x: not isinstance(x, m.Liveliness))
+    for message in [*first[:2], lost, *first[2:]]:
+        out += node.handle(message, 0)
+    closed = of(out, ch.FUSED_MAP)[-1]
+    assert [member.robot for member in closed.members] == ["r1"]
+    assert not closed.provisional
+    rest = [x for x in MESSAGES if x not in first and x not in late]
+    for message in [late[0], m.Liveliness(0, "robot/r2", True), *rest, *late[1:]]:
+        out += node.handle(message, 0)
+    (final,) = of(out, ch.FINAL_MAP)
+    assert encoded(final) == expected_final()
+
+
+# Law 3.
+
+
+def test_configurations_maps_priors_and_poses_name_their_inputs():
+    scenario = thesis()
+    messages = [opened(x) for x in run_team(scenario, streams_of(scenario))]
+    announced = {n: x for c, n, x in messages if c is ch.ROBOT_CONFIG}
+    for each in announced.values():
+        assert each.digest == translate.digest_of(each.configuration.encode())
+    maps = [x for _, _, x in messages if isinstance(x, m.FusedMap)]
+    by_digest = {each.digest: each for each in maps}
+    assert len(by_digest) == len(maps) >= 2
+    priors = [x for _, _, x in messages if isinstance(x, m.Prior)]
+    assert priors
+    for prior in priors:
+        members = {(x.robot, x.epoch): x.sequence for x in by_digest[prior.digest].members}
+        assert members[(prior.robot, prior.epoch)] == prior.sequence
+    submaps = [x for _, _, x in messages if isinstance(x, m.Submap)]
+    assert {(x.robot, x.config) for x in submaps} == {(n, x.digest) for n, x in announced.items()}
+    poses = [x for c, _, x in messages if c is ch.TEAM_POSE]
+    assert {x.map_digest for x in poses} <= set(by_digest)
+    assert {x.map_digest for c, _, x in messages if c is ch.OWN_POSE} == {translate.NO_MAP}
+    final = maps[-1]
+    paths = [x for _, _, x in messages if isinstance(x, m.Trajectory)]
+    assert {x.digest for x in paths} == {final.digest}
+
+
+# Law 4.
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_no_node_listens_to_the_truth(node):
+    assert not {ch.TRUTH, ch.TRUTH_LANDMARKS} & set(node.listens)
+
+
+def test_the_centre_listens_to_nothing_that_holds_the_fused_map():
+    fused = {ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.TEAM_POSE}
+    assert not fused & set(CentralNode.listens)
+
+
+FORBIDDEN = {"time", "datetime", "zenoh", "mcap", "threading", "socket", "random", "os", "asyncio"}
+
+
+def imports_of(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            found.add(node.module)
+    return found
+
+
+def reached_from(module: str) -> set[str]:
+    """Every module that a module's import brings in, ours followed."""
+    seen, ahead = set(), [module]
+    while ahead:
+        name = ahead.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        path = ROOT / (name.replace(".", "/") + ".py")
+        if path.is_file():
+            ahead += imports_of(path)
+    return seen
+
+
+@pytest.mark.parametrize("module", ["team.robot.node", "central.node", "sim.world_node"])
+def test_a_node_reaches_no_clock_no_socket_and_no_file(module):
+    reached = reached_from(module)
+    assert "team.wire.messages" in reached
+    assert not {name.split(".")[0] for name in reached} & FORBIDDEN
+
+
+def test_a_shell_does_reach_them():
+    """The mutant: the search above can find what it looks for."""
+    assert {name.split(".")[0] for name in reached_from("team.robot.main")} >= {"time", "threading"}
+
+
+# Whoever waits, waits for something that comes.
+
+
+def unequal(rng):
+    """Robots that end early, see little, have no odometry, or are quicker than others."""
+    return world_of(
+        *(
+            stream(
+                f"r{i + 1}",
+                rng.choice([4, 9, 16]),
+                y=float(i),
+                step_ns=rng.choice([250_000_000, 10**9]),
+                seen_every=rng.choice([1, 1, 6]),
+                drives=rng.random() < 0.85,
+                beyond=rng.choice([0, 0, 3]),
+                known=i == 0 or rng.random() < 0.8,
+            )
+            for i in range(rng.choice([2, 2, 3]))
+        )
+    )
+
+
+SEEDS = {"join": 50, "kalman": 20, "kalman-per-axis": 20, "covariance-intersection": 15}
+
+
+def played(seed, estimator, fusion):
+    """A team to its rest; in some a robot dies, and in some of those it comes back."""
+    rng = random.Random(seed)
+    team = team_of(unequal(rng), rng, estimator=estimator, fusion=fusion)
+    if rng.random() < 0.4:
+        for _ in range(rng.randrange(10, 150)):
+            team.step()
+        victim = rng.choice(sorted(team.robots))
+        team.kill(victim)
+        for _ in range(rng.randrange(30)):
+            team.step()
+        if rng.random() < 0.5:
+            team.resume(team.robots[victim].config)
+    team.run()
+    return team
+
+
+@pytest.mark.usefixtures("scarce")
+@pytest.mark.parametrize(("estimator", "fusion"), sorted(PAIRS))
+def test_every_team_comes_to_its_end_in_whatever_order_things_happen(estimator, fusion):
+    for seed in range(SEEDS[fusion]):
+        team = played(seed, estimator, fusion)
+        assert team.centre.finished, f"the team of seed {seed} never ends"
+        assert team.world.ended
+        assert team.final.final
+        for node in team.nodes.values():
+            assert node.finished, f"seed {seed}"
+
+
+@pytest.mark.usefixtures("scarce")
+def test_a_waiting_robot_that_gives_no_credit_stalls_its_team(monkeypatch):
+    """The mutant: this search finds a stall where there is one."""
+    monkeypatch.setattr(RobotNode, "_credit", lambda _: [])
+    assert not all(played(seed, "hybrid", "kalman").centre.finished for seed in range(40))
