@@ -41,20 +41,24 @@ class FeedbackRule:
         if estimate.exchange >= self._next:
             self._rounds.setdefault(estimate.exchange, {})[estimate.robot] = estimate
 
-    def rounds_sent(self, robot: str) -> int:
-        """The last round that the robot has sent a map for, of those that are open."""
-        sent = [number for number, maps in self._rounds.items() if robot in maps]
-        return max(sent, default=self._next - 1)
-
     def advance(
         self, taking_part: Callable[[str, int], bool], robots: Sequence[str]
     ) -> list[Outgoing]:
-        """Fuse every round that no robot is missing from; `taking_part(robot, round)` says who."""
+        """Fuse every round that no robot is missing from; `taking_part(robot, round)` says who.
+
+        A centre that was started again goes on with the round that everybody is in.
+        """
+
+        def complete(number: int) -> bool:
+            maps = self._rounds.get(number, {})
+            return bool(maps) and all(r in maps or not taking_part(r, number) for r in robots)
+
+        later = min(self._rounds, default=self._next)
+        if complete(later):
+            self._next = later
         out: list[Outgoing] = []
-        while self._next in self._rounds:
+        while complete(self._next):
             maps = self._rounds[self._next]
-            if any(r not in maps and taking_part(r, self._next) for r in robots):
-                break
             self._fused = self._fuse(self._next, [maps[r] for r in sorted(maps)])
             del self._rounds[self._next]
             self._next += 1

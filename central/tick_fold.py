@@ -65,11 +65,6 @@ class TickFold:
         """The fold over the ticks that have been taken."""
         return self._taken[-1][1] if self._taken else EMPTY_FOLD
 
-    @property
-    def end_ns(self) -> int:
-        """The end of the last tick that has been taken."""
-        return (self._taken[-1][0] + 1) * self._tick_ns if self._taken else 0
-
     def take_until(self, watermark_ns: float) -> bool:
         """Take every tick that ends at the watermark or before; True if there was one."""
         taken = False

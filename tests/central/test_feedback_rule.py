@@ -34,10 +34,12 @@ def everyone(_robot, _number):
 
 
 @settings(deadline=None, max_examples=40)
-@given(st.permutations([(r, n) for r in ROBOTS for n in (1, 2, 3)]))
+@given(st.permutations(ROBOTS * 3))
 def test_each_round_is_fused_once_in_its_turn_when_nobody_is_missing(order):
+    """A robot's own maps keep their order."""
     found, out, sent = rule(), [], set()
-    for robot, number in order:
+    for i, robot in enumerate(order):
+        number = order[: i + 1].count(robot)
         found.take_map(estimate(robot, number, at=float(robot[1:])))
         sent.add((robot, number))
         new = of(found.advance(everyone, ROBOTS), ch.FUSED_MAP)
@@ -63,6 +65,16 @@ def test_who_takes_no_part_is_not_waited_for():
     assert found.advance(everyone, ROBOTS) == []
     (fused,) = of(found.advance(lambda r, _: r == "r1", ROBOTS), ch.FUSED_MAP)
     assert [member.robot for member in fused.members] == ["r1"]
+
+
+def test_a_centre_that_was_started_again_goes_on_where_the_robots_are():
+    found = rule()
+    found.take_map(estimate("r1", 7))
+    found.take_map(estimate("r2", 7))
+    assert found.advance(everyone, ROBOTS) == []
+    found.take_map(estimate("r3", 7))
+    (fused,) = of(found.advance(everyone, ROBOTS), ch.FUSED_MAP)
+    assert fused.exchange == 7
 
 
 def test_the_last_map_of_one_who_ended_is_still_fused():
