@@ -1,6 +1,7 @@
 """Commands that compute a log again: rerun and verify-ledger."""
 
 import json
+import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli_options import FAILED, WRONG_USE, fail
+from sim.changes import Changes
+from sim.cli_options import FAILED, WRONG_USE, EstimatorOption, FusionOption, fail
 
 if TYPE_CHECKING:
     from sim.rerun import Verification
@@ -28,12 +30,141 @@ def rerun(
     verify: Annotated[
         bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
     ] = False,
+    without: Annotated[
+        list[str] | None, typer.Option(help="A robot that was not there; repeatable.")
+    ] = None,
+    fusion: FusionOption = None,
+    estimator: EstimatorOption = None,
+    particles: Annotated[int | None, typer.Option(help="Particles of each robot.", min=4)] = None,
+    window: Annotated[float | None, typer.Option(help="Seconds of a submap's window.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the estimators and of the losses.", min=0)
+    ] = None,
+    loss: Annotated[
+        float,
+        typer.Option(help="Probability that a submap is lost on its way; it is sent again."),
+    ] = 0.0,
+    delay: Annotated[
+        float, typer.Option(help="Seconds that submaps need to the centre.", min=0.0)
+    ] = 0.0,
+    no_centre: Annotated[
+        str | None, typer.Option(help="Seconds without a centre, as 60-120.", metavar="SPAN")
+    ] = None,
+    partition: Annotated[
+        list[str] | None,
+        typer.Option(help="Robots without the centre, as r1,r2:100-200.", metavar="ROBOTS:SPAN"),
+    ] = None,
+    unsafe_feedback: Annotated[
+        bool, typer.Option("--unsafe-feedback", help="Robots send what they took from the team.")
+    ] = False,
     json_file: JsonFile = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for a picture of both maps.")
+    ] = None,
 ) -> None:
-    """Compute a log again: to verify it."""
+    """Compute a log again: to verify it, or under other conditions to compare.
+
+    With --verify every message is computed again from the inputs that it names. Otherwise the
+    recorded readings run once more through the same nodes, with the changes asked for; without any
+    change, as they would have run with every message arriving at once.
+    """
+    changes = Changes(
+        tuple(without or ()),
+        fusion,
+        estimator,
+        particles,
+        _positive(window, "--window"),
+        seed,
+        _probability(loss),
+        delay,
+        None if no_centre is None else _span(no_centre, "--no-centre"),
+        tuple(_partition(each) for each in partition or ()),
+        unsafe_feedback,
+    )
     if not verify:
-        fail("say what to compute again: --verify", WRONG_USE)
-    _verify(log, json_file)
+        _compare(log, changes, json_file, output)
+    elif changes == Changes():
+        _verify(log, json_file)
+    else:
+        fail("--verify compares with the log as it is: leave the changes away", WRONG_USE)
+
+
+def _positive(value: float | None, option: str) -> float | None:
+    if value is not None and not (value > 0.0 and math.isfinite(value)):
+        fail(f"{option} {value}: give a positive number", WRONG_USE)
+    return value
+
+
+def _probability(loss: float) -> float:
+    if not 0.0 <= loss < 1.0:
+        fail(f"--loss {loss}: give a probability from 0 to below 1", WRONG_USE)
+    return loss
+
+
+def _span(text: str, option: str) -> tuple[float, float]:
+    try:
+        begin, end = (float(part) for part in text.split("-"))
+    except ValueError:
+        begin, end = math.nan, math.nan
+    if not 0.0 <= begin < end < math.inf:
+        fail(f"{option} {text}: give seconds since the log's first reading, as 60-120", WRONG_USE)
+    return begin, end
+
+
+def _partition(text: str) -> tuple[tuple[str, ...], tuple[float, float]]:
+    robots, colon, span = text.partition(":")
+    if not (robots and colon):
+        fail(f"--partition {text}: give robots and seconds, as r1,r2:100-200", WRONG_USE)
+    return tuple(robots.split(",")), _span(span, "--partition")
+
+
+def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from sim.evaluation import evaluate, to_json
+    from sim.rerun_change import changed_run
+    from sim.rerun_comparison import (
+        comparison_picture,
+        comparison_rows,
+        largest_move_m,
+        same_final_map,
+    )
+    from sim.rerun_log import RerunError
+    from team.recording.reader import open_log
+
+    log = open_log(path)
+    recorded = evaluate(log.samples())
+    try:
+        changed = evaluate(changed_run(log, changes))
+    except RerunError as error:
+        fail(f"{path}: {error}", FAILED)
+    table = Table("", "recorded", "recomputed")
+    for row in comparison_rows(recorded, changed):
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console()
+    console.print(table)
+    same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
+    moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
+    verdict = "the same bytes" if same else f"another one{moved}"
+    console.print(f"final map: {verdict}", highlight=False)
+    if json_file is not None:
+        figures = {
+            "changes": asdict(changes),
+            "same_final_map": same,
+            "largest_move_m": move_m,
+            "recorded": to_json(recorded),
+            "recomputed": to_json(changed),
+        }
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        picture = output / "maps.png"
+        if comparison_picture(recorded, changed, picture):
+            console.print(f"wrote {picture}", highlight=False, soft_wrap=True)
+    if changed.map is None:
+        fail("the changed run ended without a final map", FAILED)
 
 
 def _verify(path: Path, json_file: Path | None) -> None:

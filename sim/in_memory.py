@@ -1,31 +1,57 @@
 """A whole team in one process, on the bus in memory: the same nodes, synchronous, deterministic."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
 
 from central.node import CentralNode
+from sim.links import Conditions, Link
 from sim.scenario import Scenario
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from team import translate
+from team.config import RobotConfig
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 
 
-class _Seat:
-    """A node, its bus, and the end of its conversation."""
+class World(Protocol):
+    """Whatever publishes the readings: a scenario's world, or a log's."""
 
-    def __init__(self, network: MemoryNetwork, node: WorldNode | RobotNode | CentralNode) -> None:
-        self.bus = MemoryBus(network)
-        self.node = node
+    @property
+    def listens(self) -> tuple[ch.Channel, ...]:
+        """The channels that it subscribes to."""
+
+    @property
+    def now_ns(self) -> int:
+        """Team time: the stamp that it has published up to."""
+
+    def begin(self) -> list[Outgoing]:
+        """What it says first."""
+
+    def publish(self, clock_s: float) -> list[Outgoing]:
+        """The next readings; nothing when it waits or has ended."""
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Take one message."""
+
+
+@dataclass
+class _Seat:
+    """A node, its bus, the link over which the others' messages reach it."""
+
+    node: World | RobotNode | CentralNode
+    bus: MemoryBus
+    link: Link
 
     def send(self, out: list[Outgoing]) -> None:
         for outgoing in out:
             self.bus.publish(outgoing)
 
-    def take(self) -> bool:
-        samples = self.bus.receive(0.0)
+    def take(self, now_ns: int) -> bool:
+        samples = self.link.arrived(self.bus.receive(0.0), now_ns)
         for sample in samples:
             _, _, message = opened(sample)
             self.send(self.node.handle(message, sample.stamp_ns))
@@ -34,44 +60,84 @@ class _Seat:
 
 def run_team(scenario: Scenario, streams: WorldStreams) -> Iterator[Sample]:
     """Run the team to its final map; everything that a recorder would take, in its order."""
+    expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
+    world = WorldNode(streams, expected, translate.configured("world", 0, 0, scenario))
+    yield from run_nodes(scenario, world)
+
+
+def run_nodes(
+    scenario: Scenario,
+    world: World,
+    conditions: Conditions | None = None,
+    robot: Callable[[RobotConfig], RobotNode] = RobotNode,
+) -> Iterator[Sample]:
+    """Run the scenario's robots and centre in a world, until nothing is on its way any more.
+
+    conditions: what becomes of messages and of the centre; none: everything arrives at once.
+    """
+    conditions = Conditions() if conditions is None else conditions
     network = MemoryNetwork()
     recorder = MemoryBus(network)
     for channel in ch.CHANNELS:
         if channel.recorded:
             recorder.subscribe(channel, "**")
     recorder.watch_alive()
-    robots = {r.id: RobotNode(r) for r in scenario.robots}
-    central = _Seat(network, CentralNode(scenario.central, list(robots)))
-    for channel in CentralNode.listens:
-        central.bus.subscribe(channel)
-    central.bus.watch_alive()
-    configured = translate.configured("world", 0, 0, scenario)
-    world = _Seat(
-        network, WorldNode(streams, expected_nodes(list(robots), recorder=False), configured)
-    )
-    for channel in WorldNode.listens:
-        world.bus.subscribe(channel)
-    world.bus.watch_alive()
-    seats = [world, central]
-    for name, node in robots.items():
-        seat = _Seat(network, node)
-        for channel in RobotNode.listens:
-            seat.bus.subscribe(channel, name)
-        seat.bus.watch_alive("central")
-        seats.append(seat)
-    for seat, token in zip(
-        seats, ["world", "central", *(ch.robot_node(n) for n in robots)], strict=True
-    ):
-        seat.send(seat.node.begin())
-        seat.bus.declare_alive(token)
-    assert isinstance(world.node, WorldNode)
+    names = [config.id for config in scenario.robots]
+    source = _Seat(world, MemoryBus(network), Link())
+    for channel in world.listens:
+        source.bus.subscribe(channel)
+    source.bus.watch_alive()
+    centre = _centre(network, scenario, conditions)
+    robots = [_robot(network, robot(config), conditions) for config in scenario.robots]
+    _enter(source, "world")
+    _enter(centre, "central")
+    for name, seat in zip(names, robots, strict=True):
+        _enter(seat, ch.robot_node(name))
+    now_ns = world.now_ns
+    up = True
     while True:
-        published = world.node.publish(0.0)
-        world.send(published)
-        busy = sum(seat.take() for seat in seats)
+        published = world.publish(0.0)
+        source.send(published)
+        now_ns = max(now_ns, world.now_ns)
+        if up and conditions.centre_is_down(now_ns):
+            centre.bus.close()
+            up = False
+        elif not up and not conditions.centre_is_down(now_ns):
+            centre = _centre(network, scenario, conditions)
+            _enter(centre, "central")
+            up = True
+        seats = [source, *([centre] if up else []), *robots]
+        busy = sum(seat.take(now_ns) for seat in seats)
         yield from recorder.receive()
-        if not busy and not published:
+        if busy or published:
+            continue
+        coming = [seat.link.next_ns for seat in seats if seat.link.next_ns is not None]
+        coming += [] if up else [conditions.centre_back_ns]
+        if not coming:
             return
+        now_ns = min(coming)  # the world has nothing more to say: time goes on to what comes next
+
+
+def _enter(seat: _Seat, token: str) -> None:
+    seat.send(seat.node.begin())
+    seat.bus.declare_alive(token)
+
+
+def _centre(network: MemoryNetwork, scenario: Scenario, conditions: Conditions) -> _Seat:
+    names = [config.id for config in scenario.robots]
+    bus = MemoryBus(network)
+    for channel in CentralNode.listens:
+        bus.subscribe(channel)
+    bus.watch_alive()
+    return _Seat(CentralNode(scenario.central, names), bus, conditions.to_centre(names))
+
+
+def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _Seat:
+    bus = MemoryBus(network)
+    for channel in RobotNode.listens:
+        bus.subscribe(channel, node.robot)
+    bus.watch_alive("central")
+    return _Seat(node, bus, conditions.to_robot(node.robot))
 
 
 def final_map(samples: list[Sample]) -> m.FusedMap:

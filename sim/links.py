@@ -1,0 +1,138 @@
+"""What becomes of messages on their way, in team time: delay, loss, partitions, a centre that dies.
+
+Nothing is lost for good: delivery `all` sends a lost submap again. So under the rule `join` none of
+this can change the final map (law 2), only what the team knows meanwhile.
+"""
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from team.estimation.randomness import generator
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.codec import encoded
+
+RESEND_NS = 1_000_000_000
+"""A lost submap is missed and sent again after this time, as often as it takes."""
+PATIENCE_NS = 3_000_000_000
+"""The centre believes after this time that a robot is gone."""
+_FROM_ROBOTS = (ch.SUBMAP, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
+_FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
+
+
+class Link:
+    """Holds what reaches a node until it arrives; equal times in the order of sending."""
+
+    def __init__(self, arrival_ns: Callable[[Sample, int], int] | None = None) -> None:
+        self._arrival_ns = arrival_ns
+        self._held: list[tuple[int, int, Sample]] = []
+        self._sent = 0
+
+    def say(self, at_ns: int, message: m.Liveliness) -> None:
+        """The node notices at this time that another one went or came back."""
+        sample = Sample(ch.ALIVE.key(message.node), encoded(message), 0, 0, 0)
+        heapq.heappush(self._held, (at_ns, -1, sample))
+
+    def arrived(self, samples: Sequence[Sample], now_ns: int) -> list[Sample]:
+        """What is there by now, given what has been sent since the last time."""
+        if self._arrival_ns is None:
+            return list(samples)
+        for sample in samples:
+            heapq.heappush(self._held, (self._arrival_ns(sample, now_ns), self._sent, sample))
+            self._sent += 1
+        there = []
+        while self._held and self._held[0][0] <= now_ns:
+            there.append(heapq.heappop(self._held)[2])
+        return there
+
+    @property
+    def next_ns(self) -> int | None:
+        """When the next message arrives that is on its way."""
+        return self._held[0][0] if self._held else None
+
+
+@dataclass(frozen=True)
+class Partition:
+    """These robots and the centre do not reach one another from begin_ns until end_ns."""
+
+    robots: frozenset[str]
+    begin_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """loss: of submaps on the way to the centre, the probability for each transmission.
+
+    delay_ns: of submaps to the centre. down_ns: from when until when there is no centre; the one
+    that comes then knows nothing and asks the robots.
+    """
+
+    delay_ns: int = 0
+    loss: float = 0.0
+    seed: int = 0
+    partitions: tuple[Partition, ...] = ()
+    down_ns: tuple[int, int] | None = None
+
+    def centre_is_down(self, now_ns: int) -> bool:
+        """Whether there is no centre at this time."""
+        return self.down_ns is not None and self.down_ns[0] <= now_ns < self.down_ns[1]
+
+    @property
+    def centre_back_ns(self) -> int:
+        """When there is a centre again."""
+        return 0 if self.down_ns is None else self.down_ns[1]
+
+    def to_centre(self, robots: Sequence[str]) -> Link:
+        """The link by which the robots reach the centre."""
+        if not (self.delay_ns or self.loss or self.partitions):
+            return Link()
+        link = Link(self._arrival_at_centre)
+        for robot, cut in self._cuts(robots):
+            node = ch.robot_node(robot)
+            if cut.end_ns - cut.begin_ns > PATIENCE_NS:
+                link.say(cut.begin_ns + PATIENCE_NS, m.Liveliness(0, node, False))
+                link.say(cut.end_ns, m.Liveliness(0, node, True))
+        return link
+
+    def to_robot(self, robot: str) -> Link:
+        """The link by which the centre reaches a robot."""
+        cuts = [cut for _, cut in self._cuts([robot])]
+        if not cuts:
+            return Link()
+        link = Link(lambda sample, now_ns: _behind(cuts, now_ns, sample, _FROM_CENTRE))
+        for cut in cuts:
+            link.say(cut.begin_ns, m.Liveliness(0, "central", False))
+            link.say(cut.end_ns, m.Liveliness(0, "central", True))
+        return link
+
+    def _cuts(self, robots: Sequence[str]) -> list[tuple[str, Partition]]:
+        return [(r, cut) for r in robots for cut in self.partitions if r in cut.robots]
+
+    def _arrival_at_centre(self, sample: Sample, now_ns: int) -> int:
+        _, robot, message = opened(sample)
+        if isinstance(message, m.Submap):
+            now_ns += self.delay_ns + RESEND_NS * self._losses(message)
+        cuts = [cut for _, cut in self._cuts([robot])]
+        return _behind(cuts, now_ns, sample, _FROM_ROBOTS)
+
+    def _losses(self, submap: m.Submap) -> int:
+        if self.loss == 0.0:
+            return 0
+        draws = generator(self.seed, f"{submap.robot} loses", submap.epoch, submap.sequence)
+        return int(draws.geometric(1.0 - self.loss)) - 1
+
+
+def _behind(
+    cuts: Sequence[Partition], now_ns: int, sample: Sample, channels: Sequence[ch.Channel]
+) -> int:
+    """`now_ns`, or the end of the cuts that lie there, for what crosses them."""
+    found = ch.channel_of(sample.key)
+    if found is None or found[0] not in channels:
+        return now_ns
+    for cut in sorted(cuts, key=lambda c: c.begin_ns):
+        if cut.begin_ns <= now_ns < cut.end_ns:
+            now_ns = cut.end_ns
+    return now_ns

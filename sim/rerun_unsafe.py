@@ -1,0 +1,67 @@
+"""What happens without law 1: a robot that sends what it took from the team's map as its own."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from team import translate
+from team.estimation.conditioning import RobotPrior
+from team.estimation.submap import LocalMap
+from team.estimation.whole_map import WholeMap, begun, joined
+from team.robot.member import ClosedWindow
+from team.robot.node import RobotNode
+from team.wire.bus import Outgoing
+
+
+class UnsafeRobot(RobotNode):
+    """Its submaps begin with the team's map instead of with nothing.
+
+    The map holds the robot's earlier readings, and everyone's; each submap sends them again, so
+    they are counted again with every exchange. The mean hardly moves; the covariance loses its
+    meaning. Kept for demonstration: no scenario can choose it.
+    """
+
+    def _send(self, closed: ClosedWindow) -> list[Outgoing]:
+        prior = self._prior
+        if prior is not None and prior.epoch == self.epoch:
+            pending = self._locals[max(prior.sequence + 1, 0) :]
+            fed = with_prior(translate.prior_of(prior), pending, closed.local)
+            closed = replace(closed, local=fed)
+        return super()._send(closed)
+
+
+def with_prior(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> LocalMap:
+    """The window's Gaussian times the team's marginal of its landmarks, both in its start frame.
+
+    `pending` leads from the prior's pose to the start of the window.
+    """
+    mean = np.concatenate([prior.pose, prior.means.ravel()])
+    whole = WholeMap(prior.ids, mean, prior.covariance)
+    for each in pending:
+        whole = joined(whole, each)
+    fed = joined(_seen_from_its_pose(whole, local.ids), local)
+    return LocalMap(fed.ids, fed.mean, fed.covariance)
+
+
+def _seen_from_its_pose(whole: WholeMap, ids: np.ndarray) -> WholeMap:
+    """The landmarks `ids` of a map in the frame of its pose, which is then zero and certain.
+
+    l' = R(θ)ᵀ (l − p), with its Jacobian.
+    """
+    kept = np.flatnonzero(np.isin(whole.ids, ids))
+    if not len(kept):
+        return begun(np.zeros(3), None)
+    x, y, heading = whole.mean[:3]
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.array([[c, s], [-s, c]])
+    J = np.zeros((3 + 2 * len(kept), len(whole.mean)))
+    mean = np.zeros(len(J))
+    for row, k in enumerate(kept):
+        rows, columns = slice(3 + 2 * row, 5 + 2 * row), slice(3 + 2 * k, 5 + 2 * k)
+        offset = whole.mean[columns] - (x, y)
+        mean[rows] = turn @ offset
+        J[rows, :2] = -turn
+        J[rows, 2] = np.array([[-s, c], [-c, -s]]) @ offset
+        J[rows, columns] = turn
+    covariance = J @ whole.covariance @ J.T
+    return WholeMap(whole.ids[kept], mean, 0.5 * (covariance + covariance.T))
