@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from central.node import CentralNode
 from sim.links import Conditions, Link
@@ -17,6 +17,7 @@ from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 
 
+@runtime_checkable
 class World(Protocol):
     """Whatever publishes the readings: a scenario's world, or a log's."""
 

@@ -73,7 +73,7 @@ def comparison_picture(recorded: Evaluation, changed: Evaluation, path: Path) ->
     if len(truth):
         axis.plot(*truth.T, "x", color=TRUTH_COLOUR, markersize=8, label="true landmarks")
     if recorded.map is not None:
-        _draw(axis, recorded.map, RECORDED_COLOUR, "recorded", "o")
+        _draw(axis, recorded.map, RECORDED_COLOUR, "recorded", ".")
     if changed.map is not None:
         _draw(axis, changed.map, CHANGED_COLOUR, "recomputed", "+")
     axis.set_aspect("equal", adjustable="datalim")
