@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 from sim.in_memory import run_team
-from sim.scenario import load
+from sim.scenario import load, with_options
 from sim.source import streams_of
 from team.wire.channels import FINAL_MAP
 
@@ -24,9 +24,9 @@ def final_map(samples: "list[tuple[str, bytes]]") -> bytes:
     return payload
 
 
-def map_in_memory(scenario: Path) -> bytes:
+def map_in_memory(scenario: Path, seed: int = 1) -> bytes:
     """The bytes of the final map that the same nodes send on the bus in memory."""
-    resolved = load(scenario)
+    resolved = with_options(load(scenario), seed=seed)
     samples = run_team(resolved, streams_of(resolved))
     return final_map([(sample.key, sample.payload) for sample in samples])
 

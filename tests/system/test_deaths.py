@@ -69,17 +69,7 @@ async def test_a_robot_that_is_killed_is_named_and_the_others_finish_the_map(
     assert members["r1"] < SUBMAPS - 1, "what r1 did not live to see is not"
 
 
-async def test_a_robot_that_is_told_to_stop_fails_the_run(team: Processes) -> None:
-    launch, _ = await launched(team)
-    pid = await team.pid("robot", "r1")
-    os.kill(pid, signal.SIGTERM)
-    assert await launch.ended() == 1
-    await team.none_left(0.0)
-    assert failures(team)[0].startswith(f"robot-r1 (pid {pid}) ended with exit status 143")
-    assert len(failures(team)) == 1
-
-
-@pytest.mark.parametrize("name", ["central", "world", "router"])
+@pytest.mark.parametrize("name", ["central", "router"])
 async def test_a_process_without_which_no_team_runs_ends_the_run_and_is_named(
     name: str, team: Processes
 ) -> None:

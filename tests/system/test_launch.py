@@ -1,11 +1,13 @@
 """`teamslam launch`: one command, and a whole team of processes maps a place and ends by itself."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+import pytest_asyncio
 
-from sim.scenario import load
 from team.recording.reader import open_log
 from team.wire import channels as ch
 from team.wire.bus import opened
@@ -99,19 +101,6 @@ async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, ob
     return result
 
 
-async def test_two_launches_with_one_seed_end_with_the_same_bytes(
-    launched: Launched, team: Processes
-) -> None:
-    again = await launch(team, launched.scenario)
-    assert again["final_map_sha256"] == launched.result["final_map_sha256"]
-
-
-async def test_another_seed_gives_another_map(launched: Launched, team: Processes) -> None:
-    other = await launch(team, launched.scenario, "--seed", "2")
-    assert other["seed"] == 2
-    assert other["final_map_sha256"] != launched.result["final_map_sha256"]
-
-
 @pytest.mark.parametrize(
     ("estimator", "rule"),
     [("hybrid-thesis", "kalman-per-axis"), ("hybrid", "covariance-intersection")],
@@ -120,21 +109,41 @@ async def test_a_rule_that_feeds_the_map_back_ends_with_the_bytes_of_a_team_in_m
     estimator: str, rule: str, team: Processes
 ) -> None:
     scenario = short(team.folder, more=f'estimator = "{estimator}"\nfusion = "{rule}"', steps=30)
-    assert load(scenario).fusion == rule
-    result = await launch(team, scenario)
-    assert (result["estimator"], result["fusion"]) == (estimator, rule)
-    assert result["final_map_sha256"] == sha256(map_in_memory(scenario))
+    result = await launch(team, scenario, "--seed", "2")
+    assert (result["estimator"], result["fusion"], result["seed"]) == (estimator, rule, 2)
+    assert result["final_map_sha256"] == sha256(map_in_memory(scenario, seed=2))
 
 
-async def test_a_terminal_shows_a_live_table_of_the_robots(team: Processes) -> None:
-    terminal = Terminal()
-    with terminal:
-        launch = await team.run(
-            "launch",
-            [*PROGRAM, "launch", short(team.folder), "--speed", "20", "--no-report", "-o", "run"],
-            errors=terminal.end,
-        )
-        assert await launch.ended() == 0
+@dataclass(frozen=True)
+class Watched:
+    """A launch in a terminal: what was seen there, and its JSON."""
+
+    shown: str
+    result: dict[str, Any]
+
+
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
+    """The short world once more, at 20 × real time, in a terminal."""
+    team = Processes(tmp_path_factory.mktemp("watched"))
+    options = ["--speed", "20", "--no-report", "--output", "run", "--json", "result.json"]
+    try:
+        with Terminal() as terminal:
+            command = [*PROGRAM, "launch", str(short(team.folder)), *options]
+            process = await team.run("launch", command, errors=terminal.end)
+            assert await process.ended() == 0, process.said()
+    finally:
+        await team.close()
+    return Watched(terminal.shown, json.loads((team.folder / "result.json").read_text()))
+
+
+def test_a_terminal_shows_a_live_table_of_the_robots(watched: Watched) -> None:
     for text in ("short, seed 1", "pose σ [m]", "mapping", "team map by join", "world ended"):
-        assert text in terminal.shown, terminal.shown
-    assert "Traceback" not in terminal.shown
+        assert text in watched.shown, watched.shown
+    assert "Traceback" not in watched.shown
+
+
+def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(
+    launched: Launched, watched: Watched
+) -> None:
+    assert watched.result["final_map_sha256"] == launched.result["final_map_sha256"]

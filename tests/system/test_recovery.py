@@ -58,21 +58,24 @@ async def robot(team: Processes, found: Team, endpoint: str, name: str) -> Proce
     return await team.start("robot", found.scenario, "r1", "--connect", endpoint, name=name)
 
 
-@pytest.mark.parametrize("submaps", [0, 2])
-async def test_a_robot_that_is_killed_and_started_again_changes_no_bit_of_the_map(
-    submaps: int, team: Processes
+@pytest.mark.parametrize(
+    ("submaps", "number", "status"),
+    [(2, signal.SIGKILL, -signal.SIGKILL), (0, signal.SIGTERM, 128 + signal.SIGTERM)],
+)
+async def test_a_robot_that_dies_and_is_started_again_changes_no_bit_of_the_map(
+    submaps: int, number: signal.Signals, status: int, team: Processes
 ) -> None:
-    found = await assembled(team, "15")
+    found = await assembled(team, "25")
     first = await robot(team, found, found.endpoint, "r1")
     with Observer(found.endpoint, [ch.SUBMAP, ch.ODOMETRY]) as seen:
         await seen.sees(3, ch.ODOMETRY, "r1")
         await seen.sees(submaps, ch.SUBMAP, "r1")
-        first.signal(signal.SIGKILL)
-        assert await first.ended() == -signal.SIGKILL
+        first.signal(number)
+        assert await first.ended() == status, "what was stopped before its end did not end well"
     found.robots["r1"] = await robot(team, found, found.endpoint, "r1-again")
     await found.ends_well()
-    resumed = "resumed after submap" in found.robots["r1"].said()
-    assert resumed == (submaps > 0)
+    if submaps:
+        assert "resumed after submap" in found.robots["r1"].said()
     assert found.others[1].said() == "central: robot/r1 is lost\n"
     assert found.final_map() == map_in_memory(found.scenario)
 
@@ -81,7 +84,7 @@ async def test_a_robot_that_is_killed_and_started_again_changes_no_bit_of_the_ma
 async def test_readings_that_a_cut_link_loses_are_asked_for_at_their_source(
     cut_for: str, team: Processes
 ) -> None:
-    found = await assembled(team, "15")
+    found = await assembled(team, "25")
     with (
         Link(found.endpoint) as link,
         Observer(found.endpoint, [ch.SUBMAP, ch.ODOMETRY, ch.END]) as seen,
