@@ -1,5 +1,7 @@
 """The streams of a scenario's world, whichever kind it is."""
 
+import hashlib
+
 from sim.datasets.utias import utias
 from sim.scenario import Scenario
 from sim.simulator import simulated
@@ -10,5 +12,15 @@ from sim.worlds import SimulatedWorld
 def streams_of(scenario: Scenario) -> WorldStreams:
     """Simulate the world or read its data set; raises DatasetError."""
     if isinstance(scenario.world, SimulatedWorld):
-        return simulated(scenario.world, scenario.robots, scenario.seed)
+        return simulated(scenario.world, scenario.robots, noise_seed(scenario))
     return utias(scenario.world, scenario.robots)
+
+
+def noise_seed(scenario: Scenario) -> int:
+    """What the world's random numbers are keyed by: the scenario's name and its seed.
+
+    So two scenarios share no noise: what holds over the seeds of one and of the other are two
+    findings, not one finding twice. It is a positive integer of 63 bits.
+    """
+    text = f"{scenario.name}/{scenario.seed}".encode()
+    return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1
