@@ -1,13 +1,22 @@
-"""Runs of single estimators in the thesis' world: the simulator's streams cut into epochs."""
+"""Runs of single estimators in the thesis' world: one epoch a step, as its streams have them."""
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
 from sim import scenario
 from sim.simulator import simulated
-from sim.streams import OBSERVATIONS, ODOMETRY
-from team.robot.segmenter import Segmenter
+from team.estimation.models import Increment, corrected, increment_of
+
+
+class Epoch(NamedTuple):
+    """One step's motion and what was seen at its end."""
+
+    increment: Increment
+    ids: np.ndarray
+    ranges: np.ndarray
+    bearings: np.ndarray
 
 
 @functools.cache
@@ -18,36 +27,26 @@ def world(name, seed):
 
 
 def epochs_of(config, stream):
-    """The stream's epochs as the robot's own segmenter cuts them."""
-    segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
-    segmenter.begin(0)
+    """One epoch per odometry interval; every interval ends with one message of landmarks."""
+    told, seen = stream.intervals, stream.landmark_detections
+    np.testing.assert_array_equal(told.end_ns, seen.stamps_ns)
     epochs = []
-    for counter in range(len(stream)):
-        if stream.kinds[counter] == OBSERVATIONS:
-            segmenter.observe(*stream.observations(counter))
-        elif stream.kinds[counter] == ODOMETRY:
-            epochs += segmenter.drive(*stream.odometry(counter))
+    for k in range(len(told.end_ns)):
+        step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
+        increment = increment_of(config.motion, *map(float, step))
+        rows = seen.rows(k)
+        readings = corrected(config.sensor, seen.ranges[rows], seen.bearings[rows])
+        epochs.append(Epoch(increment, seen.ids[rows], *readings))
     return epochs
 
 
 def run(state, step, epochs, config, *generator):
-    for epoch in epochs:
-        state = step(
-            state,
-            epoch.increment,
-            config.sensor,
-            epoch.ids,
-            epoch.ranges,
-            epoch.bearings,
-            *generator,
-        )
+    """The state after the epochs, by an estimator's `stepped`."""
+    for increment, *readings in epochs:
+        state = step(state, increment, config.sensor, *readings, *generator)
     return state
 
 
 def map_errors(landmarks, streams):
     """Flat errors of the estimated landmarks (id k is the k-th true one), m."""
     return (landmarks.means - streams.landmarks[landmarks.ids.astype(int) - 1]).ravel()
-
-
-def truth_at_end(stream):
-    return np.array(stream.truth[-1])

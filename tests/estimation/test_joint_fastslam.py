@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from team.config import Sensor
 from team.estimation import fastslam, joint_fastslam, plain_fastslam
@@ -100,19 +102,20 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
         np.testing.assert_array_equal(joint.poses[index], state.particles.poses)
 
 
-def test_turns_in_one_step_are_turns_in_steps_of_their_own_but_for_resampling():
-    rounds, _ = team_run(3)
-    at_once = filtered(
-        rounds, joint_fastslam.begun(STARTS, 30, "fastslam2", 0.0), np.random.default_rng(2)
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 10_000), proposal=st.sampled_from(PROPOSALS))
+def test_turns_in_one_step_are_turns_in_steps_of_their_own_but_for_resampling(seed, proposal):
+    rounds, _ = team_run(seed, steps=4)
+    apart = [[turn] for turns in rounds for turn in turns]
+    at_once, one_by_one, often = (
+        filtered(
+            each,
+            joint_fastslam.begun(STARTS, 30, proposal, below),
+            np.random.default_rng(seed),
+        )
+        for each, below in ((rounds, 0.0), (apart, 0.0), (rounds, 1.0))
     )
-    apart = filtered(
-        [[turn] for turns in rounds for turn in turns],
-        joint_fastslam.begun(STARTS, 30, "fastslam2", 0.0),
-        np.random.default_rng(2),
-    )
-    assert bytes_of(at_once) == bytes_of(apart)
-    every = joint_fastslam.begun(STARTS, 30, "fastslam2", 1.0)
-    assert bytes_of(filtered(rounds, every, np.random.default_rng(2))) != bytes_of(at_once)
+    assert bytes_of(at_once) == bytes_of(one_by_one) != bytes_of(often)
 
 
 @pytest.mark.parametrize(("proposal", "count"), [("fastslam2", 4000), ("fastslam1", 100_000)])

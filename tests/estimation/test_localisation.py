@@ -4,11 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from team.config import Sensor
 from team.estimation import fastslam, localisation
 from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.geometry import compose, exponential
+from team.estimation.geometry import compose, exponential, transformed
 from team.estimation.models import Increment
 from tests.estimation.estimator_runs import epochs_of, run, world
 
@@ -131,6 +133,25 @@ def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter():
     sigma = np.sqrt(np.diag(P))
     assert np.abs((found - mean) / sigma).max() < 0.1
     assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 0.1
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.tuples(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0), st.floats(-3.0, 3.0)))
+def test_turning_and_moving_the_frame_moves_the_cloud_with_it(start):
+    shift, truth = np.array(start), np.array([1.0, 0.3, 0.2])
+    moved = np.array([transformed(shift, point) for point in LANDMARKS])
+    clouds = []
+    for pose, landmarks in ((np.zeros(3), LANDMARKS), (shift, moved)):
+        random = np.random.default_rng(7)
+        state = localisation.begun(pose, 40, IDS, landmarks)
+        for _ in range(2):
+            state = localisation.stepped(state, MOTION, SENSOR, IDS, *sights(truth), random)
+        clouds.append(state.cloud)
+    here, there = clouds
+    np.testing.assert_allclose(here.log_weights, there.log_weights, atol=1e-8)
+    expected = np.array([compose(shift, pose) for pose in here.poses])
+    np.testing.assert_allclose(there.poses[:, :2], expected[:, :2], atol=1e-9)
+    np.testing.assert_allclose(wrap(there.poses[:, 2] - expected[:, 2]), 0.0, atol=1e-9)
 
 
 def test_a_reading_of_a_landmark_that_is_not_on_the_map_is_left_out():
