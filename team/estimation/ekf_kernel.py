@@ -154,14 +154,15 @@ def _condition(
     HP, S, column = np.empty((m, n)), np.empty((m, m)), np.empty(m)
     for j in range(n):
         _all_applied(sights, places, P[j], column)
-        HP[:, j] = column
+        for k in range(m):
+            HP[k, j] = column[k]
     for k in range(m):
         _all_applied(sights, places, HP[k], S[k])
         S[k, k] += R[k]
     gains = HP.copy()
     _solve_in_place(S, gains)
     for k in range(m):
-        mean += gains[k] * innovation[k]
+        _subtract(mean, -innovation[k], gains[k])
     mean[2] = wrapped(mean[2])
     _joseph(P, HP, gains, sights, places, R)
 
@@ -185,11 +186,21 @@ def _joseph(
     for j in range(n):
         row = P[j]
         for k in range(m):
-            row -= gains[k, j] * HP[k]
+            _subtract(row, gains[k, j], HP[k])
         _all_applied(sights, places, row, left)
         for k in range(m):
-            row[: j + 1] -= (left[k] - gains[k, j] * R[k]) * gains[k, : j + 1]
-        P[:j, j] = row[:j]
+            _subtract(row[: j + 1], left[k] - gains[k, j] * R[k], gains[k])
+        for i in range(j):
+            P[i, j] = row[i]
+
+
+@compiled
+def _subtract(
+    vector: Float[np.ndarray, " n"], factor: float, other: Float[np.ndarray, " k"]
+) -> None:
+    """The vector less factor times the first entries of `other`: no temporary array is made."""
+    for i in range(len(vector)):
+        vector[i] -= factor * other[i]
 
 
 @compiled
@@ -205,9 +216,9 @@ def _solve_in_place(S: Float[np.ndarray, "m m"], B: Float[np.ndarray, "m n"]) ->
             S[i, k] /= S[k, k]
     for k in range(m):
         for i in range(k):
-            B[k] -= S[k, i] * B[i]
+            _subtract(B[k], S[k, i], B[i])
         B[k] /= S[k, k]
     for k in range(m - 1, -1, -1):
         for i in range(k + 1, m):
-            B[k] -= S[i, k] * B[i]
+            _subtract(B[k], S[i, k], B[i])
         B[k] /= S[k, k]
