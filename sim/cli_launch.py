@@ -75,6 +75,8 @@ def launch(
         dataset=dataset,
     )
     _check_world(resolved)
+    if json_file is not None:
+        _check_writable(json_file)
     folder = output or _new_folder(resolved)
     log = record or folder / "log.mcap"
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -107,6 +109,15 @@ def _check_world(scenario: Scenario) -> None:
 
     if isinstance(scenario.world, UtiasWorld):
         streams_of(scenario)
+
+
+def _check_writable(path: Path) -> None:
+    """A result that can not be written is found before the run, not after it."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("a").close()
+    except OSError as error:
+        fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
 
 
 def _new_folder(scenario: Scenario) -> Path:
@@ -179,7 +190,6 @@ def _conclude(
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
     console.print(f"{outcome.wall_s:.1f} s of wall time", highlight=False)
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(figures, indent=2) + "\n")
     if outcome.failures:
         fail("\n".join(outcome.failures), FAILED)
