@@ -42,8 +42,8 @@ class TooFewPointsError(ValueError):
 def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
     """The submap with the covariance that it is joined with.
 
-    "identity": I, whatever it was. "spherical": the position and every landmark get half the trace
-    of their block times I, the heading keeps its variance, all correlations are dropped (each block
+    "identity": I, whatever it was. "spherical": a position and every landmark get half the trace
+    of their block times I, a heading keeps its variance, all correlations are dropped (each block
     commutes with rotations, which is what Huang's count of minima needs). "full": as it is.
     """
     if weighting == "full":
@@ -51,8 +51,10 @@ def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
     if weighting == "identity":
         return replace(local, covariance=np.eye(len(local.mean)))
     variances = np.diag(local.covariance).copy()
-    variances[:2] = variances[:2].mean()
-    variances[3:] = np.repeat(variances[3:].reshape(-1, 2).mean(axis=1), 2)
+    behind = len(variances) - 2 * len(local.ids)
+    poses, landmarks = variances[:behind].reshape(-1, 3), variances[behind:].reshape(-1, 2)
+    poses[:, :2] = poses[:, :2].mean(axis=1, keepdims=True)
+    landmarks[:] = landmarks.mean(axis=1, keepdims=True)
     return replace(local, covariance=np.diag(variances))
 
 
