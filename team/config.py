@@ -34,6 +34,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     "velocity" (Ma & Ma eq. 1-4) drives the arc of constant (forward, yaw_rate).
     forward [m], turn [rad], final_turn [rad] (a rotation after the motion) and lateral [m] are the
     independent noises. forward_scale and yaw_scale multiply the logged values first.
+    turn_drag [m]: a base whose outer wheel is no faster than the logged speed loses
+    turn_drag·|yaw rate| of it in a turn, at most all. veer [rad/m]: it turns so much on each metre.
     """
 
     kind: Literal["turn-then-drive", "velocity"] = "velocity"
@@ -44,6 +46,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     forward_scale: Positive = 1.0
     yaw_scale: Positive = 1.0
     yaw_rate_limit: Positive | None = None
+    turn_drag: NonNegative = 0.0
+    veer: float = 0.0
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

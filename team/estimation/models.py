@@ -71,8 +71,9 @@ def increment_of(
 ) -> Increment:
     """One odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
 
-    With d = forward_scale·forward·t and φ = clip(yaw_scale·yaw_rate, ±yaw_rate_limit)·t and the
-    independent noises a (forward, on d), b (turn, on φ), c (final turn), l (lateral):
+    With v = forward_scale·forward, ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
+    d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the independent noises
+    a (forward, on d), b (turn, on φ), c (final turn), l (lateral):
     "velocity":        Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al. table 5.3 and
                        Ma & Ma eq. 1-4, with its limit φ → 0.
     "turn-then-drive": turn φ + b, drive d + a, then (0, l, c): the thesis, section 4.3.1.
@@ -81,8 +82,10 @@ def increment_of(
     rate = motion.yaw_scale * yaw_rate
     if motion.yaw_rate_limit is not None:
         rate = min(max(rate, -motion.yaw_rate_limit), motion.yaw_rate_limit)
-    distance = motion.forward_scale * forward * duration_s
-    turn = rate * duration_s
+    lost = motion.turn_drag * abs(rate) * duration_s
+    logged = motion.forward_scale * forward * duration_s
+    distance = math.copysign(max(abs(logged) - lost, 0.0), logged)
+    turn = rate * duration_s + motion.veer * distance
     kernel = _arc if motion.kind == "velocity" else _turn_then_drive
     return Increment(
         *kernel(

@@ -124,6 +124,22 @@ def test_scales_come_before_the_limit_of_the_yaw_rate():
     np.testing.assert_allclose(increment_of(model, 2.0, 1.0, 0.0).mean, [2.2, 0.0, 0.0])
 
 
+def test_a_turn_drags_at_the_speed_and_never_turns_it_round():
+    model = MotionModel(forward_scale=1.1, yaw_scale=0.5, turn_drag=0.2)
+    for forward, yaw_rate, left in ((1.0, 0.6, 1.04), (-1.0, 0.6, -1.04), (0.1, -3.0, 0.0)):
+        arc = logarithm(increment_of(model, 2.0, forward, yaw_rate).mean)
+        np.testing.assert_allclose(arc, [2.0 * left, 0.0, yaw_rate], atol=1e-12)
+
+
+def test_a_base_that_veers_turns_by_the_way_that_it_drove_on_top_of_what_is_logged():
+    model = MotionModel(turn_drag=0.5, veer=-0.1, turn=MotionNoise(per_rad=0.2))
+    veered = increment_of(model, 2.0, 1.0, 0.4)
+    np.testing.assert_allclose(logarithm(veered.mean), [1.6, 0.0, 0.8 - 0.16], atol=1e-12)
+    assert veered.covariance[2, 2] == pytest.approx(0.04 * 0.64)
+    back = increment_of(model, 2.0, -1.0, 0.0)
+    assert back.mean[2] == pytest.approx(0.2)
+
+
 @quick
 @given(
     st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.1, 3.1), st.floats(1.0, 20.0), turns

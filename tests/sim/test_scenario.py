@@ -60,7 +60,7 @@ def test_a_waypoints_team_is_heterogeneous() -> None:
 def test_the_utias_scenario_has_the_five_robots_of_the_rig() -> None:
     scenario = load("utias")
     assert [robot.id for robot in scenario.robots] == ["r1", "r2", "r3", "r4", "r5"]
-    assert scenario.robots[4].motion.yaw_scale == 0.97
+    assert scenario.robots[4].motion.yaw_scale == 0.955
     assert scenario.central.covariance_factor == 4.0
 
 
