@@ -23,29 +23,32 @@ _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 
 class Link:
-    """Holds what reaches a node until it arrives; equal times in the order of sending."""
+    """Holds what reaches a node until it arrives; at equal times news of others come first."""
 
     def __init__(self, arrival_ns: Callable[[Sample, int], int] | None = None) -> None:
         self._arrival_ns = arrival_ns
-        self._held: list[tuple[int, int, Sample]] = []
+        self._held: list[tuple[int, bool, int, Sample]] = []
         self._sent = 0
 
     def say(self, at_ns: int, message: m.Liveliness) -> None:
         """The node notices at this time that another one went or came back."""
         sample = Sample(ch.ALIVE.key(message.node), encoded(message), 0, 0, 0)
-        heapq.heappush(self._held, (at_ns, -1, sample))
+        self._hold(at_ns, sample, sent=False)
 
     def arrived(self, samples: Sequence[Sample], now_ns: int) -> list[Sample]:
         """What is there by now, given what has been sent since the last time."""
         if self._arrival_ns is None:
             return list(samples)
         for sample in samples:
-            heapq.heappush(self._held, (self._arrival_ns(sample, now_ns), self._sent, sample))
-            self._sent += 1
+            self._hold(self._arrival_ns(sample, now_ns), sample, sent=True)
         there = []
         while self._held and self._held[0][0] <= now_ns:
-            there.append(heapq.heappop(self._held)[2])
+            there.append(heapq.heappop(self._held)[-1])
         return there
+
+    def _hold(self, at_ns: int, sample: Sample, *, sent: bool) -> None:
+        heapq.heappush(self._held, (at_ns, sent, self._sent, sample))
+        self._sent += 1
 
     @property
     def next_ns(self) -> int | None:

@@ -87,16 +87,17 @@ def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
     for epoch in log.epochs(robot):
         readings = log.readings[(robot, epoch)]
         chain = _chain(log, robot, epoch)
-        dones = [
-            d
-            for d in log.of(ch.ROBOT_DONE)
-            if isinstance(d, m.Done) and (d.robot, d.epoch) == (robot, epoch)
-        ]
+        dones = _dones(log, robot, epoch)
         lives = [(_first_of(done, chain, readings), done.readings) for done in dones]
         if not any(first == 0 for first, _ in lives):
             yield from _life(born, readings, chain, 0, None)
         for first, until in lives:
             yield from _life(born, readings, chain, first, until)
+
+
+def _dones(log: Recorded, robot: str, epoch: int) -> list[m.Done]:
+    said = (d for d in log.of(ch.ROBOT_DONE) if isinstance(d, m.Done))
+    return [d for d in said if (d.robot, d.epoch) == (robot, epoch)]
 
 
 def _chain(log: Recorded, robot: str, epoch: int) -> list[m.Submap]:
@@ -108,8 +109,8 @@ def _first_of(done: m.Done, chain: Sequence[m.Submap], readings: Mapping[int, m.
     """The first reading of the life that ended so, by its steps."""
     steps = 0
     begins = {0, *(submap.last_reading + 1 for submap in chain)}
-    for counter in range(min(done.readings, max(readings) + 1) - 1, -1, -1):
-        steps += isinstance(readings.get(counter), m.Odometry)
+    for counter in range(min(done.readings, max(readings) + 1), -1, -1):
+        steps += counter < done.readings and isinstance(readings.get(counter), m.Odometry)
         if counter in begins and steps == done.steps:
             return counter
     return 0
@@ -127,7 +128,7 @@ def _life(
     if not isinstance(start, m.Start):
         return
     last = max(readings) + 1 if until is None else until
-    while first < last:
+    while True:
         node = born()
         if first:
             node.resume(start, [s for s in chain if s.last_reading < first])
@@ -138,8 +139,11 @@ def _life(
         if counter == last and until is not None:
             end = m.StreamEnd(start.robot, start.epoch, until)
             yield from node.handle(m.End(0, (end,)), 0)
-        behind = (s.last_reading + 1 for s in chain if s.last_reading >= counter)
-        first = next((b for b in behind if b in readings), last) if counter < last else last
+        behind = (s.last_reading + 1 for s in chain if counter <= s.last_reading < last)
+        following = next((b for b in behind if b in readings), None)
+        if counter >= last or following is None:
+            return
+        first = following
 
 
 def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
@@ -169,7 +173,7 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
 
 
 def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
-    """What the robot's node does with each recorded reading of an epoch, in its own words.
+    """What the robot's node does with each reading of an epoch that it consumed, in its own words.
 
     Without a centre nothing holds it up. Scans that no odometry covers are known at the end only.
     """
@@ -177,10 +181,11 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     node = RetoldRobot(config, digest, {})
     node.handle(m.Liveliness(0, "central", False), 0)
     readings = log.readings.get((robot, epoch), {})
+    done = max((d.readings for d in _dones(log, robot, epoch)), default=None)
     said: dict[int, str] = {}
-    for counter in takewhile(readings.__contains__, range(len(readings))):
+    for counter in takewhile(readings.__contains__, range(len(readings) if done is None else done)):
         said[counter] = next(iter(node.took(readings[counter])), "lost")
-    if said and (robot, epoch) in log.published:
+    if said and done is not None:
         end = m.StreamEnd(robot, epoch, len(said))
         for reason, count in node.took(m.End(0, (end,))).items():
             scans = [n for n in said if isinstance(readings[n], m.Observations)]

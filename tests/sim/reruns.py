@@ -1,0 +1,66 @@
+"""Logs to compute again: written from samples, honest or tampered with."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+
+from sim.in_memory import run_team
+from sim.scenario import Scenario, load, with_options
+from sim.source import streams_of
+from team.recording.provenance import provenance
+from team.recording.reader import Log, open_log
+from team.recording.recorder import Recorder
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.codec import encoded
+from tests.teams import Team
+
+Change = Callable[[m.Message], m.Message | None]
+
+
+def thesis(steps: int, **options: str | int) -> Scenario:
+    """The thesis world, shorter."""
+    scenario = with_options(load("thesis"), **options)
+    world = msgspec.structs.replace(scenario.world, steps=steps)
+    return msgspec.structs.replace(scenario, world=world)
+
+
+def team_samples(scenario: Scenario) -> list[Sample]:
+    """What a recorder takes of a run in memory."""
+    return list(run_team(scenario, streams_of(scenario)))
+
+
+def written(path: Path, samples: Iterable[Sample], more: Mapping[str, str] | None = None) -> Log:
+    """A log of these samples, with this process's provenance and `more`."""
+    with Recorder(path, "test", {**provenance(), **(more or {})}) as recorder:
+        recorder.write(samples)
+    return open_log(path)
+
+
+def changed(samples: Sequence[Sample], channel: ch.Channel, change: Change) -> list[Sample]:
+    """The samples with `change` applied to every message of a channel; None leaves it out."""
+    out = []
+    for sample in samples:
+        found, _, message = opened(sample)
+        if found is not channel:
+            out.append(sample)
+        elif (other := change(message)) is not None:
+            out.append(replace(sample, payload=encoded(other)))
+    return out
+
+
+def messages(samples: Iterable[Sample], channel: ch.Channel, name: str = "") -> list[m.Message]:
+    """The messages on one key."""
+    return [opened(s)[2] for s in samples if s.key == channel.key(name)]
+
+
+def said(team: Team) -> list[Sample]:
+    """Everything that a team of the tests has sent, key by key."""
+    return [
+        Sample(key, encoded(message), message.stamp_ns, 0, counter)
+        for key, sent in team.sent.items()
+        for counter, message in enumerate(sent)
+    ]
