@@ -59,6 +59,8 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     range_white and bearing_white are the shares of the two variances that are independent from
     reading to reading; the rest is one error per landmark, constant within a window (a camera that
     mismeasures a marker does so again a moment later).
+    A teammate's marker reads marker_range_offset [m] too long after this calibration, and lies
+    marker_sigma [m] from the pose that its robot tracks.
     """
 
     range_sigma: Positive = 0.1
@@ -72,6 +74,8 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bearing_offset: float = 0.0
     range_white: Share = 1.0
     bearing_white: Share = 1.0
+    marker_range_offset: float = 0.0
+    marker_sigma: NonNegative = 0.0
 
 
 class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,6 +84,10 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window_s: a window closes with the first odometry interval that ends this long after its start.
     keyframe_s: sightings within this time are reduced to one per landmark (median, moved with the
     odometry to the keyframe's end); 0 takes every observation message as an epoch of its own.
+    node_s: each submap carries the robot's poses at the multiples of this team time that lie in its
+    window, so that sightings of teammates are factors between poses; 0: none, sightings unused.
+    sighting_s: a sighting is used if such a time is no farther from it than this. teammate_speed:
+    how fast a teammate may move in between [m/s].
     """
 
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 100
@@ -87,6 +95,9 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     resample_below: Fraction = 0.5
     window_s: Positive = 12.0
     keyframe_s: NonNegative = 0.0
+    node_s: NonNegative = 0.0
+    sighting_s: NonNegative = 0.5
+    teammate_speed: NonNegative = 0.2
 
 
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,4 +1,4 @@
-"""Where one map lies in the frame of another, from the landmarks that both know.
+"""Where one map lies in the frame of another, from the points that both know.
 
 Weighted Procrustes by singular values gives the first guess (Downs' thesis on map joining; Arun,
 Huang & Blostein 1987), Gauss-Newton in the metric of both joint covariances the rest. Whether the
@@ -16,7 +16,7 @@ from team.estimation.geometry import wrapped
 
 ITERATIONS = 10
 NEEDED = 2
-"""Landmarks that determine a rigid motion in the plane."""
+"""Points that determine a rigid motion in the plane."""
 
 
 class Alignment(NamedTuple):
@@ -110,32 +110,41 @@ def _linearised(
     return (in_a - turned - a_from_b[:2]).ravel(), metric, jacobian
 
 
-def refusal(shared: int, alignment: Alignment | None, heading_sigma: float) -> str | None:
-    """Why the landmarks can not place one map in the other, or None if they can.
+class Shared(NamedTuple):
+    """How many points two maps share: landmarks, and teammates seen from one of them."""
 
-    `alignment` is None where `shared` is too few.
+    landmarks: int
+    sightings: int = 0
+
+    def __str__(self) -> str:
+        words = f"{self.landmarks} shared landmark{'' if self.landmarks == 1 else 's'}"
+        if self.sightings:
+            words += f" and {self.sightings} sighting{'' if self.sightings == 1 else 's'}"
+        return words
+
+
+def refusal(shared: Shared, alignment: Alignment | None, heading_sigma: float) -> str | None:
+    """Why the shared points can not place one map in the other, or None if they can.
+
+    `alignment` is None where there are too few.
     """
-    if shared < NEEDED or alignment is None:
-        plural = "" if shared == 1 else "s"
-        return f"{shared} shared landmark{plural}, {NEEDED} needed"
+    if alignment is None:
+        return f"{shared}, {NEEDED} needed"
     if alignment.heading_sigma > heading_sigma:
         return (
-            f"{shared} shared landmarks too close together for their uncertainty: "
+            f"{shared} too close together for their uncertainty: "
             f"heading to {alignment.heading_sigma:.2f} rad, {heading_sigma:.2f} needed"
         )
     return None
 
 
-def disagreement(shared: int, chi2: float, confidence: float) -> str | None:
-    """Why two maps of `shared` common landmarks are not of one place, or None.
+def disagreement(shared: Shared, chi2: float, confidence: float) -> str | None:
+    """Why two maps that share these points are not of one place, or None.
 
-    chi2: the rise of the joint cost when their landmarks are made one; χ² of 2 per landmark less
-    the 3 of the motion for maps that agree.
+    chi2: the rise of the joint cost when their landmarks are made one and the sightings taken; χ²
+    of 2 per point less the 3 of the motion for maps that agree.
     """
-    limit = float(chdtri(2 * shared - 3, 1.0 - confidence))
+    limit = float(chdtri(2 * sum(shared) - 3, 1.0 - confidence))
     if chi2 > limit:
-        return (
-            f"{shared} shared landmarks disagree: chi² {chi2:.1f} "
-            f"exceeds {limit:.1f} ({100.0 * confidence:g} %)"
-        )
+        return f"{shared} disagree: chi² {chi2:.1f} exceeds {limit:.1f} ({100.0 * confidence:g} %)"
     return None

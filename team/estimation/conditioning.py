@@ -50,7 +50,7 @@ def team_pose(
     window in progress. Three Gauss-Newton iterations over the poses of the chain and the landmarks
     that it sees; of the prior only their marginal is used, which is exact.
     """
-    chain = [*pending, *([] if open_window is None else [open_window])]
+    chain = [each.without_nodes for each in (*pending, open_window) if each is not None]
     if not chain:
         return prior.pose, prior.covariance[:3, :3]
     seen = np.unique(np.concatenate([local.ids for local in chain]))

@@ -1,9 +1,9 @@
 """The solution of a submap graph: Gauss-Newton, damped only where the cost would rise.
 
-Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ‖start − prior‖², where ρ is the identity, or Cauchy's loss on
-√(χ²/dim) per submap, by iterated re-weighting. A robust submap enters with a wide scale that
-narrows with each iteration it has lived through, so a true loop closure is not taken for an outlier
-before the chain has bent.
+Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start − prior‖², where ρ is the identity, or Cauchy's
+loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters with a wide scale
+that narrows with each iteration it has lived through, so a true loop closure is not taken for an
+outlier before the chain has bent.
 """
 
 import math
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.estimation import joining_kernel as kernel
+from team.estimation import sighting_kernel as sightings
 from team.estimation import sparse
 from team.estimation.geometry import wrapped
 from team.estimation.submap_graph import Graph
@@ -31,7 +32,7 @@ class JoinSettings:
     """How submaps are joined.
 
     iterations_per_tick: Gauss-Newton iterations of `folded`.
-    robust_c: Cauchy's scale on √(χ²/dim) of a submap; None for least squares. The scale begins at
+    robust_c: Cauchy's scale on √(χ²/dim) of a factor; None for least squares. The scale begins at
         robust_start · c and is multiplied by robust_decay with each iteration until it is c.
     covariance_factor: every submap's covariance is taken times this.
     max_iterations, step_tolerance: a full solve ends when no unknown moves by more [m, rad].
@@ -60,24 +61,27 @@ class NotDeterminedError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Island:
-    """One frame: its graph, the state (poses and landmarks by node) and the submaps' ages.
+    """One frame: its graph, the state (poses and landmarks by node) and the factors' ages.
 
-    age: iterations that each submap has lived through; the robust scale follows from it.
+    age, sighting_age: iterations that each submap and each sighting has lived through; the robust
+    scale follows from it.
     """
 
     graph: Graph
     state: Values
     age: Int64[np.ndarray, " F"]
+    sighting_age: Int64[np.ndarray, " S"]
     settings: JoinSettings
 
     @property
     def scale(self) -> Float[np.ndarray, " F"]:
         """The robust scale c of each submap at its age."""
-        settings = self.settings
-        if settings.robust_c is None:
-            return np.full(len(self.age), math.inf)
-        wide = settings.robust_start * settings.robust_decay ** self.age.astype(np.float64)
-        return settings.robust_c * np.maximum(1.0, wide)
+        return _scale_at(self.age, self.settings)
+
+    @property
+    def sighting_scale(self) -> Float[np.ndarray, " S"]:
+        """The robust scale c of each sighting at its age."""
+        return _scale_at(self.sighting_age, self.settings)
 
     @cached_property
     def chi2(self) -> Float[np.ndarray, " F"]:
@@ -92,6 +96,16 @@ class Island:
         return 1.0 / (1.0 + relative)
 
     @cached_property
+    def sighting_chi2(self) -> Float[np.ndarray, " S"]:
+        """rᵀR⁻¹r of each sighting."""
+        return sightings.sighting_costs(self.state, self.graph.offset, self.graph.sighting_factors)
+
+    @property
+    def sighting_weight(self) -> Float[np.ndarray, " S"]:
+        """Robust weight of each sighting, 1 without a robust loss."""
+        return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * self.sighting_scale**2))
+
+    @cached_property
     def prior_chi2(self) -> Float[np.ndarray, " priors"]:
         """χ² of each prior on a start."""
         return np.array([_prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
@@ -99,10 +113,13 @@ class Island:
     @cached_property
     def cost(self) -> float:
         """What is minimised, at the present scales."""
-        scale = self.scale**2 * self.graph.dimensions
         if self.settings.robust_c is None:
-            return float(self.chi2.sum() + self.prior_chi2.sum())
-        return float((scale * np.log1p(self.chi2 / scale)).sum() + self.prior_chi2.sum())
+            chi2 = float(self.chi2.sum() + self.prior_chi2.sum())
+            return chi2 + float(self.sighting_chi2.sum())
+        scale = self.scale**2 * self.graph.dimensions
+        cost = float((scale * np.log1p(self.chi2 / scale)).sum() + self.prior_chi2.sum())
+        scale = 2.0 * self.sighting_scale**2
+        return cost + float((scale * np.log1p(self.sighting_chi2 / scale)).sum())
 
     @cached_property
     def normal_equations(self) -> tuple[Values, Values]:
@@ -117,6 +134,17 @@ class Island:
             self.scale,
             graph.entry,
             pattern.column_start,
+            pattern.value_start,
+        )
+        sightings.add_sightings(
+            values,
+            gradient,
+            self.state,
+            graph.offset,
+            graph.fixed,
+            graph.sighting_factors,
+            self.sighting_scale,
+            graph.entry,
             pattern.value_start,
         )
         for k, prior in enumerate(graph.priors):
@@ -135,6 +163,22 @@ class Island:
     def selected_covariance(self) -> Values:
         """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
         return sparse.selected_inverse(self.posterior)
+
+
+def _scale_at(age: Int64[np.ndarray, " k"], settings: JoinSettings) -> Float[np.ndarray, " k"]:
+    if settings.robust_c is None:
+        return np.full(len(age), math.inf)
+    wide = settings.robust_start * settings.robust_decay ** age.astype(np.float64)
+    return settings.robust_c * np.maximum(1.0, wide)
+
+
+def aged(island: Island, iterations: int | None) -> Island:
+    """The island so many iterations older; None: every factor begins anew."""
+    if iterations is None:
+        age, sighting_age = np.zeros_like(island.age), np.zeros_like(island.sighting_age)
+    else:
+        age, sighting_age = island.age + iterations, island.sighting_age + iterations
+    return replace(island, age=age, sighting_age=sighting_age)
 
 
 def _prior_terms(
@@ -166,7 +210,6 @@ def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
     """One iteration: the island, the damping for the next one, the largest change [m, rad]."""
     values, gradient = island.normal_equations
     diagonal = island.graph.diagonal
-    older = island.age + 1
     while damping < MOST_DAMPING:
         damped = values.copy()
         damped[diagonal] *= 1.0 + damping
@@ -176,9 +219,9 @@ def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
         if moved.cost <= island.cost * (1.0 + ROUNDING) + ROUNDING:
             eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
             largest = float(np.abs(step).max(initial=0.0))
-            return replace(moved, age=older), eased, largest
+            return aged(moved, 1), eased, largest
         damping = max(10.0 * damping, LEAST_DAMPING)
-    return replace(island, age=older), 0.0, 0.0
+    return aged(island, 1), 0.0, 0.0
 
 
 def iterated(island: Island) -> Island:
@@ -192,14 +235,15 @@ def iterated(island: Island) -> Island:
 def settled(island: Island) -> tuple[Island, int, float]:
     """The full solution from here, the iterations it took and the last change [m, rad].
 
-    A robust scale is annealed anew for all submaps. Ends at `max_iterations` at the latest: the
+    A robust scale is annealed anew for all factors. Ends at `max_iterations` at the latest: the
     last change tells whether it converged.
     """
     settings = island.settings
-    island = replace(island, age=np.zeros_like(island.age))
+    island = aged(island, None)
     damping, change, count = 0.0, math.inf, 0
     while count < settings.max_iterations:
-        narrow = settings.robust_c is None or bool((island.scale == settings.robust_c).all())
+        scales = np.concatenate([island.scale, island.sighting_scale])
+        narrow = settings.robust_c is None or bool((scales == settings.robust_c).all())
         island, damping, change = _iterated(island, damping)
         count += 1
         if narrow and damping == 0.0 and change < settings.step_tolerance:

@@ -1,9 +1,10 @@
 """The team's map as a fold over its submaps in their canonical order.
 
 Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over all submaps of
-all robots. The fold takes the submaps by ticks; it is a pure function of their order and of the
-ticks' boundaries. Streams whose start in the common frame is unknown are islands of their own
-until they share enough landmarks with the main island.
+all robots, and over the sightings of teammates between their pose nodes. The fold takes the submaps
+by ticks, each with the sightings from it; it is a pure function of their order and of the ticks'
+boundaries. Streams whose start in the common frame is unknown are islands of their own until shared
+landmarks and sightings tie them to the main island.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,11 +12,14 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Int64
 
 from team.estimation import alignment
 from team.estimation.contribution import Contribution, Start, Stream, named
-from team.estimation.gauss_newton import Island, JoinSettings, iterated, joint_marginal, settled
-from team.estimation.submap_graph import EMPTY_GRAPH, extended, merged
+from team.estimation.gauss_newton import Island, JoinSettings, aged, iterated, settled
+from team.estimation.island_ties import aligned_by, ties
+from team.estimation.sighting import Sighting
+from team.estimation.submap_graph import EMPTY_GRAPH, extended, merged, met
 
 __all__ = [
     "EMPTY_FOLD",
@@ -25,6 +29,7 @@ __all__ = [
     "JoinSettings",
     "LateStartError",
     "NotCanonicalError",
+    "Sighting",
     "Start",
     "Stream",
     "converged",
@@ -76,6 +81,7 @@ class Fold:
 
     home:       island (a key of `islands`) of each stream.
     reasons:    why an island other than the main one is not merged, by its frame.
+    waiting:    sightings whose pose nodes are not both in one island, in canonical order.
     iterations, change: of the main island's last full solution: how many, the last step [m, rad].
     """
 
@@ -84,6 +90,7 @@ class Fold:
     islands: Mapping[Stream, Island]
     home: Mapping[Stream, Stream]
     reasons: Mapping[Stream, str]
+    waiting: tuple[Sighting, ...] = ()
     iterations: int = 0
     change: float = 0.0
 
@@ -127,11 +134,18 @@ def started(fold: Fold, start: Start) -> Fold:
     return replace(fold, starts={**fold.starts, start.stream: start})
 
 
-def folded(fold: Fold, contributions: Sequence[Contribution], settings: JoinSettings) -> Fold:
+def folded(
+    fold: Fold,
+    contributions: Sequence[Contribution],
+    settings: JoinSettings,
+    sightings: Sequence[Sighting] = (),
+) -> Fold:
     """One tick: take the submaps, place what is new, iterate, merge islands that can be.
 
     Contributions stand in canonical order, behind all that the fold has, without a gap in a
-    stream; else NotCanonicalError or GapError. Islands without news keep their state.
+    stream; else NotCanonicalError or GapError. Islands without news keep their state. sightings:
+    those from the submaps of this tick; each is a factor from the tick on in which both of its pose
+    nodes are in one island.
     """
     _check(fold, contributions)
     home = dict(fold.home)
@@ -142,17 +156,39 @@ def folded(fold: Fold, contributions: Sequence[Contribution], settings: JoinSett
             common = [home[other] for other in home if other in fold.starts]
             home[stream] = common[0] if common and stream in fold.starts else stream
         news.setdefault(home[stream], []).append(contribution)
+    waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
     islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
     for key, taken in news.items():
-        none = Island(EMPTY_GRAPH, np.zeros(0), np.zeros(0, dtype=np.int64), settings)
-        island = islands.get(key, none)
+        island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), _new(0), _new(0), settings))
         graph, state = extended(island.graph, island.state, taken, fold.starts)
-        age = np.concatenate([island.age, np.zeros(len(taken), dtype=np.int64)])
-        islands[key] = iterated(Island(graph, state, age, settings))
+        age = np.concatenate([island.age, _new(len(taken))])
+        island, waiting = _sighted(replace(island, graph=graph, state=state, age=age), waiting)
+        islands[key] = iterated(island)
     grown = replace(
-        fold, contributions=(*fold.contributions, *contributions), islands=islands, home=home
+        fold,
+        contributions=(*fold.contributions, *contributions),
+        islands=islands,
+        home=home,
+        waiting=waiting,
     )
     return _with_merges(grown)
+
+
+def _new(count: int) -> Int64[np.ndarray, " count"]:
+    """The ages of so many new factors."""
+    return np.zeros(count, dtype=np.int64)
+
+
+def _sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[Sighting, ...]]:
+    """The island with the sightings that it has both pose nodes of, and those that still wait."""
+    candidates = [(each, met(island.graph, each)) for each in waiting]
+    found = [between for _, between in candidates if between is not None]
+    if not found:
+        return island, tuple(waiting)
+    graph = replace(island.graph, sightings=(*island.graph.sightings, *found))
+    age = np.concatenate([island.sighting_age, _new(len(found))])
+    left = tuple(each for each, between in candidates if between is None)
+    return replace(island, graph=graph, sighting_age=age), left
 
 
 def lean(fold: Fold) -> Fold:
@@ -198,14 +234,16 @@ def _with_merges(fold: Fold) -> Fold:
         if main_key is None or key == main_key:
             continue
         main, other = fold.islands[main_key], fold.islands[key]
-        shared = sorted(main.graph.landmarks.keys() & other.graph.landmarks.keys())
-        found = _aligned(main, other, shared)
+        tied = ties(main.graph, other.graph, fold.waiting)
+        seen = sum(tie.seen is not None for tie in tied)
+        what = alignment.Shared(len(tied) - seen, seen)
+        found = aligned_by(main, other, tied)
         settings = main.settings
-        why = alignment.refusal(len(shared), found, settings.alignment_heading_sigma)
+        why = alignment.refusal(what, found, settings.alignment_heading_sigma)
         if found is not None and why is None:
             merge = _merged(fold, main_key, key, found)
             rise = _cost(merge.main) - _cost(main) - _cost(other)
-            why = alignment.disagreement(len(shared), rise, settings.alignment_confidence)
+            why = alignment.disagreement(what, rise, settings.alignment_confidence)
             if why is None:
                 return _with_merges(merge)
         frame = min(other.graph.streams)
@@ -213,31 +251,20 @@ def _with_merges(fold: Fold) -> Fold:
     return replace(fold, reasons=reasons)
 
 
-def _aligned(main: Island, other: Island, shared: list[int]) -> alignment.Alignment | None:
-    if len(shared) < alignment.NEEDED:
-        return None
-    means, covariances = zip(
-        *(
-            joint_marginal(island, [island.graph.landmarks[id_] for id_ in shared])
-            for island in (main, other)
-        ),
-        strict=True,
-    )
-    in_main, in_other = (mean.reshape(-1, 2) for mean in means)
-    return alignment.aligned(in_main, covariances[0], in_other, covariances[1])
-
-
 def _cost(island: Island) -> float:
     """The cost with every robust scale at its end, so that islands can be compared."""
-    return replace(island, age=np.full_like(island.age, FULL_AGE)).cost
+    return aged(island, FULL_AGE).cost
 
 
 def _merged(fold: Fold, main_key: Stream, key: Stream, found: alignment.Alignment) -> Fold:
     main, other = fold.islands[main_key], fold.islands[key]
     graph, state = merged(main.graph, main.state, other.graph, other.state, found.a_from_b)
-    age = np.zeros(len(main.age) + len(other.age), dtype=np.int64)
-    island, iterations, change = settled(Island(graph, state, age, main.settings))
+    ages = _new(len(graph.submaps)), _new(len(graph.sightings))
+    both, waiting = _sighted(Island(graph, state, *ages, main.settings), fold.waiting)
+    island, iterations, change = settled(both)
     islands = {at: each for at, each in fold.islands.items() if at != key}
     islands[main_key] = island
     home = {stream: main_key if at == key else at for stream, at in fold.home.items()}
-    return replace(fold, islands=islands, home=home, iterations=iterations, change=change)
+    return replace(
+        fold, islands=islands, home=home, waiting=waiting, iterations=iterations, change=change
+    )

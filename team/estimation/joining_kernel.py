@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.estimation.compiled import compiled
-from team.estimation.submap_factor import submap_normal, submap_residual
+from team.estimation.submap_factor import poses_of, submap_normal, submap_residual
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -17,8 +17,8 @@ class Factors(NamedTuple):
     """All submaps of a graph in flat arrays, in the order in which they were taken.
 
     member[member_start[f] : member_start[f + 1]] are the nodes of submap f: start pose, end pose,
-    landmarks by id. mean and information (P⁻¹, row-major) lie likewise from mean_start and
-    information_start on.
+    pose nodes by stamp, landmarks by id. mean and information (P⁻¹, row-major) lie likewise from
+    mean_start and information_start on.
     """
 
     member: Indices
@@ -117,12 +117,13 @@ def costs(state: Values, offset: Indices, factors: Factors, covariance_factor: f
         information = factors.information[begin : begin + n * n].reshape(n, n)
         residual, _ = submap_residual(state, at, mean)
         c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+        poses = poses_of(len(at) - 1, n)
         row = 0
         while row < n:
             a, b = residual[row], residual[row + 1]
             residual[row] = c * a + s * b
             residual[row + 1] = -s * a + c * b
-            row += 3 if row == 0 else 2
+            row += 3 if row < 3 * poses else 2
         chi2 = 0.0
         for i in range(n):
             total = 0.0

@@ -14,6 +14,7 @@ from team.estimation.conditioning import RobotPrior
 from team.estimation.contribution import Stream
 from team.estimation.gauss_newton import Island, joint_marginal
 from team.estimation.joining import Fold
+from team.estimation.sighting_kernel import explained_by_sightings
 
 
 class LandmarkMap(NamedTuple):
@@ -56,9 +57,9 @@ class SubmapCost(NamedTuple):
 class Agreement(NamedTuple):
     """Joint cost Σ w χ² and its degrees of freedom, in all, per robot and per submap.
 
-    Without a robust loss the joint dof is the sum of the submaps' dimensions (and of the start
-    priors') less the number of unknowns. A lasting chi2/dof above 1.1 is a warning, above 1.3 the
-    covariances are not to be trusted.
+    A sighting counts with its observer. Without a robust loss the joint dof is the sum of the
+    submaps' dimensions (and of the sightings' and the start priors') less the number of unknowns. A
+    lasting chi2/dof above 1.1 is a warning, above 1.3 the covariances are not to be trusted.
     """
 
     chi2: float
@@ -148,6 +149,7 @@ def joint_cost(fold: Fold) -> Agreement:
     for robot, chi2, own in [
         *((each.stream[0], each.weight * each.chi2, each.dof) for each in submaps),
         *_priors(island),
+        *_sightings(island),
     ]:
         before = robots.get(robot, (0.0, 0.0))
         robots[robot] = (before[0] + chi2, before[1] + own)
@@ -167,6 +169,22 @@ def _own_marginal(
     block = island.graph.pattern.diagonal_block(island.selected_covariance, node)
     fixed = bool(island.graph.fixed[node])
     return island.state[begin:end], np.zeros_like(block) if fixed else block
+
+
+def _sightings(island: Island) -> list[tuple[str, float, float]]:
+    """(observer, w χ², dof) of the sightings."""
+    graph, weight = island.graph, island.sighting_weight
+    explained = explained_by_sightings(
+        island.state,
+        graph.offset,
+        graph.sighting_factors,
+        graph.entry,
+        graph.pattern.value_start,
+        island.selected_covariance,
+    )
+    chi2, dof = weight * island.sighting_chi2, 2.0 - weight * explained
+    observers = [each.sighting.robot for each in graph.sightings]
+    return list(zip(observers, chi2.tolist(), dof.tolist(), strict=True))
 
 
 def _priors(island: Island) -> list[tuple[str, float, float]]:

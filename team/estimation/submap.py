@@ -1,24 +1,29 @@
-"""What a robot sends: one Gaussian over (end pose, landmarks) in the submap's own frame."""
+"""What a robot sends: one Gaussian over poses and landmarks in the submap's own frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, UInt32
+from jaxtyping import Float, Int64, UInt32
+
+NO_NODES = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
 class LocalMap:
-    """N(mean, covariance) of (end pose, landmark 1, …, landmark L) in the frame of its start pose.
+    """N(mean, covariance) of (end pose, pose nodes, landmarks) in the frame of its start pose.
 
-    ids:        landmark identities, strictly ascending.
-    mean:       (x [m], y [m], theta [rad], x₁, y₁, …), theta in (−π, π].
-    covariance: symmetric positive definite, [m², m·rad, rad²].
+    ids:         identities of the L landmarks, strictly ascending.
+    mean:        (x [m], y [m], theta [rad]) of the end pose and of K further poses of the robot,
+                 then (x₁, y₁, …, x_L, y_L); theta in (−π, π].
+    covariance:  symmetric positive definite, [m², m·rad, rad²].
+    node_stamps: team time of the K pose nodes [ns], strictly ascending.
     The start pose is exactly zero with zero uncertainty: nothing from outside the window is in it.
     """
 
     ids: UInt32[np.ndarray, " L"]
     mean: Float[np.ndarray, " n"]
     covariance: Float[np.ndarray, "n n"]
+    node_stamps: Int64[np.ndarray, " K"] = field(default_factory=NO_NODES.copy)
 
     @property
     def end_pose(self) -> Float[np.ndarray, "3"]:
@@ -28,4 +33,18 @@ class LocalMap:
     @property
     def landmarks(self) -> Float[np.ndarray, "L 2"]:
         """Landmark positions in the start frame [m]."""
-        return self.mean[3:].reshape(-1, 2)
+        return self.mean[3 + 3 * len(self.node_stamps) :].reshape(-1, 2)
+
+    @property
+    def nodes(self) -> Float[np.ndarray, "K 3"]:
+        """start_from_node of each pose node."""
+        return self.mean[3 : 3 + 3 * len(self.node_stamps)].reshape(-1, 3)
+
+    @property
+    def without_nodes(self) -> "LocalMap":
+        """The marginal over end pose and landmarks."""
+        if not len(self.node_stamps):
+            return self
+        behind = 3 + 3 * len(self.node_stamps)
+        kept = np.concatenate([np.arange(3), np.arange(behind, len(self.mean))])
+        return LocalMap(self.ids, self.mean[kept], self.covariance[np.ix_(kept, kept)])

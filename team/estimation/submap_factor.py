@@ -1,12 +1,12 @@
-"""A submap as a factor between its start pose, its end pose and its landmarks.
+"""A submap as a factor between its start pose, its other poses and its landmarks.
 
-A submap that starts at pose s, ends at pose e and sees landmarks l says, with the rotation R of the
-heading of s,
+A submap that starts at pose s, has the poses e (its end, then its pose nodes) and sees landmarks l
+says, with the rotation R of the heading of s,
 
-    r = (Rᵀ(p_e − p_s), wrap(θ_e − θ_s), Rᵀ(l₁ − p_s), …) − mean ~ N(0, P).
+    r = (Rᵀ(p_e − p_s), wrap(θ_e − θ_s), …, Rᵀ(l₁ − p_s), …) − mean ~ N(0, P).
 
-Seen in the map frame, r' = T r with T = blkdiag(R, 1, R, …), its Jacobian is the identity for
-(e, l₁, …) and
+Seen in the map frame, r' = T r with T = blkdiag(R, 1, …, R, …), its Jacobian is the identity for
+(e, …, l₁, …) and
 
     G = [−I | (v_y, −v_x)ᵀ] per point v = p − p_s,  [0 0 −1] for the heading
 
@@ -26,32 +26,41 @@ Values = Float[np.ndarray, " _"]
 
 
 @compiled
+def poses_of(points: int, numbers: int) -> int:
+    """How many of a submap's points are poses: 3 numbers each, the other points have 2."""
+    return numbers - 2 * points
+
+
+@compiled
 def submap_residual(
     state: Values, at: Indices, mean: Values
 ) -> tuple[Values, Float[np.ndarray, "n 2"]]:
     """The residual r' in the map frame, and v = p − p_s of each point (end pose first).
 
-    at: first number in `state` of the start pose, of the end pose and of each landmark.
+    at: first number in `state` of the start pose, of the other poses and of each landmark.
     """
-    start, end = at[0], at[1]
+    start = at[0]
+    poses = poses_of(len(at) - 1, len(mean))
     c, s = math.cos(state[start + 2]), math.sin(state[start + 2])
     residual = np.empty(len(mean))
     offsets = np.empty((len(at) - 1, 2))
     for point in range(len(at) - 1):
-        row = 0 if point == 0 else 2 * point + 1
+        row = 3 * point if point < poses else 2 * point + poses
         offsets[point, 0] = state[at[point + 1]] - state[start]
         offsets[point, 1] = state[at[point + 1] + 1] - state[start + 1]
         residual[row] = offsets[point, 0] - (c * mean[row] - s * mean[row + 1])
         residual[row + 1] = offsets[point, 1] - (s * mean[row] + c * mean[row + 1])
-    residual[2] = wrapped(state[end + 2] - state[start + 2] - mean[2])
+        if point < poses:
+            turn = state[at[point + 1] + 2] - state[start + 2]
+            residual[row + 2] = wrapped(turn - mean[row + 2])
     return residual, offsets
 
 
 @compiled
 def rotated_information(
-    information: Float[np.ndarray, "n n"], heading: float
+    information: Float[np.ndarray, "n n"], heading: float, poses: int
 ) -> Float[np.ndarray, "n n"]:
-    """M = T P⁻¹ Tᵀ: the metric of a submap, turned into the map frame."""
+    """M = T P⁻¹ Tᵀ: the metric of a submap with so many poses, turned into the map frame."""
     c, s = math.cos(heading), math.sin(heading)
     turned = information.copy()
     n = len(information)
@@ -61,14 +70,14 @@ def rotated_information(
             a, b = turned[row, k], turned[row + 1, k]
             turned[row, k] = c * a - s * b
             turned[row + 1, k] = s * a + c * b
-        row += 3 if row == 0 else 2
+        row += 3 if row < 3 * poses else 2
     row = 0
     while row < n:
         for k in range(n):
             a, b = turned[k, row], turned[k, row + 1]
             turned[k, row] = c * a - s * b
             turned[k, row + 1] = s * a + c * b
-        row += 3 if row == 0 else 2
+        row += 3 if row < 3 * poses else 2
     return turned
 
 
@@ -76,18 +85,20 @@ def rotated_information(
 def submap_normal(
     state: Values, at: Indices, mean: Values, information: Float[np.ndarray, "n n"]
 ) -> tuple[Float[np.ndarray, "m m"], Values, float]:
-    """JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r of one submap over (start pose, end pose, landmarks)."""
+    """JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r of one submap over (start pose, other poses, landmarks)."""
     n = len(mean)
+    poses = poses_of(len(at) - 1, n)
     residual, offsets = submap_residual(state, at, mean)
-    metric = rotated_information(information, state[at[0] + 2])
+    metric = rotated_information(information, state[at[0] + 2], poses)
     jacobian = np.zeros((n, 3))
     for point in range(len(at) - 1):
-        row = 0 if point == 0 else 2 * point + 1
+        row = 3 * point if point < poses else 2 * point + poses
         jacobian[row, 0] = -1.0
         jacobian[row + 1, 1] = -1.0
         jacobian[row, 2] = offsets[point, 1]
         jacobian[row + 1, 2] = -offsets[point, 0]
-    jacobian[2, 2] = -1.0
+        if point < poses:
+            jacobian[row + 2, 2] = -1.0
     hessian = np.zeros((n + 3, n + 3))
     gradient = np.zeros(n + 3)
     chi2 = 0.0

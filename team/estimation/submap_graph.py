@@ -1,4 +1,4 @@
-"""The factor graph of one frame: pose nodes, landmarks, submaps as factors, priors on starts.
+"""The factor graph of one frame: poses and landmarks, submaps and sightings, priors on starts.
 
 A `Graph` is the structure; it stays while the state moves. Every function returns new values. The
 value of a node that is added is found by composition from the nodes that are there.
@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int64
 from team.estimation.contribution import Contribution, Start, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.joining_kernel import Factors, block_pattern
+from team.estimation.sighting import Sighting
+from team.estimation.sighting_kernel import Sightings
 from team.estimation.sparse import Analysis, Pattern, analysed
 
 Indices = Int64[np.ndarray, " _"]
@@ -30,10 +32,18 @@ class Prior(NamedTuple):
 
 
 class Joined(NamedTuple):
-    """A submap in the graph: its start node, its end node and its landmarks' nodes by id."""
+    """A submap in the graph: its start, its end, its pose nodes and its landmarks' nodes by id."""
 
     contribution: Contribution
     nodes: Indices
+
+
+class Met(NamedTuple):
+    """A sighting in the graph, between the pose nodes of the observer and of the teammate."""
+
+    sighting: Sighting
+    observer: int
+    teammate: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +52,19 @@ class Graph:
 
     streams:   nodes of each stream: its start, then the end pose of submap 0, 1, …
     landmarks: node of each landmark id.
+    poses:     node of each further pose, by (stream, stamp).
     offset:    first number of each node in the state; the last is the state's length.
     fixed:     nodes that are constants (exact starts, the gauge).
-    submaps:   in the order in which they were taken.
+    submaps, sightings: in the order in which they were taken.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
     landmarks: Mapping[int, int]
+    poses: Mapping[tuple[Stream, int], int]
     offset: Indices
     fixed: Bool[np.ndarray, " _"]
     submaps: tuple[Joined, ...]
+    sightings: tuple[Met, ...]
     priors: tuple[Prior, ...]
 
     @cached_property
@@ -68,9 +81,23 @@ class Graph:
         )
 
     @cached_property
+    def sighting_factors(self) -> Sightings:
+        """The sightings in flat arrays, for the kernels; their entries follow the submaps'."""
+        return Sightings(
+            np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
+            np.array([met.sighting.reading for met in self.sightings]).reshape(-1, 2),
+            np.array([met.sighting.information for met in self.sightings]).reshape(-1, 2, 2),
+            int((np.diff(self.factors.member_start) ** 2).sum()),
+        )
+
+    @cached_property
     def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
+        factors, pairs = self.factors, self.sighting_factors.nodes
+        members = factors.member_start[-1] + 2 * np.arange(1, len(pairs) + 1)
         column_start, rows, entry = block_pattern(
-            self.fixed, self.factors.member, self.factors.member_start
+            self.fixed,
+            np.concatenate([factors.member, pairs.ravel()]),
+            np.concatenate([factors.member_start, members]),
         )
         return Pattern(np.diff(self.offset), column_start, rows), entry
 
@@ -81,7 +108,7 @@ class Graph:
 
     @property
     def entry(self) -> Indices:
-        """Entry of the pattern for each pair of members of each submap (see `block_pattern`)."""
+        """Entry of the pattern for each pair of members of each factor (see `block_pattern`)."""
         return self._pattern_and_entry[1]
 
     @cached_property
@@ -122,11 +149,14 @@ class Graph:
                 return f"the start of {named(stream)}"
             if node in nodes:
                 return f"the end of submap {nodes.index(node) - 1} of {named(stream)}"
+        for (stream, stamp_ns), at in self.poses.items():
+            if node == at:
+                return f"the pose of {named(stream)} at {stamp_ns * 1e-9:g} s"
         ids = [id_ for id_, at in self.landmarks.items() if at == node]
         return f"landmark {ids[0]}"
 
 
-EMPTY_GRAPH = Graph({}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), ())
+EMPTY_GRAPH = Graph({}, {}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), (), ())
 
 
 def _starts(lengths: Sequence[int]) -> Indices:
@@ -140,6 +170,7 @@ class _Growth:
     def __init__(self, graph: Graph, state: Values) -> None:
         self.streams = dict(graph.streams)
         self.landmarks = dict(graph.landmarks)
+        self.poses = dict(graph.poses)
         self.offset = graph.offset
         self.state = state
         self.count = len(graph.fixed)
@@ -167,8 +198,9 @@ def extended(
 ) -> tuple[Graph, Values]:
     """The graph with more submaps, in the given order; a stream without a start begins at 0.
 
-    A new end pose is start ∘ local end pose, a new landmark is placed by the first submap that
-    sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of its frame.
+    A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
+    first submap that sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of
+    its frame.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -185,20 +217,39 @@ def extended(
         map_from_start = growth.value(start_node, 3)
         end_node = growth.add(compose(map_from_start, local.end_pose), fixed=False)
         growth.streams[stream] = (*growth.streams[stream], end_node)
+        poses = [growth.add(compose(map_from_start, node), fixed=False) for node in local.nodes]
+        for stamp_ns, node in zip(local.node_stamps.tolist(), poses, strict=True):
+            growth.poses[stream, stamp_ns] = node
         for id_, point in zip(local.ids.tolist(), local.landmarks, strict=True):
             if id_ not in growth.landmarks:
                 growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
         seen = [growth.landmarks[id_] for id_ in local.ids.tolist()]
-        submaps.append(Joined(contribution, np.array([start_node, end_node, *seen])))
+        submaps.append(Joined(contribution, np.array([start_node, end_node, *poses, *seen])))
     grown = Graph(
         growth.streams,
         growth.landmarks,
+        growth.poses,
         _continued(graph.offset, [len(value) for value in growth.values]),
         np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
         tuple(submaps),
+        graph.sightings,
         tuple(priors),
     )
     return grown, np.concatenate([state, *growth.values])
+
+
+def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
+    """The robot's pose node at this stamp, of its first epoch that has one; None: there is none."""
+    epochs = sorted(epoch for name, epoch in graph.streams if name == robot)
+    found = (graph.poses.get(((robot, epoch), stamp_ns)) for epoch in epochs)
+    return next((node for node in found if node is not None), None)
+
+
+def met(graph: Graph, sighting: Sighting) -> Met | None:
+    """The sighting between its pose nodes; None while one of them is not in the graph."""
+    observer = graph.poses.get((sighting.stream, sighting.stamp_ns))
+    teammate = pose_node(graph, sighting.teammate, sighting.stamp_ns)
+    return None if observer is None or teammate is None else Met(sighting, observer, teammate)
 
 
 def _continued(starts: Indices, lengths: Sequence[int]) -> Indices:
@@ -233,12 +284,19 @@ def merged(
         stream: tuple(node_of[list(nodes)].tolist()) for stream, nodes in other.streams.items()
     }
     landmarks = {id_: int(node_of[node]) for id_, node in other.landmarks.items()}
+    poses = {key: int(node_of[node]) for key, node in other.poses.items()}
+    sightings = (
+        Met(each, int(node_of[observer]), int(node_of[teammate]))
+        for each, observer, teammate in other.sightings
+    )
     graph = Graph(
         {**main.streams, **streams},
         {**landmarks, **main.landmarks},
+        {**main.poses, **poses},
         _continued(main.offset, [len(value) for value in values]),
         np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
         (*main.submaps, *(Joined(each, node_of[nodes]) for each, nodes in other.submaps)),
+        (*main.sightings, *sightings),
         main.priors,
     )
     return graph, np.concatenate([state, *values])

@@ -40,6 +40,7 @@ def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
     each known landmark: the iterated EKF update of s in Joseph's form, then
     (pose ∘ end pose, landmarks, pose ∘ new landmarks) with its Jacobian.
     """
+    local = local.without_nodes
     n, m = len(whole.mean), len(local.mean)
     prior = np.concatenate([whole.mean, local.mean])
     covariance = np.zeros((n + m, n + m))

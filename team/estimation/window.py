@@ -20,10 +20,10 @@ from team.estimation.fastslam import Particles
 from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import wrapped
 from team.estimation.models import NEAREST_M, Increment
-from team.estimation.submap import LocalMap
+from team.estimation.submap import NO_NODES, LocalMap
 
 POSE_JITTER = (1e-6, 1e-6, 1e-8)
-"""Added to the end pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
+"""Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
 
 SOLVED = 1e-6
 """A Gauss-Newton step of squared Mahalanobis length below this changes nothing that matters."""
@@ -47,6 +47,7 @@ class Window:
     epochs:   the epoch of each of the N readings, in [0, K).
     ids:      the landmark of each reading.
     readings: (range [m], bearing [rad]) with the sensor's calibration applied.
+    node_stamps, node_epochs: team time [ns] of the pose nodes, and the epoch that each is.
     """
 
     front_end: FrontEnd
@@ -56,6 +57,8 @@ class Window:
     epochs: Int64[np.ndarray, " N"]
     ids: UInt32[np.ndarray, " N"]
     readings: Float[np.ndarray, "N 2"]
+    node_stamps: Int64[np.ndarray, " nodes"]
+    node_epochs: Int64[np.ndarray, " nodes"]
 
 
 def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
@@ -68,6 +71,8 @@ def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
         np.empty(0, np.int64),
         np.empty(0, np.uint32),
         np.empty((0, 2)),
+        NO_NODES,
+        NO_NODES,
     )
 
 
@@ -96,14 +101,22 @@ def advanced(
     )
     paths = window.paths if info.parents is None else window.paths[:, info.parents]
     epoch = np.full(len(ids), len(paths))
-    return Window(
-        window.front_end,
-        window.sensor,
-        particles,
-        np.concatenate((paths, particles.poses[None])),
-        np.concatenate((window.epochs, epoch)),
-        np.concatenate((window.ids, ids)),
-        np.concatenate((window.readings, np.column_stack((ranges, bearings)))),
+    return replace(
+        window,
+        particles=particles,
+        paths=np.concatenate((paths, particles.poses[None])),
+        epochs=np.concatenate((window.epochs, epoch)),
+        ids=np.concatenate((window.ids, ids)),
+        readings=np.concatenate((window.readings, np.column_stack((ranges, bearings)))),
+    )
+
+
+def marked(window: Window, stamp_ns: int) -> Window:
+    """The particles' poses of the last epoch become a pose node at this team time."""
+    return replace(
+        window,
+        node_stamps=np.append(window.node_stamps, stamp_ns),
+        node_epochs=np.append(window.node_epochs, len(window.paths) - 1),
     )
 
 
@@ -116,9 +129,9 @@ def moved(window: Window, increment: Increment, generator: np.random.Generator) 
 
 
 def gaussian(window: Window) -> LocalMap:
-    """The window so far as one Gaussian over (end pose, landmarks by ascending id).
+    """The window so far as one Gaussian over (end pose, pose nodes, landmarks by ascending id).
 
-    With w and (pose, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
+    With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
     Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ, headings on the circle (Xu, eq. 4.5-4.6), plus
     POSE_JITTER. The landmarks given a path come from `landmarks_along_paths`.
     Raises NotACovarianceError if P is not finite or not positive definite.
@@ -143,10 +156,12 @@ def gaussian(window: Window) -> LocalMap:
             window.sensor.bearing_white,
         ),
     )
-    mean, covariance = moments(particles.poses, np.exp(particles.log_weights), means, covariances)
-    covariance[np.arange(3), np.arange(3)] += POSE_JITTER
+    poses = np.concatenate((particles.poses, *window.paths[window.node_epochs]), axis=1)
+    mean, covariance = moments(poses, np.exp(particles.log_weights), means, covariances)
+    numbers = np.arange(poses.shape[1])
+    covariance[numbers, numbers] += np.tile(POSE_JITTER, len(numbers) // 3)
     cholesky_factor(covariance, "the submap of a window")
-    return LocalMap(ids, mean, covariance)
+    return LocalMap(ids, mean, covariance, window.node_stamps)
 
 
 @compiled
@@ -234,37 +249,50 @@ def landmarks_along_paths(
 
 
 @compiled
+def _mean_direction(angles: Float[np.ndarray, " M"], weights: Float[np.ndarray, " M"]) -> float:
+    """The direction of Σ wᵢ (cos aᵢ, sin aᵢ)."""
+    sine, cosine = 0.0, 0.0
+    for i in range(len(angles)):
+        sine += weights[i] * math.sin(angles[i])
+        cosine += weights[i] * math.cos(angles[i])
+    return math.atan2(sine, cosine)
+
+
+@compiled
 def moments(
-    poses: Float[np.ndarray, "M 3"],
+    poses: Float[np.ndarray, "M p"],
     weights: Float[np.ndarray, " M"],
     means: Float[np.ndarray, "M L 2"],
     covariances: Float[np.ndarray, "M L 3"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Mean and covariance of the mixture Σ wᵢ N(μᵢ, blkdiag(0, Σ₁, …, Σ_L)), n = 3 + 2L."""
-    count, n = len(poses), 3 + 2 * means.shape[1]
+    """Mean and covariance of the mixture Σ wᵢ N(μᵢ, blkdiag(0, Σ₁, …, Σ_L)), n = p + 2L.
+
+    Each particle has p/3 poses (x, y, theta), one behind the other.
+    """
+    count, p = poses.shape
+    n = p + 2 * means.shape[1]
     deviations = np.empty((count, n))
-    deviations[:, :3] = poses
-    deviations[:, 3::2] = means[:, :, 0]
-    deviations[:, 4::2] = means[:, :, 1]
+    deviations[:, :p] = poses
+    deviations[:, p::2] = means[:, :, 0]
+    deviations[:, p + 1 :: 2] = means[:, :, 1]
     mean = np.zeros(n)
-    sine, cosine = 0.0, 0.0
     for i in range(count):
-        sine += weights[i] * math.sin(poses[i, 2])
-        cosine += weights[i] * math.cos(poses[i, 2])
         for j in range(n):
             mean[j] += weights[i] * deviations[i, j]
-    mean[2] = math.atan2(sine, cosine)
+    for heading in range(2, p, 3):
+        mean[heading] = _mean_direction(poses[:, heading], weights)
     P = np.zeros((n, n))
     for i in range(count):
         for j in range(n):
             deviations[i, j] -= mean[j]
-        deviations[i, 2] = wrapped(deviations[i, 2])
+        for heading in range(2, p, 3):
+            deviations[i, heading] = wrapped(deviations[i, heading])
         for j in range(n):
             scaled = weights[i] * deviations[i, j]
             for k in range(j + 1):
                 P[j, k] += scaled * deviations[i, k]
         for landmark in range(means.shape[1]):
-            j = 3 + 2 * landmark
+            j = p + 2 * landmark
             P[j, j] += weights[i] * covariances[i, landmark, 0]
             P[j + 1, j] += weights[i] * covariances[i, landmark, 1]
             P[j + 1, j + 1] += weights[i] * covariances[i, landmark, 2]

@@ -12,12 +12,13 @@ from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import WholeMap, begun, joined
 from team.estimation.window import Window
+from team.robot.pose_grid import Looks, NodeSighting, PoseGrid
 from team.robot.segmenter import Epoch, Segmenter
 
 
 @dataclass(frozen=True)
 class ClosedWindow:
-    """A submap with the names of its inputs."""
+    """A submap with the names of its inputs, and the sightings from its pose nodes."""
 
     sequence: int
     first_reading: int
@@ -25,6 +26,7 @@ class ClosedWindow:
     start_ns: int
     end_ns: int
     local: LocalMap
+    sightings: tuple[NodeSighting, ...] = ()
 
 
 class HybridMember:
@@ -40,7 +42,11 @@ class HybridMember:
         self._config = config
         self._window_ns = round(config.front_end.window_s * 1e9)
         self._epoch = epoch
-        self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
+        with_nodes = config.front_end.node_s > 0.0
+        self._grid = PoseGrid(config.sensor, config.front_end) if with_nodes else None
+        self._segmenter = Segmenter(
+            config.motion, config.sensor, config.front_end.keyframe_s, self._grid
+        )
         self.sequence = 0
         self._first_reading = 0
         self._last_reading = -1
@@ -67,6 +73,14 @@ class HybridMember:
     def observe(self, stamp_ns: int, scan: tuple[np.ndarray, np.ndarray, np.ndarray]) -> str | None:
         """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
         return self._segmenter.observe(stamp_ns, *scan)
+
+    def sight(self, stamp_ns: int, reading: int, looks: Looks) -> str | None:
+        """Take sightings of teammates; the reason if they are rejected."""
+        if self._grid is None:
+            return "sightings are not used by this estimator"
+        if self._start_ns is None:
+            return "older than the odometry"
+        return self._grid.observe(stamp_ns, reading, looks)
 
     def drive(
         self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
@@ -107,6 +121,8 @@ class HybridMember:
             epoch.bearings,
             self._generator,
         )
+        if epoch.is_node:
+            self._window = windows.marked(self._window, epoch.stamp_ns)
         self.last_epoch_ns = epoch.stamp_ns
 
     def _close(self, stamp_ns: int) -> ClosedWindow:
@@ -118,7 +134,13 @@ class HybridMember:
         local = windows.gaussian(self._window)
         assert self._start_ns is not None
         closed = ClosedWindow(
-            self.sequence, self._first_reading, self._last_reading, self._start_ns, stamp_ns, local
+            self.sequence,
+            self._first_reading,
+            self._last_reading,
+            self._start_ns,
+            stamp_ns,
+            local,
+            () if self._grid is None else self._grid.sightings(),
         )
         self.whole = joined(self.whole, local)
         self._begin_window(self.sequence + 1, self._last_reading + 1, stamp_ns)

@@ -1,6 +1,6 @@
 """From a stream of odometry intervals and observations to the epochs that an estimator takes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -8,17 +8,22 @@ from jaxtyping import Float, UInt32
 from team.config import MotionModel, Sensor
 from team.estimation import geometry
 from team.estimation.models import Increment, acceptable, corrected, increment_of, located
+from team.robot.pose_grid import PoseGrid
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """The motion since the last epoch and what was seen at its end (accepted and calibrated)."""
+    """The motion since the last epoch and what was seen at its end (accepted and calibrated).
+
+    is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
+    """
 
     stamp_ns: int
     increment: Increment
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
+    is_node: bool = False
 
 
 @dataclass(frozen=True)
@@ -37,13 +42,22 @@ class Segmenter:
 
     With keyframe_s = 0 every observation message is an epoch. Otherwise the scans within keyframe_s
     are reduced to one range and bearing per landmark (the median, each scan first moved by the
-    odometry to the end of the interval that closes the keyframe).
+    odometry to the end of the interval that closes the keyframe). With a grid each of its times is
+    an epoch without readings.
     """
 
-    def __init__(self, motion: MotionModel, sensor: Sensor, keyframe_s: float) -> None:
+    def __init__(
+        self,
+        motion: MotionModel,
+        sensor: Sensor,
+        keyframe_s: float,
+        grid: PoseGrid | None = None,
+    ) -> None:
         self._motion = motion
         self._sensor = sensor
         self._keyframe_ns = round(keyframe_s * 1e9)
+        self._grid = grid
+        self._here_ns = 0
         self._increment = Increment.identity()
         self._waiting: list[_Scan] = []
         self._keyframe: list[_Scan] = []
@@ -55,6 +69,8 @@ class Segmenter:
         """A stream or a window begins at this team time."""
         self.now_ns = stamp_ns
         self._keyframe_start_ns = stamp_ns
+        if self._grid is not None:
+            self._grid.begin(stamp_ns)
 
     def observe(
         self,
@@ -78,19 +94,19 @@ class Segmenter:
     ) -> list[Epoch]:
         """Integrate one odometry interval; the epochs that lie in it, in order."""
         epochs = []
-        here_ns = stamp_ns - duration_ns
+        self._here_ns = stamp_ns - duration_ns
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
             scan = self._waiting.pop(0)
-            at_ns = max(scan.stamp_ns, here_ns)
-            self._integrate(at_ns - here_ns, forward, yaw_rate)
-            here_ns = at_ns
+            epochs += self._nodes(scan.stamp_ns - 1, forward, yaw_rate)
+            at_ns = self._go_to(scan.stamp_ns, forward, yaw_rate)
             if self._keyframe_ns:
                 self._keyframe.append(
                     _Scan(at_ns, scan.ids, scan.ranges, scan.bearings, self._scan_motion)
                 )
             else:
                 epochs.append(self._epoch(at_ns, scan.ids, scan.ranges, scan.bearings))
-        self._integrate(stamp_ns - here_ns, forward, yaw_rate)
+        epochs += self._nodes(stamp_ns, forward, yaw_rate)
+        self._go_to(stamp_ns, forward, yaw_rate)
         self.now_ns = stamp_ns
         if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
             epochs.append(self._close_keyframe(stamp_ns))
@@ -110,11 +126,32 @@ class Segmenter:
         """Scans that wait for odometry that covers their time."""
         return len(self._waiting)
 
+    def _nodes(self, until_ns: int, forward: float, yaw_rate: float) -> list[Epoch]:
+        """The grid times up to until_ns; sightings up to there find their node."""
+        epochs = []
+        grid = self._grid
+        while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
+            self._go_to(next_ns, forward, yaw_rate)
+            if grid.reach():
+                nothing = np.empty(0)
+                seen = np.empty(0, np.uint32), nothing, nothing
+                epochs.append(replace(self._epoch(next_ns, *seen), is_node=True))
+        return epochs
+
+    def _go_to(self, stamp_ns: int, forward: float, yaw_rate: float) -> int:
+        """Integrate up to a stamp; what lies before the interval's start is at its start."""
+        at_ns = max(stamp_ns, self._here_ns)
+        self._integrate(at_ns - self._here_ns, forward, yaw_rate)
+        self._here_ns = at_ns
+        return at_ns
+
     def _integrate(self, duration_ns: int, forward: float, yaw_rate: float) -> None:
         if duration_ns <= 0:
             return
         step = increment_of(self._motion, duration_ns * 1e-9, forward, yaw_rate)
         self._increment = self._increment.then(step)
+        if self._grid is not None:
+            self._grid.moved(step)
         if self._keyframe_ns:
             self._scan_motion = geometry.compose(self._scan_motion, step.mean)
 

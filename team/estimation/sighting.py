@@ -1,0 +1,119 @@
+"""A teammate seen from a pose node: a range-bearing factor between two pose nodes of two robots.
+
+The point seen is carried to the observer's pose node by the observer's odometry T ∘ Exp(xi),
+xi ~ N(0, C): p' = T Exp(xi) p forward of the node, p' = (T Exp(xi))⁻¹ p where the node came later;
+its covariance grows by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.config import Sensor
+from team.estimation.contribution import Stream, named
+from team.estimation.gaussian import information
+from team.estimation.geometry import inverse, transformed, wrapped
+from team.estimation.models import NEAREST_M, Increment, noise
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Submap `sequence` of (robot, epoch) has a pose node at stamp_ns, from where a teammate is.
+
+    reading: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
+    covariance: of the reading, [m², m·rad, rad²].
+    """
+
+    robot: str
+    epoch: int
+    sequence: int
+    stamp_ns: int
+    teammate: str
+    reading: Float[np.ndarray, "2"]
+    covariance: Float[np.ndarray, "2 2"]
+
+    @property
+    def stream(self) -> Stream:
+        """(robot, epoch) of the observer."""
+        return (self.robot, self.epoch)
+
+    @property
+    def key(self) -> tuple[int, str, int, str]:
+        """Place in the canonical order: (stamp, robot, epoch, teammate)."""
+        return (self.stamp_ns, self.robot, self.epoch, self.teammate)
+
+    @cached_property
+    def information(self) -> Float[np.ndarray, "2 2"]:
+        """The inverse covariance. Raises NotACovarianceError that names the sighting."""
+        what = f"a sighting of {self.teammate} by {named(self.stream)}"
+        return information(self.covariance, what)
+
+
+class Carried(NamedTuple):
+    """A point in the observer's frame [m] with its covariance [m²]."""
+
+    point: Float[np.ndarray, "2"]
+    covariance: Float[np.ndarray, "2 2"]
+
+
+def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) -> Carried:
+    """A teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the node.
+
+    The variances along and across are the sensor's, that of where the marker is on the teammate
+    (marker_sigma) and that of the drift.
+    """
+    range_variance, bearing_variance = noise(sensor, distance)
+    own = sensor.marker_sigma**2 + drift * drift
+    turn = _turn(bearing)
+    spread = np.diag([range_variance + own, bearing_variance * distance**2 + own])
+    return Carried(distance * turn[:, 0], turn @ spread @ turn.T)
+
+
+def carried_back(seen: Carried, node_from_here: Increment) -> Carried:
+    """The point in the frame of the node, which the observer has left."""
+    T = node_from_here.mean
+    turn = _turn(float(T[2]))
+    J = turn @ np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]])
+    spread = turn @ seen.covariance @ turn.T + J @ node_from_here.covariance @ J.T
+    return Carried(transformed(T, seen.point), spread)
+
+
+def carried_on(seen: Carried, here_from_node: Increment) -> Carried:
+    """The point in the frame of the node, which the observer has come to since."""
+    T = inverse(here_from_node.mean)
+    point = transformed(T, seen.point)
+    turn = _turn(float(T[2]))
+    J = np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
+    spread = turn @ seen.covariance @ turn.T + J @ here_from_node.covariance @ J.T
+    return Carried(point, spread)
+
+
+def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def reduced(
+    carried: Sequence[Carried],
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """One (range, bearing) and its covariance of several looks at a teammate from one node.
+
+    The median of each, bearings about the first one's; the covariance is the mean of theirs, as of
+    one look: a camera mismeasures a marker alike from one moment to the next.
+    """
+    ranges = [max(math.hypot(*each.point), NEAREST_M) for each in carried]
+    bearings = [math.atan2(each.point[1], each.point[0]) for each in carried]
+    offsets = [wrapped(bearing - bearings[0]) for bearing in bearings]
+    total = np.zeros((2, 2))
+    for each, distance in zip(carried, ranges, strict=True):
+        x, y = each.point / distance
+        polar = np.array([[x, y], [-y / distance, x / distance]])
+        total += polar @ each.covariance @ polar.T
+    bearing = wrapped(bearings[0] + float(np.median(offsets)))
+    mean = total / len(carried)
+    return np.array([float(np.median(ranges)), bearing]), 0.5 * (mean + mean.T)

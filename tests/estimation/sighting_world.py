@@ -1,0 +1,89 @@
+"""Teams whose submaps have a pose node in the middle of each, from where teammates are seen."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from team.estimation.contribution import Contribution, Start
+from team.estimation.joining import EMPTY_FOLD, folded, started
+from team.estimation.sighting import Sighting
+from team.estimation.submap import LocalMap
+from tests.estimation.submap_world import correlated, drawn, seen_from, wrap
+
+
+@dataclass
+class Met:
+    """True landmarks and exact starts; submaps and sightings in canonical order."""
+
+    landmarks: np.ndarray
+    starts: list
+    submaps: list
+    sightings: list
+
+
+def local_pose(start, pose):
+    step = seen_from(start, pose[0] + 1j * pose[1])
+    return np.array([step.real, step.imag, wrap(pose[2] - start[2])])
+
+
+def meeting(seed, robots=2, submaps=6, landmarks=5, reach=12.0, sigmas=(0.1, 0.02)):
+    """Robots that wander in 20 m × 20 m; at each node every robot sees every other one.
+
+    sigmas: of a sighting's range [m] and bearing [rad].
+    """
+    rng = np.random.default_rng([seed, 77])
+    points = rng.uniform(0.0, 20.0, (landmarks, 2))
+    starts, made, poses = [], [], {}
+    for r in range(robots):
+        robot = f"r{r}"
+        pose = np.array([*rng.uniform(6.0, 14.0, 2), rng.uniform(-3.0, 3.0)])
+        starts.append(Start(robot, 0, pose))
+        for k in range(submaps):
+            to_middle = 10.0 + 10.0j - (pose[0] + 1j * pose[1])
+            way = [pose]
+            for _ in range(2):
+                turn = 0.3 * np.sin(np.angle(to_middle) - pose[2]) + 0.2 * rng.normal()
+                ahead = way[-1][0] + 1j * way[-1][1] + 1.5 * np.exp(1j * (way[-1][2] + turn / 2))
+                way.append(np.array([ahead.real, ahead.imag, wrap(way[-1][2] + turn)]))
+            seen = np.flatnonzero(np.hypot(*(points - pose[:2]).T) < reach)
+            local = seen_from(pose, points[seen, 0] + 1j * points[seen, 1])
+            truth = np.concatenate(
+                [
+                    local_pose(pose, way[2]),
+                    local_pose(pose, way[1]),
+                    np.column_stack([local.real, local.imag]).ravel(),
+                ]
+            )
+            spread = [0.1, 0.1, 0.02, 0.07, 0.07, 0.015, *[0.2] * (2 * len(seen))]
+            covariance = correlated(np.array(spread), rng)
+            mean = drawn(truth, covariance, rng)
+            mean[5] = wrap(mean[5])
+            node_ns = 1000 * k + 500
+            local_map = LocalMap(seen.astype(np.uint32), mean, covariance, np.array([node_ns]))
+            made.append(Contribution(robot, 0, k, 1000 * (k + 1), local_map))
+            poses[robot, k] = way[1]
+            pose = way[2]
+    sightings = []
+    for (robot, k), pose in poses.items():
+        for other in (f"r{r}" for r in range(robots) if f"r{r}" != robot):
+            to = seen_from(pose, poses[other, k][0] + 1j * poses[other, k][1])
+            noise = np.array(sigmas) * rng.normal(size=2)
+            reading = np.array([abs(to) + noise[0], wrap(np.angle(to) + noise[1])])
+            covariance = np.diag(np.square(sigmas))
+            stamp = 1000 * k + 500
+            sightings.append(Sighting(robot, 0, k, stamp, other, reading, covariance))
+    canonical = sorted(made, key=lambda each: each.key)
+    return Met(points, starts, canonical, sorted(sightings, key=lambda each: each.key))
+
+
+def joined_with(submaps, starts, sightings, options, tick=4):
+    """The fold over the submaps, `tick` at a time, with the sightings from the tick's submaps."""
+    fold = EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    for begin in range(0, len(submaps), tick):
+        taken = submaps[begin : begin + tick]
+        names = {(each.robot, each.sequence) for each in taken}
+        seen = [each for each in sightings if (each.robot, each.sequence) in names]
+        fold = folded(fold, taken, options, seen)
+    return fold
