@@ -10,6 +10,7 @@ from team.estimation.submap import LocalMap
 from team.estimation.whole_map import WholeMap, begun, joined
 from team.robot.member import ClosedWindow
 from team.robot.node import RobotNode
+from team.wire.arrays import check_packed_covariance
 from team.wire.bus import Outgoing
 
 
@@ -25,9 +26,18 @@ class UnsafeRobot(RobotNode):
         prior = self._prior
         if prior is not None and prior.epoch == self.epoch:
             pending = self._locals[max(prior.sequence + 1, 0) :]
-            fed = with_prior(translate.prior_of(prior), pending, closed.local)
-            closed = replace(closed, local=fed)
+            closed = replace(closed, local=_fed(translate.prior_of(prior), pending, closed.local))
         return super()._send(closed)
+
+
+def _fed(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> LocalMap:
+    """As `with_prior`; the window alone once the covariance has been counted down to nothing."""
+    try:
+        fed = with_prior(prior, pending, local)
+        check_packed_covariance(translate.joint_bytes(fed.covariance), len(fed.mean), "covariance")
+    except ValueError:
+        return local
+    return fed
 
 
 def with_prior(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> LocalMap:
