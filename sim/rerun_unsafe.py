@@ -26,7 +26,8 @@ class UnsafeRobot(RobotNode):
         prior = self._prior
         if prior is not None and prior.epoch == self.epoch:
             pending = self._locals[max(prior.sequence + 1, 0) :]
-            closed = replace(closed, local=_fed(translate.prior_of(prior), pending, closed.local))
+            fed = _fed(translate.prior_of(prior), pending, closed.local)
+            closed = replace(closed, local=fed, sightings=())  # of its pose nodes none is left
         return super()._send(closed)
 
 
@@ -36,7 +37,7 @@ def _fed(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> LocalMa
         fed = with_prior(prior, pending, local)
         check_packed_covariance(translate.joint_bytes(fed.covariance), len(fed.mean), "covariance")
     except ValueError:
-        return local
+        return local.without_nodes
     return fed
 
 

@@ -286,8 +286,8 @@ def test_unsafe_feedback_ruins_the_covariance_before_the_error(tmp_path: Path) -
         for each in (hurried, changed_run(log, Changes(unsafe_feedback=True)))
     )
     assert honest.nees_per_dof < 3.0
-    assert fed.nees_per_dof > 30.0 * honest.nees_per_dof
-    assert fed.rmse_m < 3.0 * honest.rmse_m
+    assert fed.nees_per_dof > 8.0 * honest.nees_per_dof
+    assert fed.rmse_m < 2.0 * honest.rmse_m
     assert np.isfinite(fed.nees_per_dof)
 
 
