@@ -9,6 +9,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
+from sim.cli_calibrate import app as calibrate_commands  # noqa: E402
 from sim.cli_launch import app as launch_commands  # noqa: E402
 from sim.cli_logs import app as log_commands  # noqa: E402
 from sim.cli_nodes import app as node_commands  # noqa: E402
@@ -22,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _part in (launch_commands, node_commands, log_commands, rerun_commands):
+for _part in (launch_commands, node_commands, log_commands, rerun_commands, calibrate_commands):
     app.add_typer(_part)
 
 
