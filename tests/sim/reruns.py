@@ -22,10 +22,14 @@ Change = Callable[[m.Message], m.Message | None]
 
 
 def thesis(steps: int, **options: str | int) -> Scenario:
-    """The thesis world, shorter."""
+    """The thesis world, shorter, with windows of 10 s whatever its default is."""
     scenario = with_options(load("thesis"), **options)
     world = msgspec.structs.replace(scenario.world, steps=steps)
-    return msgspec.structs.replace(scenario, world=world)
+    robots = tuple(
+        msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, window_s=10.0))
+        for r in scenario.robots
+    )
+    return msgspec.structs.replace(scenario, world=world, robots=robots)
 
 
 def team_samples(scenario: Scenario) -> list[Sample]:
