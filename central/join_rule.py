@@ -55,13 +55,23 @@ class JoinRule:
     def take_submap(self, submap: m.Submap) -> int:
         """Admit a submap; how many of its stream have been dealt with."""
         stream = (submap.robot, submap.epoch)
-        reason = self._set.admit(submap)
+        self._judge(submap, self._set.admit(submap))
+        self._enter(stream)
+        return self._dealt_with(stream, self._set.count(stream))
+
+    def take_sighting(self, sighting: m.SightingFactor) -> int:
+        """Admit a sighting; how many submaps of its stream have been dealt with."""
+        stream = (sighting.robot, sighting.epoch)
+        self._judge(sighting, self._set.admit_sighting(sighting))
+        self._enter(stream)
+        return self._dealt_with(stream, self._set.count(stream))
+
+    def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
+        """A refused submap, or one with a refused sighting, may never be in the map."""
         if reason is not None:
             self.refused += 1
             self.warnings.append(f"refused: {reason}")
-            self._refusals.setdefault(stream, set()).add(submap.sequence)
-        self._enter(stream)
-        return self._dealt_with(stream, self._set.count(stream))
+            self._refusals.setdefault((of.robot, of.epoch), set()).add(of.sequence)
 
     def _dealt_with(self, stream: Stream, count: int) -> int:
         """`count`, unless the next one was refused: then nobody need wait for it.
@@ -71,7 +81,7 @@ class JoinRule:
         refused = self._refusals.get(stream, set())
         if count not in refused:
             return count
-        return max(*refused, *self._set.streams[stream], count) + 1
+        return max(*refused, *self._set.streams.get(stream, {}), count) + 1
 
     def _enter(self, stream: Stream) -> None:
         """Hand the fold what now is there without a gap."""
@@ -79,7 +89,9 @@ class JoinRule:
             return
         chain = self._set.chain(stream)
         for submap in chain[self._entered.get(stream, 0) :]:
-            self._ticks.add(submap, translate.digest_of(encoded(submap)))
+            sightings = self._set.sightings(submap)
+            named = translate.digest_of(encoded(submap), *(encoded(each) for each in sightings))
+            self._ticks.add(submap, named, sightings)
         self._entered[stream] = len(chain)
 
     @property

@@ -30,7 +30,10 @@ class _Robot:
 class CentralNode:
     """One centre for the robots of a team: `begin`, then `handle`, until `finished`."""
 
-    listens = (ch.START, ch.SUBMAP, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END)
+    listens = (
+        ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE,
+        ch.END,
+    )  # fmt: skip
 
     def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
         self.config = config
@@ -66,6 +69,8 @@ class CentralNode:
                 self._join.take_start(message)
             case m.Submap():
                 last = self._take_submap(message)
+            case m.SightingFactor():
+                last = self._take_sighting(message)
             case m.MapEstimate():
                 self._now_ns = max(self._now_ns, message.stamp_ns)
                 self._feedback.take_map(message)
@@ -84,9 +89,17 @@ class CentralNode:
 
     def _take_submap(self, submap: m.Submap) -> list[Outgoing]:
         self._now_ns = max(self._now_ns, submap.stamp_ns)
-        count = self._join.take_submap(submap)
-        progress = m.Progress(self._now_ns, "central", submap.robot, submap.epoch, 0, count)
-        return [Outgoing(ch.CENTRAL_PROGRESS, submap.robot, progress)]
+        return self._credit(submap, self._join.take_submap(submap))
+
+    def _take_sighting(self, sighting: m.SightingFactor) -> list[Outgoing]:
+        """The last one of a submap that is here already completes it."""
+        before = self._join.count((sighting.robot, sighting.epoch))
+        count = self._join.take_sighting(sighting)
+        return self._credit(sighting, count) if count > before else []
+
+    def _credit(self, of: m.Submap | m.SightingFactor, count: int) -> list[Outgoing]:
+        progress = m.Progress(self._now_ns, "central", of.robot, of.epoch, 0, count)
+        return [Outgoing(ch.CENTRAL_PROGRESS, of.robot, progress)]
 
     def _take_done(self, done: m.Done) -> None:
         """A robot's last word is that of its last epoch, in whichever order they come."""

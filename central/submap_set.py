@@ -1,12 +1,13 @@
 """The set of submaps: a union, so duplicates and any order of arrival change nothing.
 
+A submap is complete when the sightings from it, of which it says how many there are, are here too.
 Admission is the ledger's gate: a submap whose readings overlap another's, or that says something
 else under a name that is taken, is refused with its reason.
 """
 
 from dataclasses import dataclass, field
 
-from team.wire.messages import Member, Submap
+from team.wire.messages import Member, SightingFactor, Submap
 
 Stream = tuple[str, int]
 """(robot, epoch)."""
@@ -14,9 +15,16 @@ Stream = tuple[str, int]
 
 @dataclass
 class SubmapSet:
-    """Submaps by stream and sequence, as they came."""
+    """Submaps by stream and sequence, as they came; sightings by stream, sequence, what and when.
+
+    used: the sighting that each reading of a stream went into, by (reading, teammate).
+    """
 
     streams: dict[Stream, dict[int, Submap]] = field(default_factory=dict)
+    seen: dict[Stream, dict[int, dict[tuple[int, str], SightingFactor]]] = field(
+        default_factory=dict
+    )
+    used: dict[Stream, dict[tuple[int, str], SightingFactor]] = field(default_factory=dict)
 
     def admit(self, submap: Submap) -> str | None:
         """Take a submap; the reason if it is refused. One that is in the set already is accepted.
@@ -48,12 +56,39 @@ class SubmapSet:
         stream[submap.sequence] = submap
         return None
 
+    def admit_sighting(self, sighting: SightingFactor) -> str | None:
+        """Take a sighting; the reason if it is refused. Law 1: each look is used once."""
+        stream, teammate = (sighting.robot, sighting.epoch), sighting.teammate
+        from_submap = self.seen.setdefault(stream, {}).setdefault(sighting.sequence, {})
+        name = f"a sighting of {teammate} by {sighting.robot}, epoch {sighting.epoch}"
+        there = from_submap.get((sighting.stamp_ns, teammate))
+        if there is not None:
+            return None if there == sighting else f"{name} differs from the one in the set"
+        submap = self.streams.get(stream, {}).get(sighting.sequence)
+        if submap is not None and len(from_submap) >= submap.sightings:
+            return f"{name} is one more than submap {sighting.sequence} has"
+        used = self.used.setdefault(stream, {})
+        twice = next((n for n in sighting.readings if (n, teammate) in used), None)
+        if twice is not None:
+            return f"{name} uses reading {twice}, which another one has used"
+        from_submap[sighting.stamp_ns, teammate] = sighting
+        used |= {(reading, teammate): sighting for reading in sighting.readings}
+        return None
+
+    def sightings(self, submap: Submap) -> list[SightingFactor]:
+        """The sightings from a submap that are here, by stamp and teammate."""
+        stream = self.seen.get((submap.robot, submap.epoch), {})
+        found = stream.get(submap.sequence, {})
+        return [found[key] for key in sorted(found)]
+
     def chain(self, stream: Stream) -> list[Submap]:
-        """The submaps of a stream from sequence 0 up to the first gap."""
+        """The submaps of a stream from sequence 0 up to the first missing or incomplete one."""
         found = self.streams.get(stream, {})
         chain: list[Submap] = []
-        while len(chain) in found:
-            chain.append(found[len(chain)])
+        while (submap := found.get(len(chain))) is not None:
+            if len(self.sightings(submap)) < submap.sightings:
+                break
+            chain.append(submap)
         return chain
 
     def count(self, stream: Stream) -> int:
@@ -61,10 +96,10 @@ class SubmapSet:
         return len(self.chain(stream))
 
     def missing(self) -> tuple[Member, ...]:
-        """The first missing submap of every stream that has later ones."""
+        """Of every stream that holds more than its chain, the submap that this waits for."""
         gaps = []
         for (robot, epoch), found in sorted(self.streams.items()):
             first = self.count((robot, epoch))
-            if found and max(found) > first:
+            if found and max(found) >= first:
                 gaps.append(Member(robot, epoch, first))
         return tuple(gaps)

@@ -5,7 +5,7 @@ tick is there, so the fold is final; what comes late rolls it back to the checkp
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from central.config import CentralConfig
 from team import translate
@@ -14,12 +14,13 @@ from team.estimation.joining import (
     Contribution,
     Fold,
     JoinSettings,
+    Sighting,
     folded,
     lean,
     started,
 )
 from team.estimation.joining import Start as StartValue
-from team.wire.messages import Submap
+from team.wire.messages import SightingFactor, Submap
 
 Stream = tuple[str, int]
 
@@ -40,6 +41,7 @@ class TickFold:
         self.settings = join_settings(config)
         self._tick_ns = round(config.tick_s * 1e9)
         self._ticks: dict[int, dict[tuple[int, str, int, int], Contribution]] = defaultdict(dict)
+        self._sightings: dict[tuple[int, str, int, int], list[Sighting]] = {}
         self._digests: dict[tuple[int, str, int, int], bytes] = {}
         self._starts: dict[Stream, StartValue] = {}
         self._taken: list[tuple[int, Fold]] = []
@@ -48,11 +50,15 @@ class TickFold:
         """Where a stream starts; to be told before its first submap is added."""
         self._starts[(start.robot, start.epoch)] = start
 
-    def add(self, submap: Submap, digest: bytes) -> None:
-        """Put a submap in its tick; the fold goes back to before that tick if it was taken."""
+    def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor] = ()) -> None:
+        """Put a submap in its tick, with the sightings from it, all of which `digest` names.
+
+        The fold goes back to before that tick if it was taken.
+        """
         contribution = translate.contribution_of(submap)
         tick = self._tick_of(submap.stamp_ns)
         self._ticks[tick][contribution.key] = contribution
+        self._sightings[contribution.key] = [translate.sighting_of(each) for each in sightings]
         self._digests[contribution.key] = digest
         while self._taken and self._taken[-1][0] >= tick:
             self._taken.pop()
@@ -95,7 +101,9 @@ class TickFold:
             stream = members[key].stream
             if members[key].sequence == 0 and stream in self._starts:
                 fold = started(fold, self._starts[stream])
-        return folded(fold, [members[key] for key in sorted(members)], self.settings)
+        order = sorted(members)
+        sightings = [each for key in order for each in self._sightings[key]]
+        return folded(fold, [members[key] for key in order], self.settings, sightings)
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
         """The name of the fold's set: starts and submaps in canonical order, and `more`."""

@@ -34,8 +34,8 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
 
-UPLINK = {"submap": ch.SUBMAP, "own/map": ch.OWN_MAP}
-"""The channel of each name in `PAIRS`."""
+UPLINK = {"submap": (ch.SUBMAP, ch.SIGHTING_FACTOR), "own/map": (ch.OWN_MAP,)}
+"""The channels of each name in `PAIRS`."""
 
 
 @dataclass(frozen=True)
@@ -216,11 +216,11 @@ def _scenario(log: Collected) -> Scenario | None:
         return None
 
 
-def _bytes(log: Collected, channel: ch.Channel | None, robot: str) -> int | None:
-    if channel is None:
+def _bytes(log: Collected, uplink: tuple[ch.Channel, ...] | None, robot: str) -> int | None:
+    if uplink is None:
         return None
-    traffic = log.traffic.get(channel.key(robot))
-    return 0 if traffic is None else traffic.bytes
+    keys = [channel.key(robot) for channel in uplink]
+    return sum(log.traffic[key].bytes for key in keys if key in log.traffic)
 
 
 def _map_result(

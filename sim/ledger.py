@@ -12,6 +12,7 @@ from typing import Any
 
 from sim.rerun_log import Recorded, Stream
 from sim.rerun_robot import dispositions
+from team.robot.node import IN_SIGHTING
 from team.wire import channels as ch
 from team.wire import messages as m
 
@@ -144,7 +145,7 @@ def _entries(
         disposition = said.get(counter, IN_SUBMAP if held else LOST)
         if counter not in readings and holder[counter] is not None:
             wrong.append(f"{name} is in submap {holder[counter]}, but not in the log")
-        elif disposition == IN_SUBMAP and holder[counter] is None:
+        elif disposition in (IN_SUBMAP, IN_SIGHTING) and holder[counter] is None:
             if counter < last:
                 wrong.append(f"{name} is behind its submaps and in none of them")
             disposition = OPEN if counter < consumed else LOST

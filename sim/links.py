@@ -18,7 +18,7 @@ RESEND_NS = 1_000_000_000
 """A lost submap is missed and sent again after this time, as often as it takes."""
 PATIENCE_NS = 3_000_000_000
 """The centre believes after this time that a robot is gone."""
-_FROM_ROBOTS = (ch.SUBMAP, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
+_FROM_ROBOTS = (ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
 _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 

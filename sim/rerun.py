@@ -27,7 +27,7 @@ PLATFORM = (
 )  # fmt: skip
 """The metadata that have to be equal for equal bits."""
 CHECKED = (
-    ch.SUBMAP, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE, ch.ROBOT_DONE,
+    ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE, ch.ROBOT_DONE,
     ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES,
 )  # fmt: skip
 """Causes before what follows from them."""

@@ -35,7 +35,7 @@ def _joined(
     Which submaps lie behind a gap is what the centre knew when it spoke: it says so in the map.
     """
     starts = {s: r.get(0) for s, r in log.readings.items()}
-    submaps = log.submaps()
+    submaps, sightings = log.submaps(), log.sightings()
     rule = JoinRule(config, digest)
     inside: dict[Stream, int] = {}
     for fused in maps:
@@ -49,6 +49,8 @@ def _joined(
             if isinstance(start, m.Start):
                 rule.take_start(start)
             for k in range(inside.get(stream, -1) + 1, sequence + 1):
+                for sighting in sightings.get((*stream, k), ()):
+                    rule.take_sighting(sighting)
                 rule.take_submap(submaps[stream][k])
         inside = vector
         for out in rule.retold(_tail(fused)):

@@ -99,6 +99,15 @@ class Recorded:
             found.setdefault((submap.robot, submap.epoch), {})[submap.sequence] = submap
         return found
 
+    def sightings(self) -> Mapping[tuple[str, int, int], list[m.SightingFactor]]:
+        """The recorded sightings by (robot, epoch, sequence) of their submap."""
+        found: dict[tuple[str, int, int], list[m.SightingFactor]] = {}
+        for sighting in self.of(ch.SIGHTING_FACTOR):
+            assert isinstance(sighting, m.SightingFactor)
+            name = (sighting.robot, sighting.epoch, sighting.sequence)
+            found.setdefault(name, []).append(sighting)
+        return found
+
     def robot_config(self, robot: str) -> tuple[RobotConfig, bytes]:
         """The configuration that a robot announced, and its digest; raises RerunError."""
         announced = self._announced(ch.robot_node(robot))
@@ -153,6 +162,8 @@ def identity(key: str, message: m.Message) -> Identity:
                 message.first_reading,
                 message.last_reading,
             )
+        case m.SightingFactor():
+            names = (message.epoch, message.sequence, message.stamp_ns, message.teammate)
         case m.MapEstimate():
             names = (message.epoch, message.stamp_ns, message.sequence, message.exchange)
         case m.PoseEstimate():

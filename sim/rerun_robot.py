@@ -9,6 +9,7 @@ import msgspec
 from sim.rerun_log import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.robot.node import RobotNode
+from team.robot.pose_grid import NO_NODE
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -175,7 +176,8 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
 def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     """What the robot's node does with each reading of an epoch that it consumed, in its own words.
 
-    Without a centre nothing holds it up. Scans that no odometry covers are known at the end only.
+    Without a centre nothing holds it up. Scans that no odometry covers and sightings whose pose
+    node did not come are known at the end only.
     """
     config, digest = log.robot_config(robot)
     node = RetoldRobot(config, digest, {})
@@ -188,6 +190,8 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     if said and done is not None:
         end = m.StreamEnd(robot, epoch, len(said))
         for reason, count in node.took(m.End(0, (end,))).items():
-            scans = [n for n in said if isinstance(readings[n], m.Observations)]
-            said |= dict.fromkeys(scans[-count:], reason)
+            kind = m.Sightings if reason == f"rejected: {NO_NODE}" else m.Observations
+            taken = [n for n in said if isinstance(readings[n], kind)]
+            taken = [n for n in taken if not said[n].startswith("rejected")]
+            said |= dict.fromkeys(taken[-count:], reason)
     return said

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt32
 
 from team.estimation.conditioning import RobotPrior
 from team.estimation.gaussian import Matrix, packed, unpacked
-from team.estimation.joining import Contribution
+from team.estimation.joining import Contribution, Sighting
 from team.estimation.joining import Start as StartValue
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
@@ -59,6 +59,17 @@ def scan_of(message: m.Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray
     )
 
 
+def looks_of(
+    message: m.Sightings,
+) -> tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """(teammates, ranges [m], bearings [rad]) in the machine's byte order."""
+    return (
+        message.teammates,
+        floats(message.ranges, "ranges").astype(np.float64),
+        floats(message.bearings, "bearings").astype(np.float64),
+    )
+
+
 def submap_message(
     robot: str,
     epoch: int,
@@ -67,8 +78,9 @@ def submap_message(
     span_ns: tuple[int, int],
     config: bytes,
     local: LocalMap,
+    sightings: int = 0,
 ) -> m.Submap:
-    """A local map with the names of its inputs."""
+    """A local map with the names of its inputs, and how many sightings belong to it."""
     return m.Submap(
         span_ns[1],
         robot,
@@ -81,6 +93,8 @@ def submap_message(
         from_ids(local.ids),
         from_floats(local.mean),
         from_floats(packed(local.covariance)),
+        from_stamps(local.node_stamps),
+        sightings,
     )
 
 
@@ -91,6 +105,38 @@ def local_map_of(message: m.Submap) -> LocalMap:
         ids(message.ids, "ids").astype(np.uint32),
         mean,
         unpacked(floats(message.covariance, "covariance"), len(mean)),
+        stamps(message.nodes, "nodes").astype(np.int64),
+    )
+
+
+def sighting_message(
+    sighting: Sighting, config: bytes, readings: tuple[int, ...]
+) -> m.SightingFactor:
+    """A sighting with the names of its inputs."""
+    return m.SightingFactor(
+        sighting.stamp_ns,
+        sighting.robot,
+        sighting.epoch,
+        sighting.sequence,
+        config,
+        sighting.teammate,
+        float(sighting.reading[0]),
+        float(sighting.reading[1]),
+        from_floats(packed(sighting.covariance)),
+        readings,
+    )
+
+
+def sighting_of(message: m.SightingFactor) -> Sighting:
+    """A sighting message as the join takes it."""
+    return Sighting(
+        message.robot,
+        message.epoch,
+        message.sequence,
+        message.stamp_ns,
+        message.teammate,
+        np.array([message.range, message.bearing]),
+        unpacked(floats(message.covariance, "covariance"), 2),
     )
 
 

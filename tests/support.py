@@ -135,7 +135,11 @@ def examples() -> Iterator[m.Message]:
     yield m.TruthLandmarks(-5, two, means)
     yield m.Configured(0, "robot/alpha", 1, digest, '{"seed": 7}')
     yield m.Submap(
-        9_000, "alpha", 1, 5, 10, 19, 8_000, digest, two, from_floats(range(7)), packed(spd(7))
+        9_000, "alpha", 1, 5, 10, 19, 8_000, digest, two, from_floats(range(10)), packed(spd(10)),
+        from_stamps([8_500]), 1,
+    )  # fmt: skip
+    yield m.SightingFactor(
+        8_500, "alpha", 1, 5, digest, "bravo", 6.0, -3.0, packed(spd(2)), (12, 14)
     )
     yield m.MapEstimate(9_000, "alpha", 1, 5, 0, False, two, means, blocks)
     yield m.PoseEstimate(9_000, "alpha", 1, 5, digest, three, from_floats(spd(3)))

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from team import translate
 from team.config import RobotConfig
 from team.estimation.conditioning import RobotPrior
+from team.estimation.sighting import Sighting
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -44,6 +45,28 @@ def test_a_submap_survives_the_wire_bit_for_bit(ids, seed):
     assert (there.first_reading, there.last_reading) == (10, 19)
     assert (there.start_ns, there.stamp_ns) == (1_000, 2_000)
     assert translate.contribution_of(there).key == (2_000, "r1", 2, 5)
+
+
+def test_pose_nodes_and_sightings_survive_the_wire_bit_for_bit():
+    rng = np.random.default_rng(3)
+    nodes = np.array([1_200, 1_700])
+    local = LocalMap(
+        np.array([4], np.uint32), rng.normal(size=11), correlated(np.ones(11), rng), nodes
+    )
+    message = translate.submap_message("r1", 2, 5, (1, 9), (1_000, 2_000), b"settings", local, 1)
+    there = over_the_wire(message)
+    found = translate.local_map_of(there)
+    assert there.sightings == 1
+    assert found.node_stamps.tolist() == [1_200, 1_700]
+    assert found.nodes.tobytes() == local.mean[3:9].tobytes()
+    assert found.landmarks.tobytes() == local.mean[9:].tobytes()
+    seen = Sighting("r1", 2, 5, 1_200, "r2", np.array([2.0, -1.0]), correlated(np.ones(2), rng))
+    again = translate.sighting_of(
+        over_the_wire(translate.sighting_message(seen, b"settings", (3, 4)))
+    )
+    assert (again.key, again.sequence) == (seen.key, 5)
+    assert again.reading.tobytes() == seen.reading.tobytes()
+    assert again.covariance.tobytes() == seen.covariance.tobytes()
 
 
 @settings(deadline=None, max_examples=20)

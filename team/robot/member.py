@@ -42,7 +42,7 @@ class HybridMember:
         self._config = config
         self._window_ns = round(config.front_end.window_s * 1e9)
         self._epoch = epoch
-        with_nodes = config.front_end.node_s > 0.0
+        with_nodes = config.front_end.node_s > 0.0 and config.fusion == "join"
         self._grid = PoseGrid(config.sensor, config.front_end) if with_nodes else None
         self._segmenter = Segmenter(
             config.motion, config.sensor, config.front_end.keyframe_s, self._grid

@@ -15,10 +15,12 @@ from team import translate
 from team.config import RobotConfig
 from team.estimation.conditioning import RobotPrior, team_pose
 from team.estimation.gaussian import NotACovarianceError
+from team.estimation.sighting import Sighting
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import absorbed
 from team.robot.inbox import Inbox
 from team.robot.member import ClosedWindow, HybridMember
+from team.robot.pose_grid import NO_NODE
 from team.robot.thesis_member import ThesisMember
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -27,6 +29,8 @@ from team.wire.bus import Outgoing
 
 CREDIT_SUBMAPS = 4
 """A robot is at most this many submaps ahead of a living centre."""
+IN_SIGHTING = "in a sighting factor"
+"""The disposition of a reading of teammates that was used."""
 PROGRESS_READINGS = 64
 """A robot reports its progress at least once per this many readings."""
 CLOUD_PARTICLES = 32
@@ -51,6 +55,7 @@ class RobotNode:
         self._consumed = 0
         self._steps = 0
         self._ledger: Counter[str] = Counter()
+        self._sighted: set[int] = set()
         self._ended: list[m.Done] = []
         self._end: m.StreamEnd | None = None
         self._centre_alive: bool | None = None
@@ -230,8 +235,7 @@ class RobotNode:
             case m.Observations():
                 self._observe(reading)
             case m.Sightings():
-                self._hybrid.consumed(reading.reading)
-                self._ledger["rejected: sightings are not used by this estimator"] += 1
+                self._sight(reading)
         self._reported += 1
         if self._reported >= PROGRESS_READINGS:
             out.append(self._progress())
@@ -257,6 +261,14 @@ class RobotNode:
         self._hybrid.consumed(reading.reading)
         reason = member.observe(reading.stamp_ns, translate.scan_of(reading))
         self._ledger[self._used if reason is None else f"rejected: {reason}"] += 1
+
+    def _sight(self, reading: m.Sightings) -> None:
+        self._hybrid.consumed(reading.reading)
+        looks = translate.looks_of(reading)
+        reason = self._hybrid.sight(reading.stamp_ns, reading.reading, looks)
+        if reason is None:
+            self._sighted.add(reading.reading)
+        self._ledger[IN_SIGHTING if reason is None else f"rejected: {reason}"] += 1
 
     def _drive(self, reading: m.Odometry) -> list[Outgoing]:
         self._steps += 1
@@ -295,6 +307,7 @@ class RobotNode:
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
         self._locals.append(closed.local)
+        out = self._sightings(closed)
         submap = translate.submap_message(
             self.robot,
             self._epoch,
@@ -303,11 +316,36 @@ class RobotNode:
             (closed.start_ns, closed.end_ns),
             self._announcement.digest,
             closed.local,
+            len(closed.sightings),
         )
-        out = [Outgoing(ch.SUBMAP, self.robot, submap)]
+        out.append(Outgoing(ch.SUBMAP, self.robot, submap))
         out += self._poses(closed.end_ns)
         out += self._exchanged(closed.end_ns)
         return [*out, self._progress()]
+
+    def _sightings(self, closed: ClosedWindow | None) -> list[Outgoing]:
+        """The sightings of a window that ends, and what becomes of those that reached no node."""
+        found = () if closed is None else closed.sightings
+        out = []
+        for each in found:
+            assert closed is not None
+            sighting = Sighting(
+                self.robot,
+                self._epoch,
+                closed.sequence,
+                each.stamp_ns,
+                each.teammate,
+                each.reading,
+                each.covariance,
+            )
+            message = translate.sighting_message(sighting, self._announcement.digest, each.readings)
+            out.append(Outgoing(ch.SIGHTING_FACTOR, self.robot, message))
+        lost = len(self._sighted.difference(*(each.readings for each in found)))
+        if lost:
+            self._ledger[IN_SIGHTING] -= lost
+            self._ledger[f"rejected: {NO_NODE}"] += lost
+        self._sighted.clear()
+        return out
 
     def _exchanged(self, stamp_ns: int) -> list[Outgoing]:
         """The own map: for viewers under `join`, and the exchange itself under the other rules."""
@@ -440,7 +478,7 @@ class RobotNode:
             out = []
         else:
             closed, uncovered = self._hybrid.finish()
-            out = [] if closed is None else self._send(closed)
+            out = self._sightings(None) if closed is None else self._send(closed)
         if uncovered:
             self._ledger[self._used] -= uncovered
             self._ledger["rejected: no odometry covers it"] += uncovered

@@ -15,6 +15,8 @@ from team.config import FrontEnd, Sensor
 from team.estimation.models import Increment, acceptable, corrected
 from team.estimation.sighting import Carried, carried_back, carried_on, point_seen, reduced
 
+NO_NODE = "no pose node near it"
+"""Why a sighting is not used."""
 Looks = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Teammates, ranges [m] and bearings [rad] of one message."""
 
@@ -73,7 +75,7 @@ class PoseGrid:
         node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
         away_ns = abs(stamp_ns - node_ns)
         if away_ns > self._near_ns or not self._begin_ns < node_ns <= self._last_ns:
-            return "no pose node near it"
+            return NO_NODE
         mask = acceptable(self._sensor, ranges, bearings)
         distances, directions = corrected(self._sensor, ranges, bearings)
         distances = distances - self._sensor.marker_range_offset

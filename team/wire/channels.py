@@ -63,6 +63,9 @@ ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configured, "on
                        "latest", True, False, "the robot's configuration")  # fmt: skip
 SUBMAP = Channel("submap", "robot/{robot}/submap", m.Submap, "one per window", "all", True, True,
                  "what the rule `join` consumes")  # fmt: skip
+SIGHTING_FACTOR = Channel("sighting_factor", "robot/{robot}/sighting_factor", m.SightingFactor,
+                          "0-1 per teammate and node", "all", True, True,
+                          "a teammate seen from a pose node; what the rule `join` consumes")  # fmt: skip
 OWN_MAP = Channel("own_map", "robot/{robot}/own/map", m.MapEstimate, "one per window or exchange",
                   "latest", True, True,
                   "running landmark means and covariances; consumed by rules with feedback")  # fmt: skip

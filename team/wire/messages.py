@@ -10,6 +10,7 @@ Every message has `stamp_ns`, its team time: the time of the reading that it is 
 `check` raises `ValueError` with the reason when the numbers can not be what the message says.
 """
 
+from itertools import pairwise
 from typing import Annotated
 
 import msgspec
@@ -146,8 +147,10 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     """One window's Gaussian, the only input of the rule `join`; stamp_ns is its end pose's stamp.
 
     It names its inputs: the readings first_reading … last_reading of (robot, epoch), and the
-    configuration by digest (the seed is in it). ids: L, ascending. mean: 3 + 2L floats (end pose,
-    landmarks) in the frame of the start pose. covariance: packed upper triangle, row by row.
+    configuration by digest (the seed is in it). ids: L, ascending. mean: 3 + 3K + 2L floats (end
+    pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed upper triangle,
+    row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings: how many
+    SightingFactor messages belong to it.
     """
 
     robot: Name
@@ -160,14 +163,49 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     ids: Ids
     mean: Floats
     covariance: Floats
+    nodes: Stamps = b""
+    sightings: Count = 0
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")
-        n = 3 + 2 * len(ids(self.ids, "ids"))
+        times = stamps(self.nodes, "nodes")
+        n = 3 + 3 * len(times) + 2 * len(ids(self.ids, "ids"))
         check_finite(self.mean, "mean", n)
         check_packed_covariance(self.covariance, n, "covariance")
+        if not (times[1:] > times[:-1]).all():
+            raise ValueError("not ascending: nodes")
+        if len(times) and not self.start_ns < times[0] <= times[-1] <= self.stamp_ns:
+            raise ValueError("out of bounds: a node is not in the submap's time")
         if self.last_reading < self.first_reading or self.stamp_ns < self.start_ns:
             raise ValueError("out of bounds: the interval of readings or of time is empty")
+
+
+class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sighting_factor/1"):
+    """A teammate seen from a pose node of submap (robot, epoch, sequence); stamp_ns is the node's.
+
+    range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed
+    2 × 2 (range, bearing). readings: the counters of the sightings that went into it, ascending;
+    with the submap's odometry and configuration they are its inputs.
+    """
+
+    robot: Name
+    epoch: Count
+    sequence: Count
+    config: Digest
+    teammate: Name
+    range: Real
+    bearing: Real
+    covariance: Floats
+    readings: tuple[Count, ...]
+
+    def check(self) -> None:  # noqa: D102
+        check_packed_covariance(self.covariance, 2, "covariance")
+        if self.range <= 0.0 or abs(self.bearing) > np.pi:
+            raise ValueError("out of bounds: the range is not positive or the bearing not an angle")
+        if not self.readings or any(a >= b for a, b in pairwise(self.readings)):
+            raise ValueError("not ascending: readings, or none")
+        if self.teammate == self.robot:
+            raise ValueError("out of bounds: a robot sees itself")
 
 
 class MapEstimate(Message, frozen=True, array_like=True, gc=False, tag="map/1"):

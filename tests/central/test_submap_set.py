@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from central.submap_set import SubmapSet
 from team.wire import messages as m
-from tests.support import submap
+from tests.support import packed, spd, submap
 
 CHAIN = [submap(i) for i in range(6)]
 BOTH = [*CHAIN, *(submap(i, "bravo") for i in range(4))]
@@ -75,3 +75,63 @@ def test_another_epoch_is_another_stream():
     second = [msgspec.structs.replace(each, epoch=1) for each in CHAIN[:2]]
     found = put(*CHAIN, *second)
     assert (found.count(("alpha", 0)), found.count(("alpha", 1))) == (6, 2)
+
+
+# --- sightings: what completes a submap ---
+
+
+def sighting(i, stamp=1, teammate="bravo", readings=(3,)):
+    stamp_ns = i * 1_000_000 + stamp
+    return m.SightingFactor(
+        stamp_ns, "alpha", 0, i, b"configur", teammate, 2.0, 0.5, packed(spd(2)), readings
+    )
+
+
+SEEN = [
+    sighting(1, 1, readings=(11,)),
+    sighting(1, 1, "carol", (11,)),
+    sighting(1, 2, "bravo", (12,)),
+]
+WITH_SIGHTINGS = [CHAIN[0], changed(1, sightings=3), CHAIN[2], *SEEN]
+
+
+@settings(deadline=None)
+@given(st.permutations(WITH_SIGHTINGS * 2), st.integers(0, 12))
+def test_a_submap_counts_when_its_sightings_are_here_in_any_order(order, cut):
+    found = SubmapSet()
+    for k, each in enumerate(order):
+        if k == cut:
+            here = order[:cut]
+            complete = all(x in here for x in (WITH_SIGHTINGS[1], *SEEN))
+            first = CHAIN[0] in here
+            expected = (1 + complete + (complete and CHAIN[2] in here)) if first else 0
+            assert found.count(("alpha", 0)) == expected
+        admit = found.admit if isinstance(each, m.Submap) else found.admit_sighting
+        assert admit(each) is None
+    assert found.count(("alpha", 0)) == 3
+    assert found.sightings(WITH_SIGHTINGS[1]) == SEEN
+    assert found.missing() == ()
+
+
+def test_an_incomplete_submap_is_what_its_stream_waits_for():
+    found = put(CHAIN[0], changed(1, sightings=1))
+    assert found.missing() == (m.Member("alpha", 0, 1),)
+    assert found.chain(("alpha", 0)) == CHAIN[:1]
+
+
+@pytest.mark.parametrize(
+    ("new", "reason"),
+    [
+        (sighting(1, 1, readings=(13,)), "differs from the one in the set"),
+        (sighting(3, 1, readings=(12, 13)), "uses reading 12, which another one has used"),
+        (sighting(1, 3, "bravo", (14,)), "is one more than submap 1 has"),
+    ],
+)
+def test_a_sighting_that_does_not_fit_is_refused_and_changes_nothing(new, reason):
+    found = put(*WITH_SIGHTINGS[:3])
+    for each in SEEN:
+        found.admit_sighting(each)
+    before = copy.deepcopy(found)
+    assert reason in found.admit_sighting(new)
+    assert found.sightings(WITH_SIGHTINGS[1]) == before.sightings(WITH_SIGHTINGS[1])
+    assert found.count(("alpha", 0)) == 3

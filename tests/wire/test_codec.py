@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
+from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded
 from tests.support import ROOT, examples, odometry, packed, spd, submap
 
@@ -52,6 +52,12 @@ def test_plain_msgpack_reads_the_tag_and_the_stamp_first(tag: str) -> None:
 def test_appended_fields_are_ignored(tag: str) -> None:
     longer = msgpack.packb([*fields_of(EXAMPLES[tag]), "a later field", 7])
     assert decoded(longer) == EXAMPLES[tag]
+
+
+def test_a_submap_from_before_the_pose_nodes_has_none() -> None:
+    shorter = msgpack.packb(fields_of(submap(0))[:-2])
+    assert decoded(shorter) == submap(0)
+    assert (submap(0).nodes, submap(0).sightings) == (b"", 0)
 
 
 @settings(deadline=None)
@@ -115,11 +121,19 @@ def indefinite(n: int) -> bytes:
     return packed(spd(n) - 5.0 * np.eye(n))
 
 
+def with_two_nodes(stamps: list[int]) -> bytes:
+    joint = packed(spd(13))
+    return with_fields(
+        SUBMAP, nodes=from_stamps(stamps), mean=from_floats(range(13)), covariance=joint
+    )
+
+
 NAN, INF = struct.pack("<d", float("nan")), struct.pack("<d", float("inf"))
 POSE = EXAMPLES["pose/1"]
 SUBMAP = EXAMPLES["submap/1"]
 SEEN = EXAMPLES["observations/1"]
 MAP = EXAMPLES["map/1"]
+MET = EXAMPLES["sighting_factor/1"]
 HUGE = [1.0, 1.7e308, 0.0, -1.7e308, 1.0, 0.0, 0.0, 0.0, 1.0]
 SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
 
@@ -143,10 +157,10 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("wrong length", with_fields(SUBMAP, mean=b"\x00" * 7), None),
         ("wrong length", with_fields(SUBMAP, covariance=b""), None),
         ("wrong length", with_fields(SEEN, ranges=b"\x00" * 24), None),
-        ("not finite", with_fields(SUBMAP, mean=NAN * 7), None),
+        ("not finite", with_fields(SUBMAP, mean=NAN * 10), None),
         ("not finite", with_fields(SEEN, ranges=INF * 2), None),
         ("not symmetric", with_fields(POSE, covariance=from_floats(SKEW)), None),
-        ("not positive definite", with_fields(SUBMAP, covariance=indefinite(7)), None),
+        ("not positive definite", with_fields(SUBMAP, covariance=indefinite(10)), None),
         ("not positive definite", with_fields(POSE, covariance=from_floats(-spd(3))), None),
         (
             "not positive definite",
@@ -160,8 +174,18 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("out of bounds", with_fields(SEEN, bearings=from_floats([4.0, 0.0])), None),
         ("out of bounds", with_fields(SEEN, ranges=from_floats([-1.0, 0.0])), None),
         ("out of bounds", with_fields(SUBMAP, start_ns=2**40), None),
+        ("out of bounds", with_fields(SUBMAP, nodes=from_stamps([8_000])), None),
+        ("out of bounds", with_fields(SUBMAP, nodes=from_stamps([9_001])), None),
+        ("wrong length", with_fields(SUBMAP, nodes=b""), None),
+        ("not ascending", with_two_nodes([8_500, 8_500]), None),
+        ("out of bounds", with_fields(MET, range=0.0), None),
+        ("out of bounds", with_fields(MET, bearing=3.2), None),
+        ("out of bounds", with_fields(MET, teammate="alpha"), None),
+        ("not ascending", with_fields(MET, readings=[]), None),
+        ("not ascending", with_fields(MET, readings=[5, 5]), None),
+        ("not positive definite", with_fields(MET, covariance=indefinite(2)), None),
         ("too large", b"\xdd\x7f\xff\xff\xff" + b"\x00" * 100, None),
-        ("too large", with_fields(SUBMAP, ids=from_ids(range(4096)), mean=bytes(8 * 8195)), None),
+        ("too large", with_fields(SUBMAP, ids=from_ids(range(4096)), mean=bytes(8 * 8198)), None),
         ("too deep", b"\x91" * 100_000, None),
         ("damaged", b"\xc1", None),
         ("damaged", b"\x91\xa1\xff", None),
@@ -172,7 +196,7 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("wrong field", with_fields(SUBMAP, stamp_ns=2**62), None),
         ("wrong field", with_fields(EXAMPLES["status/1"], figures={"x": float("nan")}), None),
         ("wrong field", with_fields(EXAMPLES["odometry/1"], forward=float("nan")), None),
-        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-1]), None),
+        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-3]), None),
     ],
 )
 def test_an_unsound_payload_is_refused_for_its_reason(

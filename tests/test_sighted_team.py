@@ -1,0 +1,147 @@
+"""Whole teams that use sightings of each other: the laws hold, and the log says all of it again."""
+
+import random
+
+import msgspec
+import pytest
+
+from central.config import CentralConfig
+from sim.ledger import ledger
+from sim.rerun import verify
+from sim.rerun_log import recorded
+from sim.source import streams_of
+from team.robot.node import IN_SIGHTING, RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import encoded
+from tests.sim.reruns import messages, team_samples, thesis, written
+from tests.teams import Team, driven, of, published
+
+CENTRE = CentralConfig(tick_s=8.0, broadcast_s=8.0)
+
+
+def scenario(node_s=5.0):
+    base = thesis(60)
+    front = [
+        msgspec.structs.replace(r.front_end, node_s=node_s, sighting_s=1.0, particles=30)
+        for r in base.robots
+    ]
+    robots = zip(base.robots, front, strict=True)
+    return msgspec.structs.replace(
+        base,
+        robots=tuple(
+            msgspec.structs.replace(robot, front_end=f, pose_s=1e6) for robot, f in robots
+        ),
+    )
+
+
+SCENARIO = scenario()
+STREAMS = streams_of(SCENARIO)
+
+
+def team(seed):
+    found = Team(STREAMS, SCENARIO.robots, random.Random(seed), CENTRE)
+    found.run()
+    return found
+
+
+@pytest.fixture(scope="module")
+def first():
+    return team(0)
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return team_samples(SCENARIO)
+
+
+def test_the_robots_see_each_other_and_the_map_has_it(first):
+    seen = [x for robot in SCENARIO.robots for x in first.sent[ch.SIGHTING_FACTOR.key(robot.id)]]
+    assert len({x.robot for x in seen}) == 2
+    fold = first.centre._join._ticks.fold
+    assert 0 < len(fold.main.graph.sightings) <= len(seen)
+    assert len(fold.main.graph.sightings) + len(fold.waiting) == len(seen)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_final_map_is_the_same_bytes_for_any_interleaving_of_submaps_and_sightings(first, seed):
+    assert encoded(team(seed).final) == encoded(first.final)
+
+
+def test_a_robot_that_dies_and_comes_back_changes_no_bit_of_it(first):
+    again = Team(STREAMS, SCENARIO.robots, random.Random(3), CENTRE)
+    victim = SCENARIO.robots[0]
+    while len(again.sent[ch.SUBMAP.key(victim.id)]) < 3:
+        again.step()
+    again.kill(victim.id)
+    for _ in range(20):
+        again.step()
+    again.resume(victim)
+    again.run()
+    assert encoded(again.final) == encoded(first.final)
+
+
+def test_a_submap_enters_the_map_when_its_last_sighting_has_come(first):
+    robot = SCENARIO.robots[0].id
+    submaps, sightings = (first.sent[c.key(robot)] for c in (ch.SUBMAP, ch.SIGHTING_FACTOR))
+    whole = next(x for x in submaps if x.sightings)
+    mine = [x for x in sightings if x.sequence == whole.sequence]
+    assert len(mine) == whole.sightings
+    centre = Team(STREAMS, SCENARIO.robots, random.Random(4), CENTRE).centre
+    centre.handle(first.sent[ch.START.key(robot)][0], 0)
+    for submap in submaps[: whole.sequence]:
+        centre.handle(submap, 0)
+    for each in (whole, *mine[:-1]):
+        centre.handle(each, 0)
+    before = centre._join.count((robot, whole.epoch))
+    out = centre.handle(mine[-1], 0)
+    assert before == whole.sequence
+    assert [x.submaps for x in of(out, ch.CENTRAL_PROGRESS)] == [whole.sequence + 1]
+    assert of(centre.handle(mine[-1], 0), ch.CENTRAL_PROGRESS) == []
+
+
+def test_a_run_with_sightings_is_computed_again_to_the_last_bit(samples, tmp_path):
+    found = verify(written(tmp_path / "log.mcap", samples))
+    counts = {c.channel: (c.messages, c.equal) for c in found.channels}
+    assert found.first is None
+    assert counts["sighting_factor"][0] == counts["sighting_factor"][1] > 0
+    assert all(total == equal for total, equal in counts.values())
+
+
+def test_each_reading_of_a_run_with_sightings_has_one_disposition(samples, tmp_path):
+    found = ledger(recorded(written(tmp_path / "log.mcap", samples)))
+    assert found.offenders == ()
+    used = {
+        (x.robot, n)
+        for robot in SCENARIO.robots
+        for x in messages(samples, ch.SIGHTING_FACTOR, robot.id)
+        for n in x.readings
+    }
+    assert found.totals()[IN_SIGHTING] == len(used) > 0
+
+
+def test_sightings_whose_node_never_comes_are_rejected_at_the_end():
+    """The stream ends half a second before the node: the sighting is not in a factor."""
+    config = SCENARIO.robots[0]
+    readings = published(STREAMS.streams[0])
+    wanted = next(
+        k
+        for k, r in enumerate(readings)
+        if isinstance(r, m.Sightings) and r.stamp_ns % 5_000_000_000 == 4_000_000_000
+    )
+    out = driven(RobotNode(config), readings[: wanted + 2])
+    (done,) = of(out, ch.ROBOT_DONE)
+    told = {d.disposition: d.readings for d in done.ledger}
+    assert told["rejected: no pose node near it"] >= 1
+    assert sum(told.values()) == done.readings
+    used = {n for x in of(out, ch.SIGHTING_FACTOR) for n in x.readings}
+    assert told.get(IN_SIGHTING, 0) == len(used)
+
+
+def test_with_the_grid_off_nothing_is_said_of_teammates():
+    plain = scenario(node_s=0.0)
+    found = Team(STREAMS, plain.robots, random.Random(1), CENTRE)
+    found.run()
+    for robot in plain.robots:
+        assert found.sent[ch.SIGHTING_FACTOR.key(robot.id)] == []
+        assert {x.nodes for x in found.sent[ch.SUBMAP.key(robot.id)]} == {b""}
