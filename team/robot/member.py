@@ -1,11 +1,13 @@
 """Hybrid-SLAM on one robot's readings: windows of particles, each closed into one submap."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from team.config import RobotConfig
+from team.estimation import geometry
 from team.estimation import window as windows
 from team.estimation.gaussian import Matrix
 from team.estimation.randomness import generator
@@ -14,6 +16,16 @@ from team.estimation.whole_map import WholeMap, begun, joined
 from team.estimation.window import Window
 from team.robot.pose_grid import Looks, NodeSighting, PoseGrid
 from team.robot.segmenter import Epoch, Segmenter
+
+CLOUD_PARTICLES = 32
+"""Particles in a cloud for viewers."""
+
+
+class Cloud(NamedTuple):
+    """A thinned particle cloud in the own map's frame: P poses and their weights, summing to 1."""
+
+    poses: Float[np.ndarray, "P 3"]
+    weights: Float[np.ndarray, " P"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +39,7 @@ class ClosedWindow:
     end_ns: int
     local: LocalMap
     sightings: tuple[NodeSighting, ...] = ()
+    cloud: Cloud | None = None
 
 
 class HybridMember:
@@ -107,11 +120,6 @@ class HybridMember:
         """The open window's Gaussian at its last epoch."""
         return windows.gaussian(self._window)
 
-    @property
-    def window(self) -> Window:
-        """The open window, for viewers."""
-        return self._window
-
     def _advance(self, epoch: Epoch) -> None:
         self._window = windows.advanced(
             self._window,
@@ -141,10 +149,21 @@ class HybridMember:
             stamp_ns,
             local,
             () if self._grid is None else self._grid.sightings(),
+            self._cloud(),
         )
         self.whole = joined(self.whole, local)
         self._begin_window(self.sequence + 1, self._last_reading + 1, stamp_ns)
         return closed
+
+    def _cloud(self) -> Cloud:
+        """Every so many particles, in their order, placed where the window began."""
+        particles = self._window.particles
+        every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
+        logs = particles.log_weights[::every]
+        weights = np.exp(logs - logs.max())
+        begun_at = self.whole.mean[:3]
+        poses = [geometry.compose(begun_at, pose) for pose in particles.poses[::every]]
+        return Cloud(np.array(poses), weights / weights.sum())
 
     def _begin_window(self, sequence: int, first_reading: int, stamp_ns: int) -> None:
         self.sequence = sequence

@@ -33,8 +33,6 @@ IN_SIGHTING = "in a sighting factor"
 """The disposition of a reading of teammates that was used."""
 PROGRESS_READINGS = 64
 """A robot reports its progress at least once per this many readings."""
-CLOUD_PARTICLES = 32
-"""Particles in the cloud for viewers."""
 
 
 class RobotNode:
@@ -319,6 +317,10 @@ class RobotNode:
             len(closed.sightings),
         )
         out.append(Outgoing(ch.SUBMAP, self.robot, submap))
+        if closed.cloud is not None:
+            poses, weights = (from_floats(x) for x in closed.cloud)
+            cloud = m.ParticleCloud(closed.end_ns, self.robot, poses, weights)
+            out.append(Outgoing(ch.PARTICLES, self.robot, cloud))
         out += self._poses(closed.end_ns)
         out += self._exchanged(closed.end_ns)
         return [*out, self._progress()]
