@@ -339,10 +339,11 @@ class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajector
 
 
 class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"):
-    """How far a node is: per (robot, epoch) the count of readings consumed and of submaps sent.
+    """How far a node is: per (robot, epoch) the count of readings it is done with, and of submaps.
 
-    A robot reports itself; the centre reports submaps that are in its set; the recorder reports
-    readings that it has taken.
+    A robot reports itself: readings consumed (while it waits for an exchange of maps: received),
+    and stamp_ns is the team time before which it sends no submap any more. The centre reports
+    submaps that are in its set; the recorder reports readings that it has taken.
     """
 
     node: Text
