@@ -1,5 +1,6 @@
 """Calibration: what was put into readings comes out of them, within its own uncertainty."""
 
+import re
 from dataclasses import replace
 from pathlib import Path as File
 
@@ -20,8 +21,10 @@ from sim.calibration_sensor import fit_sensor
 from sim.calibration_source import world_of
 from sim.cli import app
 from sim.evaluation_errors import Path, on_circle
-from sim.scenario import load
-from sim.streams import Detections, Intervals, grouped
+from sim.scenario import Scenario, load, with_options
+from sim.streams import Detections, Intervals, WorldStreams, grouped
+from sim.worlds import SimulatedWorld
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.wire.bus import opened
 from tests.sim.logs import scenario, streams, world_log
 
@@ -232,6 +235,56 @@ def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path:
     for mine, theirs in zip(written.robots, expected.robots, strict=True):
         assert msgspec.to_builtins(mine.sensor) == msgspec.to_builtins(theirs.sensor)
         assert mine.motion.forward_scale == theirs.motion.forward_scale
+
+
+@pytest.fixture(scope="module")
+def slipping() -> tuple[Scenario, WorldStreams]:
+    """A simulated team whose bases drive 10 % farther than their odometry says."""
+    world = SimulatedWorld(
+        steps=1000,
+        step_s=0.25,
+        size_m=20.0,
+        landmark_count=12,
+        speed_m_s=0.4,
+        turn_rate_rad_s=0.5,
+        visible_from_m=1.0,
+        visible_to_m=12.0,
+    )
+    motion = MotionModel(forward=MotionNoise(per_m=0.05), turn=MotionNoise(per_rad=0.05))
+    sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01)
+    front_end = FrontEnd(window_s=5.0, particles=30, keyframe_s=0.5)
+    robots = tuple(RobotConfig(f"r{i}", motion, sensor, front_end) for i in (1, 2, 3))
+    team = with_options(Scenario("slipping", "slipping", world, robots), seed=3)
+    told = streams(team)
+    less = tuple(
+        replace(each, intervals=replace(each.intervals, forward=each.intervals.forward / 1.1))
+        for each in told.streams
+    )
+    return team, replace(told, streams=less)
+
+
+@pytest.mark.parametrize("by_truth", [True, False])
+def test_odometry_that_does_not_fit_is_learnt_and_told_with_and_without_truth(
+    slipping: tuple[Scenario, WorldStreams], by_truth: bool
+) -> None:
+    team, world = slipping
+    told: list[str] = []
+    world = world if by_truth else replace(world, landmarks=None)
+    found = calibrated([("a log", world)], team, told.append)
+    assert found.by_truth is by_truth
+    assert told
+    motion = by_name(found.motion)
+    assert motion["forward_scale"].value == pytest.approx(1.1, abs=0.015)
+    assert motion["yaw_scale"].value == pytest.approx(1.0, abs=0.02)
+    (alarm,) = (note for note in found.notes if "not calibrated for these data" in note)
+    assert re.match(r"forward_scale is \+(9|10)\.\d %", alarm)
+    if by_truth:
+        sensor = by_name(found.sensor)
+        assert sensor["range_scale"].value == pytest.approx(1.0, abs=0.003)
+        assert sensor["bearing_sigma"].value == pytest.approx(0.01, rel=0.05)
+        assert motion["forward.per_m"].value == pytest.approx(0.05, rel=0.25)
+    else:
+        assert found.sensor == ()
 
 
 def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path: File) -> None:
