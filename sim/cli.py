@@ -11,6 +11,7 @@ import typer  # noqa: E402 - the threads of BLAS are set before anything imports
 
 from sim.cli_calibrate import app as calibrate_commands  # noqa: E402
 from sim.cli_launch import app as launch_commands  # noqa: E402
+from sim.cli_log import app as log_tools  # noqa: E402
 from sim.cli_logs import app as log_commands  # noqa: E402
 from sim.cli_nodes import app as node_commands  # noqa: E402
 from sim.cli_options import FAILED, WRONG_USE  # noqa: E402
@@ -25,6 +26,7 @@ app = typer.Typer(
 )
 for _part in (launch_commands, node_commands, log_commands, rerun_commands, calibrate_commands):
     app.add_typer(_part)
+app.add_typer(log_tools)
 
 
 @app.callback(invoke_without_command=True)

@@ -1,64 +1,42 @@
-"""The reader: the samples of a log, also of one whose recorder was killed.
-
-Reads the records itself, one after another, because a log is untrusted input: every length is
-checked before it is believed, every chunk's CRC is checked, and a chunk that claims to expand
-beyond what the recorder can have written is refused before it is expanded.
-"""
+"""The reader: the samples of a log, also of one whose recorder was killed."""
 
 import os
 import struct
-import zlib
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple, cast
+from typing import IO
 
 import msgpack
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel as LogChannel
-from mcap.records import Chunk, Metadata
+from mcap.records import Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from team.recording.recorder import METADATA, Count
+from team.recording.records import (
+    FOOTER_SIZE,
+    LARGEST_CHUNK,
+    MALFORMED,
+    REPAIR,
+    DamagedChunkError,
+    Frame,
+    LogError,
+    expanded,
+    frames,
+    index,
+    records,
+)
 from team.wire.bus import Sample
 from team.wire.channels import Channel, channel_of
-from team.wire.codec import LARGEST_PAYLOAD
 
-LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
-"""Bytes of one chunk, expanded: the largest message behind a chunk that was almost full."""
-LARGEST_RATIO = 10_000
-"""Of expanded to compressed bytes; a map of zeros reaches a thousand, a bomb ten thousands."""
-_FRAME = struct.Struct("<BQ")
+__all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "open_log"]
+
 _MESSAGE = struct.Struct("<HIQQ")
-_FOOTER_SIZE = _FRAME.size + 20
-_MALFORMED = (McapError, UnicodeDecodeError, OverflowError, struct.error)
-"""What mcap raises where a record is not what its opcode says."""
-_REPAIR = "`teamslam repair` saves the rest"
-
-
-class LogError(ValueError):
-    """A file that is no log of ours, or a damaged one: which file, what is wrong, what to do."""
-
-    def __init__(self, path: Path, what: str, remedy: str) -> None:
-        super().__init__(f"{path}: {what}; {remedy}")
-        self.path = path
-        self.what = what
-        self.remedy = remedy
-
-
-class DamagedChunkError(LogError):
-    """One chunk can not be read; what comes after it can, by `Log.chunks`."""
-
-
-class _Frame(NamedTuple):
-    offset: int
-    opcode: int
-    body: bytes
 
 
 @dataclass(frozen=True)
@@ -104,22 +82,22 @@ class Log:
         with self.path.open("rb") as file:
             # The index repeats the channels: a chunk that introduced one may be damaged.
             keys = self._indexed(file, names) if self.complete else {}
-            for frame in _frames(file, self.path):
+            for frame in frames(file, self.path):
                 if frame.opcode == Opcode.CHUNK:
                     try:
                         yield self._samples(frame, names, keys)
-                    except (*_MALFORMED, ValueError, zstandard.ZstdError) as error:
+                    except (*MALFORMED, ValueError, zstandard.ZstdError) as error:
                         what = f"damaged chunk at offset {frame.offset}: {error}"
-                        yield DamagedChunkError(self.path, what, _REPAIR)
+                        yield DamagedChunkError(self.path, what, REPAIR)
                 elif frame.opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     return
         if self.complete:
-            raise LogError(self.path, "ends before its own index", _REPAIR)
+            raise LogError(self.path, "ends before its own index", REPAIR)
 
     def _indexed(self, file: IO[bytes], names: set[str] | None) -> dict[int, str | None]:
         keys: dict[int, str | None] = {}
-        with suppress(LogError, *_MALFORMED):  # whole chunks introduce their channels themselves
-            for frame in _index(file, self.path):
+        with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels themselves
+            for frame in index(file, self.path):
                 if frame.opcode == Opcode.CHANNEL:
                     self._introduce(frame.body, names, keys)
         return keys
@@ -129,10 +107,10 @@ class Log:
         keys[channel.id] = self._key(channel.topic, names)
 
     def _samples(
-        self, frame: _Frame, names: set[str] | None, keys: dict[int, str | None]
+        self, frame: Frame, names: set[str] | None, keys: dict[int, str | None]
     ) -> list[Sample]:
         samples = []
-        for record in _records(_expanded(_chunk(frame.body))):
+        for record in records(expanded(frame.body)):
             if record.opcode == Opcode.CHANNEL:
                 self._introduce(record.body, names, keys)
             elif record.opcode == Opcode.MESSAGE:
@@ -172,8 +150,8 @@ def _opened(file: IO[bytes], path: Path) -> Log:
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise LogError(path, "not an MCAP file", "give a log that `teamslam record` wrote")
     complete = False
-    if size > _FOOTER_SIZE + 2 * len(MCAP0_MAGIC):
-        file.seek(-_FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
+    if size > FOOTER_SIZE + 2 * len(MCAP0_MAGIC):
+        file.seek(-FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
         tail = file.read()
         complete = tail[0] == Opcode.FOOTER and tail.endswith(MCAP0_MAGIC)
     metadata = _metadata(file, path)
@@ -181,11 +159,11 @@ def _opened(file: IO[bytes], path: Path) -> Log:
 
 
 def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
-    for frame in _frames(file, path):
+    for frame in frames(file, path):
         if frame.opcode == Opcode.METADATA:
             try:
                 record = Metadata.read(ReadDataStream(BytesIO(frame.body)))
-            except _MALFORMED as error:
+            except MALFORMED as error:
                 raise LogError(path, f"damaged metadata: {error}", "nothing can be read") from None
             if record.name == METADATA:
                 return dict(record.metadata)
@@ -194,63 +172,6 @@ def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
     raise LogError(
         path, "an MCAP file of another program", f"a log of ours begins with metadata {METADATA!r}"
     )
-
-
-def _index(file: IO[bytes], path: Path) -> Iterator[_Frame]:
-    """The records of the summary section; the footer says where it starts (0: there is none)."""
-    file.seek(_FRAME.size - _FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
-    (start,) = struct.unpack("<Q", file.read(8))
-    return _frames(file, path, start) if start else iter(())
-
-
-def _frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[_Frame]:
-    """The whole records of the file from `start`; a record that is cut off is the end."""
-    size = os.fstat(file.fileno()).st_size
-    if start > size:
-        raise LogError(path, f"its index claims to start at {start} of {size} bytes", _REPAIR)
-    offset = file.seek(start)
-    while len(head := file.read(_FRAME.size)) == _FRAME.size:
-        opcode, length = _FRAME.unpack(head)
-        if opcode == 0 or offset + _FRAME.size + length > size:
-            return  # zeros, or half a record: what a machine that went down leaves behind
-        if length > LARGEST_CHUNK:
-            what = f"record of {length} bytes at offset {offset}, {LARGEST_CHUNK} at most"
-            raise LogError(path, what, _REPAIR)
-        yield _Frame(offset, opcode, file.read(length))
-        offset += _FRAME.size + length
-
-
-def _records(data: bytes) -> Iterator[_Frame]:
-    offset = 0
-    while offset < len(data):
-        opcode, length = _FRAME.unpack_from(data, offset)
-        start = offset + _FRAME.size
-        if start + length > len(data):
-            raise ValueError("a record ends beyond its chunk")
-        yield _Frame(offset, opcode, data[start : start + length])
-        offset = start + length
-
-
-def _chunk(body: bytes) -> Chunk:
-    return cast(Chunk, Chunk.read(ReadDataStream(BytesIO(body))))
-
-
-def _expanded(chunk: Chunk) -> bytes:
-    """The chunk's records; ValueError before anything is expanded that can not be ours."""
-    size, packed = chunk.uncompressed_size, len(chunk.data)
-    if size > min(LARGEST_CHUNK, LARGEST_RATIO * packed):
-        raise ValueError(f"{packed} bytes claim to expand to {size}, which no recorder writes")
-    if chunk.compression == "zstd":
-        if zstandard.frame_content_size(chunk.data) != size:
-            raise ValueError("two different sizes are claimed")
-        data = zstandard.decompress(chunk.data, max_output_size=size)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise ValueError(f"compression {chunk.compression!r}, which no recorder of ours writes")
-    if len(data) != size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
-        raise ValueError("the CRC does not match")
-    return data
 
 
 def _stamp_in(payload: bytes) -> int:

@@ -1,10 +1,12 @@
 """Repair: what is whole in a damaged or unfinished log, in a new and complete one."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from team.recording.reader import DamagedChunkError, LogError, open_log
+from team.recording.reader import Log, LogError, open_log
 from team.recording.recorder import Recorder
+from team.wire.bus import Sample
 
 
 class Report(NamedTuple):
@@ -13,6 +15,14 @@ class Report(NamedTuple):
     messages: int
     until_ns: int | None
     damaged: tuple[str, ...]
+
+
+def salvaged(log: Log) -> Iterator[list[Sample] | LogError]:
+    """Every whole chunk's samples; in the place of what is damaged, its error. Never raises it."""
+    try:
+        yield from log.chunks()
+    except LogError as error:  # nothing behind this place can be found any more
+        yield error
 
 
 def repaired(path: str | Path, out: str | Path) -> Report:
@@ -25,17 +35,12 @@ def repaired(path: str | Path, out: str | Path) -> Report:
     messages, until_ns = 0, None
     damaged: list[str] = []
     with Recorder(out, log.team, log.metadata) as recorder:
-        try:
-            for chunk in log.chunks():
-                if isinstance(chunk, DamagedChunkError):
-                    damaged.append(chunk.what)
-                    continue
-                recorder.write(chunk)
-                messages += len(chunk)
-                for sample in chunk:
-                    until_ns = (
-                        sample.stamp_ns if until_ns is None else max(until_ns, sample.stamp_ns)
-                    )
-        except LogError as error:  # nothing behind this place can be found any more
-            damaged.append(error.what)
+        for chunk in salvaged(log):
+            if isinstance(chunk, LogError):
+                damaged.append(chunk.what)
+                continue
+            recorder.write(chunk)
+            messages += len(chunk)
+            for sample in chunk:
+                until_ns = sample.stamp_ns if until_ns is None else max(until_ns, sample.stamp_ns)
     return Report(messages, until_ns, tuple(damaged))

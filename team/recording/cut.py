@@ -1,0 +1,81 @@
+"""Cut: a stretch of team time or some channels of a log, as a log of its own."""
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from team.recording.reader import Log, LogError
+from team.recording.recorder import Recorder
+from team.recording.summary import summarised
+from team.wire import channels as ch
+from team.wire.bus import Sample
+
+CUT = "cut"
+"""The metadata that says that a log is a part of another, and which."""
+STANDING = frozenset(
+    channel.name
+    for channel in (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.WORLD_CONFIG, ch.TRUTH_LANDMARKS)
+)
+"""Channels whose messages hold from when they are said: a cut keeps those from before it."""
+
+
+def cut(
+    log: Log,
+    out: str | Path,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    channels: Collection[ch.Channel] | None = None,
+) -> int:
+    """Write the samples of [from_s, to_s) on these channels to a new log `out`; how many.
+
+    Seconds of team time since the first reading; None: no bound. So adjoining cuts part a log.
+    Of `STANDING` channels what was said before from_s is kept, too. The metadata is kept, with a
+    note of the cut. Raises `LogError` when nothing is left or the log is damaged, before `out` is
+    made, and `RecorderError` when `out` exists.
+    """
+    summary = summarised(log)
+    if summary.damaged:
+        raise LogError(log.path, summary.damaged[0], "`teamslam log repair` saves the rest")
+    span = summary.span_ns()
+    if span is None:
+        raise LogError(log.path, "no message in it", "give a log that has some")
+    begin, end = (None if s is None else span[0] + round(s * 1e9) for s in (from_s, to_s))
+    beyond = (begin is not None and begin > span[1]) or (end is not None and end <= span[0])
+    if beyond or not any(True for _ in _within(log, begin, end, channels)):
+        seconds = (span[1] - span[0]) * 1e-9
+        remedy = f"its readings are from 0 to {seconds:.3f} s; `teamslam log info` has its channels"
+        raise LogError(log.path, "nothing of it is in this cut", remedy)
+    note = _note(log.path.name, span[0], from_s, to_s, channels)
+    notes = "; ".join(filter(None, (log.metadata.get(CUT), note)))
+    count = 0
+    with Recorder(out, log.team, {**log.metadata, CUT: notes}) as recorder:
+        for sample in _within(log, begin, end, channels):
+            recorder.write([sample])
+            count += 1
+    return count
+
+
+def _within(
+    log: Log, begin_ns: int | None, end_ns: int | None, channels: Collection[ch.Channel] | None
+) -> Iterator[Sample]:
+    for sample in log.samples(channels):
+        if end_ns is not None and sample.stamp_ns >= end_ns:
+            continue
+        if begin_ns is None or sample.stamp_ns >= begin_ns or _stands(sample.key):
+            yield sample
+
+
+def _stands(key: str) -> bool:
+    found = ch.channel_of(key)
+    return found is not None and found[0].name in STANDING
+
+
+def _note(
+    name: str,
+    start_ns: int,
+    from_s: float | None,
+    to_s: float | None,
+    channels: Collection[ch.Channel] | None,
+) -> str:
+    begin, end = ("" if s is None else f"{s:g}" for s in (from_s, to_s))
+    names = "all channels" if channels is None else ", ".join(each.name for each in channels)
+    return f"{name}: [{begin}, {end}) s since {start_ns} ns, {names}"

@@ -1,0 +1,92 @@
+"""What a log says of its channels: the encoding and the schema of each key."""
+
+import json
+from collections.abc import Iterator
+from io import BytesIO
+from typing import Any, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from team.recording.reader import Log
+from team.recording.records import MALFORMED, Frame, LogError, expanded, frames, records
+from team.recording.schemas import schema_of
+from team.wire.channels import channel_of
+from team.wire.messages import Message, tag_of
+
+
+class Declared(NamedTuple):
+    """A key as a log declares it; without a schema its name is empty."""
+
+    key: str
+    encoding: str
+    schema: str
+    text: bytes
+
+
+def declared(log: Log) -> dict[str, Declared]:
+    """The declaration of each key, the last where there are several; damaged parts give none."""
+    schemas: dict[int, tuple[str, bytes]] = {0: ("", b"")}
+    found: dict[str, Declared] = {}
+    for frame in _declarations(log):
+        stream = ReadDataStream(BytesIO(frame.body))
+        try:
+            if frame.opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                schemas[schema.id] = (schema.name, schema.data)
+            else:
+                channel = Channel.read(stream)
+                key = channel.topic.removeprefix(f"team/{log.team}/")
+                named = schemas.get(channel.schema_id, ("", b""))
+                found[key] = Declared(key, channel.message_encoding, *named)
+        except MALFORMED:
+            continue
+    return found
+
+
+def misdeclared(of: Declared) -> str | None:
+    """What is wrong with the declaration of a key; None of a sound one.
+
+    A version of the program may append fields: of two field lists one begins with the other.
+    """
+    row = channel_of(of.key)
+    if row is None:
+        return None if of.key.startswith("view/") else "no channel has this key"
+    kind = row[0].message
+    if (of.encoding, of.schema) != ("msgpack", tag_of(kind)):
+        said = f"{of.encoding or 'no encoding'}, {of.schema or 'no schema'}"
+        return f"declared as {said}; its messages are msgpack, {tag_of(kind)}"
+    ours, theirs = _fields(schema_of(kind), kind), _fields(of.text, kind)
+    shared = min(len(ours), len(theirs))
+    if not theirs or ours[:shared] != theirs[:shared]:
+        return f"its schema is not that of {tag_of(kind)}"
+    return None
+
+
+def _fields(text: bytes, kind: type[Message]) -> list[Any]:
+    """The types of a schema's fields in order; none of what is no schema of this message."""
+    try:
+        fields = json.loads(text)["$defs"][kind.__name__]["prefixItems"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return []
+    return fields if isinstance(fields, list) else []
+
+
+def _declarations(log: Log) -> Iterator[Frame]:
+    """Schema and channel records, in chunks or in the index behind them."""
+    wanted = (Opcode.SCHEMA, Opcode.CHANNEL)
+    with log.path.open("rb") as file:
+        try:
+            for frame in frames(file, log.path):
+                if frame.opcode in wanted:
+                    yield frame
+                elif frame.opcode == Opcode.CHUNK:
+                    try:
+                        inside = list(records(expanded(frame.body)))
+                    except (*MALFORMED, ValueError, zstandard.ZstdError):
+                        continue
+                    yield from (each for each in inside if each.opcode in wanted)
+        except LogError:
+            return

@@ -1,0 +1,71 @@
+"""Merge: the logs of several robots, or the parts of one, as one log."""
+
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+from team.recording.reader import Log, LogError
+from team.recording.recorder import Recorder
+from team.wire.bus import Sample
+
+MERGED = "merged"
+"""The metadata that names what a log was merged from."""
+
+
+class Merged(NamedTuple):
+    """Messages in the new log, and duplicates that are not."""
+
+    messages: int
+    duplicates: int
+
+
+def merge(logs: Sequence[Log], out: str | Path) -> Merged:
+    """Write every sample of the logs once to a new log `out`, by team time.
+
+    Equal stamps stay in the order of the logs and of each file. Equal key, counter,
+    wall clock and payload is one publication that several recorders took; a robot that was started
+    again announces the same configuration by another. All samples are in memory at once. Raises
+    `LogError` where the logs are of different teams or one is damaged, before `out` is made, and
+    `RecorderError` when `out` exists.
+    """
+    first = logs[0]
+    for log in logs[1:]:
+        if log.team != first.team:
+            what = f"a log of team {log.team!r}, not {first.team!r} as {first.path} is"
+            raise LogError(log.path, what, "merge the logs of one team")
+    read = list(chain.from_iterable(log.samples() for log in logs))
+    once = sorted(_once(read), key=lambda sample: sample.stamp_ns)
+    with Recorder(out, first.team, merged_metadata(logs)) as recorder:
+        recorder.write(once)
+    return Merged(len(once), len(read) - len(once))
+
+
+def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
+    """What the logs that have it agree on, as it is; the rest as `name@file` of each log.
+
+    Logs of equal file names are numbered: `name@1:file`.
+    """
+    files = [log.path.name for log in logs]
+    if len(set(files)) < len(files):
+        files = [f"{i}:{file}" for i, file in enumerate(files, 1)]
+    merged: dict[str, str] = {}
+    for name in dict.fromkeys(chain.from_iterable(log.metadata for log in logs)):
+        values = {
+            f"{name}@{file}": log.metadata.get(name) for file, log in zip(files, logs, strict=True)
+        }
+        said = {value for value in values.values() if value is not None}
+        if len(said) == 1:
+            merged[name] = said.pop()
+        else:
+            merged |= {at: value for at, value in values.items() if value is not None}
+    return {**merged, MERGED: ", ".join(files)}
+
+
+def _once(samples: Sequence[Sample]) -> Iterator[Sample]:
+    seen: set[tuple[str, int, int, bytes]] = set()
+    for sample in samples:
+        name = (sample.key, sample.counter, sample.wall_ns, sample.payload)
+        if name not in seen:
+            seen.add(name)
+            yield sample

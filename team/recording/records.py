@@ -1,0 +1,133 @@
+"""The records of an MCAP file, one after another, as an untrusted input has to be read.
+
+Every length is checked before it is believed, every chunk's CRC is checked, and a chunk that claims
+to expand beyond what the recorder can have written is refused before it is expanded.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple, cast
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.records import Chunk
+from mcap.writer import MCAP0_MAGIC
+
+from team.wire.codec import LARGEST_PAYLOAD
+
+LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
+"""Bytes of one chunk, expanded: the largest message behind a chunk that was almost full."""
+LARGEST_RATIO = 10_000
+"""Of expanded to compressed bytes; a map of zeros reaches a thousand, a bomb ten thousands."""
+_FRAME = struct.Struct("<BQ")
+_BLOCK = 2**20
+FOOTER_SIZE = _FRAME.size + 20
+MALFORMED = (McapError, UnicodeDecodeError, OverflowError, struct.error)
+"""What mcap raises where a record is not what its opcode says."""
+REPAIR = "`teamslam repair` saves the rest"
+
+
+class LogError(ValueError):
+    """A file that is no log of ours, or a damaged one: which file, what is wrong, what to do."""
+
+    def __init__(self, path: Path, what: str, remedy: str) -> None:
+        super().__init__(f"{path}: {what}; {remedy}")
+        self.path = path
+        self.what = what
+        self.remedy = remedy
+
+
+class DamagedChunkError(LogError):
+    """One chunk can not be read; what comes after it can, by `Log.chunks`."""
+
+
+class Frame(NamedTuple):
+    """One record: where it begins, what it is, and its bytes."""
+
+    offset: int
+    opcode: int
+    body: bytes
+
+
+def index(file: IO[bytes], path: Path) -> Iterator[Frame]:
+    """The records of the summary section; the footer says where it starts (0: there is none)."""
+    file.seek(_FRAME.size - FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
+    (start,) = struct.unpack("<Q", file.read(8))
+    return frames(file, path, start) if start else iter(())
+
+
+def index_damage(file: IO[bytes]) -> str | None:
+    """What is wrong with the index of a complete file; None when its CRC is that of its bytes.
+
+    The CRC spans the summary section and the footer up to the CRC itself; 0: none was written.
+    """
+    end = file.seek(-FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
+    footer = file.read(FOOTER_SIZE)
+    start, _, crc = struct.unpack_from("<QQI", footer, _FRAME.size)
+    if start > end:
+        return f"its index claims to start at {start} of {end} bytes"
+    file.seek(start or end)
+    found, left = 0, end - file.tell()
+    while left:
+        block = file.read(min(left, _BLOCK))
+        found, left = zlib.crc32(block, found), left - len(block)
+    if crc and zlib.crc32(footer[:-4], found) != crc:
+        return "the CRC of its index does not match"
+    return None
+
+
+def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
+    """The whole records of the file from `start`; a record that is cut off is the end."""
+    size = os.fstat(file.fileno()).st_size
+    if start > size:
+        raise LogError(path, f"its index claims to start at {start} of {size} bytes", REPAIR)
+    offset = file.seek(start)
+    while len(head := file.read(_FRAME.size)) == _FRAME.size:
+        opcode, length = _FRAME.unpack(head)
+        if opcode == 0 or offset + _FRAME.size + length > size:
+            return  # zeros, or half a record: what a machine that went down leaves behind
+        if length > LARGEST_CHUNK:
+            what = f"record of {length} bytes at offset {offset}, {LARGEST_CHUNK} at most"
+            raise LogError(path, what, REPAIR)
+        yield Frame(offset, opcode, file.read(length))
+        offset += _FRAME.size + length
+
+
+def records(data: bytes) -> Iterator[Frame]:
+    """The records of an expanded chunk; ValueError where one ends beyond it."""
+    offset = 0
+    while offset < len(data):
+        opcode, length = _FRAME.unpack_from(data, offset)
+        start = offset + _FRAME.size
+        if start + length > len(data):
+            raise ValueError("a record ends beyond its chunk")
+        yield Frame(offset, opcode, data[start : start + length])
+        offset = start + length
+
+
+def expanded(body: bytes) -> bytes:
+    """The records in a chunk record's body.
+
+    Raises ValueError before anything is expanded that can not be ours, one of `MALFORMED` where
+    the body is no chunk, `ZstdError` where it is damaged.
+    """
+    chunk = cast(Chunk, Chunk.read(ReadDataStream(BytesIO(body))))
+    size, packed = chunk.uncompressed_size, len(chunk.data)
+    if size > min(LARGEST_CHUNK, LARGEST_RATIO * packed):
+        raise ValueError(f"{packed} bytes claim to expand to {size}, which no recorder writes")
+    if chunk.compression == "zstd":
+        if zstandard.frame_content_size(chunk.data) != size:
+            raise ValueError("two different sizes are claimed")
+        data = zstandard.decompress(chunk.data, max_output_size=size)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise ValueError(f"compression {chunk.compression!r}, which no recorder of ours writes")
+    if len(data) != size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
+        raise ValueError("the CRC does not match")
+    return data

@@ -1,0 +1,75 @@
+"""What is in a log: messages, bytes, rates and times of each key, and the span of its readings."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from team.recording.reader import Log, LogError
+from team.recording.repair import salvaged
+from team.wire.bus import Sample
+from team.wire.channels import SENSORS, channel_of
+
+FOREIGN = "(no channel)"
+"""The channel of a key that no row of the table has, as those of a viewer."""
+
+
+@dataclass
+class KeySummary:
+    """Messages, payload bytes and team times [ns] of one key; first_ns ≤ last_ns."""
+
+    key: str
+    channel: str
+    messages: int
+    bytes: int
+    first_ns: int
+    last_ns: int
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages per second of team time, (n − 1) / (last − first); None for one instant."""
+        if self.last_ns == self.first_ns:
+            return None
+        return (self.messages - 1) * 1e9 / (self.last_ns - self.first_ns)
+
+    def take(self, sample: Sample) -> None:
+        """Count one more."""
+        self.messages += 1
+        self.bytes += len(sample.payload)
+        self.first_ns = min(self.first_ns, sample.stamp_ns)
+        self.last_ns = max(self.last_ns, sample.stamp_ns)
+
+
+class Summary(NamedTuple):
+    """The keys in the order of their first message, and what of the log can not be read."""
+
+    keys: tuple[KeySummary, ...]
+    damaged: tuple[str, ...]
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """Team time of the first and the last reading; of any message where there is no reading.
+
+        A configuration is announced at team time zero, long before the readings of a data set.
+        """
+        sensors = {channel.name for channel in SENSORS}
+        chosen = [each for each in self.keys if each.channel in sensors] or self.keys
+        if not chosen:
+            return None
+        return min(each.first_ns for each in chosen), max(each.last_ns for each in chosen)
+
+
+def summarised(log: Log) -> Summary:
+    """One pass over every whole chunk of a log, damaged or not."""
+    found: dict[str, KeySummary] = {}
+    damaged = []
+    for chunk in salvaged(log):
+        if isinstance(chunk, LogError):
+            damaged.append(chunk.what)
+            continue
+        for sample in chunk:
+            if sample.key not in found:
+                row = channel_of(sample.key)
+                name = FOREIGN if row is None else row[0].name
+                found[sample.key] = KeySummary(
+                    sample.key, name, 0, 0, sample.stamp_ns, sample.stamp_ns
+                )
+            found[sample.key].take(sample)
+    return Summary(tuple(found.values()), tuple(damaged))
