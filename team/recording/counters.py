@@ -1,8 +1,8 @@
 """The counters of one key: which publications a log lacks, has twice, or has out of order.
 
 A publisher counts what it publishes on a key from 0, and its wall clock ascends with the count. So
-in the order of the wall clock a step of more than one is a gap, and a step back is a publisher that
-was started again.
+in the order of the wall clock a step of more than one is a gap, and a step back, or none, is a
+publisher that was started again.
 """
 
 from array import array
@@ -39,14 +39,13 @@ class Counters:
         """
         counters, walls = (np.frombuffer(each, np.int64) for each in (self._counters, self._walls))
         order = np.lexsort((counters, walls))
-        in_order = counters[order]
         found = []
-        again = np.diff(in_order) == 0
-        again &= np.diff(walls[order]) == 0
+        again = np.append(False, (np.diff(counters[order]) == 0) & (np.diff(walls[order]) == 0))
         if again.any():
-            found.append(
-                f"{_messages(int(again.sum()))} twice, the first is {in_order[:-1][again][0]}"
-            )
+            first = counters[order][again][0]
+            found.append(f"{_messages(int(again.sum()))} twice, the first is {first}")
+        order = order[~again]
+        in_order = counters[order]
         gaps = _gaps(in_order, part=part)
         if gaps:
             lost = sum(last - first + 1 for first, last in gaps)
@@ -63,8 +62,8 @@ class Counters:
 def _gaps(counters: Int64[np.ndarray, " n"], *, part: bool) -> list[tuple[int, int]]:
     """The intervals of counters that are not there; a step back begins again at 0."""
     before = np.concatenate([[-1], counters[:-1]])
-    begins = counters < before
-    begins[0] = True
+    begins = counters <= before
+    begins[:1] = True
     expected = np.where(begins, 0, before + 1)
     missing = counters > expected
     if part:

@@ -1,0 +1,367 @@
+"""Check, cut, merge and CSV: what is wrong is named, and parts put together are the whole."""
+
+import csv
+import json
+import random
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from team.recording.check import checked
+from team.recording.counters import Counters
+from team.recording.csv_tables import export_csv
+from team.recording.cut import CUT, cut
+from team.recording.declared import declared, misdeclared
+from team.recording.merge import MERGED, merge
+from team.recording.reader import Log, LogError, open_log
+from team.recording.recorder import Recorder, RecorderError
+from team.recording.schemas import schema_of
+from team.recording.summary import summarised
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing, Sample
+from team.wire.codec import encoded
+from tests.recording.test_log import chunks_of
+from tests.support import examples, odometry, submap
+
+SECOND = 10**9
+
+
+def sampled(channel: c.Channel, name: str, message: m.Message, counter: int) -> Sample:
+    key = Outgoing(channel, name, message).key
+    return Sample(key, encoded(message), message.stamp_ns, 10**18 + counter, counter)
+
+
+def drive(robot: str, seconds: int) -> list[Sample]:
+    """A configuration at zero, ten odometry readings a second and a submap each second."""
+    out = [sampled(c.ROBOT_CONFIG, robot, m.Configured(0, f"robot/{robot}", 1, bytes(8), "{}"), 0)]
+    for i in range(10 * seconds):
+        stamp = 100 * SECOND + i * SECOND // 10
+        reading = m.Odometry(stamp, robot, 1, i, SECOND // 10, 0.5, 0.1)
+        out.append(sampled(c.ODOMETRY, robot, reading, i))
+        if i % 10 == 9:
+            times = {"stamp_ns": stamp, "start_ns": stamp - SECOND}
+            said = msgspec.structs.replace(submap(i // 10, robot), **times)
+            out.append(sampled(c.SUBMAP, robot, said, i // 10))
+    return out
+
+
+def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
+    with Recorder(path, "t", metadata) as recorder:
+        recorder.write(samples)
+    return open_log(path)
+
+
+def found(log: Log) -> list[str]:
+    return [str(finding) for finding in checked(log)]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "log.mcap"
+
+
+@pytest.fixture
+def whole(path: Path) -> Log:
+    samples = sorted([*drive("alpha", 6), *drive("bravo", 6)], key=lambda s: s.stamp_ns)
+    return recorded(path, samples, seed="7")
+
+
+# Check.
+
+
+def test_nothing_is_wrong_with_a_sound_log(whole: Log) -> None:
+    assert found(whole) == []
+
+
+def test_lost_messages_are_named_by_their_counters(path: Path) -> None:
+    lost = [s for s in drive("alpha", 2) if s.counter not in (3, 4, 8) or "odometry" not in s.key]
+    assert found(recorded(path, lost)) == ["robot/alpha/odometry: 3 messages missing: 3–4, 8"]
+
+
+def test_a_recorder_that_came_late_is_told_but_a_cut_is_not(tmp_path: Path) -> None:
+    late = drive("alpha", 2)[6:]
+    assert found(recorded(tmp_path / "a.mcap", late)) == [
+        "robot/alpha/odometry: 5 messages missing: 0–4"
+    ]
+    assert found(recorded(tmp_path / "b.mcap", late, cut="said")) == []
+
+
+def test_a_publisher_that_starts_again_has_lost_nothing(path: Path) -> None:
+    again = [replace(s, wall_ns=s.wall_ns + 10**9) for s in drive("alpha", 1)]
+    assert found(recorded(path, drive("alpha", 1) + again)) == []
+
+
+def test_a_message_that_is_there_twice_or_late_is_named(path: Path) -> None:
+    samples = drive("alpha", 1)
+    samples[2], samples[5] = samples[5], samples[2]
+    assert found(recorded(path, [*samples, samples[-2]])) == [
+        "robot/alpha/odometry: 1 message twice, the first is 9",
+        "robot/alpha/odometry: 2 messages out of order, the first is 2",
+    ]
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.lists(st.sets(st.integers(1, 30), max_size=12), min_size=1, max_size=4), st.randoms())
+def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(
+    lives: list[set[int]], rng: random.Random
+) -> None:
+    """Each life of a publisher is known by its message 0."""
+    samples = [
+        Sample("robot/alpha/odometry", b"", 0, 1_000 * life + counter, counter)
+        for life, kept in enumerate(lives)
+        for counter in sorted({0, *kept})
+    ]
+    lost = sum(max(kept, default=0) - len(kept) for kept in lives)
+    rng.shuffle(samples)
+    counters = Counters()
+    for sample in samples:
+        counters.take(sample)
+    lines = counters.findings(part=False, sorted_by_time=True)
+    assert [line.split(" missing")[0].split()[0] for line in lines] == ([str(lost)] if lost else [])
+
+
+def test_unsound_messages_are_counted_and_the_first_is_explained(path: Path) -> None:
+    samples = drive("alpha", 1)
+    samples[3] = replace(samples[3], payload=samples[3].payload[:-1])
+    samples[4] = replace(samples[4], payload=encoded(odometry(4, "bravo")))
+    samples[5] = replace(samples[5], stamp_ns=5)
+    (line,) = found(recorded(path, samples))
+    assert line.startswith("robot/alpha/odometry: 3 unsound, the first: message 2: truncated")
+    samples[3:5] = drive("alpha", 1)[3:5]
+    (line,) = found(recorded(path.with_name("b.mcap"), samples))
+    assert line.endswith("message 4: logged at 5 ns, of 100400000000 ns")
+
+
+def flip(path: Path, offset: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[offset] ^= 1
+    path.write_bytes(data)
+
+
+def test_a_flipped_bit_is_found_in_a_chunk_and_in_the_index(whole: Log) -> None:
+    ((offset, length),) = chunks_of(whole.path)
+    flip(whole.path, offset + length - 5)
+    assert found(whole)[0].startswith(f"file: damaged chunk at offset {offset}")
+    flip(whole.path, offset + length - 5)
+    size = whole.path.stat().st_size
+    start = struct.unpack_from("<Q", whole.path.read_bytes(), size - len(MCAP0_MAGIC) - 20)[0]
+    flip(whole.path, (start + size) // 2)
+    assert "file: the CRC of its index does not match" in found(whole)
+
+
+def test_a_log_without_its_end_is_told(whole: Log) -> None:
+    whole.path.write_bytes(whole.path.read_bytes()[:-40])
+    assert found(open_log(whole.path)) == ["file: its recorder did not finish it"]
+
+
+def foreign(path: Path, key: str, encoding: str, schema: str, text: bytes) -> Log:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("teamslam", {"team": "t"})
+        number = writer.register_schema(schema, "jsonschema", text)
+        writer.register_channel(f"team/t/{key}", encoding, number)
+        writer.finish()
+    return open_log(path)
+
+
+SHORTER = json.loads(schema_of(m.Submap))
+SHORTER["$defs"]["Submap"]["prefixItems"][-2:] = []
+OTHER = schema_of(m.Submap).replace(b'"integer"', b'"number"')
+
+
+@pytest.mark.parametrize(
+    ("key", "encoding", "schema", "text", "told"),
+    [
+        ("robot/r1/submap", "msgpack", "submap/1", schema_of(m.Submap), None),
+        ("robot/r1/submap", "msgpack", "submap/1", json.dumps(SHORTER).encode(), None),
+        ("robot/r1/submap", "msgpack", "submap/1", OTHER, "its schema is not that of submap/1"),
+        ("robot/r1/submap", "msgpack", "submap/1", b"[", "its schema is not that of submap/1"),
+        ("robot/r1/submap", "msgpack", "submap/2", b"{}", "declared as msgpack, submap/2; its"),
+        ("robot/r1/submap", "json", "submap/1", b"{}", "declared as json, submap/1; its messages"),
+        ("robot/r1/banana", "msgpack", "submap/1", b"{}", "no channel has this key"),
+        ("view/scene", "protobuf", "foxglove.SceneUpdate", b"", None),
+    ],
+)
+def test_a_schema_is_held_against_its_channel(
+    path: Path, key: str, encoding: str, schema: str, text: bytes, told: str | None
+) -> None:
+    found = misdeclared(declared(foreign(path, key, encoding, schema, text))[key])
+    assert found is None if told is None else found is not None and found.startswith(told)
+
+
+# Summary.
+
+
+def test_a_summary_counts_and_its_span_is_that_of_the_readings(whole: Log) -> None:
+    summary = summarised(whole)
+    of = {each.key: each for each in summary.keys}
+    assert {key: each.messages for key, each in of.items()} == {
+        key: count.messages for key, count in whole.counts().items()
+    }
+    assert summary.span_ns() == (100 * SECOND, 105_900_000_000)
+    assert of["robot/alpha/odometry"].rate_hz == pytest.approx(10.0)
+    assert of["robot/alpha/submap"].rate_hz == pytest.approx(1.0)
+    assert of["robot/alpha/config"].rate_hz is None
+
+
+# Cut and merge.
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.floats(-1.0, 7.0))
+def test_two_parts_of_a_log_merge_to_the_log_in_time_order(
+    tmp_path_factory: pytest.TempPathFactory, at_s: float
+) -> None:
+    folder = tmp_path_factory.mktemp("parts")
+    log = recorded(folder / "log.mcap", [*drive("bravo", 6), *drive("alpha", 6)])
+    parts = []
+    for name, bounds in (("a", (None, at_s)), ("b", (at_s, None))):
+        try:
+            cut(log, folder / f"{name}.mcap", *bounds)
+        except LogError:  # nothing in it
+            assert not 0.0 < at_s <= 5.9
+        else:
+            parts.append(open_log(folder / f"{name}.mcap"))
+    merged = merge(parts, folder / "m.mcap")
+    again = open_log(folder / "m.mcap")
+    assert list(again.samples()) == log.in_time_order()
+    assert merged.duplicates == (2 if len(parts) == 2 else 0)  # configurations hold in both
+    assert [line for part in [*parts, again] for line in found(part)] == []
+
+
+def test_a_cut_has_its_stretch_its_channels_and_what_holds_in_it(
+    whole: Log, tmp_path: Path
+) -> None:
+    count = cut(whole, tmp_path / "a.mcap", 2.0, 4.0, [c.ODOMETRY, c.ROBOT_CONFIG])
+    part = list(open_log(tmp_path / "a.mcap").samples())
+    assert count == len(part) == 2 + 2 * 20
+    driven = [s for s in part if s.key.endswith("odometry")]
+    assert {s.stamp_ns for s in driven} == {102 * SECOND + i * SECOND // 10 for i in range(20)}
+    assert {s.key for s in part} - {s.key for s in driven} == {
+        "robot/alpha/config", "robot/bravo/config",
+    }  # fmt: skip
+
+
+def test_every_cut_is_noted_in_the_metadata(whole: Log, tmp_path: Path) -> None:
+    cut(whole, tmp_path / "a.mcap", 2.0)
+    cut(open_log(tmp_path / "a.mcap"), tmp_path / "b.mcap", to_s=1.0, channels=[c.ODOMETRY])
+    metadata = open_log(tmp_path / "b.mcap").metadata
+    assert metadata["seed"] == "7"
+    assert metadata[CUT] == (
+        "log.mcap: [2, ) s since 100000000000 ns, all channels; "
+        "a.mcap: [, 1) s since 102000000000 ns, odometry"
+    )
+
+
+@pytest.mark.parametrize("bounds", [(6.0, None), (None, 0.0), (2.01, 2.02)])
+def test_a_cut_with_nothing_in_it_is_refused(
+    tmp_path: Path, bounds: tuple[float | None, float | None]
+) -> None:
+    log = recorded(tmp_path / "log.mcap", [s for s in drive("alpha", 6) if "config" not in s.key])
+    with pytest.raises(LogError, match=r"nothing of it is in this cut; its readings are .* 5\.900"):
+        cut(log, tmp_path / "a.mcap", *bounds)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_damage_is_told_before_a_new_log_is_made(whole: Log, tmp_path: Path) -> None:
+    ((offset, length),) = chunks_of(whole.path)
+    flip(whole.path, offset + length - 5)
+    with pytest.raises(LogError, match=r"damaged chunk .* log repair` saves the rest"):
+        cut(whole, tmp_path / "a.mcap", 1.0)
+    with pytest.raises(LogError, match="damaged chunk"):
+        merge([whole], tmp_path / "a.mcap")
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_neither_overwrites(whole: Log) -> None:
+    with pytest.raises(RecorderError, match="exists"):
+        cut(whole, whole.path)
+    with pytest.raises(RecorderError, match="exists"):
+        merge([whole], whole.path)
+
+
+def test_robots_own_logs_merge_once_and_stably(tmp_path: Path) -> None:
+    a = recorded(tmp_path / "a.mcap", drive("alpha", 3), seed="7", host="x")
+    b = recorded(tmp_path / "b.mcap", [*drive("alpha", 1), *drive("bravo", 3)], seed="7", host="y")
+    merged = merge([a, b], tmp_path / "m.mcap")
+    log = open_log(tmp_path / "m.mcap")
+    both = [*drive("alpha", 3), *drive("bravo", 3)]
+    assert list(log.samples()) == sorted(both, key=lambda s: s.stamp_ns)
+    assert merged == (len(both), len(drive("alpha", 1)))
+    assert log.metadata == {
+        "seed": "7", "host@a.mcap": "x", "host@b.mcap": "y", MERGED: "a.mcap, b.mcap",
+    }  # fmt: skip
+
+
+def test_what_differs_of_logs_of_one_name_is_numbered(tmp_path: Path) -> None:
+    logs = []
+    for robot in ("alpha", "bravo"):
+        (tmp_path / robot).mkdir()
+        logs.append(recorded(tmp_path / robot / "log.mcap", drive(robot, 1), host=robot))
+    merge(logs, tmp_path / "m.mcap")
+    metadata = open_log(tmp_path / "m.mcap").metadata
+    assert metadata["host@1:log.mcap"] == "alpha"
+    assert metadata["host@2:log.mcap"] == "bravo"
+
+
+def test_logs_of_two_teams_are_not_merged(whole: Log, tmp_path: Path) -> None:
+    with Recorder(tmp_path / "u.mcap", "u", {}) as recorder:
+        recorder.write(drive("alpha", 1))
+    with pytest.raises(LogError, match=r"u\.mcap: a log of team 'u', not 't' as .*log\.mcap is"):
+        merge([whole, open_log(tmp_path / "u.mcap")], tmp_path / "m.mcap")
+
+
+# CSV.
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2**32 - 1), st.floats(0, 1e9), st.floats(-3.14, 3.14)), max_size=5
+    )
+)
+def test_numbers_read_back_from_csv_are_the_same(
+    tmp_path_factory: pytest.TempPathFactory, seen: list[tuple[int, float, float]]
+) -> None:
+    folder = tmp_path_factory.mktemp("csv")
+    ids, ranges, bearings = ([row[i] for row in seen] for i in range(3))
+    message = m.Observations(
+        5, "alpha", 1, 9, from_ids(ids), from_floats(ranges), from_floats(bearings)
+    )
+    log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
+    export_csv(log, folder / "out")
+    (row,) = rows_of(folder / "out" / "observations.csv")
+    assert (row["key"], row["counter"], row["reading"]) == ("robot/alpha/observations", "3", "9")
+    assert from_ids([int(word) for word in row["ids"].split()]) == message.ids
+    for name in ("ranges", "bearings"):
+        back = np.array([float(word) for word in row[name].split()])
+        assert from_floats(back) == getattr(message, name)
+
+
+def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: Path) -> None:
+    by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
+    kept = [message for message in examples() if type(message) in by_class]
+    samples = [sampled(by_class[type(x)], "alpha", x, i) for i, x in enumerate(kept)]
+    samples += [replace(samples[0], payload=b"\x90"), Sample("view/scene", b"?", 0, 0, 0)]
+    exported = export_csv(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
+    assert exported.unsound == 1
+    assert {path.stem for path in exported.rows} == {by_class[type(x)].name for x in kept}
+    for path, count in exported.rows.items():
+        rows = rows_of(path)
+        assert len(rows) == count
+        assert list(rows[0])[:3] == ["key", "counter", "wall_ns"]
