@@ -120,6 +120,11 @@ class HybridMember:
         """The open window's Gaussian at its last epoch."""
         return windows.gaussian(self._window)
 
+    @property
+    def window(self) -> Window:
+        """The open window."""
+        return self._window
+
     def _advance(self, epoch: Epoch) -> None:
         self._window = windows.advanced(
             self._window,
