@@ -3,6 +3,7 @@
 import json
 import time
 from datetime import datetime
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,7 +34,9 @@ app = typer.Typer()
 def launch(
     scenario: Annotated[
         str | None,
-        typer.Argument(help="A built-in scenario or a .toml file; utias with --dataset."),
+        typer.Argument(
+            help="A built-in scenario or a .toml file; default: thesis, with --dataset utias."
+        ),
     ] = None,
     dataset: Dataset = None,
     robots: Robots = None,
@@ -93,10 +96,21 @@ def launch(
 
 
 @app.command()
-def scenarios() -> None:
-    """List the built-in scenarios."""
+def scenarios(
+    show: Annotated[
+        str | None, typer.Option(help="Print this one as TOML, to read or to begin with.")
+    ] = None,
+) -> None:
+    """List the built-in scenarios, or show one."""
     from sim.scenario import builtin_names, load
 
+    if show is not None:
+        if show not in builtin_names():
+            known = ", ".join(builtin_names())
+            fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
+        text = files("sim.scenarios").joinpath(f"{show}.toml").read_text("utf-8")
+        typer.echo(text, nl=False)
+        return
     for name in builtin_names():
         found = load(name)
         typer.echo(f"{name:12} {len(found.robots)} robots, {found.estimator} with {found.fusion}")

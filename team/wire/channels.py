@@ -1,7 +1,8 @@
 """The table of channels: the only place where a key is spelt.
 
 Keys are relative to the team; a bus puts `team/<team name>/` before them. `{robot}` stands for a
-robot's name, `{node}` for `world`, `central`, `recorder` or `robot/<name>`.
+robot's name, `{node}` for `world`, `central`, `recorder` or `robot/<name>`. In the rates a life is
+one incarnation of a robot's stream (the messages' `epoch`), a keyframe one epoch of observation.
 """
 
 import re
@@ -44,7 +45,7 @@ class Channel:
         return None if match is None else match.groupdict().get("name", "")
 
 
-START = Channel("start", "robot/{robot}/start", m.Start, "once per epoch", "all", True, False,
+START = Channel("start", "robot/{robot}/start", m.Start, "once per life of the stream", "all", True, False,
                 "reading 0: the start pose, if known")  # fmt: skip
 ODOMETRY = Channel("odometry", "robot/{robot}/odometry", m.Odometry, "8-100 Hz", "stream", True,
                    False, "one odometry interval")  # fmt: skip
@@ -59,7 +60,7 @@ TRUTH = Channel("truth", "truth/{robot}", m.Truth, "1 Hz, batched", "all", True,
 TRUTH_LANDMARKS = Channel("truth_landmarks", "truth_landmarks", m.TruthLandmarks, "once", "latest",
                           True, False, "true landmarks; the evaluator's only")  # fmt: skip
 
-ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configured, "once per epoch",
+ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configured, "once per life of the stream",
                        "latest", True, False, "the robot's configuration")  # fmt: skip
 SUBMAP = Channel("submap", "robot/{robot}/submap", m.Submap, "one per window", "all", True, True,
                  "what the rule `join` consumes")  # fmt: skip
@@ -69,15 +70,15 @@ SIGHTING_FACTOR = Channel("sighting_factor", "robot/{robot}/sighting_factor", m.
 OWN_MAP = Channel("own_map", "robot/{robot}/own/map", m.MapEstimate, "one per window or exchange",
                   "latest", True, True,
                   "running landmark means and covariances; consumed by rules with feedback")  # fmt: skip
-OWN_POSE = Channel("own_pose", "robot/{robot}/own/pose", m.PoseEstimate, "one per epoch", "latest",
+OWN_POSE = Channel("own_pose", "robot/{robot}/own/pose", m.PoseEstimate, "one per keyframe", "latest",
                    True, True, "running pose from own readings alone")  # fmt: skip
-TEAM_POSE = Channel("team_pose", "robot/{robot}/team/pose", m.PoseEstimate, "one per epoch",
+TEAM_POSE = Channel("team_pose", "robot/{robot}/team/pose", m.PoseEstimate, "one per keyframe",
                     "latest", True, True, "pose given the fused map; never an input of fusion")  # fmt: skip
 PARTICLES = Channel("particles", "robot/{robot}/particles", m.ParticleCloud, "one per window",
                     "latest", True, True, "thinned cloud, for viewers")  # fmt: skip
 ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 readings",
                          "latest", True, False, "credit for the world")  # fmt: skip
-ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per epoch", "latest", True,
+ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per life of the stream", "latest", True,
                      True, "all readings consumed, last submap sent")  # fmt: skip
 
 CENTRAL_CONFIG = Channel("central_config", "central/config", m.Configured, "once", "latest", True,
@@ -88,7 +89,7 @@ PRIOR = Channel("prior", "central/prior/{robot}", m.Prior, "one per broadcast", 
                 True, "the joint marginal that a robot needs")  # fmt: skip
 FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
                     "the team's map with its joint covariance")  # fmt: skip
-TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per epoch",
+TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per life of the stream",
                      "all", True, True, "smoothed end poses of the submaps")  # fmt: skip
 CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress,
                            "one per submap", "latest", True, False, "credit for the robots")  # fmt: skip
