@@ -100,6 +100,22 @@ def test_a_publisher_that_starts_again_has_lost_nothing(path: Path) -> None:
     assert found(recorded(path, drive("alpha", 1) + again)) == []
 
 
+def test_a_publisher_that_starts_again_unheard_is_told(path: Path) -> None:
+    first = [s for s in drive("alpha", 1) if "odometry" in s.key][:3]
+    again = [replace(s, wall_ns=s.wall_ns + 10**9) for s in first[2:]]
+    assert found(recorded(path, first + again)) == ["robot/alpha/odometry: 2 messages missing: 0–1"]
+
+
+def test_what_no_publisher_counts_is_not_held_against_its_counters(path: Path) -> None:
+    alive = [sampled(c.ALIVE, "central", m.Liveliness(0, "central", up), 0) for up in (True, False)]
+    own = sampled(c.STATUS, "recorder", m.Status(0, "recorder", "recording", {}), 4)
+    assert found(recorded(path, [*alive, own])) == []
+    other = sampled(c.STATUS, "central", m.Status(0, "central", "waiting", {}), 4)
+    assert found(recorded(path.with_name("b.mcap"), [other])) == [
+        "central/status: 4 messages missing: 0–3"
+    ]
+
+
 def test_a_message_that_is_there_twice_or_late_is_named(path: Path) -> None:
     samples = drive("alpha", 1)
     samples[2], samples[5] = samples[5], samples[2]
@@ -301,6 +317,14 @@ def test_robots_own_logs_merge_once_and_stably(tmp_path: Path) -> None:
     assert log.metadata == {
         "seed": "7", "host@a.mcap": "x", "host@b.mcap": "y", MERGED: "a.mcap, b.mcap",
     }  # fmt: skip
+
+
+def test_what_a_robot_says_again_after_a_restart_is_no_duplicate(tmp_path: Path) -> None:
+    first = drive("alpha", 1)[0]
+    twice = [first, replace(first, wall_ns=first.wall_ns + 10**9)]
+    log = recorded(tmp_path / "a.mcap", twice)
+    assert merge([log, log], tmp_path / "m.mcap") == (2, 2)
+    assert list(open_log(tmp_path / "m.mcap").samples()) == twice
 
 
 def test_what_differs_of_logs_of_one_name_is_numbered(tmp_path: Path) -> None:
