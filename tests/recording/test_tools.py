@@ -1,5 +1,6 @@
 """Check, cut, merge and CSV: what is wrong is named, and parts put together are the whole."""
 
+import contextlib
 import csv
 import json
 import random
@@ -177,6 +178,24 @@ def test_a_flipped_bit_is_found_in_a_chunk_and_in_the_index(whole: Log) -> None:
 def test_a_log_without_its_end_is_told(whole: Log) -> None:
     whole.path.write_bytes(whole.path.read_bytes()[:-40])
     assert found(open_log(whole.path)) == ["file: its recorder did not finish it"]
+
+
+@settings(deadline=None, max_examples=120)
+@given(st.data())
+def test_a_damaged_log_is_told_of_and_never_a_crash(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "checked.mcap"
+    path.unlink(missing_ok=True)
+    damaged = bytearray(recorded(path, drive("alpha", 2)).path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(damaged[: data.draw(st.integers(len(damaged) // 2, len(damaged)))])
+    with contextlib.suppress(LogError):
+        log = open_log(path)
+        lines = found(log)
+        assert not summarised(log).damaged or lines
+        assert log.complete or lines
 
 
 def foreign(path: Path, key: str, encoding: str, schema: str, text: bytes) -> Log:
