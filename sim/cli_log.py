@@ -200,7 +200,8 @@ def _line(text: str) -> str:
 def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> "Table":
     """Messages, bytes, rate of one key, first and last time [s after start_ns], by key or channel.
 
-    The rate of a channel is the mean of those of its keys.
+    The rate of a channel is the mean of those of its keys; a key that begins before start_ns, as
+    what is said at team time zero of a data set, has none.
     """
     from rich.table import Table
     from rich.text import Text
@@ -212,14 +213,19 @@ def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> 
     for title in ("keys", "messages", "bytes", "Hz", "from s", "to s"):
         table.add_column(title, justify="right")
     for name, of in groups.items():
-        rates = [each.rate_hz for each in of if each.rate_hz is not None]
+        running = [each.rate_hz for each in of if each.first_ns >= start_ns]
+        rates = [rate for rate in running if rate is not None]
         table.add_row(
             Text(_line(name)),
             str(len(of)),
             str(sum(each.messages for each in of)),
             str(sum(each.bytes for each in of)),
             f"{sum(rates) / len(rates):.3g}" if rates else "",
-            f"{(min(each.first_ns for each in of) - start_ns) * 1e-9:.1f}",
-            f"{(max(each.last_ns for each in of) - start_ns) * 1e-9:.1f}",
+            _after(min(each.first_ns for each in of), start_ns),
+            _after(max(each.last_ns for each in of), start_ns),
         )
     return table
+
+
+def _after(stamp_ns: int, start_ns: int) -> str:
+    return "before" if stamp_ns < start_ns else f"{(stamp_ns - start_ns) * 1e-9:.1f}"

@@ -60,6 +60,17 @@ def test_info_fits_eighty_columns_and_steers_no_terminal(
     assert ("robot/r1/odometry" if options else "odometry") in out
 
 
+def test_what_is_said_before_the_readings_has_neither_time_nor_rate(tmp_path: Path) -> None:
+    late = [s for s in published() if "odometry" in s.key and s.counter > 5]
+    config = next(s for s in published() if s.key == "world/config")
+    with Recorder(tmp_path / "late.mcap", "small", {}) as recorder:
+        recorder.write([config, *late])
+    rows = [line.split("│")[1:-1] for line in run("info", tmp_path / "late.mcap")[1].splitlines()]
+    cells = {row[0].strip(): [cell.strip() for cell in row[3:]] for row in rows if row}
+    assert cells["world_config"][1:] == ["", "before", "before"]
+    assert cells["odometry"][1:] == ["1", "0.0", "13.0"]
+
+
 def test_the_figures_of_info_are_written_for_machines(log: Path, tmp_path: Path) -> None:
     assert run("info", log, "--json", tmp_path / "info.json")[0] == 0
     figures = json.loads((tmp_path / "info.json").read_text())
