@@ -10,6 +10,7 @@ from central.node import CentralNode
 from team.shell import WAIT_S, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.arrays import ids
 from team.wire.bus import Bus, Sample, opened
 
 PATIENCE_S = 3.0
@@ -50,6 +51,12 @@ class CentralShell:
             self._shell.take(self._given_up())
             self._shell.report()
         self._shell.report(last=True)
+        final = self.node.final
+        if final is None:
+            _LOG.info("ended without a final map")
+        else:
+            digest = final.digest.hex()
+            _LOG.info("final map of %d landmarks, set %s", len(ids(final.ids, "ids")), digest)
         self._leave_last()
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:

@@ -1,6 +1,7 @@
 """`teamslam launch` and `teamslam scenarios`."""
 
 import json
+import threading
 import time
 from datetime import datetime
 from importlib.resources import files
@@ -22,11 +23,13 @@ from sim.cli_options import (
     parsed_speed,
     scenario_of,
 )
-from sim.scenario import Scenario, with_options
+from sim.scenario import Scenario, doubts, with_options
 
 if TYPE_CHECKING:
     from sim.launch import Outcome
 
+PREPARING_S = 2.0
+"""The kernels are spoken of when they take longer: then they are being compiled."""
 app = typer.Typer()
 
 
@@ -78,6 +81,8 @@ def launch(
         dataset=dataset,
     )
     _check_world(resolved)
+    for text in doubts(resolved):
+        typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)
     folder = output or _new_folder(resolved)
@@ -159,10 +164,18 @@ def _keep_earlier(log: Path) -> None:
 def _prepare(scenario: Scenario) -> None:
     from sim.warm_up import warm_up
 
+    text = "preparing the kernels (compiled once per machine) …"
+    said = threading.Timer(PREPARING_S, typer.echo, [text], {"err": True})
+    said.start()
     began = time.monotonic()
-    typer.echo("preparing the kernels (compiled once per machine) …", err=True)
-    warm_up(scenario.estimator, scenario.fusion)
-    typer.echo(f"kernels ready after {time.monotonic() - began:.1f} s", err=True)
+    try:
+        warm_up(scenario.estimator, scenario.fusion)
+    finally:
+        said.cancel()
+        said.join()
+    took = time.monotonic() - began
+    if took > PREPARING_S:
+        typer.echo(f"kernels ready after {took:.1f} s", err=True)
 
 
 def _conclude(

@@ -1,5 +1,6 @@
 """One process each: router, world, robot, central, record. `launch` starts these very commands."""
 
+import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -19,9 +20,10 @@ from sim.cli_options import (
     parsed_speed,
     scenario_of,
 )
-from sim.scenario import Scenario, with_options
+from sim.scenario import Scenario, doubts, with_options
 
 LOOPBACK = "tcp/127.0.0.1:7447"
+_LOG = logging.getLogger("teamslam")
 
 app = typer.Typer()
 
@@ -42,6 +44,10 @@ def _scenario(
         fusion=fusion,
         dataset=dataset,
     )
+
+
+def _connected(scenario: Scenario, connect: str) -> None:
+    _LOG.info("connected to team %s at %s", scenario.team, connect)
 
 
 @app.command()
@@ -83,6 +89,9 @@ def world(
     resolved = _scenario(scenario, robots, seed, None, None, dataset)
     streams = streams_of(resolved)
     with process("world") as stop, ZenohBus(resolved.team, connect) as bus:
+        _connected(resolved, connect)
+        for text in doubts(resolved):
+            _LOG.warning("%s", text)
         run_world(bus, resolved, streams, stop, speed=pace, recorder=recorder, cache=cache)
 
 
@@ -112,6 +121,7 @@ def robot(
             WRONG_USE,
         )
     with process(f"robot-{name}") as stop, ZenohBus(resolved.team, connect) as bus:
+        _connected(resolved, connect)
         RobotShell(bus, configs[name], stop).run()
 
 
@@ -135,6 +145,7 @@ def central(
     resolved = _scenario(scenario, robots, seed, estimator, fusion)
     names = [config.id for config in resolved.robots]
     with process("central") as stop, ZenohBus(resolved.team, connect) as bus:
+        _connected(resolved, connect)
         CentralShell(bus, resolved.central, names, stop, patience).run()
 
 
@@ -163,4 +174,6 @@ def record(
     expected = ["world", "central", *(robot_node(r.id) for r in resolved.robots)]
     with process("recorder", endless=True) as stop, ZenohBus(resolved.team, connect) as bus:
         recorder = Recorder(output, resolved.team, metadata)
-        record_until_end(bus, recorder, expected, stop=stop)
+        _connected(resolved, connect)
+        written = record_until_end(bus, recorder, expected, stop=stop)
+        _LOG.info("wrote %s, %d messages", output, written)

@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,12 +40,16 @@ class Outcome:
 
 @dataclass
 class Watch:
-    """What is known of the team while it runs: the last status of each node, and the last map."""
+    """What is known of the team while it runs: the last status of each node, and the last map.
+
+    robots: how many there are to be.
+    """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
     fused: m.FusedMap | None = None
     failures: list[str] = field(default_factory=list)
     began: float = field(default_factory=time.monotonic)
+    robots: int = 0
 
     def take(self, bus: Bus) -> None:
         """Take what has come since."""
@@ -83,7 +87,7 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     plan.folder.mkdir(parents=True, exist_ok=True)
     resolved = plan.folder / "scenario.json"
     resolved.write_text(dumps(plan.scenario))
-    watch = Watch(began=began)
+    watch = Watch(began=began, robots=len(plan.scenario.robots))
     with _interruptible(), _children() as children:
         endpoint = _start_router(plan, children)
         with ZenohBus(plan.scenario.team, endpoint) as bus:
@@ -92,7 +96,11 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
             bus.subscribe(ch.FINAL_MAP)
             for name, arguments in _commands(plan, resolved, endpoint):
                 children.append(Child(name, arguments, plan.folder))
-            _supervise(children, bus, watch, show)
+            again = {
+                f"robot-{r.id}": f"teamslam robot {resolved} {r.id} --connect {endpoint}"
+                for r in plan.scenario.robots
+            }
+            _supervise(children, bus, watch, show, again)
         ended = end_all(children)
     failures = watch.failures + [
         _failure(e)
@@ -152,9 +160,16 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
 
 
 def _supervise(
-    children: Sequence[Child], bus: Bus, watch: Watch, show: Callable[[Watch], None]
+    children: Sequence[Child],
+    bus: Bus,
+    watch: Watch,
+    show: Callable[[Watch], None],
+    again: Mapping[str, str],
 ) -> None:
-    """Until every process but the router has ended, or an essential one has failed."""
+    """Until every process but the router has ended, or an essential one has failed.
+
+    again: the commands that start those anew which a run can lose, by name.
+    """
     named: dict[str, m.Status | None] = {}  # a process that died -> the world's status then
     while True:
         try:
@@ -166,7 +181,7 @@ def _supervise(
             if child.exit in (None, 0) or child.name in named:
                 continue
             named[child.name] = watch.statuses.get("world")
-            watch.failures.append(_failure(child.ended()))
+            watch.failures.append(_failure(child.ended(), again.get(child.name)))
             if child.name in _ESSENTIAL:
                 return
         if _waits_in_vain(watch.statuses.get("world"), named.values()):
@@ -184,8 +199,10 @@ def _waits_in_vain(world: m.Status | None, then: Iterable[m.Status | None]) -> b
     return world is not None and world.state == "waiting" and any(world is not s for s in then)
 
 
-def _failure(ended: Ended) -> str:
-    tail = "\n".join(f"    {line}" for line in ended.last_lines)
-    return f"{ended.name} (pid {ended.pid}) {ended.how}" + (
-        f"; its last lines:\n{tail}" if tail else ""
-    )
+def _failure(ended: Ended, again: str | None = None) -> str:
+    parts = [f"{ended.name} (pid {ended.pid}) {ended.how}"]
+    if again is not None:
+        parts.append(f"while the others go on, start it again by: {again}")
+    if ended.last_lines:
+        parts.append("its last lines:\n" + "\n".join(f"    {line}" for line in ended.last_lines))
+    return "; ".join(parts)

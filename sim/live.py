@@ -51,6 +51,9 @@ class _Lines:
         self._due = now + LINE_S
         world = watch.statuses["world"].figures
         robots = [s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")]
+        if watch.statuses["world"].state == "waiting":
+            self._print(watch, f"waiting: {len(robots)} of {watch.robots} robots")
+            return
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4

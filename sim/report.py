@@ -14,6 +14,9 @@ from rich.text import Text
 from sim.evaluation import Evaluation, RobotResult
 from sim.pictures import error_picture, map_picture
 
+ABSURD_NEES = 1000
+"""Beyond this a NEES per dof is over-confident by any measure."""
+_COUNT_AGAIN = ("kalman", "kalman-per-axis")
 Rows = Sequence[tuple[str, str]]
 
 _STYLE = """
@@ -30,7 +33,7 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     team = Table(title=Text(_title(evaluation)), show_header=False)
     for name, value in _team_rows(evaluation):
         team.add_row(Text(name), Text(value))
-    robots = Table(caption=_ROBOT_NOTE)
+    robots = Table(caption=_robot_note(evaluation))
     for heading in _ROBOT_HEADINGS:
         robots.add_column(Text(heading), justify="left" if heading == "robot" else "right")
     for name, robot in evaluation.robots.items():
@@ -76,7 +79,7 @@ def _page(evaluation: Evaluation, pictures: Sequence[Path], provenance: Mapping[
         *(f"<p>{_image(path)}</p>" for path in pictures),
         "<h2>Robots</h2>",
         _html_table(_ROBOT_HEADINGS, robots),
-        f"<p>{_ROBOT_NOTE}</p>",
+        f"<p>{_robot_note(evaluation)}</p>",
         "<h2>What became of the readings</h2>",
         _html_table(("robot", "disposition", "readings"), _ledger_rows(evaluation)),
         *(f"<p>{escape(note)}</p>" for note in notes),
@@ -129,19 +132,34 @@ def _team_rows(evaluation: Evaluation) -> Rows:
             ("after rigid alignment", _shown(errors.aligned_rmse_m, ".3f", " m")),
             (
                 "map NEES per dof",
-                f"{errors.nees_per_dof:.4g}, {verdict} 95 % of {low:.2f}…{high:.2f} ({kind})",
+                _absurd(evaluation)
+                if errors.nees_per_dof > ABSURD_NEES
+                else f"{errors.nees_per_dof:.4g}, {verdict} 95 % of {low:.2f}…{high:.2f} ({kind})",
             ),
         ]
     rows.append(("joint cost per dof", _shown(fused.cost_per_dof, ".3f", "")))
-    rows.append(("final map", f"{fused.digest}, frame {fused.frame or '–'}"))
+    rows.append(("final map, its set", f"{fused.digest}, frame {fused.frame or '–'}"))
     if evaluation.unsound:
         rows.append(("unsound messages", str(evaluation.unsound)))
     return rows
 
 
-_ROBOT_NOTE = "a step is one odometry interval; errors of smoothed poses, * of online ones"
+def _absurd(evaluation: Evaluation) -> str:
+    """The digits of a NEES of 1e18 say nothing to people; why it is so large does."""
+    scenario = evaluation.scenario
+    again = scenario is not None and scenario.fusion in _COUNT_AGAIN
+    why = " (this rule counts readings again)" if again else ""
+    return f"> {ABSURD_NEES}: over-confident{why}"
+
+
+def _robot_note(evaluation: Evaluation) -> str:
+    online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
+    star = ", * of online ones" if online else ""
+    return f"a step is one odometry interval; errors of smoothed poses{star}"
+
+
 _ROBOT_HEADINGS = (
-    "robot", "steps", "readings\nused/sent", "sub-\nmaps", "position\nRMSE [m]",
+    "robot", "steps", "readings\naccounted\nfor/sent", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
 )  # fmt: skip
 

@@ -32,7 +32,7 @@ def comparison_rows(recorded: Evaluation, changed: Evaluation) -> list[Row]:
             lambda e: _shown(None if e.map is None else e.map.cost_per_dof, ".4g"),
         ),
         ("maps broadcast", lambda e: str(_messages(e, "central/map"))),
-        ("final map", lambda e: "–" if e.map is None else e.map.payload_sha256[:16]),
+        ("final map, its bytes", lambda e: "–" if e.map is None else e.map.payload_sha256[:16]),
     )
     rows = [(name, of(recorded), of(changed)) for name, of in of_the_team]
     for name in sorted(recorded.robots.keys() | changed.robots.keys()):

@@ -24,10 +24,11 @@ from sim.scenario_document import (
     resolved,
 )
 from sim.worlds import SimulatedWorld, UtiasWorld, World
-from team.config import Estimator, FusionRule, RobotConfig
+from team.config import Estimator, FusionRule, MotionNoise, RobotConfig
 from team.robot.pairs import PAIRS, named_pairs
 
-__all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads", "with_options"]
+__all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
+           "with_options"]  # fmt: skip
 
 WORLDS: dict[str, type[World]] = {"simulated": SimulatedWorld, "utias": UtiasWorld}
 
@@ -105,6 +106,26 @@ def loads(text: str) -> Scenario:
     return _converted(fields)
 
 
+def doubts(scenario: Scenario) -> list[str]:
+    """What is valid, but hardly meant, in words: a simulated robot whose odometry has no noise."""
+    if not isinstance(scenario.world, SimulatedWorld):
+        return []
+    none = MotionNoise()
+    return [
+        f"{robot.id}: odometry without noise; give it some in [defaults.motion]"
+        for robot in scenario.robots
+        if all(
+            noise == none
+            for noise in (
+                robot.motion.forward,
+                robot.motion.turn,
+                robot.motion.final_turn,
+                robot.motion.lateral,
+            )
+        )
+    ]
+
+
 def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
     """So many robots: the first ones as they are, further ones after their pattern in turn."""
     checked_count(count)
@@ -150,6 +171,8 @@ def _filled(scenario: Scenario) -> Scenario:
 
 
 def _check_team(ids: list[str], world: World) -> None:
+    if not ids:
+        raise ScenarioError("no robots: give robot_count, [[robots]], or a base that has some")
     checked_count(len(ids))
     for i, robot in enumerate(ids):
         if robot in ids[:i]:

@@ -4,7 +4,8 @@ base = "thesis"            # optional: a built-in scenario that this file change
 name, team, seed, estimator, fusion
 [world]      kind = "simulated" | "utias", then the fields of sim.worlds
 [defaults]   fields of every robot (team.config.RobotConfig)
-[[robots]]   what is different for one robot; or robot_count = N for r1 … rN
+[[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS
+             world: its five
 [central]    fields of central.config.CentralConfig
 """
 
@@ -73,9 +74,11 @@ def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
     if count is not None and "robots" in fields:
         raise ScenarioError("robot_count and [[robots]] exclude each other: leave one away")
     world = checked_table(fields.get("world", {}), "world")
-    if count is None:
-        count = UTIAS_ROBOTS if world.get("kind") == "utias" else 1
-    robots = fields["robots"] if "robots" in fields else [{}] * checked_count(count)
+    if count is not None:
+        unnamed = checked_count(count)
+    else:
+        unnamed = UTIAS_ROBOTS if world.get("kind") == "utias" else 0
+    robots = fields.get("robots", [{}] * unnamed)
     if not isinstance(robots, list):
         raise ScenarioError("expected [[robots]], an array of tables, at robots")
     for i, robot in enumerate(robots):

@@ -1,8 +1,10 @@
 """The world process: the node's shell, which publishes as long as there is credit."""
 
+import logging
 import threading
 import time
 
+from sim.configurations import Configurations, expected_configurations
 from sim.scenario import Scenario
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
@@ -13,6 +15,7 @@ from team.wire.bus import Bus
 
 PACE_S = 0.002
 """Wait when there is nothing to publish: the clock or the credit must move first."""
+_LOG = logging.getLogger("teamslam")
 
 
 def run_world(
@@ -28,7 +31,14 @@ def run_world(
     """Publish every reading of the world, then wait for the final map."""
     robots = [robot.id for robot in scenario.robots]
     configured = translate.configured("world", 0, 0, scenario)
-    node = WorldNode(streams, expected_nodes(robots, recorder=recorder), configured, speed, cache)
+    node = WorldNode(
+        streams,
+        expected_nodes(robots, recorder=recorder),
+        configured,
+        speed,
+        cache,
+        Configurations(expected_configurations(scenario)),
+    )
     shell = Shell(bus, node, "world", stop)
     for channel in node.listens:
         bus.subscribe(channel)
@@ -36,9 +46,15 @@ def run_world(
     for robot in robots:
         bus.answer(ch.READINGS, robot, node.readings)
     shell.begin()
+    said: set[str] = set()
     while shell.going:
         out = node.publish(time.monotonic())
         shell.publish(out)
         shell.take(bus.receive(0.0 if out else PACE_S))
+        for mismatch in node.configurations.mismatches:
+            if mismatch not in said:
+                said.add(mismatch)
+                _LOG.warning("%s", mismatch)
         shell.report()
     shell.report(last=True)
+    _LOG.info("published %d readings", int(node.status().figures["readings"]))

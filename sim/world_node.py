@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from sim import streams as s
+from sim.configurations import Configurations
 from sim.streams import RobotStream, WorldStreams
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -102,7 +103,8 @@ class WorldNode:
     expected: the nodes that must be alive before the first reading. speed: team seconds per second
     of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's last
     readings can be asked for again; None: all. Who asks for older ones gets a new epoch instead: a
-    start at an unknown pose, and readings that count from there.
+    start at an unknown pose, and readings that count from there. configurations: what the others
+    are to announce; the world does not begin while anyone has announced something else.
     """
 
     streams: WorldStreams
@@ -110,6 +112,7 @@ class WorldNode:
     scenario: m.Configured
     speed: float = float("inf")
     cache: int | None = None
+    configurations: Configurations = field(default_factory=lambda: Configurations({}))
     ended: bool = field(default=False, init=False)
     finished: bool = field(default=False, init=False)
 
@@ -133,12 +136,17 @@ class WorldNode:
         ch.ROBOT_PROGRESS,
         ch.RECORDER_PROGRESS,
         ch.FINAL_MAP,
+        ch.ROBOT_CONFIG,
+        ch.CENTRAL_CONFIG,
     )
 
     @property
     def waiting_for(self) -> list[str]:
-        """Who is not there yet."""
-        return sorted(self.expected - self._alive) if self._began_at is None else []
+        """Who is not there yet, or has not said yet with which configuration."""
+        if self._began_at is not None:
+            return []
+        silent = self.configurations.unheard(self.expected & self._alive)
+        return sorted([*(self.expected - self._alive), *silent])
 
     def begin(self) -> list[Outgoing]:
         """The scenario, and the true landmarks for the evaluator."""
@@ -154,7 +162,7 @@ class WorldNode:
         return out
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take progress, liveliness, and the final map; nothing is published in answer."""
+        """Take progress, liveliness, configurations, the final map; the answer is always empty."""
         match message:
             case m.Liveliness():
                 self._take_liveliness(message)
@@ -165,6 +173,8 @@ class WorldNode:
                 source = self._sources.get(message.robot)
                 if source is not None and message.epoch == source.epoch:
                     source.consumed = max(source.consumed, source.base + message.readings)
+            case m.Configured():
+                self.configurations.take(message)
             case m.FusedMap() if message.final:
                 self.finished = True
             case _:
@@ -184,7 +194,7 @@ class WorldNode:
         if self.ended:  # a new epoch may begin after the end; it has its own last counters
             out, self._starts = self._starts, []
             return [*out, Outgoing(ch.END, "", self._end())] if out else []
-        if self._began_at is None and not self.expected <= self._alive:
+        if self._began_at is None and (self.waiting_for or self.configurations.mismatches):
             return []
         if self._began_at is None:
             self._began_at = clock_s
@@ -279,9 +289,15 @@ class WorldNode:
             "team_time_s": (self.now_ns - self._first_ns) * 1e-9,
         }
         waiting = self.waiting_for
-        state = "ended" if self.ended else "waiting" if waiting else "publishing"
+        state = "publishing" if self._began_at is not None else "waiting"
         warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
-        return m.Status(self.now_ns, "world", state, figures, warnings)
+        return m.Status(
+            self.now_ns,
+            "world",
+            "ended" if self.ended else state,
+            figures,
+            (*self.configurations.mismatches, *warnings),
+        )
 
 
 def expected_nodes(robots: Sequence[str], *, recorder: bool) -> frozenset[str]:

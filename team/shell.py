@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import msgspec
 
@@ -21,6 +21,8 @@ from team.wire.messages import Message, Status
 
 STATUS_S = 0.5
 """Wall time between two statuses of a node."""
+REMIND_S = 10.0
+"""Wall time between two lines of a node that waits."""
 WAIT_S = 0.05
 """How long a shell waits for input before it looks at its other duties."""
 PARENT = "TEAMSLAM_PARENT"
@@ -29,6 +31,7 @@ _LOG = logging.getLogger("teamslam")
 _PR_SET_PDEATHSIG = 1
 
 
+@runtime_checkable
 class Node(Protocol):
     """What a shell runs: messages and time in, messages out."""
 
@@ -56,6 +59,7 @@ class Shell:
         self._name = name
         self._stop = stop
         self._status_due = 0.0
+        self._remind_due = time.monotonic() + REMIND_S
         self._refused = 0
         self._messages = 0
         self._bytes = 0
@@ -104,6 +108,11 @@ class Shell:
         self._messages = self._bytes = 0
         self._since = now
         warnings = status.warnings
+        if status.state != "waiting":
+            self._remind_due = now + REMIND_S
+        elif now >= self._remind_due:
+            self._remind_due = now + REMIND_S
+            _LOG.info("%s", "; ".join(warnings) or "waiting")
         if self._refused:
             warnings = (*warnings, f"{self._refused} messages were dropped at the door")
         status = msgspec.structs.replace(status, figures=status.figures | rates, warnings=warnings)

@@ -1,5 +1,6 @@
 """The processes `record` and `replay`: a bus and a clock around the recorder and the reader."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable
@@ -30,6 +31,8 @@ _FAR_BEHIND = 20_000  # samples: the disk takes half a second for as many
 _WAIT_S = 0.05
 _QUIET_S = 0.5
 _STATUS_S = 1.0
+_REMIND_S = 10.0
+_LOG = logging.getLogger("teamslam")
 _HEAD = 128  # bytes of a reading: its tag, stamp, robot and epoch are within
 
 
@@ -61,6 +64,11 @@ class RecordLoop:
                 bus.subscribe(channel)
         bus.watch_alive()
         bus.declare_alive(NODE)
+
+    @property
+    def written(self) -> int:
+        """How many messages have gone to the log."""
+        return self._messages + self._statuses
 
     @property
     def finished(self) -> bool:
@@ -125,9 +133,10 @@ def record(
     expected: Collection[str] = (),
     on_status: Callable[[Status], None] | None = None,
     stop: threading.Event | None = None,
-) -> None:
+) -> int:
     """Record until the final map is there and all other nodes have gone, or until `stop`; close.
 
+    Returns how many messages were written.
     `expected`: nodes whose absence is a warning in the status. Raises `RecorderError` when the log
     can not be written.
     """
@@ -135,6 +144,7 @@ def record(
     with recorder:
         loop = RecordLoop(bus, recorder, expected)
         due = time.monotonic()
+        remind_due = due + _REMIND_S
         while not (stop.is_set() or loop.finished):
             loop.take(bus.receive(_WAIT_S))
             if time.monotonic() >= due:
@@ -142,10 +152,14 @@ def record(
                 status = loop.status()
                 if on_status is not None:
                     on_status(status)
+                if status.warnings and time.monotonic() >= remind_due:
+                    remind_due = time.monotonic() + _REMIND_S
+                    _LOG.info("%s", "; ".join(status.warnings))
         loop.take(bus.receive(0.0))
         # A token goes with a higher priority than data: what it overtook is still on its way.
         while loop.finished and (samples := bus.receive(_QUIET_S)):
             loop.take(samples)
+    return loop.written
 
 
 def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Event) -> int:

@@ -15,14 +15,28 @@ from team.wire.codec import decoded
 GAP_PATIENCE_S = 0.5
 """A reading that is missing for so long is asked for at its source."""
 ASK_TIMEOUT_S = 10.0
+SECOND_PATIENCE_S = 6.0
+"""The token of a process that was cut off is there for the lease of its link: 5 s of silence."""
+SECOND_PERIOD_S = 0.5
 _LOG = logging.getLogger("teamslam")
 
 
 class RobotShell:
-    """A robot's process: subscribe, resume an earlier life if there was one, run."""
+    """A robot's process: subscribe, resume an earlier life if there was one, run.
 
-    def __init__(self, bus: Bus, config: RobotConfig, stop: threading.Event) -> None:
+    `run` raises BusError when another process is this robot, and stays it for `patience_s`.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        config: RobotConfig,
+        stop: threading.Event,
+        patience_s: float = SECOND_PATIENCE_S,
+    ) -> None:
         self._bus = bus
+        self._stop = stop
+        self._patience_s = patience_s
         self.node = RobotNode(config)
         self._shell = Shell(bus, self.node, ch.robot_node(config.id), stop)
         self._gap_since: float | None = None
@@ -30,12 +44,25 @@ class RobotShell:
     def run(self) -> None:
         """Until the final map."""
         name = self.node.robot
+        self._be_the_only_one()
         for channel in self.node.listens:
             self._bus.subscribe(channel, name)
         self._bus.watch_alive("central")
         if self._resume():
             self._catch_up()
         self._shell.run(self._mend)
+        _LOG.info("%d submaps from %d readings", self.node.submaps, self.node.next_reading)
+
+    def _be_the_only_one(self) -> None:
+        """Return when no other process is this robot."""
+        node = ch.robot_node(self.node.robot)
+        deadline = time.monotonic() + self._patience_s
+        while self._bus.is_alive(node):
+            if time.monotonic() >= deadline or self._stop.wait(SECOND_PERIOD_S):
+                raise BusError(
+                    f"another process is {node} in this team already: "
+                    "stop that one first, or start another robot"
+                )
 
     def _resume(self) -> bool:
         """Take over the submaps of an earlier life that the centre has; False if there are none."""

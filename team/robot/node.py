@@ -165,7 +165,9 @@ class RobotNode:
         }
         state = "done" if self._done else "mapping" if self._inbox.next_reading else "waiting"
         node = ch.robot_node(self.robot)
-        return m.Status(self._now_ns, node, state, figures, tuple(self.warnings[-3:]))
+        waiting = ("no readings of this team yet",) if state == "waiting" else ()
+        warnings = (*waiting, *self.warnings[-3:])
+        return m.Status(self._now_ns, node, state, figures, warnings)
 
     # The stream.
 

@@ -75,6 +75,9 @@ class Bus(Protocol):
     def watch_alive(self, node: str = "**") -> None:
         """Receive `Liveliness` of others' tokens as they appear and go, the present ones first."""
 
+    def is_alive(self, node: str) -> bool:
+        """Whether anyone holds the node's liveliness token."""
+
     def close(self) -> None:
         """Leave; the tokens go."""
 
@@ -197,6 +200,10 @@ class MemoryBus:
         for source, sample in self._network.alive.values():
             if source is not self:
                 self.offer(sample)
+
+    def is_alive(self, node: str) -> bool:
+        """Whether anyone holds the token."""
+        return node in self._network.alive
 
     def _token(self, node: str, *, alive: bool) -> None:
         sample = Sample(ALIVE.key(node), encoded(Liveliness(0, node, alive)), 0, 0, 0)

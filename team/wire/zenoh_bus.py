@@ -41,6 +41,7 @@ _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
 _BLOCK_US = 10_000_000  # that a full queue may stop a publisher before its link is closed
 _HEARTBEAT_S = 0.25
+_ALIVE_TIMEOUT_S = 5.0
 _LATEST_KEPT = 1_024  # of a `latest` key, so that a cut of minutes recovers; 1 would recover 1
 _MAPS_KEPT = 16  # of a `latest` key of maps: a joint covariance may take megabytes
 _ALL_KEPT = 1_000_000
@@ -267,6 +268,13 @@ class ZenohBus:
         self._session.liveliness().declare_subscriber(
             self._prefix + ALIVE.key(node), Callback(notice, indirect=False), history=True
         )
+
+    def is_alive(self, node: str) -> bool:
+        """Whether anyone holds the node's liveliness token, as far as the router knows."""
+        self._check_open()
+        key = self._prefix + ALIVE.key(node)
+        replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
+        return any(reply.ok is not None for reply in replies)
 
     def _check_open(self) -> None:
         if self._closed.is_set():

@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from sim.scenario import builtin_names, dumps, load, loads, with_options
+from sim.scenario import builtin_names, doubts, dumps, load, loads, with_options
 from sim.scenario_checks import ScenarioError
 from sim.source import streams_of
 from sim.worlds import SimulatedWorld, UtiasWorld
@@ -166,7 +166,8 @@ UTIAS = 'world = { kind = "utias" }\n'
         ("robot_count = 0\n" + SMALL, "0 robots: a team has 1 to 100"),
         ("robot_count = 101\n" + SMALL, "101 robots: a team has 1 to 100"),
         ("robot_count = 'two'\n" + SMALL, "expected a number of robots from 1 to 100, got 'two'"),
-        ("robots = []\n" + SMALL, "0 robots: a team has 1 to 100"),
+        ("robots = []\n" + SMALL, "no robots: give robot_count, [[robots]], or a base"),
+        (SMALL, "no robots: give robot_count, [[robots]], or a base that has some"),
         ("robots = 3\n" + SMALL, "expected [[robots]], an array of tables, at robots"),
         ("robots = [3]\n" + SMALL, "expected a table, got int at robots[0]"),
         ("central = 3\n" + SMALL, "expected a table, got int at central"),
@@ -180,7 +181,10 @@ UTIAS = 'world = { kind = "utias" }\n'
         ("base = [1]\n" + SMALL, "expected a built-in scenario, got [1] at base"),
         (SMALL + "landmarks = [[1, 2]]", "landmarks and landmark_count exclude each other"),
         (SMALL + "paths = [[[1, 2]]]", "path 0 has no length: give two way-points or more"),
-        (SMALL + "unknown_starts = ['r2']", "world.unknown_starts names r2, no such robot"),
+        (
+            "robot_count = 1\n" + SMALL + "unknown_starts = ['r2']",
+            "world.unknown_starts names r2, no such robot",
+        ),
         ("world = { kind = 'simulated' }", "missing required field steps"),
         (UTIAS + "[[robots]]\nid = 'alice'", "the robot alice: in a UTIAS world robots are r1, r2"),
         ("world = { kind = 'utias', start_sigma_m = 1 }", "are both 0 or both above 0"),
@@ -218,3 +222,14 @@ def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
 def test_json_that_is_no_resolved_scenario_is_refused(text: str) -> None:
     with pytest.raises(ScenarioError):
         loads(text)
+
+
+def test_a_simulated_robot_whose_odometry_has_no_noise_is_doubted(tmp_path: Path) -> None:
+    noisy = "[[robots]]\nmotion = { turn = { per_rad = 0.1 } }\n[[robots]]\n"
+    (said,) = doubts(load(written(tmp_path, SMALL + noisy)))
+    assert said.startswith("r2: odometry without noise")
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_a_built_in_scenario_is_not_doubted(name: str) -> None:
+    assert doubts(load(name)) == []

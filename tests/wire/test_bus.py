@@ -222,3 +222,13 @@ def test_tokens_are_seen_as_they_appear_and_go_and_never_ones_own(joined: Joined
         m.Liveliness(0, "robot/alpha", True),
         m.Liveliness(0, "robot/alpha", False),
     ]
+
+
+def test_who_holds_a_token_can_be_asked_for(joined: Joined) -> None:
+    asker, robot = joined(), joined()
+    assert not asker.is_alive("robot/alpha")
+    robot.declare_alive("robot/alpha")
+    wait_until(lambda: asker.is_alive("robot/alpha"))
+    assert not asker.is_alive("robot/alph")
+    robot.close()
+    wait_until(lambda: not asker.is_alive("robot/alpha"))

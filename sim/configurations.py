@@ -1,0 +1,86 @@
+"""Whether robots and centre run with the configurations that the world's scenario gives them.
+
+Processes that were started by hand may have been given other options. What a robot or the centre
+announces is compared with the scenario, field by field.
+"""
+
+import json
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+from sim.scenario import Scenario
+from team import translate
+from team.wire import messages as m
+from team.wire.channels import robot_node
+
+SHOWN = 3
+"""Fields that differ which are named; one that was given a whole other scenario has dozens."""
+REMEDY = "start it again with the same scenario and options"
+
+
+class Configurations:
+    """What is to be announced, by node, and what has been.
+
+    A node's newest announcement counts. Nothing is compared when nothing is to be announced.
+    """
+
+    def __init__(self, expected: Mapping[str, m.Configured]) -> None:
+        self._expected = expected
+        self._heard: set[str] = set()
+        self._mismatches: dict[str, str] = {}
+
+    def take(self, announced: m.Configured) -> None:
+        """Take one announcement."""
+        if not self._expected:
+            return
+        node = announced.node
+        self._heard.add(node)
+        self._mismatches.pop(node, None)
+        expected = self._expected.get(node)
+        if expected is None:
+            self._mismatches[node] = (
+                f"{node} is not in the world's scenario, which has {', '.join(self._expected)}: "
+                + REMEDY
+            )
+        elif announced.digest != expected.digest:
+            found = differences(announced.configuration, expected.configuration)
+            more = f", and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+            self._mismatches[node] = (
+                f"{node} differs from the world's scenario: {', '.join(found[:SHOWN])}{more}: "
+                + REMEDY
+            )
+
+    @property
+    def mismatches(self) -> tuple[str, ...]:
+        """Who differs in what, and the remedy; by node."""
+        return tuple(self._mismatches[node] for node in sorted(self._mismatches))
+
+    def unheard(self, nodes: Collection[str]) -> list[str]:
+        """Of these nodes, those whose announcement is due and has not come."""
+        return sorted((self._expected.keys() & set(nodes)) - self._heard)
+
+
+def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:
+    """What the centre and the robots of a scenario announce, by node."""
+    nodes = {robot_node(robot.id): robot for robot in scenario.robots}
+    robots = {node: translate.configured(node, 0, 0, robot) for node, robot in nodes.items()}
+    return {"central": translate.configured("central", 0, 0, scenario.central)} | robots
+
+
+def differences(announced: str, expected: str) -> list[str]:
+    """The fields in which two configurations in JSON differ, with both values, by name."""
+    theirs, ours = dict(_fields(json.loads(announced))), dict(_fields(json.loads(expected)))
+    return [
+        f"{name} is {theirs.get(name, 'absent')} there and {ours.get(name, 'absent')} here"
+        for name in sorted(theirs.keys() | ours.keys())
+        if theirs.get(name) != ours.get(name)
+    ]
+
+
+def _fields(value: Any, at: str = "") -> Iterator[tuple[str, str]]:
+    """(path, value in JSON) of every field that is not a table itself."""
+    if isinstance(value, dict) and value:
+        for name, part in value.items():
+            yield from _fields(part, f"{at}.{name}" if at else name)
+    else:
+        yield at, json.dumps(value)
