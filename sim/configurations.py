@@ -8,10 +8,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from sim.scenario import Scenario
-from team import translate
 from team.wire import messages as m
-from team.wire.channels import robot_node
 
 SHOWN = 3
 """Fields that differ which are named; one that was given a whole other scenario has dozens."""
@@ -58,13 +55,6 @@ class Configurations:
     def unheard(self, nodes: Collection[str]) -> list[str]:
         """Of these nodes, those whose announcement is due and has not come."""
         return sorted((self._expected.keys() & set(nodes)) - self._heard)
-
-
-def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:
-    """What the centre and the robots of a scenario announce, by node."""
-    nodes = {robot_node(robot.id): robot for robot in scenario.robots}
-    robots = {node: translate.configured(node, 0, 0, robot) for node, robot in nodes.items()}
-    return {"central": translate.configured("central", 0, 0, scenario.central)} | robots
 
 
 def differences(announced: str, expected: str) -> list[str]:

@@ -148,7 +148,7 @@ def _absurd(evaluation: Evaluation) -> str:
     """The digits of a NEES of 1e18 say nothing to people; why it is so large does."""
     scenario = evaluation.scenario
     again = scenario is not None and scenario.fusion in _COUNT_AGAIN
-    why = " (this rule counts readings again)" if again else ""
+    why = " (rule counts readings again)" if again else ""
     return f"> {ABSURD_NEES}: over-confident{why}"
 
 

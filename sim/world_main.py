@@ -4,13 +4,14 @@ import logging
 import threading
 import time
 
-from sim.configurations import Configurations, expected_configurations
+from sim.configurations import Configurations
 from sim.scenario import Scenario
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from team import translate
 from team.shell import Shell
 from team.wire import channels as ch
+from team.wire import messages as m
 from team.wire.bus import Bus
 
 PACE_S = 0.002
@@ -58,3 +59,10 @@ def run_world(
         shell.report()
     shell.report(last=True)
     _LOG.info("published %d readings", int(node.status().figures["readings"]))
+
+
+def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:
+    """What the centre and the robots of a scenario announce, by node."""
+    nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
+    robots = {node: translate.configured(node, 0, 0, robot) for node, robot in nodes.items()}
+    return {"central": translate.configured("central", 0, 0, scenario.central)} | robots

@@ -3,10 +3,11 @@
 import msgspec
 import pytest
 
-from sim.configurations import Configurations, differences, expected_configurations
+from sim.configurations import Configurations, differences
 from sim.in_memory import run_team
 from sim.scenario import load, with_options
 from sim.source import streams_of
+from sim.world_main import expected_configurations
 from sim.world_node import WorldNode, expected_nodes
 from team.wire import channels as ch
 from team.wire import messages as m

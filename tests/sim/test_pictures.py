@@ -20,6 +20,7 @@ from sim.pictures import (
     map_picture,
 )
 from sim.report import summary_tables, write_report
+from sim.scenario import with_options
 from team.wire import channels as ch
 from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
 
@@ -115,7 +116,40 @@ def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
     said = online(ch.OWN_POSE, truth[1:] + np.array([3.0, 4.0, 0.0]), of)
     console = Console(width=80, record=True, force_terminal=False)
     console.print(summary_tables(evaluate(world_log(of) + samples(said)))[1])
-    assert "5.000*" in console.export_text()
+    text = console.export_text()
+    assert "5.000*" in text
+    assert "* of online ones" in text
+
+
+def test_a_star_is_explained_only_where_there_is_one(run: Evaluation) -> None:
+    console = Console(width=80, record=True, force_terminal=False)
+    console.print(summary_tables(run)[1])
+    assert "*" not in console.export_text()
+
+
+@pytest.mark.parametrize(
+    ("fusion", "said"),
+    [
+        ("join", "> 1000: over-confident"),
+        ("kalman", "> 1000: over-confident (rule counts readings again)"),
+    ],
+)
+def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(
+    run: Evaluation, fusion: str, said: str
+) -> None:
+    assert run.map is not None
+    assert run.map.errors is not None
+    assert run.scenario is not None
+    absurd = replace(
+        run,
+        map=replace(run.map, errors=replace(run.map.errors, nees_per_dof=6e18)),
+        scenario=with_options(run.scenario, fusion=fusion),
+    )
+    console = Console(width=80, record=True, force_terminal=False)
+    console.print(summary_tables(absurd)[0])
+    (line,) = [x for x in console.export_text().splitlines() if "NEES per dof" in x]
+    assert line.strip("│ ").partition("│")[2].strip() == said
+    assert to_json(absurd)["map_nees_per_dof"] == 6e18
 
 
 def test_labels_point_away_from_their_neighbours() -> None:
