@@ -41,7 +41,7 @@ def run_world(
         Configurations(expected_configurations(scenario)),
     )
     shell = Shell(bus, node, "world", stop)
-    for channel in node.listens:
+    for channel in (*node.listens, *node.announcements):
         bus.subscribe(channel)
     bus.watch_alive()
     for robot in robots:

@@ -136,9 +136,9 @@ class WorldNode:
         ch.ROBOT_PROGRESS,
         ch.RECORDER_PROGRESS,
         ch.FINAL_MAP,
-        ch.ROBOT_CONFIG,
-        ch.CENTRAL_CONFIG,
     )
+    announcements: ClassVar[tuple[ch.Channel, ...]] = (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
+    """Listened to as well where configurations are compared."""
 
     @property
     def waiting_for(self) -> list[str]:
