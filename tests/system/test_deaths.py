@@ -15,7 +15,7 @@ from tests.system.observer import Observer, endpoint_of
 from tests.system.processes import Process, Processes, until
 from tests.system.scenarios import STEPS, short
 
-SUBMAPS = STEPS // 10
+SUBMAPS = STEPS // 12  # windows of 12 s, steps of 1 s
 
 
 async def launched(team: Processes, speed: str = "20") -> tuple[Process, Path]:
