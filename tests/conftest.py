@@ -1,4 +1,7 @@
-"""What holds in every test run: one BLAS thread, checked shapes, system tests one by one."""
+"""What holds in every test run: one BLAS thread, checked shapes, repeatable examples.
+
+System tests run one by one.
+"""
 
 import os
 
@@ -6,9 +9,14 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"  # before NumPy is imported, here and in every child process
 
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 import tests.shapes
+
+# The same examples in every run: what fails once fails again. HYPOTHESIS_SEARCH=1 finds new ones.
+settings.register_profile("repeatable", derandomize="HYPOTHESIS_SEARCH" not in os.environ)
+settings.load_profile("repeatable")
 
 install_import_hook(["team", "central", "sim"], f"{tests.shapes.__name__}.checked")
 

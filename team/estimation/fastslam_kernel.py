@@ -38,12 +38,17 @@ def slots_of(
     return ids[:count].copy(), slots, first
 
 
+SMALLEST_VARIANCE = 1e-200
+"""A variance of motion below this is none [m², rad²]."""
+
+
 @compiled
 def semidefinite_factor(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """Lower L with L Lᵀ = covariance, of any rank; NaN where there is none.
 
     A pivot within 1e-12 of its diagonal entry is what rounding leaves of zero: its column is zero.
-    A pivot below −1e-9 of it says that the matrix is indefinite.
+    So is one below SMALLEST_VARIANCE, whose quotients are not numbers any more. A pivot below −1e-9
+    of its diagonal entry says that the matrix is indefinite.
     """
     L = np.zeros((3, 3))
     for j in range(3):
@@ -52,7 +57,7 @@ def semidefinite_factor(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarra
             pivot -= L[j, k] * L[j, k]
         if not pivot >= -1e-9 * abs(covariance[j, j]):
             L[j, j] = np.nan
-        elif pivot > 1e-12 * covariance[j, j]:
+        elif pivot > max(1e-12 * covariance[j, j], SMALLEST_VARIANCE):
             L[j, j] = math.sqrt(pivot)
             for i in range(j + 1, 3):
                 rest = covariance[i, j]
