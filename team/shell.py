@@ -27,6 +27,8 @@ WAIT_S = 0.05
 """How long a shell waits for input before it looks at its other duties."""
 PARENT = "TEAMSLAM_PARENT"
 """Environment variable: the process without which this one must not live."""
+LAST_S = 20
+"""A process that was told to stop is ended by SIGALRM after this many seconds."""
 _LOG = logging.getLogger("teamslam")
 _PR_SET_PDEATHSIG = 1
 
@@ -142,6 +144,7 @@ def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
     def take(number: int, _: FrameType | None) -> None:
         told.append(number)
         stop.set()
+        signal.alarm(LAST_S)  # by the kernel: a link that hangs while it closes holds no process
 
     handlers = {number: signal.signal(number, take) for number in (signal.SIGTERM, signal.SIGINT)}
     parent = os.environ.get(PARENT)
@@ -150,6 +153,7 @@ def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
     try:
         yield stop
     finally:
+        signal.alarm(0)
         for number, handler in handlers.items():
             signal.signal(number, handler)
     if told and not endless:
