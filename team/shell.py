@@ -144,7 +144,7 @@ def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
     def take(number: int, _: FrameType | None) -> None:
         told.append(number)
         stop.set()
-        signal.alarm(LAST_S)  # by the kernel: a link that hangs while it closes holds no process
+        signal.alarm(LAST_S)  # by the kernel: neither a closing link nor the exit holds it
 
     handlers = {number: signal.signal(number, take) for number in (signal.SIGTERM, signal.SIGINT)}
     parent = os.environ.get(PARENT)
@@ -153,7 +153,6 @@ def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
     try:
         yield stop
     finally:
-        signal.alarm(0)
         for number, handler in handlers.items():
             signal.signal(number, handler)
     if told and not endless:
