@@ -68,7 +68,8 @@ class RobotResult:
     smoothed: the final map's poses at the ends of the submaps. online: what the robot said when it
     was there, given the team's map (`online_channel`: "team/pose"), or from its own readings alone
     where it never had that. aligned_rmse_m: of the smoothed positions after the rigid motion that
-    aligns the map (`alignment`: "map"), or else their own ("trajectory").
+    aligns the map (`alignment`: "map"), or else their own ("trajectory"); online_aligned_rmse_m: of
+    the online ones after the map's.
     """
 
     consumption: Consumption
@@ -82,6 +83,7 @@ class RobotResult:
     final_pose_nees_per_dof: float | None
     aligned_rmse_m: float | None
     alignment: str | None
+    online_aligned_rmse_m: float | None
 
     @property
     def uplink_bytes_per_step(self) -> float | None:
@@ -152,6 +154,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
     """The figures under the names that machines read; `extra` is laid over them."""
     scenario, fused = evaluation.scenario, evaluation.map
     errors = None if fused is None else fused.errors
+    shape = None if errors is None else errors.shape
     figures = {
         "scenario": None if scenario is None else scenario.name,
         "seed": None if scenario is None else scenario.seed,
@@ -164,6 +167,9 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
         "map_nees_band": None if errors is None else list(errors.band),
         "map_nees_in_band": None if errors is None else errors.in_band,
+        "shape_nees_per_landmark": None if shape is None else shape.nees_per_landmark,
+        "shape_coverage_95": None if shape is None else shape.coverage,
+        "landmark_coverage_95": None if errors is None else errors.coverage,
         "map_covariance": None if fused is None else "joint" if fused.joint else "blocks",
         "joint_cost_per_dof": None if fused is None else fused.cost_per_dof,
         "joint_cost_per_dof_by_robot": dict(evaluation.cost_by_robot),
@@ -194,12 +200,15 @@ def _robot_json(robot: RobotResult) -> dict[str, Any]:
         "position_rmse_m": None if smoothed is None else smoothed.position_rmse_m,
         "heading_rmse_rad": None if smoothed is None else smoothed.heading_rmse_rad,
         "pose_nees_per_dof": None if smoothed is None else smoothed.nees_per_dof,
+        "pose_coverage_95": None if smoothed is None else smoothed.coverage,
         "final_pose_nees_per_dof": robot.final_pose_nees_per_dof,
         "position_rmse_aligned_m": robot.aligned_rmse_m,
         "aligned_by": robot.alignment,
         "online_position_rmse_m": None if online is None else online.position_rmse_m,
         "online_heading_rmse_rad": None if online is None else online.heading_rmse_rad,
         "online_pose_nees_per_dof": None if online is None else online.nees_per_dof,
+        "online_pose_coverage_95": None if online is None else online.coverage,
+        "online_position_rmse_aligned_m": robot.online_aligned_rmse_m,
         "online_channel": robot.online_channel,
         "uplink_bytes": robot.uplink_bytes,
         "uplink_bytes_per_step": robot.uplink_bytes_per_step,
@@ -261,6 +270,7 @@ def _robot_result(
     smoothed = pose_errors(log.smoothed, log.smoothed_covariances, log.truth)
     ends_known = smoothed is not None and smoothed.stamps_ns[-1] == log.smoothed.stamps_ns[-1]
     aligned, alignment = _aligned(log, fused)
+    map_motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
     return RobotResult(
         used,
         uplink_bytes,
@@ -273,7 +283,16 @@ def _robot_result(
         float(smoothed.nees[-1]) / 3.0 if smoothed is not None and ends_known else None,
         aligned,
         alignment,
+        None if map_motion is None else _moved_rmse(map_motion, log.online, log.truth),
     )
+
+
+def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> float | None:
+    """RMSE of a path's positions after a rigid motion, where the truth is known."""
+    true_poses, known = interpolated(truth, path.stamps_ns)
+    if not known.any():
+        return None
+    return distance_rmse(moved(motion, path.poses[known, :2]), true_poses[known, :2])
 
 
 def _aligned(log: RobotLog, fused: MapResult | None) -> tuple[float | None, str | None]:

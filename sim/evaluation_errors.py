@@ -4,9 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
+from scipy.linalg import solve_triangular
 
 from team.estimation.alignment import NEEDED, procrustes
-from team.estimation.consistency import chi2_interval, nees
+from team.estimation.consistency import chi2_interval, coverage, nees
+from team.estimation.gaussian import cholesky_factor
+from team.estimation.geometry import between
 
 TRUTH_GAP_NS = 1_000_000_000
 """Truth is interpolated between samples that are at most this far apart."""
@@ -48,6 +51,11 @@ class PoseErrors:
         """The mean of NEES/3; 1 where the covariances are right."""
         return float(self.nees.mean()) / 3.0
 
+    @property
+    def coverage(self) -> float:
+        """The share of poses within their own 95 % ellipsoid; 0.95 where they are right."""
+        return coverage(self.nees, np.full(len(self.nees), 3.0), BAND)
+
 
 @dataclass(frozen=True)
 class MapErrors:
@@ -56,6 +64,8 @@ class MapErrors:
     rmse_m, aligned_rmse_m: 2-D distances, as the map lies and after truth_from_map, the rigid
     motion of least squares (None below two landmarks). nees_per_dof: of the joint covariance, in
     the frame as the map lies; `band` is where a single run of 2L degrees of freedom lies in 95 %.
+    shape: of what no rigid motion explains, so whatever the start poses were (None where
+    aligned_rmse_m is). coverage: the share of landmarks in their own 95 % ellipse, as the map lies.
     """
 
     count: int
@@ -64,11 +74,25 @@ class MapErrors:
     truth_from_map: Float[np.ndarray, "3"] | None
     nees_per_dof: float
     band: tuple[float, float]
+    shape: "ShapeErrors | None"
+    coverage: float
 
     @property
     def in_band(self) -> bool:
         """Whether this run's NEES lies in its band."""
         return self.band[0] <= self.nees_per_dof <= self.band[1]
+
+
+@dataclass(frozen=True)
+class ShapeErrors:
+    """A map's errors without their rigid part, against the covariance of the same.
+
+    nees_per_landmark: NEES of the 2L − 3 numbers that are left, scaled to 2 per landmark: 2 is
+    right. coverage: the share of landmarks in their 95 % ellipse of these.
+    """
+
+    nees_per_landmark: float
+    coverage: float
 
 
 def rms(values: Float[np.ndarray, " n"]) -> float:
@@ -92,15 +116,55 @@ def map_errors(
     """The errors of L ≥ 1 landmarks with their joint 2L × 2L covariance."""
     count = len(means)
     difference = means - truth
-    truth_from_map = rigid_alignment(truth, means)
+    motion = rigid_alignment(truth, means)
     return MapErrors(
         count,
         rms(np.hypot(difference[:, 0], difference[:, 1])),
-        None if truth_from_map is None else distance_rmse(moved(truth_from_map, means), truth),
-        truth_from_map,
+        None if motion is None else distance_rmse(moved(motion, means), truth),
+        motion,
         nees(difference.ravel(), covariance) / (2 * count),
         chi2_interval(2 * count, BAND, 1),
+        None if motion is None else _shape_errors(means, covariance, truth, motion),
+        _covered(difference, covariance),
     )
+
+
+def _shape_errors(
+    means: Float[np.ndarray, "L 2"],
+    covariance: Float[np.ndarray, "m m"],
+    truth: Float[np.ndarray, "L 2"],
+    truth_from_map: Float[np.ndarray, "3"],
+) -> ShapeErrors:
+    """Of the errors after alignment, in the map's frame.
+
+    With G = ∂(positions moved by x, y, θ)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g);
+    the covariance of what is left is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
+    """
+    count = len(means)
+    error = (means - moved(between(truth_from_map, np.zeros(3)), truth)).ravel()
+    centred = means - means.mean(axis=0)
+    G = np.zeros((2 * count, 3))
+    G[0::2, 0] = G[1::2, 1] = 1.0
+    G[0::2, 2], G[1::2, 2] = -centred[:, 1], centred[:, 0]
+    L = cholesky_factor(covariance, "a map")
+    white_error, white_G = (solve_triangular(L, part, lower=True) for part in (error, G))
+    left = white_error - white_G @ np.linalg.lstsq(white_G, white_error)[0]
+    basis = np.linalg.qr(G)[0]
+    projection = np.eye(2 * count) - basis @ basis.T
+    return ShapeErrors(
+        2.0 * float(left @ left) / (2 * count - 3),
+        _covered((projection @ error).reshape(-1, 2), projection @ covariance @ projection),
+    )
+
+
+def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m m"]) -> float:
+    """The share of points whose error lies in the 95 % ellipse of their own 2 × 2 covariance."""
+    count = len(errors)
+    blocks = covariance.reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count), :]
+    # The shape of two landmarks has one number, so their blocks are singular.
+    inverses = np.linalg.pinv(blocks, hermitian=True)
+    squared = np.einsum("ki,kij,kj->k", errors, inverses, errors)
+    return coverage(squared, np.linalg.matrix_rank(blocks, hermitian=True).astype(float), BAND)
 
 
 def rigid_alignment(

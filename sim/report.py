@@ -38,7 +38,14 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
         robots.add_column(Text(heading), justify="left" if heading == "robot" else "right")
     for name, robot in evaluation.robots.items():
         robots.add_row(*(Text(cell) for cell in _robot_row(name, robot)))
-    return [team, robots]
+    if all(robot.smoothed is None for robot in evaluation.robots.values()):
+        return [team, robots]
+    paths = Table(caption=_PATH_NOTE)
+    for heading in _PATH_HEADINGS:
+        paths.add_column(Text(heading), justify="left" if heading == "robot" else "right")
+    for name, robot in evaluation.robots.items():
+        paths.add_row(*(Text(cell) for cell in _path_row(name, robot)))
+    return [team, robots, paths]
 
 
 def write_report(
@@ -80,6 +87,9 @@ def _page(evaluation: Evaluation, pictures: Sequence[Path], provenance: Mapping[
         "<h2>Robots</h2>",
         _html_table(_ROBOT_HEADINGS, robots),
         f"<p>{_robot_note(evaluation)}</p>",
+        "<h2>Paths against the truth</h2>",
+        _html_table(_PATH_HEADINGS, [_path_row(n, r) for n, r in evaluation.robots.items()]),
+        f"<p>{_PATH_NOTE}</p>",
         "<h2>What became of the readings</h2>",
         _html_table(("robot", "disposition", "readings"), _ledger_rows(evaluation)),
         *(f"<p>{escape(note)}</p>" for note in notes),
@@ -137,6 +147,11 @@ def _team_rows(evaluation: Evaluation) -> Rows:
                 else f"{errors.nees_per_dof:.4g}, {verdict} 95 % of {low:.2f}…{high:.2f} ({kind})",
             ),
         ]
+        shape = errors.shape
+        if shape is not None:
+            nees = f"{shape.nees_per_landmark:.2f}, 2 is right; {shape.coverage:.0%} within 95 %"
+            rows.append(("shape NEES/landmark", nees))
+        rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
     rows.append(("joint cost per dof", _shown(fused.cost_per_dof, ".3f", "")))
     rows.append(("final map, its set", f"{fused.digest}, frame {fused.frame or '–'}"))
     if evaluation.unsound:
@@ -180,6 +195,29 @@ def _robot_row(name: str, robot: RobotResult) -> tuple[str, ...]:
         _shown(None if errors is None else errors.nees_per_dof, ".3g", mark),
         _shown(robot.uplink_bytes_per_step, ".1f", ""),
     )
+
+
+_PATH_HEADINGS = (
+    "robot", "path\n[m]", "moved\n[m]", "NEES\n/dof", "in\n95 %",
+    "online\n[m]", "moved\n[m]", "NEES\n/dof", "in\n95 %",
+)  # fmt: skip
+_PATH_NOTE = "position RMSE of the smoothed path and online; moved: as the map to align it"
+
+
+def _path_row(name: str, robot: RobotResult) -> tuple[str, ...]:
+    """Position errors, NEES and coverage of the smoothed and of the online path."""
+    cells = [name]
+    for errors, aligned in (
+        (robot.smoothed, robot.aligned_rmse_m),
+        (robot.online, robot.online_aligned_rmse_m),
+    ):
+        cells += [
+            _shown(None if errors is None else errors.position_rmse_m, ".3f", ""),
+            _shown(aligned, ".3f", ""),
+            _shown(None if errors is None else errors.nees_per_dof, ".3g", ""),
+            _shown(None if errors is None else errors.coverage, ".0%", ""),
+        ]
+    return tuple(cells)
 
 
 def _ledger_rows(evaluation: Evaluation) -> list[tuple[str, str, str]]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sim.evaluation import evaluate, to_json
 from sim.evaluation_errors import Path, interpolated, map_errors, moved, pose_errors
-from team.estimation.consistency import nees, state_error
+from team.estimation.consistency import chi2_interval, nees, state_error
 from team.translate import joint_bytes
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -114,6 +114,53 @@ def test_map_nees_takes_the_joint_covariance_not_its_blocks() -> None:
     assert errors.nees_per_dof == pytest.approx(error @ np.linalg.solve(P, error) / 4.0)
 
 
+def drawn_maps(runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True positions, maps drawn about them, and the covariance that they were drawn with."""
+    rng = np.random.default_rng(7)
+    truth = rng.uniform(-8.0, 8.0, (15, 2))
+    P = 1e-4 * spd(30)
+    noise = rng.standard_normal((runs, 30)) @ np.linalg.cholesky(P).T
+    return truth, truth + noise.reshape(runs, 15, 2), P
+
+
+def test_the_shape_of_drawn_maps_has_nees_2_per_landmark_and_covers_95_percent() -> None:
+    runs = 200
+    truth, maps, P = drawn_maps(runs)
+    motion = np.array([3.0, -2.0, 0.5])
+    turn = np.kron(np.eye(15), np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]]))
+    turned = turn @ P @ turn.T
+    values, covered, raw = [], [], []
+    for means in maps:
+        shape = map_errors(moved(motion, means), turned, truth).shape
+        assert shape is not None
+        values.append(shape.nees_per_landmark)
+        covered.append(shape.coverage)
+        raw.append(map_errors(means, P, truth).coverage)
+    low, high = chi2_interval(27, 0.999, runs)
+    assert 2.0 * low < np.mean(values) < 2.0 * high
+    assert np.mean(covered) == pytest.approx(0.95, abs=0.015)
+    assert np.mean(raw) == pytest.approx(0.95, abs=0.015)
+    # The mutant: a covariance that claims half of the variance.
+    claimed = [map_errors(means, 0.5 * P, truth) for means in maps]
+    shapes = [each.shape for each in claimed if each.shape is not None]
+    assert np.mean([each.nees_per_landmark for each in shapes]) > 2.0 * high
+    assert np.mean([each.coverage for each in shapes]) < 0.85
+    assert np.mean([each.coverage for each in claimed]) < 0.85
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_the_shape_of_few_landmarks_is_what_their_distances_say(count: int) -> None:
+    truth = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])[:count]
+    means = truth + np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]])[:count]
+    shape = map_errors(means, 0.01 * np.eye(2 * count), truth).shape
+    assert shape is not None
+    if count == 2:  # one number: a length of variance 0.02 that is 0.3 too large
+        assert shape.nees_per_landmark == pytest.approx(2.0 * 0.09 / 0.02)
+        assert shape.coverage == 0.0
+    else:
+        assert 0.0 < shape.nees_per_landmark < 2.0 * 0.09 / 0.01
+
+
 def test_pose_errors_are_those_of_the_consistency_module() -> None:
     P = np.stack([spd(3), 0.25 * spd(3)])
     truth = path([0.0, 1.0], [[0.0, 0.0, 3.1], [1.0, 1.0, -1.0]])
@@ -124,6 +171,14 @@ def test_pose_errors_are_those_of_the_consistency_module() -> None:
     np.testing.assert_allclose(errors.errors, expected, atol=1e-12)
     np.testing.assert_allclose(errors.nees, [nees(e, p) for e, p in zip(expected, P, strict=True)])
     assert errors.position_rmse_m == pytest.approx(np.sqrt((0.05 + 0.25) / 2.0))
+
+
+def test_coverage_is_the_share_of_poses_within_their_own_95_percent() -> None:
+    truth = path([0.0, 3.0], [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    offsets = [[2.79, 0.0, 0.0], [2.80, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 2.81]]
+    errors = pose_errors(path([0.0, 1.0, 2.0, 3.0], offsets), np.tile(np.eye(3), (4, 1, 1)), truth)
+    assert errors is not None
+    assert errors.coverage == 0.5  # the 95 % quantile of three numbers is 2.795²
 
 
 def test_a_log_whose_map_is_off_by_a_known_shift_says_so() -> None:
@@ -143,6 +198,7 @@ def test_a_log_whose_map_is_off_by_a_known_shift_says_so() -> None:
         assert robot.alignment == "map"
         # The map's own alignment takes its shift of (0.3, −0.3) off; (0.15, −0.15) is left.
         assert robot.aligned_rmse_m == pytest.approx(0.15 * np.sqrt(2.0))
+        assert robot.online_aligned_rmse_m is None
 
 
 def test_a_reading_that_is_in_the_log_twice_is_counted_once() -> None:
@@ -229,6 +285,9 @@ def test_the_own_pose_counts_only_where_there_is_no_team_pose() -> None:
     assert alone.online.position_rmse_m == pytest.approx(5.0)
     assert both.online.position_rmse_m == pytest.approx(1.0)
     assert both.online.nees_per_dof == pytest.approx(1.0 / 3.0)
+    joined = evaluate([*joined_log(of, 0.3), *samples(team)]).robots["r1"]
+    # The map's alignment takes its shift of (0.3, −0.3) off the online poses as well.
+    assert joined.online_aligned_rmse_m == pytest.approx(np.hypot(0.3, 1.3))
 
 
 def test_damaged_messages_are_counted_and_left_out() -> None:
@@ -273,11 +332,14 @@ def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds() -> 
     figures = json.loads(json.dumps(to_json(evaluate(joined_log(scenario(), 0.1)), extra)))
     names = (
         "landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof", "joint_cost_per_dof",
+        "shape_nees_per_landmark", "shape_coverage_95", "landmark_coverage_95",
         "landmarks", "final_map_digest", "robots", "channels", "processes", "log", "wall_s",
     )  # fmt: skip
     of_a_robot = (
         "steps", "readings_published", "readings_consumed", "position_rmse_m", "heading_rmse_rad",
-        "pose_nees_per_dof", "uplink_bytes", "submaps",
+        "pose_nees_per_dof", "pose_coverage_95", "uplink_bytes", "submaps",
+        "position_rmse_aligned_m", "online_position_rmse_m", "online_position_rmse_aligned_m",
+        "online_pose_nees_per_dof", "online_pose_coverage_95",
     )  # fmt: skip
     assert set(names) <= set(figures)
     assert set(of_a_robot) <= set(figures["robots"]["r1"])

@@ -105,8 +105,9 @@ def test_the_tables_fit_a_terminal_of_80_columns_and_name_their_units(run: Evalu
         assert console.measure(table).maximum <= 80
         console.print(table)
     text = console.export_text()
-    for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2"):
+    for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2", "2 is right", "0% within 95 %"):
         assert words in text
+    assert "…" not in text.partition("readings")[2]
 
 
 def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
