@@ -28,7 +28,7 @@ PLATFORM = (
 """The metadata that have to be equal for equal bits."""
 CHECKED = (
     ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE, ch.ROBOT_DONE,
-    ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES,
+    ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
 )  # fmt: skip
 """Causes before what follows from them."""
 

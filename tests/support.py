@@ -144,6 +144,7 @@ def examples() -> Iterator[m.Message]:
     yield m.MapEstimate(9_000, "alpha", 1, 5, 0, False, two, means, blocks)
     yield m.PoseEstimate(9_000, "alpha", 1, 5, digest, three, from_floats(spd(3)))
     yield m.ParticleCloud(9_000, "alpha", from_floats(range(6)), from_floats([0.25, 0.75]))
+    yield m.Innovation(9_000, "alpha", 1, 5, 20.5, 22)
     yield m.FusedMap(
         9_000, "join", digest, "alpha/1", True, False, 0, (member,), (m.Member("bravo", 0, 2),),
         True, two, means, packed(spd(4)), 12.5, 14, ("bravo: 1 shared landmark, 2 needed",),

@@ -19,6 +19,7 @@ from team.estimation.compiled import compiled
 from team.estimation.fastslam import Particles
 from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import wrapped
+from team.estimation.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import NEAREST_M, Increment
 from team.estimation.submap import NO_NODES, LocalMap
 
@@ -48,6 +49,7 @@ class Window:
     ids:      the landmark of each reading.
     readings: (range [m], bearing [rad]) with the sensor's calibration applied.
     node_stamps, node_epochs: team time [ns] of the pose nodes, and the epoch that each is.
+    innovation: of all readings so far that were predicted.
     """
 
     front_end: FrontEnd
@@ -59,6 +61,7 @@ class Window:
     readings: Float[np.ndarray, "N 2"]
     node_stamps: Int64[np.ndarray, " nodes"]
     node_epochs: Int64[np.ndarray, " nodes"]
+    innovation: Innovation = NOTHING
 
 
 def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
@@ -88,6 +91,7 @@ def advanced(
 
     The readings are accepted and corrected already (`models.acceptable`, `models.corrected`).
     """
+    expected = innovation(window.particles, increment, window.sensor, ids, ranges, bearings)
     particles, info = fastslam.propagated_and_updated(
         window.particles,
         increment,
@@ -108,6 +112,7 @@ def advanced(
         epochs=np.concatenate((window.epochs, epoch)),
         ids=np.concatenate((window.ids, ids)),
         readings=np.concatenate((window.readings, np.column_stack((ranges, bearings)))),
+        innovation=window.innovation.plus(expected),
     )
 
 

@@ -10,6 +10,7 @@ from team.config import RobotConfig
 from team.estimation import geometry
 from team.estimation import window as windows
 from team.estimation.gaussian import Matrix
+from team.estimation.innovation import NOTHING, Innovation
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import WholeMap, begun, joined
@@ -30,7 +31,10 @@ class Cloud(NamedTuple):
 
 @dataclass(frozen=True)
 class ClosedWindow:
-    """A submap with the names of its inputs, and the sightings from its pose nodes."""
+    """A submap with the names of its inputs, and the sightings from its pose nodes.
+
+    innovation: of the window's readings that were predicted.
+    """
 
     sequence: int
     first_reading: int
@@ -40,6 +44,7 @@ class ClosedWindow:
     local: LocalMap
     sightings: tuple[NodeSighting, ...] = ()
     cloud: Cloud | None = None
+    innovation: Innovation = NOTHING
 
 
 class HybridMember:
@@ -66,6 +71,7 @@ class HybridMember:
         self._start_ns: int | None = None
         self._window: Window = windows.opened(config.front_end, config.sensor)
         self._generator = generator(config.seed, config.id, epoch, 0)
+        self._innovation = NOTHING
         self.whole: WholeMap = begun(np.zeros(3), None)
         self.last_epoch_ns: int | None = None
 
@@ -125,6 +131,11 @@ class HybridMember:
         """The open window."""
         return self._window
 
+    @property
+    def innovation(self) -> Innovation:
+        """Of every window of this epoch, since this process consumes it."""
+        return self._innovation.plus(self._window.innovation)
+
     def _advance(self, epoch: Epoch) -> None:
         self._window = windows.advanced(
             self._window,
@@ -155,7 +166,9 @@ class HybridMember:
             local,
             () if self._grid is None else self._grid.sightings(),
             self._cloud(),
+            self._window.innovation,
         )
+        self._innovation = self._innovation.plus(closed.innovation)
         self.whole = joined(self.whole, local)
         self._begin_window(self.sequence + 1, self._last_reading + 1, stamp_ns)
         return closed

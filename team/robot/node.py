@@ -163,6 +163,9 @@ class RobotNode:
             "landmarks": float(len(self._own_landmarks()[0])),
             "pose_sigma_m": self._pose_sigma,
         }
+        nis = self._hybrid.innovation
+        if nis.per_dof is not None:
+            figures |= {"nis_per_dof": nis.per_dof, "nis_dof": float(nis.dof)}
         state = "done" if self._done else "mapping" if self._inbox.next_reading else "waiting"
         node = ch.robot_node(self.robot)
         waiting = ("no readings of this team yet",) if state == "waiting" else ()
@@ -323,6 +326,10 @@ class RobotNode:
             poses, weights = (from_floats(x) for x in closed.cloud)
             cloud = m.ParticleCloud(closed.end_ns, self.robot, poses, weights)
             out.append(Outgoing(ch.PARTICLES, self.robot, cloud))
+        innovation = m.Innovation(
+            closed.end_ns, self.robot, self._epoch, closed.sequence, *closed.innovation
+        )
+        out.append(Outgoing(ch.INNOVATION, self.robot, innovation))
         out += self._poses(closed.end_ns)
         out += self._exchanged(closed.end_ns)
         return [*out, self._progress()]

@@ -76,6 +76,8 @@ TEAM_POSE = Channel("team_pose", "robot/{robot}/team/pose", m.PoseEstimate, "one
                     "latest", True, True, "pose given the fused map; never an input of fusion")  # fmt: skip
 PARTICLES = Channel("particles", "robot/{robot}/particles", m.ParticleCloud, "one per window",
                     "latest", True, True, "thinned cloud, for viewers")  # fmt: skip
+INNOVATION = Channel("innovation", "robot/{robot}/innovation", m.Innovation, "one per window", "latest",
+                     True, True, "how well a window's readings were predicted (NIS)")  # fmt: skip
 ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 readings",
                          "latest", True, False, "credit for the world")  # fmt: skip
 ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per life of the stream", "latest", True,

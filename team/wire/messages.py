@@ -260,6 +260,20 @@ class ParticleCloud(Message, frozen=True, array_like=True, gc=False, tag="partic
         check_finite(self.weights, "weights")
 
 
+class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovation/1"):
+    """Σ νᵀ S⁻¹ ν of a window's readings against their prediction; χ² where the models are right.
+
+    dof: its degrees of freedom, two for each reading of a landmark that the window knew already.
+    (robot, epoch, sequence) and stamp_ns are those of the window's submap.
+    """
+
+    robot: Name
+    epoch: Count
+    sequence: Count
+    squared: Annotated[float, Meta(ge=0.0, le=1e300)]
+    dof: Count
+
+
 class Member(msgspec.Struct, frozen=True, array_like=True):
     """One entry of a version vector: all submaps of (robot, epoch) up to `sequence` are in."""
 
