@@ -10,6 +10,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
 from sim.cli_calibrate import app as calibrate_commands  # noqa: E402
+from sim.cli_experiment import app as experiment_commands  # noqa: E402
 from sim.cli_launch import app as launch_commands  # noqa: E402
 from sim.cli_log import app as log_tools  # noqa: E402
 from sim.cli_logs import app as log_commands  # noqa: E402
@@ -27,6 +28,7 @@ app = typer.Typer(
 for _part in (launch_commands, node_commands, log_commands, rerun_commands, calibrate_commands):
     app.add_typer(_part)
 app.add_typer(log_tools)
+app.add_typer(experiment_commands)
 
 
 @app.callback(invoke_without_command=True)

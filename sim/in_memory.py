@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from central.config import CentralConfig
 from central.node import CentralNode
 from sim.links import Conditions, Link
 from sim.scenario import Scenario
@@ -71,6 +72,7 @@ def run_nodes(
     world: World,
     conditions: Conditions | None = None,
     robot: Callable[[RobotConfig], RobotNode] = RobotNode,
+    central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
 ) -> Iterator[Sample]:
     """Run the scenario's robots and centre in a world, until nothing is on its way any more.
 
@@ -88,7 +90,7 @@ def run_nodes(
     for channel in world.listens:
         source.bus.subscribe(channel)
     source.bus.watch_alive()
-    centre = _centre(network, scenario, conditions)
+    centre = _centre(network, scenario, conditions, central)
     robots = [_robot(network, robot(config), conditions) for config in scenario.robots]
     _enter(source, "world")
     _enter(centre, "central")
@@ -104,7 +106,7 @@ def run_nodes(
             centre.bus.close()
             up = False
         elif not up and not conditions.centre_is_down(now_ns):
-            centre = _centre(network, scenario, conditions)
+            centre = _centre(network, scenario, conditions, central)
             _enter(centre, "central")
             up = True
         seats = [source, *([centre] if up else []), *robots]
@@ -124,13 +126,18 @@ def _enter(seat: _Seat, token: str) -> None:
     seat.bus.declare_alive(token)
 
 
-def _centre(network: MemoryNetwork, scenario: Scenario, conditions: Conditions) -> _Seat:
+def _centre(
+    network: MemoryNetwork,
+    scenario: Scenario,
+    conditions: Conditions,
+    central: Callable[[CentralConfig, list[str]], CentralNode],
+) -> _Seat:
     names = [config.id for config in scenario.robots]
     bus = MemoryBus(network)
     for channel in CentralNode.listens:
         bus.subscribe(channel)
     bus.watch_alive()
-    return _Seat(CentralNode(scenario.central, names), bus, conditions.to_centre(names))
+    return _Seat(central(scenario.central, names), bus, conditions.to_centre(names))
 
 
 def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _Seat:

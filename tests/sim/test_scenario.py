@@ -26,7 +26,16 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_the_built_in_scenarios_are_the_documented_ones() -> None:
-    assert builtin_names() == ("thesis", "thesis-b", "utias", "waypoints")
+    assert builtin_names() == (
+        "large",
+        "random-10",
+        "random-3",
+        "random-5",
+        "thesis",
+        "thesis-b",
+        "utias",
+        "waypoints",
+    )
 
 
 @pytest.mark.parametrize("name", builtin_names())
@@ -188,7 +197,7 @@ UTIAS = 'world = { kind = "utias" }\n'
         ("world = { kind = 'simulated' }", "missing required field steps"),
         (UTIAS + "[[robots]]\nid = 'alice'", "the robot alice: in a UTIAS world robots are r1, r2"),
         ("world = { kind = 'utias', start_sigma_m = 1 }", "are both 0 or both above 0"),
-        ("base = 'thesys'", "expected a built-in scenario, got 'thesys' at base; known: thesis"),
+        ("base = 'thesys'", "expected a built-in scenario, got 'thesys' at base; known: large, "),
         ("estimator = 'hybrid-thesis'\n" + SMALL, "valid: hybrid + join, hybrid + kalman, "),
     ],
 )

@@ -1,0 +1,208 @@
+"""One run of a team in memory, judged against the truth and the batch optimiser, as a task."""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from statistics import fmean, median
+from typing import Any, NamedTuple
+
+import msgspec
+
+from central.node import CentralNode
+from sim.evaluation import Evaluation, evaluate
+from sim.experiments.experiment import Dataset
+from sim.experiments.task import Task
+from sim.in_memory import run_nodes
+from sim.limit import Limit, LimitError, batch_map
+from sim.scenario import Scenario, loads, with_options
+from sim.source import streams_of
+from sim.world_node import WorldNode, expected_nodes
+from sim.worlds import SimulatedWorld
+from team import translate
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample
+
+Figures = dict[str, Any]
+_COST_S = 2.5e-3
+"""Of a robot's step, about."""
+_UTIAS_COST_S = 40.0
+
+
+def team_task(scenario: Scenario, *, batch: bool = False, dataset: Dataset | None = None) -> Task:
+    """A run of this scenario. batch: with the batch MAP of the same readings beside it."""
+    world = scenario.world
+    cost = (
+        _COST_S * world.steps * len(scenario.robots)
+        if isinstance(world, SimulatedWorld)
+        else _UTIAS_COST_S
+    )
+    pair = f"{scenario.estimator} + {scenario.fusion}"
+    place = scenario.name if dataset is None else dataset.name
+    return Task(
+        "sim.experiments.team_runs:team_run",
+        {"scenario": msgspec.to_builtins(scenario), "batch": batch}
+        | ({} if dataset is None else {"sha256": dataset.sha256}),
+        f"{place}, {len(scenario.robots)} robots, {pair}, seed {scenario.seed}",
+        cost,
+        {} if dataset is None else {"path": str(dataset.path)},
+    )
+
+
+def team_run(
+    scenario: Mapping[str, Any], batch: bool, sha256: str = "", path: str | None = None
+) -> Figures:
+    """The figures of one run; `batch`, if asked for, holds those of the batch MAP.
+
+    sha256: of the data set at `path`; it stands for it in the task's name.
+    """
+    resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
+    samples, times = timed_run(resolved)
+    figures = team_figures(evaluate(samples)) | times.figures(samples)
+    if batch:
+        try:
+            figures["batch"] = limit_figures(batch_map(samples))
+        except LimitError as error:
+            figures["batch_error"] = str(error)
+    return figures
+
+
+class Times:
+    """CPU time [s] that the robots and the centre spent on messages."""
+
+    def __init__(self) -> None:
+        self.robots = 0.0
+        self.centre = 0.0
+
+    def figures(self, samples: Sequence[Sample]) -> Figures:
+        """Per odometry interval and per fused map."""
+        channels = [sample.key.rpartition("/")[2] for sample in samples]
+        fusions = sum(sample.key == ch.FUSED_MAP.key() for sample in samples)
+        steps = sum(channel == ch.ODOMETRY.template.rpartition("/")[2] for channel in channels)
+        return {
+            "robot_seconds": self.robots,
+            "centre_seconds": self.centre,
+            "seconds_per_step": self.robots / steps if steps else None,
+            "seconds_per_fusion": self.centre / fusions if fusions else None,
+        }
+
+
+def timed_run(scenario: Scenario) -> tuple[list[Sample], Times]:
+    """Run the team in memory; its log, and what it cost."""
+    times = Times()
+
+    class TimedRobot(RobotNode):
+        def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+            begin = time.process_time()
+            out = super().handle(message, now_ns)
+            times.robots += time.process_time() - begin
+            return out
+
+    class TimedCentre(CentralNode):
+        def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+            begin = time.process_time()
+            out = super().handle(message, now_ns)
+            times.centre += time.process_time() - begin
+            return out
+
+    expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
+    world = WorldNode(streams_of(scenario), expected, translate.configured("world", 0, 0, scenario))
+    return list(run_nodes(scenario, world, None, TimedRobot, TimedCentre)), times
+
+
+def team_figures(evaluation: Evaluation) -> Figures:
+    """The figures of a run; None where there is nothing to judge. Means are over the robots."""
+    robots = list(evaluation.robots.values())
+    errors = None if evaluation.map is None else evaluation.map.errors
+    steps = sum(r.consumption.steps for r in robots)
+    sent = sum(r.uplink_bytes or 0 for r in robots)
+    return {
+        "rmse": None if errors is None else errors.rmse_m,
+        "rmse_aligned": None if errors is None else errors.aligned_rmse_m,
+        "nees": None if errors is None else errors.nees_per_dof,
+        "in_band": None if errors is None else errors.in_band,
+        "landmarks": None if errors is None else errors.count,
+        "cost_per_dof": None if evaluation.map is None else evaluation.map.cost_per_dof,
+        "position_rmse": rms(r.smoothed.position_rmse_m for r in robots if r.smoothed),
+        "position_rmse_aligned": rms(r.aligned_rmse_m for r in robots),
+        "final_pose_nees": mean(r.final_pose_nees_per_dof for r in robots),
+        "online_position_rmse": rms(r.online.position_rmse_m for r in robots if r.online),
+        "online_pose_nees": mean(r.online.nees_per_dof for r in robots if r.online),
+        "bytes_per_step": sent / steps if steps else None,
+        "each_once": all(
+            r.consumption.each_once and r.consumption.consumed == r.consumption.published
+            for r in robots
+        ),
+        "final_map_sha256": None if evaluation.map is None else evaluation.map.payload_sha256,
+        "not_joined": [] if evaluation.map is None else list(evaluation.map.reasons),
+    }
+
+
+def limit_figures(limit: Limit) -> Figures:
+    """The figures of the batch MAP under the same names."""
+    errors = limit.errors
+    return {
+        "rmse": None if errors is None else errors.rmse_m,
+        "rmse_aligned": None if errors is None else errors.aligned_rmse_m,
+        "nees": None if errors is None else errors.nees_per_dof,
+        "in_band": None if errors is None else errors.in_band,
+        "position_rmse": rms(limit.position_rmse_m.values()),
+        "final_pose_nees": mean(limit.final_pose_nees_per_dof.values()),
+    }
+
+
+class Figure(NamedTuple):
+    """A figure over seeds: its name, the run's figure that it is made of, and how."""
+
+    name: str
+    source: str
+    over_seeds: Callable[[Iterable[float | None]], float | None]
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """The mean of the values that there are."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
+
+
+def middle(values: Iterable[float | None]) -> float | None:
+    """The median of the values that there are."""
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
+def rms(values: Iterable[float | None]) -> float | None:
+    """The root of the mean square of the values that there are."""
+    square = mean(None if value is None else value * value for value in values)
+    return None if square is None else square**0.5
+
+
+OVER_SEEDS = (
+    Figure("rmse", "rmse", rms),
+    Figure("rmse_aligned", "rmse_aligned", rms),
+    Figure("nees", "nees", mean),
+    Figure("nees_median", "nees", middle),
+    Figure("in_band", "in_band", mean),
+    Figure("cost_per_dof", "cost_per_dof", mean),
+    Figure("position_rmse", "position_rmse", rms),
+    Figure("position_rmse_aligned", "position_rmse_aligned", rms),
+    Figure("final_pose_nees", "final_pose_nees", mean),
+    Figure("online_position_rmse", "online_position_rmse", rms),
+    Figure("online_pose_nees", "online_pose_nees", mean),
+    Figure("bytes_per_step", "bytes_per_step", mean),
+    Figure("each_once", "each_once", mean),
+    Figure("robot_seconds", "robot_seconds", mean),
+    Figure("centre_seconds", "centre_seconds", mean),
+    Figure("seconds_per_step", "seconds_per_step", mean),
+    Figure("seconds_per_fusion", "seconds_per_fusion", mean),
+)
+"""Errors as the root of the mean square over the seeds, all else as the mean."""
+
+
+def over_seeds(runs: Sequence[Figures]) -> Figures:
+    """The figures of several runs, under the runs' names, with how many there are."""
+    return {"seeds": len(runs)} | {
+        figure.name: figure.over_seeds(run.get(figure.source) for run in runs)
+        for figure in OVER_SEEDS
+        if any(figure.source in run for run in runs)
+    }
