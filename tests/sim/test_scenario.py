@@ -215,7 +215,7 @@ def test_an_unknown_name_lists_what_is_built_in() -> None:
     with pytest.raises(ScenarioError) as refused:
         load("thesis2")
     assert str(refused.value) == (
-        "thesis2: no such scenario; built in: thesis, thesis-b, utias, waypoints; "
+        f"thesis2: no such scenario; built in: {', '.join(builtin_names())}; "
         "or give a path to a .toml file"
     )
 
