@@ -110,4 +110,4 @@ def test_a_built_in_scenario_that_was_shown_is_the_same_one_as_a_file(tmp_path: 
 def test_a_scenario_that_is_not_built_in_can_not_be_shown() -> None:
     refused = CliRunner().invoke(app, ["scenarios", "--show", "thesis-c"])
     assert refused.exit_code == 2
-    assert "known: thesis, thesis-b" in refused.stderr
+    assert "thesis, thesis-b, utias" in refused.stderr
