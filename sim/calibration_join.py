@@ -92,14 +92,14 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
             seen = stream.observations(counter)
             member.observe(seen.stamp_ns, (seen.ids, seen.ranges, seen.bearings))
         elif kind == ODOMETRY:
-            closed = member.drive(*stream.odometry(counter))
+            closed = member.drive(*stream.odometry(counter)).closed
             if closed is not None:
                 tracks.append(_track(closed, stamps, window))
                 stamps = []
             window = member.window
             if member.last_epoch_ns is not None:
                 stamps += [member.last_epoch_ns] * (len(window.paths) - len(stamps))
-    last, _ = member.finish()
+    last = member.finish()[0].closed
     return tracks if last is None else [*tracks, _track(last, stamps, window)]
 
 

@@ -29,7 +29,7 @@ from sim.scenario import Scenario, loads
 from sim.scenario_checks import ScenarioError
 from team import translate
 from team.estimation.gaussian import Matrix
-from team.robot.pairs import PAIRS
+from team.pairs import PAIRS
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample

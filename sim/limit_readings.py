@@ -14,7 +14,7 @@ from team.config import RobotConfig
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Pose, between, compose
 from team.estimation.models import Increment
-from team.robot.segmenter import Epoch, Segmenter
+from team.stream.segmenter import Epoch, Segmenter
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened

@@ -9,7 +9,7 @@ import msgspec
 from sim.rerun_log import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.robot.node import RobotNode
-from team.robot.pose_grid import NO_NODE
+from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing

@@ -25,7 +25,7 @@ from sim.scenario_document import (
 )
 from sim.worlds import SimulatedWorld, UtiasWorld, World
 from team.config import Estimator, FusionRule, MotionNoise, RobotConfig
-from team.robot.pairs import PAIRS, named_pairs
+from team.pairs import PAIRS, named_pairs
 
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
            "with_options"]  # fmt: skip

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sim.world_node
-import team.robot.node
+import team.robot.pace
 from central.config import CentralConfig
 from central.node import CentralNode
 from sim.datasets.utias_writer import write_utias
@@ -24,8 +24,8 @@ from sim.scenario import load, with_options
 from sim.source import streams_of
 from sim.world_node import WorldNode
 from team import translate
+from team.pairs import PAIRS
 from team.robot.node import RobotNode
-from team.robot.pairs import PAIRS
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import opened
@@ -48,8 +48,8 @@ def scarce(monkeypatch):
     """Little credit and small portions, so that everybody waits for somebody."""
     monkeypatch.setattr(sim.world_node, "CREDIT_READINGS", 16)
     monkeypatch.setattr(sim.world_node, "BATCH", 5)
-    monkeypatch.setattr(team.robot.node, "PROGRESS_READINGS", 4)
-    monkeypatch.setattr(team.robot.node, "CREDIT_SUBMAPS", 1)
+    monkeypatch.setattr(team.robot.pace, "PROGRESS_READINGS", 4)
+    monkeypatch.setattr(team.robot.pace, "CREDIT_SUBMAPS", 1)
 
 
 # Law 1.

@@ -18,7 +18,7 @@ from sim.experiments.experiment import (
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, over_seeds, team_task
 from sim.scenario import load, with_options
-from team.robot.pairs import PAIRS
+from team.pairs import PAIRS
 
 OURS = ("hybrid", "join")
 

@@ -1,7 +1,7 @@
 """Hybrid-SLAM on one robot's readings: windows of particles, each closed into one submap."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -9,17 +9,20 @@ from jaxtyping import Float
 from team.config import RobotConfig
 from team.estimation import geometry
 from team.estimation import window as windows
-from team.estimation.gaussian import Matrix
+from team.estimation.conditioning import RobotPrior, team_pose
+from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.innovation import NOTHING, Innovation
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
-from team.estimation.whole_map import WholeMap, begun, joined
+from team.estimation.whole_map import WholeMap, absorbed, begun, joined
 from team.estimation.window import Window
-from team.robot.pose_grid import Looks, NodeSighting, PoseGrid
-from team.robot.segmenter import Epoch, Segmenter
+from team.stream.pose_grid import Looks, NodeSighting, PoseGrid
+from team.stream.segmenter import Epoch, Segmenter
 
 CLOUD_PARTICLES = 32
 """Particles in a cloud for viewers."""
+NOT_USED = "sightings are not used by this estimator"
+"""Why a sighting of a teammate is rejected where there are no pose nodes."""
 
 
 class Cloud(NamedTuple):
@@ -47,6 +50,20 @@ class ClosedWindow:
     innovation: Innovation = NOTHING
 
 
+@dataclass(frozen=True)
+class Driven:
+    """What an odometry interval gave: a submap; the stamps of a new running pose and map."""
+
+    closed: ClosedWindow | None = None
+    pose_ns: int | None = None
+    map_ns: int | None = None
+
+    @classmethod
+    def with_submap(cls, closed: ClosedWindow) -> Self:
+        """The pose and the map are new with a submap."""
+        return cls(closed, closed.end_ns, closed.end_ns)
+
+
 class HybridMember:
     """One epoch of a robot's stream, from its start or from its last submap.
 
@@ -55,6 +72,9 @@ class HybridMember:
     own whole map by joining them one by one (Brooks & Bailey's back end): that is what the robot
     knows by itself, and no submap depends on it.
     """
+
+    used = "in a submap"
+    joint = True
 
     def __init__(self, config: RobotConfig, epoch: int) -> None:
         self._config = config
@@ -96,35 +116,54 @@ class HybridMember:
     def sight(self, stamp_ns: int, reading: int, looks: Looks) -> str | None:
         """Take sightings of teammates; the reason if they are rejected."""
         if self._grid is None:
-            return "sightings are not used by this estimator"
+            return NOT_USED
         if self._start_ns is None:
             return "older than the odometry"
         return self._grid.observe(stamp_ns, reading, looks)
 
-    def drive(
-        self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
-    ) -> ClosedWindow | None:
+    def drive(self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float) -> Driven:
         """Take one odometry interval; the submap that it closes, if it does."""
         if self._start_ns is None:
             self._start_ns = stamp_ns - duration_ns
             self._segmenter.begin(self._start_ns)
+        before_ns = self.last_epoch_ns
         for epoch in self._segmenter.drive(stamp_ns, duration_ns, forward, yaw_rate):
             self._advance(epoch)
-        if stamp_ns - self._start_ns < self._window_ns:
-            return None
-        return self._close(stamp_ns)
+        if stamp_ns - self._start_ns >= self._window_ns:
+            return Driven.with_submap(self._close(stamp_ns))
+        moved = self.last_epoch_ns != before_ns
+        return Driven(None, self.last_epoch_ns if moved else None)
 
-    def finish(self) -> tuple[ClosedWindow | None, int]:
+    def finish(self) -> tuple[Driven, int]:
         """The stream has ended: the last submap, and how many scans no odometry covered."""
         uncovered = self._segmenter.uncovered
         end_ns = self._segmenter.now_ns
         if self._start_ns is None or end_ns is None or end_ns <= self._start_ns:
-            return None, uncovered
-        return self._close(end_ns), uncovered
+            return Driven(), uncovered
+        return Driven.with_submap(self._close(end_ns)), uncovered
 
     def open_gaussian(self) -> LocalMap:
         """The open window's Gaussian at its last epoch."""
         return windows.gaussian(self._window)
+
+    def open_window(self) -> LocalMap | None:
+        """The open window's Gaussian, if it has an epoch."""
+        return None if self.last_epoch_ns is None else self.open_gaussian()
+
+    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+        """The pose of the own whole map, times the open window."""
+        ids, means = self.whole.ids, self.whole.mean[3:].reshape(-1, 2)
+        own = RobotPrior(self.whole.mean[:3], ids, means, self.whole.covariance)
+        return PoseGaussian(*team_pose(own, (), window))
+
+    def own_map(self) -> LandmarkGaussian:
+        """The landmarks of the own whole map."""
+        whole = self.whole
+        return LandmarkGaussian(whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:])
+
+    def absorb(self, ids: np.ndarray, means: Float[np.ndarray, "L 2"], covariance: Matrix) -> None:
+        """The fused landmarks replace those of the own whole map; submaps never see it."""
+        self.whole = absorbed(self.whole, ids, means, covariance)
 
     @property
     def window(self) -> Window:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from team import translate
 from team.robot.member import HybridMember
-from team.robot.thesis_member import ThesisMember
+from team.robot.members import member_of
 from team.wire import messages as m
 from tests.teams import config, published, stream
 
@@ -25,7 +25,7 @@ def fed(member, readings):
         if isinstance(reading, m.Odometry):
             window = member.drive(
                 reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
-            )
+            ).closed
             closed += [] if window is None else [window]
     return closed
 
@@ -49,9 +49,9 @@ def same(a, b):
 def test_windows_are_contiguous_in_readings_and_time():
     member = begun()
     closed = fed(member, READINGS)
-    last, uncovered = member.finish()
+    ended, uncovered = member.finish()
     assert uncovered == 0
-    assert last is None, "the last window ended with the last odometry"
+    assert ended.closed is None, "the last window ended with the last odometry"
     assert [w.sequence for w in closed] == [0, 1, 2, 3]
     assert closed[0].first_reading == 0
     assert closed[-1].last_reading == len(READINGS) - 1
@@ -107,35 +107,31 @@ def test_what_no_odometry_covers_is_counted_at_the_end():
     readings = published(stream("r1", 4, beyond=3))
     member = begun()
     closed = fed(member, readings)
-    last, uncovered = member.finish()
+    ended, uncovered = member.finish()
     assert uncovered == 3
-    assert last.last_reading == readings[-1].reading
-    assert last.first_reading == closed[-1].last_reading + 1
-    assert last.end_ns == 4_000_000_000
+    assert ended.closed.last_reading == readings[-1].reading
+    assert ended.closed.first_reading == closed[-1].last_reading + 1
+    assert ended.closed.end_ns == 4_000_000_000
 
 
 def test_a_member_without_odometry_has_no_window_and_covers_nothing():
     readings = published(stream("r1", 4, drives=False))
     member = begun()
     assert fed(member, readings) == []
-    last, uncovered = member.finish()
-    assert last is None
+    ended, uncovered = member.finish()
+    assert ended.closed is None
     assert uncovered == sum(isinstance(r, m.Observations) for r in readings)
 
 
 def test_the_thesis_member_starts_where_it_is_told_and_replaces_what_it_absorbs():
-    member = ThesisMember(config(), 1)
-    member.start(np.array([1.0, 2.0, 0.5]))
-    np.testing.assert_array_equal(member.state.pose, [1.0, 2.0, 0.5])
-    for reading in READINGS[1:]:
-        if isinstance(reading, m.Observations):
-            member.observe(reading.stamp_ns, translate.scan_of(reading))
-        if isinstance(reading, m.Odometry):
-            member.drive(reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate)
-    assert member.epochs == sum(isinstance(r, m.Observations) for r in READINGS)
-    assert len(member.state.ids) > 0
-    ids = member.state.ids[:1]
-    member.absorb(ids, np.array([[50.0, 60.0]]), 4.0 * np.eye(2)[None])
-    where = int(np.flatnonzero(member.state.ids == ids[0])[0])
-    np.testing.assert_array_equal(member.state.landmarks[where], [50.0, 60.0])
-    np.testing.assert_array_equal(member.state.covariances[where], 4.0 * np.eye(2))
+    member = member_of(config(estimator="hybrid-thesis", fusion="kalman-per-axis"), 1)
+    member.start(np.array([1.0, 2.0, 0.5]), None)
+    np.testing.assert_array_equal(member.own_pose(None).mean, [1.0, 2.0, 0.5])
+    fed(member, READINGS[1:])
+    assert member.sequence == sum(isinstance(r, m.Observations) for r in READINGS)
+    before = member.own_map()
+    assert len(before.ids) > 0
+    member.absorb(before.ids[:1], np.array([[50.0, 60.0]]), 4.0 * np.eye(2))
+    after = member.own_map()
+    np.testing.assert_array_equal(after.means, [[50.0, 60.0], *before.means[1:]])
+    np.testing.assert_array_equal(after.covariance[:2, :2], 4.0 * np.eye(2))

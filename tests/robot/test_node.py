@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team import translate
-from team.robot import node as robot_node
+from team.robot import pace
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -199,7 +199,7 @@ def test_everything_it_sends_passes_the_door():
 
 def test_progress_never_passes_a_window_that_may_still_end(monkeypatch):
     """At a progress's stamp every submap that ends there or before has been sent."""
-    monkeypatch.setattr(robot_node, "PROGRESS_READINGS", 1)
+    monkeypatch.setattr(pace, "PROGRESS_READINGS", 1)
     node, passed = RobotNode(config()), -1
     for reading in published(stream("r1", 12)):
         for o in node.handle(reading, 0):
@@ -211,7 +211,7 @@ def test_progress_never_passes_a_window_that_may_still_end(monkeypatch):
 
 
 def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeypatch):
-    monkeypatch.setattr(robot_node, "CREDIT_SUBMAPS", 1)
+    monkeypatch.setattr(pace, "CREDIT_SUBMAPS", 1)
     node = RobotNode(config())
     node.handle(CENTRE, 0)
     out = [o for r in READINGS for o in node.handle(r, 0)] + node.handle(END, 0)
@@ -297,7 +297,7 @@ def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
 
 def test_waiting_for_an_exchange_a_robot_reports_what_it_has_received(monkeypatch):
     """Else the world waits for it, and it for a teammate that waits for the world."""
-    monkeypatch.setattr(robot_node, "PROGRESS_READINGS", 4)
+    monkeypatch.setattr(pace, "PROGRESS_READINGS", 4)
     node = feedback()
     out = [o for r in READINGS for o in node.handle(r, 0)]
     assert node.next_reading < len(READINGS) - 10

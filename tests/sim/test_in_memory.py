@@ -8,7 +8,7 @@ from sim.in_memory import final_map, run_team
 from sim.scenario import load, with_options
 from sim.source import streams_of
 from team import translate
-from team.robot.pairs import PAIRS
+from team.pairs import PAIRS
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import opened

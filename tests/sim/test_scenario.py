@@ -9,7 +9,7 @@ from sim.scenario import builtin_names, doubts, dumps, load, loads, with_options
 from sim.scenario_checks import ScenarioError
 from sim.source import streams_of
 from sim.worlds import SimulatedWorld, UtiasWorld
-from team.robot.pairs import PAIRS
+from team.pairs import PAIRS
 
 SMALL = """
 [world]

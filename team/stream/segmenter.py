@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt32
 from team.config import MotionModel, Sensor
 from team.estimation import geometry
 from team.estimation.models import Increment, acceptable, corrected, increment_of, located
-from team.robot.pose_grid import PoseGrid
+from team.stream.pose_grid import PoseGrid
 
 
 @dataclass(frozen=True)

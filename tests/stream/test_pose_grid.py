@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation.models import Increment
 from team.robot.member import HybridMember
-from team.robot.pose_grid import PoseGrid
-from team.robot.segmenter import Segmenter
+from team.stream.pose_grid import PoseGrid
+from team.stream.segmenter import Segmenter
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
 
@@ -157,7 +157,7 @@ def test_a_member_closes_its_windows_with_their_nodes_and_sightings():
         if k > 1:
             reason = member.sight(k * SECOND - 500_000_000, k, look())
             assert reason == ("no pose node near it" if k == 4 else None), "its node was the end"
-        window = member.drive(k * SECOND, SECOND, 0.5, 0.1)
+        window = member.drive(k * SECOND, SECOND, 0.5, 0.1).closed
         closed += [] if window is None else [window]
     assert [w.local.node_stamps.tolist() for w in closed] == [
         [1_500_000_000, 3 * SECOND],

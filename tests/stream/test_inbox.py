@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.robot.inbox import Inbox
+from team.stream.inbox import Inbox
 from team.wire import messages as m
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.models import Increment
-from team.robot.segmenter import Segmenter
+from team.stream.segmenter import Segmenter
 
 SECOND = 1_000_000_000
 WHITE = MotionModel(

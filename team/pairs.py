@@ -17,9 +17,13 @@ PAIRS: MappingProxyType[tuple[Estimator, FusionRule], Channel] = MappingProxyTyp
     }
 )
 """(estimator, rule) → what the centre subscribes to. `submap`: independent, each reading once.
-`own/map`: whole maps that the robots absorb again. A pair that is not here has no meaning: the
-thesis' estimator makes no submaps and no joint covariance, so only the rule per axis can take it.
+`own/map`: whole maps. A pair that is not here has no meaning: the thesis' estimator makes no
+submaps and no joint covariance, so only the rule per axis can take it.
 """
+FEEDBACK: frozenset[FusionRule] = frozenset(
+    {"kalman", "kalman-per-axis", "covariance-intersection"}
+)
+"""The rules whose map the robots absorb again, in lockstep."""
 
 
 def named_pairs() -> str:

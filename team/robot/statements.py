@@ -1,0 +1,106 @@
+"""What a robot says of what its estimator has found: values to messages on their channels."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from team import translate
+from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.sighting import Sighting
+from team.robot.member import ClosedWindow
+from team.stream.pose_grid import NodeSighting
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+
+
+@dataclass(frozen=True)
+class Speaker:
+    """One epoch of a robot's stream under an announced configuration (by its digest)."""
+
+    robot: str
+    epoch: int
+    config: bytes
+
+    def submap(self, closed: ClosedWindow) -> Outgoing:
+        """The window's Gaussian with the names of its inputs."""
+        message = translate.submap_message(
+            self.robot,
+            self.epoch,
+            closed.sequence,
+            (closed.first_reading, closed.last_reading),
+            (closed.start_ns, closed.end_ns),
+            self.config,
+            closed.local,
+            len(closed.sightings),
+        )
+        return Outgoing(ch.SUBMAP, self.robot, message)
+
+    def sighting(self, closed: ClosedWindow, each: NodeSighting) -> Outgoing:
+        """A teammate seen from a pose node of the window."""
+        sighting = Sighting(
+            self.robot,
+            self.epoch,
+            closed.sequence,
+            each.stamp_ns,
+            each.teammate,
+            each.reading,
+            each.covariance,
+        )
+        message = translate.sighting_message(sighting, self.config, each.readings)
+        return Outgoing(ch.SIGHTING_FACTOR, self.robot, message)
+
+    def cloud(self, closed: ClosedWindow) -> list[Outgoing]:
+        """The thinned particles of the window's end, if it has any."""
+        if closed.cloud is None:
+            return []
+        poses, weights = (from_floats(x) for x in closed.cloud)
+        message = m.ParticleCloud(closed.end_ns, self.robot, poses, weights)
+        return [Outgoing(ch.PARTICLES, self.robot, message)]
+
+    def innovation(self, closed: ClosedWindow) -> Outgoing:
+        """How well the window's readings were predicted."""
+        message = m.Innovation(
+            closed.end_ns, self.robot, self.epoch, closed.sequence, *closed.innovation
+        )
+        return Outgoing(ch.INNOVATION, self.robot, message)
+
+    def own_map(
+        self,
+        stamp_ns: int,
+        sequence: int,
+        exchange: int,
+        landmarks: LandmarkGaussian,
+        kind: Literal["joint", "blocks"],
+    ) -> Outgoing:
+        """The running map, with the joint covariance or with each landmark's own."""
+        joint = kind == "joint"
+        message = m.MapEstimate(
+            stamp_ns,
+            self.robot,
+            self.epoch,
+            sequence,
+            exchange,
+            joint,
+            from_ids(landmarks.ids),
+            from_floats(landmarks.means),
+            translate.joint_bytes(landmarks.covariance)
+            if joint
+            else translate.block_bytes(translate.blocks_of(landmarks.covariance)),
+        )
+        return Outgoing(ch.OWN_MAP, self.robot, message)
+
+    def pose(
+        self,
+        channel: ch.Channel,
+        stamp_ns: int,
+        sequence: int,
+        digest: bytes,
+        pose: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
+    ) -> Outgoing:
+        """A running pose; `digest` names the fused map in it."""
+        message = translate.pose_message(stamp_ns, self.robot, self.epoch, sequence, digest, *pose)
+        return Outgoing(channel, self.robot, message)
