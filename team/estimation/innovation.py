@@ -97,26 +97,42 @@ def _predictive(
     readings: Float[np.ndarray, "n 2"],
     sensor: Triple,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
-    """(z − ẑ, S) of n readings as (range, bearing, range, …), m = 2n; L Lᵀ is the motion's Q."""
+    """(z − ẑ, S) of n readings as (range, bearing, range, …), m = 2n; L Lᵀ is the motion's Q.
+
+    S = A Aᵀ + blocks: row j of A is √wᵢ (Hₓ L, dᵢ) of all particles, one behind the other.
+    """
     count, m = len(poses), 2 * len(slots)
     # What was read less what each particle predicts lies near zero, where angles have a mean.
     errors = np.empty((m, count))
+    A, of_landmark = np.empty((m, 4 * count)), np.empty((m, 2, count))
     S = np.zeros((m, m))
     for i in range(count):
-        pose = compose(poses[i], motion)
+        root = math.sqrt(weights[i])
         _predict(
-            pose, means[i], covariances[i], L, slots, readings, sensor, weights[i], errors[:, i], S
-        )
+            compose(poses[i], motion), means[i], L, slots, readings, errors[:, i],
+            A[:, 4 * i : 4 * i + 3], of_landmark[:, :, i],
+        )  # fmt: skip
+        A[:, 4 * i : 4 * i + 3] *= root
+        for k in range(len(slots)):
+            distance = readings[k, 0] - errors[2 * k, i]
+            S[2 * k, 2 * k] += weights[i] * (sensor[0] + sensor[1] * distance * distance)
+            S[2 * k + 1, 2 * k + 1] += weights[i] * sensor[2]
     mean = np.empty(m)
     for j in range(m):
         mean[j] = _centred(errors[j], weights, j % 2 == 1)
+        A[j, 3::4] = np.sqrt(weights) * errors[j]
     for j in range(m):
-        scaled = weights * errors[j]
         for k in range(j + 1):
-            spread = 0.0
-            for i in range(count):
-                spread += scaled[i] * errors[k, i]
-            S[j, k] += spread
+            total = 0.0
+            for column in range(4 * count):
+                total += A[j, column] * A[k, column]
+            if slots[j // 2] == slots[k // 2]:
+                for i in range(count):
+                    xx, xy, yy = covariances[i, slots[j // 2]]
+                    x, y = of_landmark[k, 0, i], of_landmark[k, 1, i]
+                    along = of_landmark[j, 0, i] * (xx * x + xy * y)
+                    total += weights[i] * (along + of_landmark[j, 1, i] * (xy * x + yy * y))
+            S[j, k] += total
             S[k, j] = S[j, k]
     return mean, S
 
@@ -125,18 +141,14 @@ def _predictive(
 def _predict(
     pose: Float[np.ndarray, "3"],
     means: Float[np.ndarray, "L 2"],
-    covariances: Float[np.ndarray, "L 3"],
     L: Float[np.ndarray, "3 3"],
     slots: Int64[np.ndarray, " n"],
     readings: Float[np.ndarray, "n 2"],
-    sensor: Triple,
-    weight: float,
     errors: Float[np.ndarray, " m"],
-    S: Float[np.ndarray, "m m"],
+    of_motion: Float[np.ndarray, "m 3"],
+    of_landmark: Float[np.ndarray, "m 2"],
 ) -> None:
-    """One particle's z − ẑ into `errors`, its weighted covariance onto S's lower triangle."""
-    m = 2 * len(slots)
-    of_motion, of_landmark = np.empty((m, 3)), np.empty((m, 2))
+    """One particle's z − ẑ and the Jacobians Hₓ L and Hₗ of ẑ, all in place."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for k in range(len(slots)):
         r, b = 2 * k, 2 * k + 1
@@ -152,19 +164,6 @@ def _predict(
         of_motion[b, 2] = -L[2, 2]
         of_landmark[r, 0], of_landmark[r, 1] = ex, ey
         of_landmark[b, 0], of_landmark[b, 1] = -ey / distance, ex / distance
-        S[r, r] += weight * (sensor[0] + sensor[1] * distance * distance)
-        S[b, b] += weight * sensor[2]
-    for j in range(m):
-        for k in range(j + 1):
-            shared = 0.0
-            for axis in range(3):
-                shared += of_motion[j, axis] * of_motion[k, axis]
-            if slots[j // 2] == slots[k // 2]:
-                xx, xy, yy = covariances[slots[j // 2]]
-                x, y = of_landmark[k, 0], of_landmark[k, 1]
-                shared += of_landmark[j, 0] * (xx * x + xy * y)
-                shared += of_landmark[j, 1] * (xy * x + yy * y)
-            S[j, k] += weight * shared
 
 
 @compiled
