@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sim.live_truth import LiveErrors
 from sim.scenario import Scenario, dumps
 from sim.supervisor import Child, Ended, end_all
 from team.wire import channels as ch
@@ -42,7 +43,7 @@ class Outcome:
 class Watch:
     """What is known of the team while it runs: the last status of each node, and the last map.
 
-    robots: how many there are to be.
+    robots: how many there are to be. errors: against the truth, where there is one.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -50,18 +51,23 @@ class Watch:
     failures: list[str] = field(default_factory=list)
     began: float = field(default_factory=time.monotonic)
     robots: int = 0
+    errors: LiveErrors = field(default_factory=LiveErrors)
 
     def take(self, bus: Bus) -> None:
         """Take what has come since."""
         for sample in bus.receive(TURN_S):
+            found = ch.channel_of(sample.key)
+            if found is None or not self.errors.wants(*found, sample):
+                continue
             try:
-                _, _, message = opened(sample)
+                channel, _, message = opened(sample)
             except WireError:
                 continue
             if isinstance(message, m.Status):
                 self.statuses[message.node] = message
             elif isinstance(message, m.FusedMap):
                 self.fused = message
+            self.errors.take(channel, message)
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,8 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
             bus.subscribe(ch.STATUS)
             bus.subscribe(ch.FUSED_MAP)
             bus.subscribe(ch.FINAL_MAP)
+            for channel in watch.errors.listens:
+                bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):
                 children.append(Child(name, arguments, plan.folder))
             again = {

@@ -192,6 +192,14 @@ def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
     return joint
 
 
+def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray, "L 2 2"]:
+    """The 2 × 2 covariance of each landmark."""
+    if message.joint:
+        return blocks_of(landmark_covariance_of(message))
+    xx, xy, yy = floats(message.covariance, "covariance").astype(np.float64).reshape(-1, 3).T
+    return np.stack((xx, xy, xy, yy), axis=1).reshape(-1, 2, 2)
+
+
 def landmarks_of(
     message: m.MapEstimate | m.FusedMap | m.TruthLandmarks,
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:

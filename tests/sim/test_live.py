@@ -2,12 +2,14 @@
 
 from io import StringIO
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from sim import live
 from sim.launch import Watch
 from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
 
 
 def status(node: str, state: str, **figures: float) -> m.Status:
@@ -29,3 +31,55 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     waiting, running = out.getvalue().splitlines()
     assert waiting.endswith("] waiting: 1 of 3 robots")
     assert " 50%  team time 0 s, 1 robots" in running
+
+
+def told(robots: int, *, truth: bool) -> Watch:
+    watch = Watch(robots=robots)
+    watch.statuses["world"] = status("world", "publishing", readings=5.0, of=10.0)
+    watch.statuses["central"] = status("central", "joining", joint_cost_per_dof=1.07, submaps=9.0)
+    for k in range(1, robots + 1):
+        watch.statuses[f"robot/r{k}"] = status(
+            f"robot/r{k}", "mapping", steps=12345.0, submaps=1234.0, landmarks=1000.0,
+            pose_sigma_m=12.34, nis_per_dof=1.05, messages_per_s=1500.0, bytes_per_s=150_000.0,
+        )  # fmt: skip
+        if truth:
+            watch.errors._robot(f"r{k}").tally.take(np.array([3.0, 9.0]), 3)
+    watch.fused = m.FusedMap(
+        0, "join", bytes(8), "r1/1", False, False, 0, (), (), False, from_ids([1, 2]),
+        from_floats([0.0] * 4), from_floats([1.0, 0.0, 1.0] * 2), 1.0, 1,
+    )  # fmt: skip
+    if truth:
+        watch.errors.landmarks.take(np.array([1.0, 2.0]), 2)
+    return watch
+
+
+def printed(watch: Watch, width: int) -> list[str]:
+    out = StringIO()
+    Console(file=out, width=width).print(live._view("thesis, seed 1", watch))
+    return out.getvalue().splitlines()
+
+
+def test_the_table_fits_eighty_columns_with_the_largest_figures() -> None:
+    lines = printed(told(5, truth=True), 80)
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    row = next(line for line in lines if line.strip().startswith("r3")).split()
+    assert row == [
+        "r3", "12,345", "1,234", "1,000", "12.34", "1.05", "1,500", "150,000", "2.00", "50%",
+        "mapping",
+    ]  # fmt: skip
+    expected = "joint cost per dof 1.07, map NEES per dof 0.75, 100% of landmarks within 95 %"
+    assert expected in lines
+
+
+def test_without_truth_there_are_the_monitor_and_nis_alone() -> None:
+    lines = printed(told(2, truth=False), 80)
+    assert any("NIS" in line for line in lines)
+    assert not any("NEES" in line or "95 %" in line for line in lines)
+    assert "joint cost per dof 1.07" in lines
+
+
+def test_a_large_team_is_cut_before_the_terminal_cuts_it() -> None:
+    lines = printed(told(20, truth=False), 100)
+    assert any("8 more" in line for line in lines)
+    assert len(lines) < 24
