@@ -8,6 +8,17 @@ from msgspec import Meta
 from team.config import FusionRule, Positive
 
 
+class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How large the errors are that all submaps of a robot share, before they are estimated.
+
+    bearing [rad]; range_scale, forward_scale: shares of the range and of the way driven.
+    """
+
+    bearing: Positive = 0.01
+    range_scale: Positive = 0.005
+    forward_scale: Positive = 0.05
+
+
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The rule and its figures.
 
@@ -19,6 +30,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap; absent: plain squares.
     covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors
     are independent from reading to reading.
+    bias_sigma: of the errors that robots send their submaps' sensitivities for.
     """
 
     fusion: FusionRule = "join"
@@ -27,3 +39,4 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_c: Positive | None = None
     covariance_factor: Annotated[float, Meta(ge=1.0)] = 1.0
     gauss_newton_per_tick: Annotated[int, Meta(ge=1, le=50)] = 2
+    bias_sigma: BiasSigmas = BiasSigmas()

@@ -169,6 +169,8 @@ class JoinRule:
             ids, means, blocks = marginals.landmark_blocks(fold)
             covariance = translate.block_bytes(blocks)
         self.landmarks = len(ids)
+        biases = marginals.bias_estimates(fold)
+        self.finding = self.finding.with_biases(biases)
         frame = fold.frame
         last_ns = fold.contributions[-1].end_ns if fold.contributions else 0
         return m.FusedMap(
@@ -188,6 +190,7 @@ class JoinRule:
             chi2,
             round(dof),
             tuple(fold.reasons[k] for k in sorted(fold.reasons)),
+            tuple(m.BiasEstimate(*b.stream, b.bias, b.value, b.sigma) for b in biases),
         )
 
     def _priors(self, fold: Fold, digest: bytes) -> list[Outgoing]:

@@ -5,12 +5,13 @@ NEES is 1, 1.10-1.18 where it is 1.4-2, 54 where it is 514. With few degrees of 
 so a level counts only beyond the 99.9 % quantile of χ² as well.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from scipy.stats import chi2 as chi_squared
 
-from team.estimation.marginals import Agreement
+from team.estimation.marginals import Agreement, BiasEstimate
 
 WARN = 1.1
 FAIL = 1.3
@@ -25,6 +26,14 @@ class Finding:
 
     figures: dict[str, float]
     warnings: tuple[str, ...]
+
+    def with_biases(self, biases: Sequence[BiasEstimate]) -> "Finding":
+        """The finding with each bias and its sigma among the figures, by robot and name."""
+        figures = {}
+        for (robot, _), bias, value, sigma in biases:
+            figures[f"bias.{robot}.{bias}"] = value
+            figures[f"bias_sigma.{robot}.{bias}"] = sigma
+        return replace(self, figures=self.figures | figures)
 
 
 NOTHING = Finding({}, ())

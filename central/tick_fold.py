@@ -31,6 +31,11 @@ def join_settings(config: CentralConfig) -> JoinSettings:
         iterations_per_tick=config.gauss_newton_per_tick,
         robust_c=config.robust_c,
         covariance_factor=config.covariance_factor,
+        bias_sigma={
+            "bearing": config.bias_sigma.bearing,
+            "forward_scale": config.bias_sigma.forward_scale,
+            "range_scale": config.bias_sigma.range_scale,
+        },
     )
 
 

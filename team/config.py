@@ -16,6 +16,7 @@ Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 
 Estimator = Literal["hybrid", "hybrid-thesis"]
+Bias = Literal["bearing", "forward_scale", "range_scale"]
 FusionRule = Literal["join", "kalman", "kalman-per-axis", "covariance-intersection"]
 
 
@@ -36,6 +37,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     independent noises. forward_scale and yaw_scale multiply the logged values first.
     turn_drag [m]: a base whose outer wheel is no faster than the logged speed loses
     turn_drag·|yaw rate| of it in a turn, at most all. veer [rad/m]: it turns so much on each metre.
+    calibrated_speed: the logged speeds [m/s] from which forward_scale was learnt; where the robot
+    is slower or faster the scale has an error of its own (the bias "forward_scale").
     """
 
     kind: Literal["turn-then-drive", "velocity"] = "velocity"
@@ -48,6 +51,12 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     yaw_rate_limit: Positive | None = None
     turn_drag: NonNegative = 0.0
     veer: float = 0.0
+    calibrated_speed: tuple[NonNegative, NonNegative] | None = None
+
+    def __post_init__(self) -> None:
+        speeds = self.calibrated_speed
+        if speeds is not None and speeds[0] > speeds[1]:
+            raise ValueError("calibrated_speed is [least, most]: the least comes first")
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,6 +97,8 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window, so that sightings of teammates are factors between poses; 0: none, sightings unused.
     sighting_s: a sighting is used if such a time is no farther from it than this. teammate_speed:
     how fast a teammate may move in between [m/s].
+    biases: the errors shared by all of the robot's windows that the centre estimates; each submap
+    carries its derivative by each of them.
     """
 
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 100
@@ -98,6 +109,11 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     node_s: NonNegative = 0.0
     sighting_s: NonNegative = 0.5
     teammate_speed: NonNegative = 0.2
+    biases: tuple[Bias, ...] = ()
+
+    def __post_init__(self) -> None:
+        if tuple(sorted(set(self.biases))) != self.biases:
+            raise ValueError("biases are named once each, in alphabetical order")
 
 
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ from team.estimation.conditioning import RobotPrior
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.joining import Contribution, Sighting
 from team.estimation.joining import Start as StartValue
-from team.estimation.submap import LocalMap
+from team.estimation.submap import NO_COLUMNS, LocalMap
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, stamps
 
@@ -95,6 +95,8 @@ def submap_message(
         from_floats(packed(local.covariance)),
         from_stamps(local.node_stamps),
         sightings,
+        local.biases,
+        from_floats(local.sensitivity),
     )
 
 
@@ -106,7 +108,16 @@ def local_map_of(message: m.Submap) -> LocalMap:
         mean,
         unpacked(floats(message.covariance, "covariance"), len(mean)),
         stamps(message.nodes, "nodes").astype(np.int64),
+        message.biases,
+        _sensitivity_of(message),
     )
+
+
+def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
+    if not message.biases:
+        return NO_COLUMNS
+    rows = floats(message.sensitivity, "sensitivity").astype(np.float64)
+    return rows.reshape(len(message.biases), -1)
 
 
 def sighting_message(

@@ -136,7 +136,7 @@ def examples() -> Iterator[m.Message]:
     yield m.Configured(0, "robot/alpha", 1, digest, '{"seed": 7}')
     yield m.Submap(
         9_000, "alpha", 1, 5, 10, 19, 8_000, digest, two, from_floats(range(10)), packed(spd(10)),
-        from_stamps([8_500]), 1,
+        from_stamps([8_500]), 1, ("bearing", "range_scale"), from_floats(np.arange(20) / 16.0),
     )  # fmt: skip
     yield m.SightingFactor(
         8_500, "alpha", 1, 5, digest, "bravo", 6.0, -3.0, packed(spd(2)), (12, 14)
@@ -148,6 +148,7 @@ def examples() -> Iterator[m.Message]:
     yield m.FusedMap(
         9_000, "join", digest, "alpha/1", True, False, 0, (member,), (m.Member("bravo", 0, 2),),
         True, two, means, packed(spd(4)), 12.5, 14, ("bravo: 1 shared landmark, 2 needed",),
+        (m.BiasEstimate("alpha", 1, "bearing", 0.25, 0.125),),
     )  # fmt: skip
     yield m.Prior(9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)))
     yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))

@@ -1,19 +1,20 @@
 """The solution of a submap graph: Gauss-Newton, damped only where the cost would rise.
 
-Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start − prior‖², where ρ is the identity, or Cauchy's
-loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters with a wide scale
-that narrows with each iteration it has lived through, so a true loop closure is not taken for an
-outlier before the chain has bent.
+Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start or bias − prior‖², where ρ is the identity, or
+Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters with a wide
+scale that narrows with each iteration it has lived through, so a true loop closure is not taken for
+an outlier before the chain has bent.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.config import Bias
 from team.estimation import joining_kernel as kernel
 from team.estimation import sighting_kernel as sightings
 from team.estimation import sparse
@@ -38,6 +39,7 @@ class JoinSettings:
     max_iterations, step_tolerance: a full solve ends when no unknown moves by more [m, rad].
     alignment_confidence: quantile of the χ² test before a free island is merged.
     alignment_heading_sigma: the shape of the shared landmarks must give a heading this well [rad].
+    bias_sigma: how large the errors are that a robot's submaps share, before they are estimated.
     """
 
     iterations_per_tick: int = 2
@@ -49,6 +51,7 @@ class JoinSettings:
     step_tolerance: float = 1e-6
     alignment_confidence: float = 0.999
     alignment_heading_sigma: float = 0.3
+    bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
 
 
 class NotDeterminedError(ValueError):
@@ -150,7 +153,7 @@ class Island:
         for k, prior in enumerate(graph.priors):
             slope, hessian, _ = _prior_terms(self, k)
             begin = graph.offset[prior.node]
-            gradient[begin : begin + 3] += slope
+            gradient[begin : begin + len(slope)] += slope
             pattern.diagonal_block(values, prior.node)[...] += hessian
         return values, gradient
 
@@ -183,11 +186,12 @@ def aged(island: Island, iterations: int | None) -> Island:
 
 def _prior_terms(
     island: Island, k: int
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float]:
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], float]:
     node, mean, information = island.graph.priors[k]
     begin = island.graph.offset[node]
-    residual = island.state[begin : begin + 3] - mean
-    residual[2] = wrapped(residual[2])
+    residual = island.state[begin : begin + len(mean)] - mean
+    if len(mean) == 3:
+        residual[2] = wrapped(residual[2])
     slope = information @ residual
     return slope, information, float(residual @ slope)
 

@@ -160,7 +160,7 @@ def folded(
     islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
     for key, taken in news.items():
         island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), _new(0), _new(0), settings))
-        graph, state = extended(island.graph, island.state, taken, fold.starts)
+        graph, state = extended(island.graph, island.state, taken, fold.starts, settings.bias_sigma)
         age = np.concatenate([island.age, _new(len(taken))])
         island, waiting = _sighted(replace(island, graph=graph, state=state, age=age), waiting)
         islands[key] = iterated(island)

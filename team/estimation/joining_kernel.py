@@ -7,7 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.estimation.compiled import compiled
-from team.estimation.submap_factor import poses_of, submap_normal, submap_residual
+from team.estimation.submap_factor import (
+    biased_normal,
+    poses_of,
+    shifted_mean,
+    submap_residual,
+)
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -17,8 +22,8 @@ class Factors(NamedTuple):
     """All submaps of a graph in flat arrays, in the order in which they were taken.
 
     member[member_start[f] : member_start[f + 1]] are the nodes of submap f: start pose, end pose,
-    pose nodes by stamp, landmarks by id. mean and information (P⁻¹, row-major) lie likewise from
-    mean_start and information_start on.
+    pose nodes by stamp, landmarks by id, biases. mean, information (P⁻¹, row-major) and sensitivity
+    (a row per bias) lie likewise from mean_start, information_start and sensitivity_start on.
     """
 
     member: Indices
@@ -27,6 +32,8 @@ class Factors(NamedTuple):
     mean_start: Indices
     information: Values
     information_start: Indices
+    sensitivity: Values
+    sensitivity_start: Indices
 
 
 @compiled
@@ -106,6 +113,12 @@ def _places(offset: Indices, nodes: Indices) -> Indices:
 
 
 @compiled
+def _sensitivity(factors: Factors, f: int, n: int) -> Float[np.ndarray, "B n"]:
+    begin, end = factors.sensitivity_start[f], factors.sensitivity_start[f + 1]
+    return factors.sensitivity[begin:end].reshape((end - begin) // n, n)
+
+
+@compiled
 def costs(state: Values, offset: Indices, factors: Factors, covariance_factor: float) -> Values:
     """χ² of each submap in the metric (covariance_factor · P)⁻¹."""
     result = np.empty(len(factors.member_start) - 1)
@@ -115,9 +128,11 @@ def costs(state: Values, offset: Indices, factors: Factors, covariance_factor: f
         n = len(mean)
         begin = factors.information_start[f]
         information = factors.information[begin : begin + n * n].reshape(n, n)
-        residual, _ = submap_residual(state, at, mean)
+        sensitivity = _sensitivity(factors, f, n)
+        members = at[: len(at) - len(sensitivity)]
+        residual, _ = submap_residual(state, members, shifted_mean(state, at, mean, sensitivity))
         c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
-        poses = poses_of(len(at) - 1, n)
+        poses = poses_of(len(members) - 1, n)
         row = 0
         while row < n:
             a, b = residual[row], residual[row + 1]
@@ -167,7 +182,8 @@ def normal_equations(
         n = len(mean)
         begin = factors.information_start[f]
         information = factors.information[begin : begin + n * n].reshape(n, n)
-        hessian, slope, raw = submap_normal(state, at, mean, information)
+        sensitivity = _sensitivity(factors, f, n)
+        hessian, slope, raw = biased_normal(state, at, mean, information, sensitivity)
         chi2[f] = raw / covariance_factor
         weight = robust_weight(chi2[f], n, scale[f]) / covariance_factor
         row = 0
@@ -214,7 +230,8 @@ def explained(
         n = len(mean)
         begin = factors.information_start[f]
         information = factors.information[begin : begin + n * n].reshape(n, n)
-        hessian, _, _ = submap_normal(state, at, mean, information)
+        sensitivity = _sensitivity(factors, f, n)
+        hessian, _, _ = biased_normal(state, at, mean, information, sensitivity)
         row = 0
         for a in range(len(nodes)):
             size = offset[nodes[a] + 1] - offset[nodes[a]]

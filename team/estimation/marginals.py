@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from team.config import Bias
 from team.estimation import joining_kernel as kernel
 from team.estimation.conditioning import RobotPrior
 from team.estimation.contribution import Stream
@@ -40,6 +41,15 @@ class Trajectory(NamedTuple):
     covariances: Float[np.ndarray, "K 3 3"]
 
 
+class BiasEstimate(NamedTuple):
+    """An error that the submaps of a stream share, ± one sigma."""
+
+    stream: Stream
+    bias: Bias
+    value: float
+    sigma: float
+
+
 class SubmapCost(NamedTuple):
     """How one submap agrees with the rest: χ² should be near dof.
 
@@ -66,6 +76,17 @@ class Agreement(NamedTuple):
     dof: float
     robots: dict[str, tuple[float, float]]
     submaps: tuple[SubmapCost, ...]
+
+
+def bias_estimates(fold: Fold) -> list[BiasEstimate]:
+    """The errors that each stream's submaps share, in the island that the stream is in."""
+    found = []
+    for island in fold.islands.values():
+        for (stream, bias), node in island.graph.biases.items():
+            mean, covariance = _own_marginal(island, node)
+            sigma = float(np.sqrt(covariance[0, 0]))
+            found.append(BiasEstimate(stream, bias, float(mean[0]), sigma))
+    return sorted(found)
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
@@ -188,13 +209,15 @@ def _sightings(island: Island) -> list[tuple[str, float, float]]:
 
 
 def _priors(island: Island) -> list[tuple[str, float, float]]:
-    """(robot, χ², dof) of the priors on starts."""
+    """(robot, χ², dof) of the priors on starts and biases."""
     robots = {nodes[0]: stream[0] for stream, nodes in island.graph.streams.items()}
+    robots |= {node: stream[0] for (stream, _), node in island.graph.biases.items()}
     return [
         (
             robots[prior.node],
             float(chi2),
-            3.0 - float(np.sum(prior.information * _own_marginal(island, prior.node)[1])),
+            len(prior.mean)
+            - float(np.sum(prior.information * _own_marginal(island, prior.node)[1])),
         )
         for prior, chi2 in zip(island.graph.priors, island.prior_chi2, strict=True)
     ]

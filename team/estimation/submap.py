@@ -5,7 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team.config import Bias
+
 NO_NODES = np.empty(0, np.int64)
+NO_COLUMNS = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -17,6 +20,8 @@ class LocalMap:
                  then (x₁, y₁, …, x_L, y_L); theta in (−π, π].
     covariance:  symmetric positive definite, [m², m·rad, rad²].
     node_stamps: team time of the K pose nodes [ns], strictly ascending.
+    biases, sensitivity: errors b that the robot's submaps share, ascending, and a row ∂mean/∂b of
+    each: given b the mean is mean + bᵀ sensitivity.
     The start pose is exactly zero with zero uncertainty: nothing from outside the window is in it.
     """
 
@@ -24,6 +29,8 @@ class LocalMap:
     mean: Float[np.ndarray, " n"]
     covariance: Float[np.ndarray, "n n"]
     node_stamps: Int64[np.ndarray, " K"] = field(default_factory=NO_NODES.copy)
+    biases: tuple[Bias, ...] = ()
+    sensitivity: Float[np.ndarray, "B _"] = field(default_factory=NO_COLUMNS.copy)
 
     @property
     def end_pose(self) -> Float[np.ndarray, "3"]:
@@ -47,4 +54,10 @@ class LocalMap:
             return self
         behind = 3 + 3 * len(self.node_stamps)
         kept = np.concatenate([np.arange(3), np.arange(behind, len(self.mean))])
-        return LocalMap(self.ids, self.mean[kept], self.covariance[np.ix_(kept, kept)])
+        return LocalMap(
+            self.ids,
+            self.mean[kept],
+            self.covariance[np.ix_(kept, kept)],
+            biases=self.biases,
+            sensitivity=self.sensitivity[:, kept] if self.biases else NO_COLUMNS,
+        )

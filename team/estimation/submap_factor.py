@@ -11,6 +11,9 @@ Seen in the map frame, r' = T r with T = blkdiag(R, 1, …, R, …), its Jacobia
     G = [−I | (v_y, −v_x)ᵀ] per point v = p − p_s,  [0 0 −1] for the heading
 
 for s, and its metric is M = T P⁻¹ Tᵀ. The state is additive in (x, y, θ).
+
+A submap with sensitivities S (a row per bias) has the mean mean + Sᵀ b; the Jacobian of r' for a
+bias is −T S_b. Its biases, one number each, stand behind the other members.
 """
 
 import math
@@ -119,4 +122,63 @@ def submap_normal(
             hessian[j + 3, a] = hessian[a, j + 3]
             for b in range(3):
                 hessian[a, b] += hessian[a, j + 3] * jacobian[j, b]
+    return hessian, gradient, chi2
+
+
+@compiled
+def shifted_mean(
+    state: Values, at: Indices, mean: Values, sensitivity: Float[np.ndarray, "B n"]
+) -> Values:
+    """The mean given the biases, mean + Sᵀ b: `at` ends with the places of the biases."""
+    shifted = mean.copy()
+    first = len(at) - len(sensitivity)
+    for b in range(len(sensitivity)):
+        value = state[at[first + b]]
+        for i in range(len(mean)):
+            shifted[i] += value * sensitivity[b, i]
+    return shifted
+
+
+@compiled
+def biased_normal(
+    state: Values,
+    at: Indices,
+    mean: Values,
+    information: Float[np.ndarray, "n n"],
+    sensitivity: Float[np.ndarray, "B n"],
+) -> tuple[Float[np.ndarray, "m m"], Values, float]:
+    """`submap_normal` over (start pose, other poses, landmarks, biases)."""
+    biases = len(sensitivity)
+    members = at[: len(at) - biases]
+    if biases == 0:
+        return submap_normal(state, members, mean, information)
+    shifted = shifted_mean(state, at, mean, sensitivity)
+    unbiased, slope, chi2 = submap_normal(state, members, shifted, information)
+    n = len(mean)
+    hessian, gradient = np.zeros((n + 3 + biases, n + 3 + biases)), np.zeros(n + 3 + biases)
+    hessian[: n + 3, : n + 3] = unbiased
+    gradient[: n + 3] = slope
+    c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+    poses = poses_of(len(members) - 1, n)
+    turned = np.empty((biases, n))
+    for b in range(biases):
+        row = 0
+        while row < n:
+            x, y = sensitivity[b, row], sensitivity[b, row + 1]
+            turned[b, row], turned[b, row + 1] = c * x - s * y, s * x + c * y
+            if row < 3 * poses:
+                turned[b, row + 2] = sensitivity[b, row + 2]
+                row += 1
+            row += 2
+        for a in range(n + 3):
+            total = 0.0
+            for j in range(n):
+                total += unbiased[a, 3 + j] * turned[b, j]
+            hessian[a, n + 3 + b] = hessian[n + 3 + b, a] = -total
+        for j in range(n):
+            gradient[n + 3 + b] -= turned[b, j] * slope[3 + j]
+    for b in range(biases):
+        for other in range(biases):
+            for j in range(n):
+                hessian[n + 3 + other, n + 3 + b] -= turned[other, j] * hessian[3 + j, n + 3 + b]
     return hessian, gradient, chi2

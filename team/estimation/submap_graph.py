@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.config import Bias
 from team.estimation.contribution import Contribution, Start, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.joining_kernel import Factors, block_pattern
@@ -24,15 +25,15 @@ Values = Float[np.ndarray, " _"]
 
 
 class Prior(NamedTuple):
-    """A pose node with (x, y, theta) ~ N(mean, information⁻¹), never down-weighted."""
+    """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹), never down-weighted."""
 
     node: int
-    mean: Float[np.ndarray, "3"]
-    information: Float[np.ndarray, "3 3"]
+    mean: Float[np.ndarray, " k"]
+    information: Float[np.ndarray, "k k"]
 
 
 class Joined(NamedTuple):
-    """A submap in the graph: its start, its end, its pose nodes and its landmarks' nodes by id."""
+    """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases."""
 
     contribution: Contribution
     nodes: Indices
@@ -53,6 +54,7 @@ class Graph:
     streams:   nodes of each stream: its start, then the end pose of submap 0, 1, …
     landmarks: node of each landmark id.
     poses:     node of each further pose, by (stream, stamp).
+    biases:    node of each error that the submaps of a stream share: the only nodes of one number.
     offset:    first number of each node in the state; the last is the state's length.
     fixed:     nodes that are constants (exact starts, the gauge).
     submaps, sightings: in the order in which they were taken.
@@ -61,6 +63,7 @@ class Graph:
     streams: Mapping[Stream, tuple[int, ...]]
     landmarks: Mapping[int, int]
     poses: Mapping[tuple[Stream, int], int]
+    biases: Mapping[tuple[Stream, Bias], int]
     offset: Indices
     fixed: Bool[np.ndarray, " _"]
     submaps: tuple[Joined, ...]
@@ -78,6 +81,8 @@ class Graph:
             _starts([len(each.local.mean) for each in submaps]),
             np.concatenate([np.zeros(0), *(each.information.ravel() for each in submaps)]),
             _starts([each.information.size for each in submaps]),
+            np.concatenate([np.zeros(0), *(each.local.sensitivity.ravel() for each in submaps)]),
+            _starts([each.local.sensitivity.size for each in submaps]),
         )
 
     @cached_property
@@ -152,11 +157,14 @@ class Graph:
         for (stream, stamp_ns), at in self.poses.items():
             if node == at:
                 return f"the pose of {named(stream)} at {stamp_ns * 1e-9:g} s"
+        for (stream, bias), at in self.biases.items():
+            if node == at:
+                return f"the bias {bias} of {named(stream)}"
         ids = [id_ for id_, at in self.landmarks.items() if at == node]
         return f"landmark {ids[0]}"
 
 
-EMPTY_GRAPH = Graph({}, {}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), (), ())
+EMPTY_GRAPH = Graph({}, {}, {}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), (), ())
 
 
 def _starts(lengths: Sequence[int]) -> Indices:
@@ -171,6 +179,7 @@ class _Growth:
         self.streams = dict(graph.streams)
         self.landmarks = dict(graph.landmarks)
         self.poses = dict(graph.poses)
+        self.biases = dict(graph.biases)
         self.offset = graph.offset
         self.state = state
         self.count = len(graph.fixed)
@@ -195,12 +204,13 @@ def extended(
     state: Values,
     contributions: Sequence[Contribution],
     starts: Mapping[Stream, Start],
+    bias_sigma: Mapping[Bias, float],
 ) -> tuple[Graph, Values]:
     """The graph with more submaps, in the given order; a stream without a start begins at 0.
 
     A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
     first submap that sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of
-    its frame.
+    its frame. A bias is N(0, bias_sigma²).
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -224,11 +234,19 @@ def extended(
             if id_ not in growth.landmarks:
                 growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
         seen = [growth.landmarks[id_] for id_ in local.ids.tolist()]
-        submaps.append(Joined(contribution, np.array([start_node, end_node, *poses, *seen])))
+        for bias in local.biases:
+            if (stream, bias) not in growth.biases:
+                growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
+                certainty = np.array([[bias_sigma[bias] ** -2]])
+                priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
+        errors = [growth.biases[stream, bias] for bias in local.biases]
+        nodes = np.array([start_node, end_node, *poses, *seen, *errors])
+        submaps.append(Joined(contribution, nodes))
     grown = Graph(
         growth.streams,
         growth.landmarks,
         growth.poses,
+        growth.biases,
         _continued(graph.offset, [len(value) for value in growth.values]),
         np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
         tuple(submaps),
@@ -272,14 +290,13 @@ def merged(
     }
     node_of = np.empty(len(other.fixed), dtype=np.int64)
     values: list[Values] = []
-    for node, size in enumerate(np.diff(other.offset).tolist()):
+    for node in range(len(other.fixed)):
         if node in common:
             node_of[node] = common[node]
             continue
         node_of[node] = len(main.fixed) + len(values)
         value = other_state[other.offset[node] : other.offset[node + 1]]
-        moved = compose if size == 3 else transformed
-        values.append(moved(main_from_other, value))
+        values.append(_moved(main_from_other, value))
     streams = {
         stream: tuple(node_of[list(nodes)].tolist()) for stream, nodes in other.streams.items()
     }
@@ -289,14 +306,28 @@ def merged(
         Met(each, int(node_of[observer]), int(node_of[teammate]))
         for each, observer, teammate in other.sightings
     )
+    biases = {key: int(node_of[node]) for key, node in other.biases.items()}
+    priors = (
+        prior._replace(node=int(node_of[prior.node]))
+        for prior in other.priors
+        if len(prior.mean) == 1
+    )
     graph = Graph(
         {**main.streams, **streams},
         {**landmarks, **main.landmarks},
         {**main.poses, **poses},
+        {**main.biases, **biases},
         _continued(main.offset, [len(value) for value in values]),
         np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
         (*main.submaps, *(Joined(each, node_of[nodes]) for each, nodes in other.submaps)),
         (*main.sightings, *sightings),
-        main.priors,
+        (*main.priors, *priors),
     )
     return graph, np.concatenate([state, *values])
+
+
+def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:
+    """A node's value in the main frame: a pose, a landmark, or a bias, which has no frame."""
+    if len(value) == 3:
+        return compose(main_from_other, value)
+    return transformed(main_from_other, value) if len(value) == 2 else value

@@ -8,7 +8,6 @@ bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -21,23 +20,15 @@ from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import wrapped
 from team.estimation.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import NEAREST_M, Increment
+from team.estimation.sensitivity import Motion, Noise, columns
 from team.estimation.submap import NO_NODES, LocalMap
 
+STILL = np.zeros(3)
 POSE_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
 
 SOLVED = 1e-6
 """A Gauss-Newton step of squared Mahalanobis length below this changes nothing that matters."""
-
-
-class Noise(NamedTuple):
-    """Variances of a reading, and the share of each that is white: the rest is constant."""
-
-    range_variance: float
-    range_per_m2: float
-    range_white: float
-    bearing_variance: float
-    bearing_white: float
 
 
 @dataclass(frozen=True)
@@ -50,6 +41,7 @@ class Window:
     readings: (range [m], bearing [rad]) with the sensor's calibration applied.
     node_stamps, node_epochs: team time [ns] of the pose nodes, and the epoch that each is.
     innovation: of all readings so far that were predicted.
+    motions:  up to each epoch, and after the last one; kept where biases are asked for.
     """
 
     front_end: FrontEnd
@@ -62,6 +54,7 @@ class Window:
     node_stamps: Int64[np.ndarray, " nodes"]
     node_epochs: Int64[np.ndarray, " nodes"]
     innovation: Innovation = NOTHING
+    motions: tuple[Motion, ...] = ()
 
 
 def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
@@ -86,10 +79,12 @@ def advanced(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
     generator: np.random.Generator,
+    forward: Float[np.ndarray, "3"] = STILL,
 ) -> Window:
     """One observation epoch: the motion since the last one, then its readings (there may be none).
 
     The readings are accepted and corrected already (`models.acceptable`, `models.corrected`).
+    forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
     """
     expected = innovation(window.particles, increment, window.sensor, ids, ranges, bearings)
     particles, info = fastslam.propagated_and_updated(
@@ -113,7 +108,16 @@ def advanced(
         ids=np.concatenate((window.ids, ids)),
         readings=np.concatenate((window.readings, np.column_stack((ranges, bearings)))),
         innovation=window.innovation.plus(expected),
+        motions=_with_motion(window, increment, forward),
     )
+
+
+def _with_motion(
+    window: Window, increment: Increment, forward: Float[np.ndarray, "3"]
+) -> tuple[Motion, ...]:
+    if not window.front_end.biases:
+        return ()
+    return (*window.motions, Motion(increment.covariance, forward))
 
 
 def marked(window: Window, stamp_ns: int) -> Window:
@@ -125,12 +129,18 @@ def marked(window: Window, stamp_ns: int) -> Window:
     )
 
 
-def moved(window: Window, increment: Increment, generator: np.random.Generator) -> Window:
+def moved(
+    window: Window,
+    increment: Increment,
+    generator: np.random.Generator,
+    forward: Float[np.ndarray, "3"] = STILL,
+) -> Window:
     """Motion without an observation epoch, as from the last one to the window's end.
 
     It never resamples: the weights of the last readings stay as they are.
     """
-    return replace(window, particles=fastslam.propagated(window.particles, increment, generator))
+    particles = fastslam.propagated(window.particles, increment, generator)
+    return replace(window, particles=particles, motions=_with_motion(window, increment, forward))
 
 
 def gaussian(window: Window) -> LocalMap:
@@ -138,7 +148,8 @@ def gaussian(window: Window) -> LocalMap:
 
     With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
     Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ, headings on the circle (Xu, eq. 4.5-4.6), plus
-    POSE_JITTER. The landmarks given a path come from `landmarks_along_paths`.
+    POSE_JITTER. The landmarks given a path come from `landmarks_along_paths`, the derivatives by
+    the biases from `sensitivity.columns`.
     Raises NotACovarianceError if P is not finite or not positive definite.
     """
     particles = window.particles
@@ -146,6 +157,13 @@ def gaussian(window: Window) -> LocalMap:
     ids = particles.ids[order]
     slots = np.searchsorted(ids, window.ids)
     by_slot = np.argsort(slots, kind="stable")
+    noise = Noise(
+        window.sensor.range_sigma**2,
+        window.sensor.range_sigma_per_m**2,
+        window.sensor.range_white,
+        window.sensor.bearing_sigma**2,
+        window.sensor.bearing_white,
+    )
     means, covariances = landmarks_along_paths(
         particles.means[:, order],
         particles.covariances[:, order],
@@ -153,20 +171,42 @@ def gaussian(window: Window) -> LocalMap:
         np.searchsorted(slots[by_slot], np.arange(len(ids) + 1)),
         window.epochs[by_slot],
         window.readings[by_slot],
-        Noise(
-            window.sensor.range_sigma**2,
-            window.sensor.range_sigma_per_m**2,
-            window.sensor.range_white,
-            window.sensor.bearing_sigma**2,
-            window.sensor.bearing_white,
-        ),
+        noise,
     )
     poses = np.concatenate((particles.poses, *window.paths[window.node_epochs]), axis=1)
     mean, covariance = moments(poses, np.exp(particles.log_weights), means, covariances)
     numbers = np.arange(poses.shape[1])
     covariance[numbers, numbers] += np.tile(POSE_JITTER, len(numbers) // 3)
     cholesky_factor(covariance, "the submap of a window")
-    return LocalMap(ids, mean, covariance, window.node_stamps)
+    local = LocalMap(ids, mean, covariance, window.node_stamps)
+    return _with_sensitivity(window, local, slots, noise) if window.front_end.biases else local
+
+
+def _with_sensitivity(
+    window: Window, local: LocalMap, slots: Int64[np.ndarray, " N"], noise: Noise
+) -> LocalMap:
+    """The Gaussian with its derivatives by the biases.
+
+    That by `forward_scale` is left out where all of the window's motion is calibrated.
+    """
+    uncalibrated = any(motion.forward.any() for motion in window.motions)
+    biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
+    weights = np.exp(window.particles.log_weights)
+    path = np.array([*(_mean_pose(poses, weights) for poses in window.paths), local.end_pose])
+    path = path[: len(window.motions)]
+    poses, landmarks = columns(
+        biases, path, window.motions, local.landmarks, (window.epochs, slots), noise
+    )
+    end = poses[:, -1:] if len(path) else np.zeros((len(biases), 1, 3))
+    kept = np.concatenate((end, poses[:, window.node_epochs]), axis=1)
+    rows = (kept.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))
+    return replace(local, biases=biases, sensitivity=np.concatenate(rows, axis=1))
+
+
+def _mean_pose(
+    poses: Float[np.ndarray, "M 3"], weights: Float[np.ndarray, " M"]
+) -> Float[np.ndarray, "3"]:
+    return np.array([*(weights @ poses[:, :2]), _mean_direction(poses[:, 2], weights)])
 
 
 @compiled

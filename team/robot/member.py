@@ -183,6 +183,7 @@ class HybridMember:
             epoch.ranges,
             epoch.bearings,
             self._generator,
+            epoch.forward,
         )
         if epoch.is_node:
             self._window = windows.marked(self._window, epoch.stamp_ns)
@@ -193,7 +194,8 @@ class HybridMember:
         for epoch in epochs:
             self._advance(epoch)
         if rest.mean.any() or rest.covariance.any():
-            self._window = windows.moved(self._window, rest, self._generator)
+            forward = self._segmenter.rest_forward
+            self._window = windows.moved(self._window, rest, self._generator, forward)
         local = windows.gaussian(self._window)
         assert self._start_ns is not None
         closed = ClosedWindow(

@@ -1,6 +1,6 @@
 """From a stream of odometry intervals and observations to the epochs that an estimator takes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt32
 from team.config import MotionModel, Sensor
 from team.estimation import geometry
 from team.estimation.models import Increment, acceptable, corrected, increment_of, located
+from team.estimation.sensitivity import carried_on, forward_column
 from team.stream.pose_grid import PoseGrid
 
 
@@ -16,6 +17,7 @@ class Epoch:
     """The motion since the last epoch and what was seen at its end (accepted and calibrated).
 
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
+    forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
     """
 
     stamp_ns: int
@@ -24,6 +26,7 @@ class Epoch:
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
     is_node: bool = False
+    forward: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,12 @@ class Segmenter:
         self._grid = grid
         self._here_ns = 0
         self._increment = Increment.identity()
+        self._forward = np.zeros(3)
         self._waiting: list[_Scan] = []
         self._keyframe: list[_Scan] = []
         self._keyframe_start_ns = 0
         self._scan_motion = np.zeros(3)
+        self.rest_forward = np.zeros(3)
         self.now_ns: int | None = None
 
     def begin(self, stamp_ns: int) -> None:
@@ -113,10 +118,13 @@ class Segmenter:
         return epochs
 
     def cut(self, stamp_ns: int) -> tuple[list[Epoch], Increment]:
-        """A window ends here: its last epoch if one is open, and the motion after it."""
+        """A window ends here: its last epoch if one is open, and the motion after it.
+
+        That motion's shift by an error of the scale of speed is `rest_forward`.
+        """
         epochs = [self._close_keyframe(stamp_ns)] if self._keyframe else []
-        rest = self._increment
-        self._increment = Increment.identity()
+        rest, self.rest_forward = self._increment, self._forward
+        self._increment, self._forward = Increment.identity(), np.zeros(3)
         self._keyframe_start_ns = stamp_ns
         self._scan_motion = np.zeros(3)
         return epochs, rest
@@ -150,6 +158,9 @@ class Segmenter:
             return
         step = increment_of(self._motion, duration_ns * 1e-9, forward, yaw_rate)
         self._increment = self._increment.then(step)
+        if self._motion.calibrated_speed is not None:
+            column = forward_column(self._motion, duration_ns * 1e-9, forward, yaw_rate)
+            self._forward = carried_on(self._forward, step.mean) + column
         if self._grid is not None:
             self._grid.moved(step)
         if self._keyframe_ns:
@@ -162,8 +173,9 @@ class Segmenter:
         ranges: Float[np.ndarray, " n"],
         bearings: Float[np.ndarray, " n"],
     ) -> Epoch:
-        epoch = Epoch(stamp_ns, self._increment, ids, ranges, bearings)
+        epoch = Epoch(stamp_ns, self._increment, ids, ranges, bearings, forward=self._forward)
         self._increment = Increment.identity()
+        self._forward = np.zeros(3)
         return epoch
 
     def _close_keyframe(self, stamp_ns: int) -> Epoch:

@@ -11,7 +11,7 @@ Every message has `stamp_ns`, its team time: the time of the reading that it is 
 """
 
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -36,6 +36,7 @@ Text = Annotated[str, Meta(max_length=20_000)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 StampNs = Annotated[int, Meta(ge=-(2**62), lt=2**62)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
+Bias = Literal["bearing", "forward_scale", "range_scale"]
 Real = Annotated[float, Meta(ge=-1e300, le=1e300)]
 """A finite number: the bounds reject NaN and the infinities."""
 
@@ -150,7 +151,9 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     configuration by digest (the seed is in it). ids: L, ascending. mean: 3 + 3K + 2L floats (end
     pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed upper triangle,
     row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings: how many
-    SightingFactor messages belong to it.
+    SightingFactor messages belong to it. biases: errors that the robot's submaps share, B of them,
+    ascending; sensitivity: B × n floats, the mean's derivative by each: given the error b of the
+    bearings [rad], of the scale of the ranges or of the speed, the mean is mean + b · sensitivity.
     """
 
     robot: Name
@@ -165,6 +168,8 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     covariance: Floats
     nodes: Stamps = b""
     sightings: Count = 0
+    biases: tuple[Bias, ...] = ()
+    sensitivity: Floats = b""
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")
@@ -172,6 +177,9 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
         n = 3 + 3 * len(times) + 2 * len(ids(self.ids, "ids"))
         check_finite(self.mean, "mean", n)
         check_packed_covariance(self.covariance, n, "covariance")
+        check_finite(self.sensitivity, "sensitivity", n * len(self.biases))
+        if any(a >= b for a, b in pairwise(self.biases)):
+            raise ValueError("not ascending: biases")
         if not (times[1:] > times[:-1]).all():
             raise ValueError("not ascending: nodes")
         if len(times) and not self.start_ns < times[0] <= times[-1] <= self.stamp_ns:
@@ -282,6 +290,16 @@ class Member(msgspec.Struct, frozen=True, array_like=True):
     sequence: int
 
 
+class BiasEstimate(msgspec.Struct, frozen=True, array_like=True):
+    """What the map says of an error that the submaps of (robot, epoch) share, ± one sigma."""
+
+    robot: Name
+    epoch: Count
+    bias: Bias
+    value: Real
+    sigma: Real
+
+
 class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1"):
     """The team's map: landmark means and covariances, its set and its frame.
 
@@ -289,7 +307,8 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     (robot, epoch, sequence). digest: 8-byte name of the set (and of the rule and its settings).
     frame: "robot/epoch" whose start fixes it. provisional: some members lie ahead of the watermark.
     covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 where the rule has none.
-    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined.
+    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined. biases: by
+    robot, epoch and name, where submaps have sensitivities.
     """
 
     rule: Text
@@ -307,6 +326,7 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     chi2: Annotated[float, Meta(ge=0.0, le=1e300)]
     dof: int
     reasons: tuple[Text, ...] = ()
+    biases: tuple[BiasEstimate, ...] = ()
 
     def check(self) -> None:  # noqa: D102
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)

@@ -10,7 +10,7 @@ import pytest
 from msgspec import Meta
 from typer.testing import CliRunner
 
-from central.config import CentralConfig
+from central.config import BiasSigmas, CentralConfig
 from sim.cli import app
 from sim.scenario import Scenario, load
 from sim.source import streams_of
@@ -21,7 +21,7 @@ from tests.support import ROOT
 PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
     Scenario, SimulatedWorld, UtiasWorld, RobotConfig, MotionModel, MotionNoise, Sensor, FrontEnd,
-    CentralConfig,
+    CentralConfig, BiasSigmas,
 )  # fmt: skip
 
 

@@ -55,9 +55,32 @@ def test_appended_fields_are_ignored(tag: str) -> None:
 
 
 def test_a_submap_from_before_the_pose_nodes_has_none() -> None:
-    shorter = msgpack.packb(fields_of(submap(0))[:-2])
+    shorter = msgpack.packb(fields_of(submap(0))[:-4])
     assert decoded(shorter) == submap(0)
     assert (submap(0).nodes, submap(0).sightings) == (b"", 0)
+
+
+def test_a_submap_from_before_the_sensitivities_has_none() -> None:
+    shorter = msgpack.packb(fields_of(submap(0))[:-2])
+    assert decoded(shorter) == submap(0)
+    assert (submap(0).biases, submap(0).sensitivity) == ((), b"")
+
+
+@pytest.mark.parametrize(
+    ("biases", "numbers", "why"),
+    [
+        (("range_scale", "bearing"), 14, "not ascending: biases"),
+        (("bearing",), 14, "sensitivity"),
+        (("bearing",), 6, "sensitivity"),
+        ((), 7, "sensitivity"),
+    ],
+)
+def test_a_submap_whose_sensitivities_do_not_fit_is_refused(
+    biases: tuple[str, ...], numbers: int, why: str
+) -> None:
+    fields = fields_of(submap(0))
+    fields[-2:] = [biases, from_floats(np.zeros(numbers))]
+    assert why in reason_of(msgpack.packb(fields))
 
 
 @settings(deadline=None)

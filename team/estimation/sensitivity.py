@@ -1,0 +1,267 @@
+"""How a window's Gaussian would move if an error that many windows share were taken out of it.
+
+A calibration that is a little wrong, b, shifts every submap of a robot alike. With S = ∂mean/∂b a
+submap says r = h(x) − (mean + S b) ~ N(0, P), and the centre estimates b with the map. The
+mean of the particles has no derivative in closed form; S is that of the window's smoother,
+linearised about the particles' mean path: with J, W over the motions and the readings and g the
+derivative of their residuals, S = −(JᵀWJ)⁻¹ Jᵀ W g. As in the window itself the path takes the
+readings as independent, and the landmarks are solved for given the path.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.linalg import cho_solve
+
+from team.config import Bias, MotionModel
+from team.estimation.compiled import compiled
+from team.estimation.gaussian import cholesky_factor
+from team.estimation.geometry import adjoint, between
+from team.estimation.models import NEAREST_M
+
+BIASES: tuple[Bias, ...] = get_args(Bias)
+"""In the order of the columns."""
+MOTION_JITTER = (1e-7, 1e-7, 1e-9)
+"""Added to each motion's variances [m², m², rad²]: noise of rank 2 has no information matrix."""
+
+
+class Noise(NamedTuple):
+    """Variances of a reading, and the share of each that is white: the rest is constant."""
+
+    range_variance: float
+    range_per_m2: float
+    range_white: float
+    bearing_variance: float
+    bearing_white: float
+
+
+class Motion(NamedTuple):
+    """The motion up to an epoch, or after the last one: its noise, its shift by `forward_scale`.
+
+    covariance, forward: in the tangent space of the motion's end (forward [m], left [m], turn).
+    """
+
+    covariance: Float[np.ndarray, "3 3"]
+    forward: Float[np.ndarray, "3"]
+
+
+def forward_column(
+    motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
+) -> Float[np.ndarray, "3"]:
+    """d/db at 0 of the interval's motion if the logged way is (1 + b) times as long.
+
+    In the tangent space of its end; zero where |forward| lies in `calibrated_speed`, whose scale
+    is known, and without such a range.
+    """
+    column = np.zeros(3)
+    speeds = motion.calibrated_speed
+    if speeds is None or speeds[0] <= abs(forward) <= speeds[1]:
+        return column
+    way = motion.forward_scale * forward * duration_s
+    if motion.kind == "turn-then-drive":
+        column[0] = way
+        return column
+    limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
+    turn = min(max(motion.yaw_scale * yaw_rate, -limit), limit) * duration_s
+    column[0], column[1] = way * math.cos(0.5 * turn), -way * math.sin(0.5 * turn)
+    return column
+
+
+def carried_on(
+    column: Float[np.ndarray, "3"], motion: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """A shift of what came before, seen at the end of a further motion: Ad(motion⁻¹) column."""
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    x = column[0] - motion[1] * column[2]
+    y = column[1] + motion[0] * column[2]
+    return np.array([c * x + s * y, -s * x + c * y, column[2]])
+
+
+def columns(
+    biases: Sequence[Bias],
+    path: Float[np.ndarray, "P 3"],
+    motions: Sequence[Motion],
+    landmarks: Float[np.ndarray, "L 2"],
+    readings: tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " N"]],
+    noise: Noise,
+) -> tuple[Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"]]:
+    """∂/∂b of the path's poses (x, y, theta) and of the landmarks, in the window's frame.
+
+    path: the pose at the end of each motion; the first motion begins at zero. readings: of each
+    the pose (an index into path) and the landmark. The bias b is the error: a bearing reads b too
+    much, a range (1 + b) times itself, and the way driven is (1 + b) times the odometry's.
+    """
+    size = 3 * len(path) + 2 * len(landmarks)
+    A, right = np.zeros((size, size)), np.zeros((size, len(BIASES)))
+    covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 3, 3)
+    metrics = np.linalg.inv(covariances + np.diag(MOTION_JITTER)) if len(path) else covariances
+    shifts = np.array([motion.forward for motion in motions]).reshape(-1, 3)
+    rows = _reading_rows(path, landmarks, *readings, noise)
+    _add_motions(A, right, path, metrics, shifts)
+    _add_readings(A, right, rows, *readings, 3 * len(path))
+    moved = cho_solve((cholesky_factor(A, "the smoother of a window"), True), right).T
+    twists = np.ascontiguousarray(moved[:, : 3 * len(path)]).reshape(len(BIASES), len(path), 3)
+    points = _landmarks_given(twists, rows, *readings, len(landmarks), noise)
+    c, s = np.cos(path[:, 2]), np.sin(path[:, 2])
+    x, y = c * twists[..., 0] - s * twists[..., 1], s * twists[..., 0] + c * twists[..., 1]
+    chosen = [BIASES.index(bias) for bias in biases]
+    return np.stack([x, y, twists[..., 2]], axis=-1)[chosen], points[chosen]
+
+
+@compiled
+def _add_motions(
+    A: Float[np.ndarray, "n n"],
+    right: Float[np.ndarray, "n B"],
+    path: Float[np.ndarray, "P 3"],
+    metrics: Float[np.ndarray, "P 3 3"],
+    shifts: Float[np.ndarray, "P 3"],
+) -> None:
+    """Residual ξ_k − Ad(x_k⁻¹ x_{k−1}) ξ_{k−1} − shift·b in the metric C⁻¹, for each motion."""
+    for k in range(len(path)):
+        before = np.zeros(3) if k == 0 else path[k - 1]
+        J = np.zeros((3, 6))
+        J[:, :3] = -adjoint(between(path[k], before))
+        for i in range(3):
+            J[i, 3 + i] = 1.0
+        for i in range(6):
+            if k == 0 and i < 3:
+                continue
+            row = 3 * (k - 1) + i
+            weighted = np.zeros(3)
+            for a in range(3):
+                for b in range(3):
+                    weighted[b] += J[a, i] * metrics[k, a, b]
+            for b in range(3):
+                right[row, 1] += weighted[b] * shifts[k, b]
+            for j in range(6):
+                if k > 0 or j >= 3:
+                    for b in range(3):
+                        A[row, 3 * (k - 1) + j] += weighted[b] * J[b, j]
+
+
+@compiled
+def _reading_rows(
+    path: Float[np.ndarray, "P 3"],
+    landmarks: Float[np.ndarray, "L 2"],
+    poses: Int64[np.ndarray, " N"],
+    slots: Int64[np.ndarray, " N"],
+    noise: Noise,
+) -> Float[np.ndarray, "N 2 7"]:
+    """Of each reading, for range and bearing: ∂h by the pose and the landmark, g, the variance."""
+    rows = np.zeros((len(poses), 2, 7))
+    for n in range(len(poses)):
+        pose = path[poses[n]]
+        dx, dy = landmarks[slots[n], 0] - pose[0], landmarks[slots[n], 1] - pose[1]
+        distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
+        direction = math.atan2(dy, dx)
+        bearing = direction - pose[2]
+        of_range, of_bearing = rows[n, 0], rows[n, 1]
+        of_range[0], of_range[1] = -math.cos(bearing), -math.sin(bearing)
+        of_range[3], of_range[4] = math.cos(direction), math.sin(direction)
+        of_range[5] = distance
+        of_range[6] = noise.range_variance + noise.range_per_m2 * distance * distance
+        of_bearing[0], of_bearing[1] = math.sin(bearing) / distance, -math.cos(bearing) / distance
+        of_bearing[2] = -1.0
+        of_bearing[3] = -math.sin(direction) / distance
+        of_bearing[4] = math.cos(direction) / distance
+        of_bearing[5] = 1.0
+        of_bearing[6] = noise.bearing_variance
+    return rows
+
+
+@compiled
+def _add_readings(
+    A: Float[np.ndarray, "n n"],
+    right: Float[np.ndarray, "n B"],
+    rows: Float[np.ndarray, "N 2 7"],
+    poses: Int64[np.ndarray, " N"],
+    slots: Int64[np.ndarray, " N"],
+    first: int,
+) -> None:
+    """Residual h(pose, landmark) + g b of readings that are independent, as particles weigh them.
+
+    first: where the landmarks' unknowns begin.
+    """
+    at = np.empty(5, dtype=np.int64)
+    for n in range(len(rows)):
+        for i in range(3):
+            at[i] = 3 * poses[n] + i
+        at[3], at[4] = first + 2 * slots[n], first + 2 * slots[n] + 1
+        for kind in range(2):
+            row = rows[n, kind]
+            for i in range(5):
+                weighted = row[i] / row[6]
+                right[at[i], 0 if kind else 2] -= weighted * row[5]
+                for j in range(5):
+                    A[at[i], at[j]] += weighted * row[j]
+
+
+@compiled
+def _add_given_path(
+    A: Float[np.ndarray, "2 2"],
+    right: Float[np.ndarray, "2 B"],
+    rows: Float[np.ndarray, "n 7"],
+    shifts: Float[np.ndarray, "n B"],
+    white: float,
+) -> None:
+    """The ranges or the bearings of one landmark, given by how much each residual moves.
+
+    The share of the variance that is not white is one constant error, eliminated by Schur's
+    complement.
+    """
+    count, biases = shifts.shape
+    column, error, total = np.zeros(2), np.zeros(biases), 0.0
+    for n in range(count):
+        weight = 1.0 / (white * rows[n, 6])
+        total += weight
+        for b in range(biases):
+            error[b] += weight * shifts[n, b]
+        for i in range(2):
+            column[i] += weight * rows[n, 3 + i]
+            for b in range(biases):
+                right[i, b] -= weight * rows[n, 3 + i] * shifts[n, b]
+            for j in range(2):
+                A[i, j] += weight * rows[n, 3 + i] * rows[n, 3 + j]
+    if white < 1.0:
+        share = 1.0 / (total + 1.0 / ((1.0 - white) * rows[count - 1, 6]))
+        for i in range(2):
+            for b in range(biases):
+                right[i, b] += share * column[i] * error[b]
+            for j in range(2):
+                A[i, j] -= share * column[i] * column[j]
+
+
+@compiled
+def _landmarks_given(
+    twists: Float[np.ndarray, "B P 3"],
+    rows: Float[np.ndarray, "N 2 7"],
+    poses: Int64[np.ndarray, " N"],
+    slots: Int64[np.ndarray, " N"],
+    count: int,
+    noise: Noise,
+) -> Float[np.ndarray, "B L 2"]:
+    """How the landmarks answer, given the path's answer, as they are solved again at the end."""
+    biases = len(twists)
+    moved = np.zeros((biases, count, 2))
+    for landmark in range(count):
+        own = np.flatnonzero(slots == landmark)
+        A, right = np.zeros((2, 2)), np.zeros((2, biases))
+        for kind in range(2):
+            shifts = np.zeros((len(own), biases))
+            for k in range(len(own)):
+                row = rows[own[k], kind]
+                shifts[k, 0 if kind else 2] = row[5]
+                for b in range(biases):
+                    twist = twists[b, poses[own[k]]]
+                    shifts[k, b] += row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]
+            white = noise.bearing_white if kind else noise.range_white
+            _add_given_path(A, right, rows[own, kind], shifts, white)
+        determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+        for b in range(biases):
+            x, y = right[0, b], right[1, b]
+            moved[b, landmark, 0] = (A[1, 1] * x - A[0, 1] * y) / determinant
+            moved[b, landmark, 1] = (A[0, 0] * y - A[1, 0] * x) / determinant
+    return moved
