@@ -147,7 +147,11 @@ def indefinite(n: int) -> bytes:
 def with_two_nodes(stamps: list[int]) -> bytes:
     joint = packed(spd(13))
     return with_fields(
-        SUBMAP, nodes=from_stamps(stamps), mean=from_floats(range(13)), covariance=joint
+        SUBMAP,
+        nodes=from_stamps(stamps),
+        mean=from_floats(range(13)),
+        covariance=joint,
+        sensitivity=from_floats(range(26)),
     )
 
 
@@ -219,7 +223,7 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("wrong field", with_fields(SUBMAP, stamp_ns=2**62), None),
         ("wrong field", with_fields(EXAMPLES["status/1"], figures={"x": float("nan")}), None),
         ("wrong field", with_fields(EXAMPLES["odometry/1"], forward=float("nan")), None),
-        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-3]), None),
+        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-5]), None),
     ],
 )
 def test_an_unsound_payload_is_refused_for_its_reason(
