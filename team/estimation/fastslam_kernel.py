@@ -46,18 +46,19 @@ SMALLEST_VARIANCE = 1e-200
 def semidefinite_factor(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """Lower L with L Lᵀ = covariance, of any rank; NaN where there is none.
 
-    A pivot within 1e-12 of its diagonal entry is what rounding leaves of zero: its column is zero.
-    So is one below SMALLEST_VARIANCE, whose quotients are not numbers any more. A pivot below −1e-9
-    of its diagonal entry says that the matrix is indefinite.
+    A pivot within 1e-9 of its diagonal entry is taken for what rounding leaves of zero: its column
+    is zero, and rounding grows by 1e9 at the most until the next pivot. So is one below
+    SMALLEST_VARIANCE, whose quotients are not numbers any more. A pivot below −1e-6 of its diagonal
+    entry says that the matrix is indefinite.
     """
     L = np.zeros((3, 3))
     for j in range(3):
         pivot = covariance[j, j]
         for k in range(j):
             pivot -= L[j, k] * L[j, k]
-        if not pivot >= -1e-9 * abs(covariance[j, j]):
+        if not pivot >= -1e-6 * abs(covariance[j, j]):
             L[j, j] = np.nan
-        elif pivot > max(1e-12 * covariance[j, j], SMALLEST_VARIANCE):
+        elif pivot > max(1e-9 * covariance[j, j], SMALLEST_VARIANCE):
             L[j, j] = math.sqrt(pivot)
             for i in range(j + 1, 3):
                 rest = covariance[i, j]
