@@ -108,6 +108,19 @@ class Experiment(Protocol):
         """What comes of them."""
 
 
+def combined(title: str, parts: Sequence[Outcome]) -> Outcome:
+    """Several outcomes as one, in their order; their figures differ in name."""
+    return Outcome(
+        title,
+        {name: figure for part in parts for name, figure in part.figures.items()},
+        tuple(table for part in parts for table in part.tables),
+        tuple(picture for part in parts for picture in part.pictures),
+        tuple(goal for part in parts for goal in part.goals),
+        tuple(remark for part in parts for remark in part.remarks),
+        tuple(text for part in parts for text in part.missing),
+    )
+
+
 def without_datasets(what: str) -> str:
     """The line for `Outcome.missing` of what needs a UTIAS data set."""
     return (

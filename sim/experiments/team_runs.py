@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from central.node import CentralNode
-from sim.evaluation import Evaluation, evaluate
+from sim.evaluation import Evaluation, RobotResult, evaluate
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
 from sim.in_memory import run_nodes
@@ -18,12 +18,16 @@ from sim.source import streams_of
 from sim.world_node import WorldNode, expected_nodes
 from sim.worlds import SimulatedWorld
 from team import translate
+from team.config import Estimator, FusionRule
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
 
 Figures = dict[str, Any]
+Shown = Sequence[tuple[str, str, str]]
+"""Columns of a table: the figure's name, the heading, the format."""
+OURS: tuple[Estimator, FusionRule] = ("hybrid", "join")
 _COST_S = 2.5e-3
 """Of a robot's step, about."""
 _UTIAS_COST_S = 40.0
@@ -37,7 +41,7 @@ def team_task(scenario: Scenario, *, batch: bool = False, dataset: Dataset | Non
         if isinstance(world, SimulatedWorld)
         else _UTIAS_COST_S
     )
-    pair = f"{scenario.estimator} + {scenario.fusion}"
+    pair = named(scenario.estimator, scenario.fusion)
     place = scenario.name if dataset is None else dataset.name
     return Task(
         "sim.experiments.team_runs:team_run",
@@ -47,6 +51,11 @@ def team_task(scenario: Scenario, *, batch: bool = False, dataset: Dataset | Non
         cost,
         {} if dataset is None else {"path": str(dataset.path)},
     )
+
+
+def named(estimator: str, fusion: str) -> str:
+    """A pair as users write it."""
+    return f"{estimator} + {fusion}"
 
 
 def team_run(
@@ -122,6 +131,11 @@ def team_figures(evaluation: Evaluation) -> Figures:
         "nees": None if errors is None else errors.nees_per_dof,
         "in_band": None if errors is None else errors.in_band,
         "landmarks": None if errors is None else errors.count,
+        "coverage_raw": None if errors is None else errors.coverage,
+        "shape_nees": None
+        if errors is None or errors.shape is None
+        else errors.shape.nees_per_landmark,
+        "coverage": None if errors is None or errors.shape is None else errors.shape.coverage,
         "cost_per_dof": None if evaluation.map is None else evaluation.map.cost_per_dof,
         "position_rmse": rms(r.smoothed.position_rmse_m for r in robots if r.smoothed),
         "position_rmse_aligned": rms(r.aligned_rmse_m for r in robots),
@@ -135,6 +149,20 @@ def team_figures(evaluation: Evaluation) -> Figures:
         ),
         "final_map_sha256": None if evaluation.map is None else evaluation.map.payload_sha256,
         "not_joined": [] if evaluation.map is None else list(evaluation.map.reasons),
+        "robots": {name: _robot_figures(robot) for name, robot in evaluation.robots.items()},
+    }
+
+
+def _robot_figures(robot: RobotResult) -> Figures:
+    """One robot's errors [m]; first_pose_chi2: of its first smoothed pose, 3 degrees of freedom."""
+    smoothed, online = robot.smoothed, robot.online
+    return {
+        "position_rmse": None if smoothed is None else smoothed.position_rmse_m,
+        "position_rmse_aligned": robot.aligned_rmse_m,
+        "pose_nees": None if smoothed is None else smoothed.nees_per_dof,
+        "first_pose_chi2": None if smoothed is None else float(smoothed.nees[0]),
+        "online_position_rmse": None if online is None else online.position_rmse_m,
+        "online_pose_nees": None if online is None else online.nees_per_dof,
     }
 
 
@@ -183,6 +211,9 @@ OVER_SEEDS = (
     Figure("nees", "nees", mean),
     Figure("nees_median", "nees", middle),
     Figure("in_band", "in_band", mean),
+    Figure("shape_nees", "shape_nees", mean),
+    Figure("coverage", "coverage", mean),
+    Figure("coverage_raw", "coverage_raw", mean),
     Figure("cost_per_dof", "cost_per_dof", mean),
     Figure("position_rmse", "position_rmse", rms),
     Figure("position_rmse_aligned", "position_rmse_aligned", rms),
@@ -206,3 +237,10 @@ def over_seeds(runs: Sequence[Figures]) -> Figures:
         for figure in OVER_SEEDS
         if any(figure.source in run for run in runs)
     }
+
+
+def cells_of(figures: Figures, shown: Shown) -> list[str]:
+    """A row of a table; a dash where there is no figure."""
+    return [
+        "–" if figures.get(name) is None else form.format(figures[name]) for name, _, form in shown
+    ]

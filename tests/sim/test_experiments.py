@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sim.cli import app
-from sim.experiments import accuracy
+from sim.experiments import accuracy_worlds
 from sim.experiments.catalogue import ENTRIES, Entry
 from sim.experiments.experiment import Goal, Options, Outcome, Picture, Results, Table
 from sim.experiments.output import to_json, write
@@ -37,7 +37,7 @@ def test_a_figure_that_no_run_has_is_none_and_one_that_some_have_is_theirs() -> 
 
 def test_the_ratio_is_of_the_rms_over_the_seeds_to_the_batch_of_the_default_pair() -> None:
     runs = {"hybrid + join": [run(0.6), run(0.8)], "hybrid + kalman": [run(2.0, 9.0, None)]}
-    figures = accuracy.world_figures(runs)
+    figures = accuracy_worlds.world_figures(runs)
     assert figures["hybrid + join"]["ratio"] == pytest.approx(0.5**0.5 / 0.5)
     assert figures["hybrid + kalman"]["ratio"] == pytest.approx(4.0)
     assert figures["batch"]["ratio"] == 1.0
@@ -53,11 +53,11 @@ def test_a_goal_is_passed_within_its_bounds_only(value: float | None, passed: bo
 
 def test_a_team_that_counts_readings_twice_misses_the_goals() -> None:
     options = Options((1,), quick=True)
-    tasks = accuracy.tasks(options)
+    tasks = accuracy_worlds.tasks(options)
     honest = Results({task.name: run(0.5) | _POSES for task in tasks})
     twice = Results({task.name: run(0.5, 2.0) | _POSES for task in tasks})
-    assert all(goal.passed is not False for goal in accuracy.outcome(options, honest).goals)
-    missed = [goal for goal in accuracy.outcome(options, twice).goals if goal.passed is False]
+    assert all(goal.passed is not False for goal in accuracy_worlds.outcome(options, honest).goals)
+    missed = [goal for goal in accuracy_worlds.outcome(options, twice).goals if goal.passed is False]
     assert {goal.figure.rpartition(" ")[2] for goal in missed} == {"nees"}
 
 

@@ -1,0 +1,111 @@
+"""Real data: every UTIAS set that is given, five robots, one fixed profile for all of them.
+
+The raw map lies where the start poses say; `shape` is what no rigid motion explains, and its NEES
+is per landmark: 2 where the covariance is right.
+"""
+
+from collections.abc import Mapping
+
+from sim.experiments.experiment import (
+    Dataset,
+    Goal,
+    Options,
+    Outcome,
+    Results,
+    Table,
+    without_datasets,
+)
+from sim.experiments.task import Task
+from sim.experiments.team_runs import Figures, Shown, cells_of, team_task
+from sim.scenario import load
+
+MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
+"""By the data set's number; other sets have no goal of their own."""
+MOST_RAW_TRAJECTORY_M = {"1": 0.035, "2": 0.070, "6": 0.116}
+SHOWN: Shown = (
+    ("aligned", "aligned [m]", "{:.4f}"),
+    ("raw", "raw [m]", "{:.4f}"),
+    ("nees", "NEES/dof", "{:.3g}"),
+    ("shape_nees", "shape NEES", "{:.3g}"),
+    ("coverage", "coverage", "{:.0%}"),
+    ("trajectory_raw", "path raw [m]", "{:.3f}"),
+    ("trajectory_aligned", "aligned [m]", "{:.3f}"),
+    ("online_position_rmse", "online [m]", "{:.3f}"),
+    ("online_pose_nees", "NEES/dof", "{:.3g}"),
+    ("bytes_per_step", "B/step", "{:.1f}"),
+)
+ROBOT: Shown = (
+    ("position_rmse", "path raw [m]", "{:.3f}"),
+    ("position_rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("pose_nees", "NEES/dof", "{:.3g}"),
+    ("online_position_rmse", "online [m]", "{:.3f}"),
+    ("online_pose_nees", "NEES/dof", "{:.3g}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """One run of each set; its world and its robots have no randomness but the estimator's."""
+    return [_task(dataset) for dataset in options.datasets]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """The figures of each set, and of each robot in it."""
+    if not options.datasets:
+        return Outcome(
+            "real data", {"utias": {}}, missing=(without_datasets("figures on real data"),)
+        )
+    figures = {
+        dataset.name: set_figures(run)
+        for dataset in options.datasets
+        if (run := results.of(_task(dataset))) is not None
+    }
+    rows = tuple((name, *cells_of(of_set, SHOWN)) for name, of_set in figures.items())
+    robots = tuple(
+        (f"{name}, {robot}", *cells_of(of_robot, ROBOT))
+        for name, of_set in figures.items()
+        for robot, of_robot in of_set["robots"].items()
+    )
+    goals = [goal for dataset in options.datasets for goal in _goals(dataset, figures)]
+    return Outcome(
+        "real data",
+        {"utias": figures},
+        (
+            Table("UTIAS, five robots, one profile", _heads("set", SHOWN), rows),
+            Table("each robot", _heads("robot", ROBOT), robots),
+        ),
+        goals=tuple(goals),
+    )
+
+
+def set_figures(run: Figures) -> Figures:
+    """The figures of one set under the names of real data."""
+    renamed = {
+        "aligned": "rmse_aligned",
+        "raw": "rmse",
+        "trajectory_raw": "position_rmse",
+        "trajectory_aligned": "position_rmse_aligned",
+    }
+    return {new: run[old] for new, old in renamed.items()} | {
+        name: value for name, value in run.items() if name not in renamed.values()
+    }
+
+
+def _task(dataset: Dataset) -> Task:
+    return team_task(load("utias"), dataset=dataset)
+
+
+def _goals(dataset: Dataset, figures: Mapping[str, Figures]) -> list[Goal]:
+    name, of_set = dataset.name, figures.get(dataset.name, {})
+    number = "".join(each for each in name if each.isdigit())
+    goals = [
+        Goal(f"{name}: shape_nees", of_set.get("shape_nees"), 1.0, 3.5),
+        Goal(f"{name}: coverage", of_set.get("coverage"), 0.8, 1.0),
+    ]
+    for figure, most in (("aligned", MOST_ALIGNED_M), ("trajectory_raw", MOST_RAW_TRAJECTORY_M)):
+        if number in most:
+            goals.append(Goal(f"{name}: {figure} [m]", of_set.get(figure), 0.0, most[number]))
+    return goals
+
+
+def _heads(first: str, shown: Shown) -> tuple[str, ...]:
+    return (first, *(heading for _, heading, _ in shown))
