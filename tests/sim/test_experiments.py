@@ -57,7 +57,9 @@ def test_a_team_that_counts_readings_twice_misses_the_goals() -> None:
     honest = Results({task.name: run(0.5) | _POSES for task in tasks})
     twice = Results({task.name: run(0.5, 2.0) | _POSES for task in tasks})
     assert all(goal.passed is not False for goal in accuracy_worlds.outcome(options, honest).goals)
-    missed = [goal for goal in accuracy_worlds.outcome(options, twice).goals if goal.passed is False]
+    missed = [
+        goal for goal in accuracy_worlds.outcome(options, twice).goals if goal.passed is False
+    ]
     assert {goal.figure.rpartition(" ")[2] for goal in missed} == {"nees"}
 
 
