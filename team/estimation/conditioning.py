@@ -1,8 +1,10 @@
 """A robot's pose in the team's map: the broadcast prior times the robot's own later submaps.
 
 The prior (the joint marginal of the robot's last joined end pose and the landmarks) and the submaps
-that are not in it are independent, so their product is exact, up to linearisation. The result is
-for display and control; it never enters anything that the robot sends for fusion.
+that are not in it are independent, so their product is exact, up to linearisation. A landmark that
+a submap sees where everything else contradicts it (a misread barcode) is left out of that submap,
+for this pose only: nothing is remembered, so nobody is locked out. The result is for display and
+control; it never enters anything that the robot sends for fusion.
 """
 
 from collections.abc import Sequence
@@ -10,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
+from scipy.stats import chi2
 
 from team.estimation.gaussian import information
 from team.estimation.geometry import compose, transformed, wrapped
@@ -17,6 +20,11 @@ from team.estimation.submap import LocalMap
 from team.estimation.submap_factor import submap_normal
 
 ITERATIONS = 3
+GATE = float(chi2.ppf(0.9999, 2))
+"""χ² beyond which what a submap says of a landmark is taken for another landmark's: some twenty are
+tested for each pose, and a good one that is left out costs little."""
+REDUNDANT = 1e-6
+"""The least share of a landmark's information that must be redundant for it to be tested."""
 Values = Float[np.ndarray, " _"]
 
 
@@ -41,6 +49,14 @@ class _Link(NamedTuple):
     information: Float[np.ndarray, "n n"]
 
 
+class _Solution(NamedTuple):
+    """The state of prior pose, landmarks and chain, its covariance, and the chain's factors."""
+
+    state: Values
+    spread: Float[np.ndarray, "n n"]
+    links: list[_Link]
+
+
 def team_pose(
     prior: RobotPrior, pending: Sequence[LocalMap], open_window: LocalMap | None
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
@@ -48,11 +64,26 @@ def team_pose(
 
     pending: the robot's submaps behind the prior's pose, in order; open_window: the Gaussian of the
     window in progress. Three Gauss-Newton iterations over the poses of the chain and the landmarks
-    that it sees; of the prior only their marginal is used, which is exact.
+    that it sees; of the prior only their marginal is used, which is exact. Then, one by one, what
+    `_worst` names is left out, and all is solved again.
     """
     chain = [each.without_nodes for each in (*pending, open_window) if each is not None]
     if not chain:
         return prior.pose, prior.covariance[:3, :3]
+    while True:
+        solution = _solved(prior, chain)
+        wrong = _worst(solution)
+        if wrong is None:
+            last = int(solution.links[-1].at[1])
+            pose = solution.state[last : last + 3].copy()
+            pose[2] = wrapped(pose[2])
+            return pose, solution.spread[last : last + 3, last : last + 3]
+        link, landmark = wrong
+        chain[link] = _without(chain[link], landmark)
+
+
+def _solved(prior: RobotPrior, chain: Sequence[LocalMap]) -> _Solution:
+    """Gauss-Newton over the chain, and the covariance at its result."""
     seen = np.unique(np.concatenate([local.ids for local in chain]))
     index = np.flatnonzero(np.isin(prior.ids, seen))
     kept = np.concatenate([np.arange(3), *(3 + 2 * k + np.arange(2) for k in index)])
@@ -71,10 +102,39 @@ def team_pose(
     spread[np.ix_(unknown, unknown)] = information(
         hessian[np.ix_(unknown, unknown)], "the information of the team's pose"
     )
-    last = int(links[-1].at[1])
-    pose = state[last : last + 3].copy()
-    pose[2] = wrapped(pose[2])
-    return pose, spread[last : last + 3, last : last + 3]
+    return _Solution(state, spread, links)
+
+
+def _worst(solution: _Solution) -> tuple[int, int] | None:
+    """The (link, place in it) of the landmark that the rest contradicts most; None within GATE.
+
+    Baarda's test of a shift of one landmark in one submap: with v = r at the solution, W = P⁻¹ and
+    Q = P − J Σ Jᵀ, T = (W v)ₗᵀ ((W Q W)ₗₗ)⁻¹ (W v)ₗ is by how much the cost falls if that submap
+    says nothing about that landmark; χ² with two degrees of freedom. Where nothing else says where
+    the landmark is, W Q W is zero there and nothing can be tested.
+    """
+    worst, found = GATE, None
+    for k, link in enumerate(solution.links):
+        own, slope, _ = submap_normal(solution.state, link.at, link.mean, link.information)
+        of_residual = own[:, 3:]  # Jᵀ W, since J is the identity behind the start pose
+        span = solution.spread[np.ix_(link.span, link.span)]
+        for place in range(len(link.at) - 2):
+            at = slice(3 + 2 * place, 5 + 2 * place)
+            weight = own[3:, 3:][at, at]
+            tested = weight - of_residual[:, at].T @ span @ of_residual[:, at]
+            if np.linalg.eigvalsh(tested)[0] < REDUNDANT * np.linalg.eigvalsh(weight)[0]:
+                continue
+            gain = float(slope[3:][at] @ np.linalg.solve(tested, slope[3:][at]))
+            if gain > worst:
+                worst, found = gain, (k, place)
+    return found
+
+
+def _without(local: LocalMap, place: int) -> LocalMap:
+    """The map as if it had not seen its landmark at this place."""
+    rows = np.delete(np.arange(len(local.mean)), [3 + 2 * place, 4 + 2 * place])
+    ids = np.delete(local.ids, place)
+    return LocalMap(ids, local.mean[rows], local.covariance[np.ix_(rows, rows)])
 
 
 def _chained(

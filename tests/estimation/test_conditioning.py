@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from team.estimation import conditioning
 from team.estimation.conditioning import RobotPrior, team_pose
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.gauss_newton import JoinSettings
@@ -85,6 +86,54 @@ def test_a_landmark_that_only_the_later_submaps_see_does_no_harm_and_ties_them()
     pose, covariance = team_pose(prior, [first, second], None)
     assert pose[0] == pytest.approx(2.0 + 1.5, abs=1e-2)
     assert covariance[0, 0] == pytest.approx(1.0, rel=1e-2)
+
+
+def misread(local, place, shift):
+    """The submap whose landmark at this place was taken for another one, `shift` away."""
+    mean = local.mean.copy()
+    mean[3 + 2 * place : 5 + 2 * place] += shift
+    return LocalMap(local.ids, mean, local.covariance)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_misread_landmark_leaves_the_pose_as_it_is_without_it(seed, monkeypatch):
+    world = team(seed, submaps=6)
+    before, after = later(world, "r0", 4)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    first, second = (each.local for each in after)
+    known = [k for k, id_ in enumerate(second.ids.tolist()) if id_ in prior.ids]
+    place = known[0]
+    expected, covariance = team_pose(prior, [first], conditioning._without(second, place))
+    wrong = misread(second, place, np.array([4.0, -3.0]))
+    pose, spread = team_pose(prior, [first], wrong)
+    np.testing.assert_array_equal(pose, expected)
+    np.testing.assert_array_equal(spread, covariance)
+    monkeypatch.setattr(conditioning, "GATE", np.inf)
+    trusting, _ = team_pose(prior, [first], wrong)
+    sigma = np.sqrt(np.diag(covariance))
+    assert np.abs((trusting - expected) / sigma).max() > 3.0
+
+
+def test_two_misread_landmarks_in_two_submaps_are_both_left_out():
+    world = team(2, submaps=6)
+    before, after = later(world, "r0", 4)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    good = [each.local for each in after]
+    places = [int(np.flatnonzero(np.isin(each.ids, prior.ids))[-1]) for each in good]
+    bad = [misread(e, k, np.array([2.0, 5.0])) for e, k in zip(good, places, strict=True)]
+    kept = [conditioning._without(e, k) for e, k in zip(good, places, strict=True)]
+    expected, _ = team_pose(prior, kept[:1], kept[1])
+    pose, _ = team_pose(prior, bad[:1], bad[1])
+    np.testing.assert_array_equal(pose, expected)
+
+
+def test_good_submaps_are_all_used():
+    for seed in range(20):
+        world = team(seed, submaps=6)
+        before, after = later(world, "r1", 4)
+        prior = prior_for(joined(before, world.starts), "r1", 0)
+        chain = [each.local for each in after]
+        assert conditioning._worst(conditioning._solved(prior, chain)) is None
 
 
 def test_the_team_pose_is_consistent_and_counting_a_submap_twice_is_not():
