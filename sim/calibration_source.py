@@ -1,6 +1,6 @@
 """The readings to calibrate by: a data set's, or those of a log."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,15 +39,23 @@ def readings_of(path: Path) -> tuple[WorldStreams, Scenario]:
     configured = [each for each in messages if isinstance(each, m.Configured)]
     if not configured:
         raise ScenarioError(f"{path}: the log does not say the world's scenario")
-    return world_of(messages, path.name), loads(configured[-1].configuration)
+    scenario = loads(configured[-1].configuration)
+    clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
+    return world_of(messages, path.name, clocks), scenario
 
 
 def _samples(path: Path) -> list[Sample]:
     return list(open_log(path).samples(CHANNELS))
 
 
-def world_of(messages: Sequence[m.Message], source: str) -> WorldStreams:
-    """The streams that these messages make, whatever else is among them."""
+def world_of(
+    messages: Sequence[m.Message], source: str, clocks: Mapping[str, float] | None = None
+) -> WorldStreams:
+    """The streams that these messages make, whatever else is among them.
+
+    clocks: the offset of each robot's odometry [s] that is to be put right; absent: none.
+    """
+    offsets = {} if clocks is None else clocks
     readings: dict[str, dict[int, m.Reading]] = {}
     truth: dict[str, list[m.Truth]] = {}
     landmark_ids, landmarks = np.empty(0, np.uint32), None
@@ -63,14 +71,24 @@ def world_of(messages: Sequence[m.Message], source: str) -> WorldStreams:
             case _:
                 pass
     streams = [
-        _stream(robot, [of[i] for i in sorted(of)], truth.get(robot, []), tuple(sorted(readings)))
+        _stream(
+            robot,
+            [of[i] for i in sorted(of)],
+            truth.get(robot, []),
+            tuple(sorted(readings)),
+            offsets.get(robot, 0.0),
+        )
         for robot, of in sorted(readings.items())
     ]
     return WorldStreams(tuple(streams), landmark_ids, landmarks, source)
 
 
 def _stream(
-    robot: str, readings: Sequence[m.Reading], truth: Sequence[m.Truth], robots: tuple[str, ...]
+    robot: str,
+    readings: Sequence[m.Reading],
+    truth: Sequence[m.Truth],
+    robots: tuple[str, ...],
+    clock_offset_s: float,
 ) -> RobotStream:
     starts = [each for each in readings if isinstance(each, m.Start)]
     odometry = [each for each in readings if isinstance(each, m.Odometry)]
@@ -78,7 +96,9 @@ def _stream(
     sighted = [each for each in readings if isinstance(each, m.Sightings)]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
     intervals = Intervals(
-        np.array([each.stamp_ns for each in odometry], dtype=np.int64),
+        np.array(
+            [translate.motion_of(each, clock_offset_s)[0] for each in odometry], dtype=np.int64
+        ),
         np.array([each.duration_ns for each in odometry], dtype=np.int64),
         np.array([each.forward for each in odometry]),
         np.array([each.yaw_rate for each in odometry]),

@@ -132,14 +132,18 @@ def simulate(
     robots: Robots = None,
     seed: Seed = None,
 ) -> None:
-    """Write a scenario's world as a data set in the UTIAS format."""
+    """Write a scenario's world as a data set in the UTIAS format, with a scenario that runs it."""
     from sim.datasets.utias_writer import write_utias
+    from sim.scenario_toml import data_set_scenario
     from sim.source import streams_of
 
     if output.exists() and any(output.iterdir()):
         fail(f"{output} is not empty: give a new folder", WRONG_USE)
-    write_utias(streams_of(with_options(scenario_of(scenario), robots=robots, seed=seed)), output)
-    typer.echo(f"wrote {output}")
+    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed)
+    write_utias(streams_of(resolved), output)
+    beside = output / "scenario.toml"
+    beside.write_text(data_set_scenario(resolved), encoding="utf-8")
+    typer.echo(f"wrote {output}; `teamslam launch {beside}` runs the team on it")
 
 
 def _hint_if_cut(log: "Log") -> None:

@@ -80,10 +80,14 @@ def chains_of(samples: Iterable[Sample], scenario: Scenario) -> list[Chain]:
 
 def _chain(config: RobotConfig, epoch: int, readings: Sequence[m.Reading]) -> Chain | None:
     """None for a stream without odometry: it has no motion that links its poses."""
-    odometry = [reading for reading in readings if isinstance(reading, m.Odometry)]
+    odometry = [
+        translate.motion_of(reading, config.clock_offset_s)
+        for reading in readings
+        if isinstance(reading, m.Odometry)
+    ]
     if not odometry:
         return None
-    first_ns = odometry[0].stamp_ns - odometry[0].duration_ns
+    first_ns, last_ns = odometry[0][0] - odometry[0][1], odometry[-1][0]
     segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
     segmenter.begin(first_ns)
     start: tuple[Pose | None, Matrix | None] = (None, None)
@@ -95,15 +99,13 @@ def _chain(config: RobotConfig, epoch: int, readings: Sequence[m.Reading]) -> Ch
             case m.Observations():
                 segmenter.observe(reading.stamp_ns, *translate.scan_of(reading))
             case m.Odometry():
-                epochs += segmenter.drive(
-                    reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
-                )
-    last, rest = segmenter.cut(odometry[-1].stamp_ns)
+                epochs += segmenter.drive(*translate.motion_of(reading, config.clock_offset_s))
+    last, rest = segmenter.cut(last_ns)
     epochs += last
     if rest.mean.any() or rest.covariance.any():
         none = np.empty(0)
         nothing = np.empty(0, np.uint32)
-        epochs.append(Epoch(odometry[-1].stamp_ns, rest, nothing, none, none))
+        epochs.append(Epoch(last_ns, rest, nothing, none, none))
     return Chain(
         config,
         epoch,

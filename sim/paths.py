@@ -12,9 +12,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-Kind = Literal["turn-then-drive", "velocity"]
+Kind = Literal["turn-then-drive", "velocity", "differential-drive"]
 Pose = tuple[float, float, float]
 Step = tuple[float, float]
+
+ALIGNED_RAD = 0.02
+"""Who turns before it drives drives when its way-point lies less than this to the side."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +30,15 @@ class Drive:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a robot can do in one step, and when a way-point counts as reached."""
+    """What a robot can do in one step, and when a way-point counts as reached.
+
+    turn_first: a step that turns does not drive.
+    """
 
     distance: float
     turn: float
     tolerance: float
+    turn_first: bool = False
 
 
 def wrapped(angle: float) -> float:
@@ -90,8 +97,8 @@ def moved(
 ) -> Pose:
     """The pose after one step, a slip to the left at its end and a last turn.
 
-    turn-then-drive: the whole turn first, then straight on. velocity: the circular arc, whose chord
-    has the length distance · sin(φ/2)/(φ/2) and the direction θ + φ/2.
+    turn-then-drive: the whole turn first, then straight on. velocity and differential-drive: the
+    circular arc, whose chord has the length distance · sin(φ/2)/(φ/2) and the direction θ + φ/2.
     """
     x, y, heading = pose
     distance, turn = step
@@ -112,5 +119,9 @@ def _towards(pose: Pose, target: tuple[float, float], limits: Limits) -> Step:
     dx, dy = target[0] - pose[0], target[1] - pose[1]
     aside = wrapped(atan2(dy, dx) - pose[2])
     turn = min(max(aside, -limits.turn), limits.turn)
+    if limits.turn_first:
+        if abs(aside) > ALIGNED_RAD:
+            return 0.0, turn
+        turn = 0.0
     distance = min(limits.distance, hypot(dx, dy)) * max(0.0, cos(aside - turn))
     return distance, turn

@@ -24,7 +24,7 @@ from sim.scenario_document import (
     resolved,
 )
 from sim.worlds import SimulatedWorld, UtiasWorld, World
-from team.config import Estimator, FusionRule, MotionNoise, RobotConfig
+from team.config import Estimator, FusionRule, RobotConfig
 from team.pairs import PAIRS, named_pairs
 
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
@@ -110,19 +110,10 @@ def doubts(scenario: Scenario) -> list[str]:
     """What is valid, but hardly meant, in words: a simulated robot whose odometry has no noise."""
     if not isinstance(scenario.world, SimulatedWorld):
         return []
-    none = MotionNoise()
     return [
         f"{robot.id}: odometry without noise; give it some in [defaults.motion]"
         for robot in scenario.robots
-        if all(
-            noise == none
-            for noise in (
-                robot.motion.forward,
-                robot.motion.turn,
-                robot.motion.final_turn,
-                robot.motion.lateral,
-            )
-        )
+        if robot.motion.is_exact
     ]
 
 

@@ -42,17 +42,41 @@ def visible(
     return Visible(steps, seen, ranges[steps, seen], bearings[inside])
 
 
+def persistent(
+    seen: Visible, sensor: Sensor, step_s: float, normals: Float[np.ndarray, "V 4"]
+) -> Float[np.ndarray, "V 2"]:
+    """Errors of unit variance, of which a share stays with each point from reading to reading.
+
+    n = √white w + √(1 − white) g with white w and, for each point, g of a first-order Gauss-Markov
+    process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). All from standard
+    normal numbers: two columns of w, two of n'; range first.
+    """
+    constant = normals[:, 2:].copy()
+    times = np.array([sensor.range_correlation_s, sensor.bearing_correlation_s])
+    order = np.lexsort((seen.steps, seen.points))
+    again = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
+    gaps = np.diff(seen.steps[order])[again - 1] * step_s
+    kept = np.exp(-gaps[:, np.newaxis] / times)
+    for row, rho in zip(again.tolist(), kept, strict=True):
+        before = constant[order[row - 1]]
+        constant[order[row]] = rho * before + np.sqrt(1.0 - rho**2) * constant[order[row]]
+    white = np.array([sensor.range_white, sensor.bearing_white])
+    both: Float[np.ndarray, "V 2"] = np.sqrt(white) * normals[:, :2]
+    both += np.sqrt(1.0 - white) * constant
+    return both
+
+
 def readings(
-    seen: Visible, sensor: Sensor, normals: Float[np.ndarray, "V 2"]
+    seen: Visible, sensor: Sensor, errors: Float[np.ndarray, "V 2"]
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Ranges [m] and bearings [rad] as the sensor reads them, from standard normal numbers.
+    """Ranges [m] and bearings [rad] as the sensor reads them, from errors n of unit variance.
 
     range = range_scale · (r + σ(r) n₁) + range_offset with σ(r)² = range_sigma² +
     (range_sigma_per_m r)²; bearing = b + bearing_sigma n₂ + bearing_offset.
     """
     sigma = np.hypot(sensor.range_sigma, sensor.range_sigma_per_m * seen.ranges)
-    ranges = sensor.range_scale * (seen.ranges + sigma * normals[:, 0]) + sensor.range_offset
-    bearings = seen.bearings + sensor.bearing_sigma * normals[:, 1] + sensor.bearing_offset
+    ranges = sensor.range_scale * (seen.ranges + sigma * errors[:, 0]) + sensor.range_offset
+    bearings = seen.bearings + sensor.bearing_sigma * errors[:, 1] + sensor.bearing_offset
     return np.maximum(ranges, SHORTEST_READING_M), on_circle(bearings)
 
 

@@ -1,20 +1,22 @@
 """A simulated world: true paths, odometry with noise in it, readings of landmarks and teammates.
 
-Nothing here comes from the estimator: the motion and the sensor are written again in `sim.paths`
-and `sim.sensing`, so that an error in either half shows. Every stream of random numbers is named by
-(seed, robot, purpose): a further robot changes nobody else's noise.
+Nothing here comes from the estimator: the motion and the sensor are written again in `sim.paths`,
+`sim.odometry` and `sim.sensing`, so that an error in either half shows. Every stream of random
+numbers is named by (seed, robot, purpose): a further robot changes nobody else's noise.
 """
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from itertools import chain
-from math import atan2
+from itertools import islice
+from math import atan2, hypot
 
 import numpy as np
 from jaxtyping import Float, Int64
 
+from sim.garbage import spoilt
+from sim.odometry import slip, told
 from sim.paths import Drive, Limits, Pose, Step, driven, followed
-from sim.sensing import Visible, readings, visible
+from sim.sensing import Visible, persistent, readings, visible
 from sim.streams import (
     Detections,
     Intervals,
@@ -25,7 +27,7 @@ from sim.streams import (
     robot_stream,
 )
 from sim.worlds import SimulatedWorld
-from team.config import MotionModel, MotionNoise, RobotConfig
+from team.config import RobotConfig, Sensor
 
 
 def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
@@ -33,16 +35,25 @@ def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -
 
     Robot i follows path i; without one, or if its motion slips or goes in arcs, it steers: to its
     path's way-points or to random ones. Each step ends with one message of the landmarks seen,
-    perhaps empty, and one of the teammates seen, if any.
+    perhaps empty, and one of the teammates seen, if any. Where an odometry's clock is late, team
+    time begins so much later than 0 that no stamp of it is negative.
     """
     landmarks = _landmarks(world, seed)
     ids = np.arange(1, len(landmarks) + 1, dtype=np.uint32)
-    drives = [_drive(world, robot, i, seed) for i, robot in enumerate(robots)]
-    stamps = np.rint(np.arange(world.steps + 1) * (world.step_s * 1e9)).astype(np.int64)
+    drives = _until_all_stand(
+        world, [_drive(world, robot, i, seed) for i, robot in enumerate(robots)]
+    )
+    steps = len(drives[0].steps)
+    begin_ns = max(0, *(_clock_ns(robot) for robot in robots))
+    stamps = begin_ns + np.rint(np.arange(steps + 1) * (world.step_s * 1e9)).astype(np.int64)
     streams = tuple(
         _stream(world, robots, drives, i, landmarks, stamps, seed) for i in range(len(robots))
     )
     return WorldStreams(streams, ids, landmarks, source=f"simulated world, seed {seed}")
+
+
+def _clock_ns(robot: RobotConfig) -> int:
+    return round(robot.clock_offset_s * 1e9)
 
 
 def generator(seed: int, *names: str) -> np.random.Generator:
@@ -55,8 +66,16 @@ def generator(seed: int, *names: str) -> np.random.Generator:
 def _landmarks(world: SimulatedWorld, seed: int) -> Float[np.ndarray, "L 2"]:
     if world.landmark_count:
         uniform = generator(seed, "world", "landmarks").random((world.landmark_count, 2))
-        return uniform * world.size_m
+        return _places(world, uniform)
     return np.array(world.landmarks, dtype=np.float64).reshape(-1, 2)
+
+
+def _places(world: SimulatedWorld, uniform: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+    """Uniform numbers → points of the square, or of the disc by radius and direction."""
+    if world.radius_m is None:
+        return uniform * world.size_m
+    radius, direction = world.radius_m * uniform[:, 0], 2.0 * np.pi * uniform[:, 1]
+    return np.column_stack((radius * np.cos(direction), radius * np.sin(direction)))
 
 
 def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> Drive:
@@ -64,24 +83,40 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
     motion = robot.motion
     turn_rate = min(world.turn_rate_rad_s, motion.yaw_rate_limit or np.inf)
     path = np.array(world.paths[index]) if index < len(world.paths) else None
-    slips = motion.final_turn != MotionNoise() or motion.lateral != MotionNoise()
-    if path is not None and motion.kind == "turn-then-drive" and not slips:
+    if path is not None and motion.kind == "turn-then-drive" and not motion.slips:
         return followed(path, world.steps)
-    way_points = _random_way_points(world, robot.id, seed) if path is None else _each(path)
-    first, second = next(way_points), next(way_points)
-    start: Pose = (*first, atan2(second[1] - first[1], second[0] - first[0]))
+    start, way_points = _route(world, robot.id, path, seed)
     limits = Limits(
-        world.speed_m_s * world.step_s, turn_rate * world.step_s, world.way_point_tolerance_m
+        world.speed_m_s * world.step_s,
+        turn_rate * world.step_s,
+        world.way_point_tolerance_m,
+        world.steering == "turn-first",
     )
     normals = generator(seed, robot.id, "slip").standard_normal((world.steps, 2))
 
-    def slip(k: int, step: Step) -> tuple[float, float]:
-        seconds, steps = np.array([world.step_s]), np.array([step])
-        final_turn = deviation(motion.final_turn, seconds, steps) * normals[k, 0]
-        lateral = deviation(motion.lateral, seconds, steps) * normals[k, 1]
-        return final_turn.item(), lateral.item()
+    def slipped(k: int, step: Step) -> tuple[float, float]:
+        return slip(motion, step, world.step_s, normals[k])
 
-    return driven(start, chain([second], way_points), limits, motion.kind, world.steps, slip)
+    return driven(start, way_points, limits, motion.kind, world.steps, slipped)
+
+
+def _route(
+    world: SimulatedWorld, robot: str, path: Float[np.ndarray, "W 2"] | None, seed: int
+) -> tuple[Pose, Iterator[tuple[float, float]]]:
+    """Where a robot starts, looking to where it goes first, and the way-points that follow."""
+    way_points = _random_way_points(world, robot, seed) if path is None else _each(path)
+    if path is None and world.radius_m is not None:
+        return (0.0, 0.0, 0.0), way_points
+    first, second = next(way_points), next(way_points)
+    start: Pose = (*first, atan2(second[1] - first[1], second[0] - first[0]))
+    return start, _behind(second, way_points)
+
+
+def _behind(
+    first: tuple[float, float], others: Iterator[tuple[float, float]]
+) -> Iterator[tuple[float, float]]:
+    yield first
+    yield from others
 
 
 def _each(path: Float[np.ndarray, "W 2"]) -> Iterator[tuple[float, float]]:
@@ -91,40 +126,24 @@ def _each(path: Float[np.ndarray, "W 2"]) -> Iterator[tuple[float, float]]:
 def _random_way_points(
     world: SimulatedWorld, robot: str, seed: int
 ) -> Iterator[tuple[float, float]]:
-    uniform = generator(seed, robot, "way-points")
-    while True:
-        x, y = (uniform.random(2) * world.size_m).tolist()
-        yield x, y
+    def endless() -> Iterator[tuple[float, float]]:
+        uniform = generator(seed, robot, "way-points")
+        while True:
+            x, y = _places(world, uniform.random((1, 2)))[0].tolist()
+            yield x, y
+
+    starts = 0 if world.radius_m is not None else 1
+    count = world.way_point_count
+    return islice(endless(), starts + count) if count else endless()
 
 
-def deviation(
-    noise: MotionNoise, seconds: Float[np.ndarray, " K"], steps: Float[np.ndarray, "K 2"]
-) -> Float[np.ndarray, " K"]:
-    """σ = √(per_s² t + per_m² |distance| + per_rad² |turn|) of one noise in each step."""
-    distance, turn = np.abs(steps).T
-    per_s, per_m, per_rad = noise.per_s, noise.per_m, noise.per_rad
-    variance = per_s**2 * seconds + per_m**2 * distance + per_rad**2 * turn
-    sigma: Float[np.ndarray, " K"] = np.sqrt(variance)
-    return sigma
-
-
-def _odometry(
-    motion: MotionModel,
-    steps: Float[np.ndarray, "K 2"],
-    stamps_ns: Int64[np.ndarray, " K_plus_1"],
-    normals: Float[np.ndarray, "K 2"],
-) -> Intervals:
-    """(distance + noise)/t/forward_scale and (turn + noise)/t/yaw_scale of each true step."""
-    duration_ns = np.diff(stamps_ns)
-    seconds = duration_ns * 1e-9
-    told_distance = steps[:, 0] + deviation(motion.forward, seconds, steps) * normals[:, 0]
-    told_turn = steps[:, 1] + deviation(motion.turn, seconds, steps) * normals[:, 1]
-    return Intervals(
-        end_ns=stamps_ns[1:],
-        duration_ns=duration_ns,
-        forward=told_distance / seconds / motion.forward_scale,
-        yaw_rate=told_turn / seconds / motion.yaw_scale,
-    )
+def _until_all_stand(world: SimulatedWorld, drives: Sequence[Drive]) -> list[Drive]:
+    """With a number of way-points the world ends when the last robot has reached its last one."""
+    if not world.way_point_count:
+        return list(drives)
+    moving = [np.flatnonzero(drive.steps.any(axis=1)) for drive in drives]
+    last = max((int(steps[-1]) + 1 for steps in moving if len(steps)), default=1)
+    return [Drive(drive.poses[: last + 1], drive.steps[:last]) for drive in drives]
 
 
 def _stream(
@@ -137,19 +156,30 @@ def _stream(
     seed: int,
 ) -> RobotStream:
     robot, drive = robots[index], drives[index]
-    normals = generator(seed, robot.id, "odometry").standard_normal((world.steps, 2))
     start = None if robot.id in world.unknown_starts else StartPose(drive.poses[0].copy(), None)
     return robot_stream(
         robot.id,
-        0,
+        int(stamps_ns[0]),
         start,
-        _odometry(robot.motion, drive.steps, stamps_ns, normals),
-        _observations(world, robot, drive, landmarks, stamps_ns[1:], seed),
+        _odometry(robot, drive, stamps_ns, seed),
+        _observations(world, robot, drive, landmarks, stamps_ns, seed),
         _sightings(world, robots, drives, index, stamps_ns[1:], seed),
         [other.id for other in robots],
         stamps_ns,
         drive.poses,
+        clock_offset_ns=_clock_ns(robot),
     )
+
+
+def _odometry(
+    robot: RobotConfig, drive: Drive, stamps_ns: Int64[np.ndarray, " K_plus_1"], seed: int
+) -> Intervals:
+    count = len(drive.steps)
+    normals = generator(seed, robot.id, "odometry").standard_normal((count, 2))
+    of_wheels = generator(seed, robot.id, "wheels").standard_normal((count, 2))
+    duration_ns = np.diff(stamps_ns)
+    forward, yaw_rate = told(robot.motion, drive.steps, duration_ns * 1e-9, normals, of_wheels)
+    return Intervals(stamps_ns[1:], duration_ns, forward, yaw_rate)
 
 
 def _observations(
@@ -157,15 +187,39 @@ def _observations(
     robot: RobotConfig,
     drive: Drive,
     landmarks: Float[np.ndarray, "L 2"],
-    ends_ns: Int64[np.ndarray, " K"],
+    stamps_ns: Int64[np.ndarray, " K_plus_1"],
     seed: int,
 ) -> Detections:
     """One message a step, perhaps empty."""
-    seen = _visible(world, robot, drive, landmarks[np.newaxis])
-    normals = generator(seed, robot.id, "observations").standard_normal((len(seen.steps), 2))
-    ranges, bearings = readings(seen, robot.sensor, normals)
-    offsets = np.searchsorted(seen.steps, np.arange(len(ends_ns) + 1))
-    return Detections(ends_ns, offsets, (seen.points + 1).astype(np.uint32), ranges, bearings)
+    first = 0 if world.look_at_start else 1
+    at_ns = stamps_ns[first:]
+    seen = _visible(world, robot, drive.poses[first:], landmarks[np.newaxis])
+    ranges, bearings = _read(world, robot.sensor, seen, seed, robot.id, "observations")
+    offsets = np.searchsorted(seen.steps, np.arange(len(at_ns) + 1))
+    ids = (seen.points + 1).astype(np.uint32)
+    clean = Detections(at_ns, offsets, ids, ranges, bearings)
+    if not world.garbage:
+        return clean
+    return spoilt(
+        clean,
+        world.garbage,
+        world.garbage_kind,
+        _span(world, robot.sensor),
+        robot.sensor.field_of_view,
+        len(landmarks),
+        generator(seed, robot.id, "garbage").random((len(ids), 3)),
+    )
+
+
+def _read(
+    world: SimulatedWorld, sensor: Sensor, seen: Visible, seed: int, *names: str
+) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
+    """What the sensor reads of what is seen, with the random numbers of this purpose."""
+    errors = generator(seed, *names).standard_normal((len(seen.steps), 2))
+    if sensor.range_white < 1.0 or sensor.bearing_white < 1.0:
+        lasting = generator(seed, *names, "persistent").standard_normal((len(seen.steps), 2))
+        errors = persistent(seen, sensor, world.step_s, np.column_stack((errors, lasting)))
+    return readings(seen, sensor, errors)
 
 
 def _sightings(
@@ -183,14 +237,11 @@ def _sightings(
     for i, other in enumerate(robots):
         if i != index:
             at = drives[i].poses[1:, np.newaxis, :2]
-            seen = _visible(world, robot, drives[index], at)
-            purpose = generator(seed, robot.id, "sightings", other.id)
-            ranges, bearings = readings(
-                seen, robot.sensor, purpose.standard_normal((len(seen.steps), 2))
+            seen = _visible(world, robot, drives[index].poses[1:], at)
+            ranges, bearings = _read(
+                world, robot.sensor, seen, seed, robot.id, "sightings", other.id
             )
             columns.append((seen.steps, np.full(len(ranges), i), ranges, bearings))
-    if not columns:
-        columns.append((np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)))
     steps, others, ranges, bearings = (
         np.concatenate(parts) for parts in zip(*columns, strict=True)
     )
@@ -201,10 +252,26 @@ def _sightings(
 
 
 def _visible(
-    world: SimulatedWorld, robot: RobotConfig, drive: Drive, points: Float[np.ndarray, "#K P 2"]
+    world: SimulatedWorld,
+    robot: RobotConfig,
+    poses: Float[np.ndarray, "K 3"],
+    points: Float[np.ndarray, "#K P 2"],
 ) -> Visible:
-    """What the robot truly sees from the end of each step."""
+    """What the robot truly sees from these poses."""
     sensor = robot.sensor
+    nearest, farthest = _limits(world, sensor)
+    return visible(poses, points, nearest, farthest, sensor.field_of_view)
+
+
+def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
+    """The world's true ranges of sight; where it has none, those of the sensor's readings."""
     nearest = sensor.min_range if world.visible_from_m is None else world.visible_from_m
     farthest = sensor.max_range if world.visible_to_m is None else world.visible_to_m
-    return visible(drive.poses[1:], points, nearest, farthest, sensor.field_of_view)
+    return nearest, farthest
+
+
+def _span(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
+    """The ranges at which anything can be seen; no farther than the place is wide."""
+    nearest, farthest = _limits(world, sensor)
+    across = hypot(world.size_m, world.size_m) if world.radius_m is None else 2.0 * world.radius_m
+    return nearest, max(nearest, min(farthest, across))

@@ -93,7 +93,8 @@ class RobotStream:
 
     start: None when the start pose is not known. rows: the reading's row in the arrays of its kind.
     truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was repaired or can not be
-    given, in a user's words.
+    given, in a user's words. clock_offset_ns: all stamps here are team time, and the odometry's own
+    clock, whose stamps go out, reads so much less.
     """
 
     robot: str
@@ -108,6 +109,7 @@ class RobotStream:
     truth_ns: Int64[np.ndarray, " T"] | None = None
     truth: Float[np.ndarray, "T 3"] | None = None
     notes: tuple[str, ...] = ()
+    clock_offset_ns: int = 0
 
     def __len__(self) -> int:
         """The number of readings, the start pose included."""
@@ -185,6 +187,7 @@ def robot_stream(
     truth_ns: Int64[np.ndarray, " T"] | None = None,
     truth: Float[np.ndarray, "T 3"] | None = None,
     notes: Sequence[str] = (),
+    clock_offset_ns: int = 0,
 ) -> RobotStream:
     """Number the readings of one robot by (stamp, kind), the start pose first.
 
@@ -213,6 +216,7 @@ def robot_stream(
         truth_ns=truth_ns,
         truth=truth,
         notes=tuple(notes),
+        clock_offset_ns=clock_offset_ns,
     )
 
 

@@ -58,6 +58,7 @@ class _Source:
         kind = self.stream.kinds[index]
         if kind == s.ODOMETRY:
             o = self.stream.odometry(index)
+            stamp_ns -= self.stream.clock_offset_ns
             return m.Odometry(stamp_ns, robot, epoch, reading, o.duration_ns, o.forward, o.yaw_rate)
         if kind == s.OBSERVATIONS:
             z = self.stream.observations(index)

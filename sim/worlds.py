@@ -2,13 +2,15 @@
 
 from itertools import pairwise
 from math import hypot
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from team.config import NonNegative, Positive
+from team.config import Fraction, NonNegative, Positive
 
+GarbageKind = Literal["reading", "identity", "drop"]
+Steering = Literal["together", "turn-first"]
 Point = tuple[float, float]
 
 
@@ -17,17 +19,27 @@ class SimulatedWorld(
 ):
     """A square place of side size_m with point landmarks; robots drive steps of step_s seconds.
 
+    radius_m: the place is a disc about (0, 0) instead: random landmarks and way-points have a
+    radius that is uniform up to it and a uniform direction, and robots start at its centre.
     landmarks: their positions, or landmark_count of them at random.
     paths: path i is the way-points of robot i. A robot without one drives to random way-points at
-    up to speed_m_s and turn_rate_rad_s, a way-point being reached within way_point_tolerance_m.
+    up to speed_m_s and turn_rate_rad_s, a way-point being reached within way_point_tolerance_m;
+    way_point_count: to so many of them, and the world ends, before `steps`, when all robots have.
+    steering: "together" turns and drives in one step; "turn-first" drives no step that turns.
+    look_at_start: there is a message of what is seen before the first step, too.
     visible_from_m, visible_to_m: what lies at a *true* range between them is seen; absent: the
     limits of the robot's sensor. They are the world's, since a robot that gates its noisy readings
     at the same limits selects by the noise, and its map is biased.
     unknown_starts: the robots whose start pose is not told to the team.
+    garbage: the probability of each reading of a landmark to be spoilt. garbage_kind: "reading"
+    gives it a uniform range and bearing of what can be seen, "identity" the identity of another of
+    the world's landmarks; "drop" leaves out the very readings that the others spoil, all else
+    being the same: what a run with garbage is compared with.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
     size_m: Positive = 100.0
+    radius_m: Positive | None = None
     step_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 1.0
     landmarks: tuple[Point, ...] = ()
     landmark_count: Annotated[int, Meta(ge=0, le=100_000)] = 0
@@ -35,9 +47,14 @@ class SimulatedWorld(
     speed_m_s: Positive = 1.0
     turn_rate_rad_s: Positive = 1.0
     way_point_tolerance_m: Positive = 1.0
+    way_point_count: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
+    steering: Steering = "together"
+    look_at_start: bool = False
     visible_from_m: NonNegative | None = None
     visible_to_m: Positive | None = None
     unknown_starts: tuple[str, ...] = ()
+    garbage: Fraction = 0.0
+    garbage_kind: GarbageKind = "reading"
 
     def __post_init__(self) -> None:
         if self.landmarks and self.landmark_count:

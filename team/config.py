@@ -28,20 +28,29 @@ class MotionNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     per_rad: NonNegative = 0.0
 
 
+Alphas = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
+
+
 class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a robot moves in one odometry interval, and how far the odometry may be wrong.
 
     kind: "turn-then-drive" (thesis, section 4.3.1) turns by yaw_rate·t, then drives forward·t;
-    "velocity" (Ma & Ma eq. 1-4) drives the arc of constant (forward, yaw_rate).
+    "velocity" (Ma & Ma eq. 1-4) drives the arc of constant (forward, yaw_rate);
+    "differential-drive" (Downs eq. 2.3-2.4) drives that arc on two wheels wheel_base apart.
     forward [m], turn [rad], final_turn [rad] (a rotation after the motion) and lateral [m] are the
     independent noises. forward_scale and yaw_scale multiply the logged values first.
+    alphas: Ma & Ma's α₁ … α₆, in addition: at speed v and yaw rate ω, forward has the variance
+    (α₁v² + α₂ω²)·alpha_interval_s·t, turn that with α₃ and α₄, final_turn that with α₅ and α₆:
+    theirs for t = alpha_interval_s, and a density like all noise of motion.
+    left_wheel, right_wheel [m/√m], in addition: the variance of a wheel's way is noise² |way|, and
+    the two make one error of (forward, turn), correlated where the wheels differ.
     turn_drag [m]: a base whose outer wheel is no faster than the logged speed loses
     turn_drag·|yaw rate| of it in a turn, at most all. veer [rad/m]: it turns so much on each metre.
     calibrated_speed: the logged speeds [m/s] from which forward_scale was learnt; where the robot
     is slower or faster the scale has an error of its own (the bias "forward_scale").
     """
 
-    kind: Literal["turn-then-drive", "velocity"] = "velocity"
+    kind: Literal["turn-then-drive", "velocity", "differential-drive"] = "velocity"
     forward: MotionNoise = MotionNoise()
     turn: MotionNoise = MotionNoise()
     final_turn: MotionNoise = MotionNoise()
@@ -52,11 +61,41 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turn_drag: NonNegative = 0.0
     veer: float = 0.0
     calibrated_speed: tuple[NonNegative, NonNegative] | None = None
+    alphas: Alphas | None = None
+    alpha_interval_s: Positive = 1.0
+    wheel_base: Positive | None = None
+    left_wheel: NonNegative = 0.0
+    right_wheel: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         speeds = self.calibrated_speed
         if speeds is not None and speeds[0] > speeds[1]:
             raise ValueError("calibrated_speed is [least, most]: the least comes first")
+        on_wheels = self.kind == "differential-drive"
+        if on_wheels and self.wheel_base is None:
+            raise ValueError(
+                "differential-drive needs wheel_base, the distance of its wheels in metres"
+            )
+        if not on_wheels and (self.left_wheel or self.right_wheel):
+            raise ValueError(
+                f"left_wheel and right_wheel are noises of differential-drive, not of {self.kind}"
+            )
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it has no noise at all."""
+        none = MotionNoise()
+        return (
+            self.forward == self.turn == self.final_turn == self.lateral == none
+            and not any(self.alphas or ())
+            and not (self.left_wheel or self.right_wheel)
+        )
+
+    @property
+    def slips(self) -> bool:
+        """Whether it has noise behind the motion that odometry measures."""
+        final = any((self.alphas or ())[4:])
+        return final or self.final_turn != MotionNoise() or self.lateral != MotionNoise()
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,7 +106,9 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Readings outside [min_range, max_range] or more than field_of_view/2 from the axis are rejected.
     range_white and bearing_white are the shares of the two variances that are independent from
     reading to reading; the rest is one error per landmark, constant within a window (a camera that
-    mismeasures a marker does so again a moment later).
+    mismeasures a marker does so again a moment later). In a simulated world the rest is a
+    first-order Gauss-Markov process for each landmark (and each teammate), whose correlation falls
+    to 1/e in range_correlation_s or bearing_correlation_s.
     A teammate's marker reads marker_range_offset [m] too long after this calibration, and lies
     marker_sigma [m] from the pose that its robot tracks.
     """
@@ -83,6 +124,8 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bearing_offset: float = 0.0
     range_white: Share = 1.0
     bearing_white: Share = 1.0
+    range_correlation_s: Positive = 10.0
+    bearing_correlation_s: Positive = 10.0
     marker_range_offset: float = 0.0
     marker_sigma: NonNegative = 0.0
 
@@ -121,7 +164,8 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     exchange_s: under a rule with feedback, the least team time between two exchanges of maps (at
     window ends; for `hybrid-thesis` at epochs). pose_s: the least team time between two running
-    poses.
+    poses. clock_offset_s: what the odometry's clock stamps t happened at t + clock_offset_s of team
+    time, which is the sensor's clock; the robot corrects it before it uses a stamp.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
@@ -132,4 +176,5 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fusion: FusionRule = "join"
     exchange_s: NonNegative = 0.0
     pose_s: NonNegative = 0.0
+    clock_offset_s: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1

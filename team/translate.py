@@ -59,6 +59,19 @@ def scan_of(message: m.Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray
     )
 
 
+def motion_of(message: m.Odometry, clock_offset_s: float) -> tuple[int, int, float, float]:
+    """(end [team time, ns], duration [ns], forward [m/s], yaw rate [rad/s]) of one interval.
+
+    What the odometry's clock stamps t happened at t + clock_offset_s.
+    """
+    return (
+        message.stamp_ns + round(clock_offset_s * 1e9),
+        message.duration_ns,
+        message.forward,
+        message.yaw_rate,
+    )
+
+
 def looks_of(
     message: m.Sightings,
 ) -> tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:

@@ -30,17 +30,21 @@ SURVEY = ("subject", "x [m]", "y [m]", "x std-dev [m]", "y std-dev [m]")
 def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     """The readings of the robots r1, r2, … (the number is the data set's); raises DatasetError.
 
-    Odometry row k acts from its time until the next row's, both odometry_delay_s later. Stamps are
+    Odometry row k acts from its time until the next row's, both odometry_delay_s and the robot's
+    clock_offset_s later; the latter the robot puts right by itself. Stamps are
     the data set's, in nanoseconds since 1970. A robot's start pose is its ground truth at its first
     reading, with the world's start sigmas.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
     with opened(world.path, "Barcodes.dat") as files:
-        return _streams(world, [robot.id for robot in robots], files)
+        clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
+        return _streams(world, clocks, files)
 
 
-def _streams(world: UtiasWorld, robots: Sequence[str], files: Mapping[str, File]) -> WorldStreams:
+def _streams(
+    world: UtiasWorld, clocks: Mapping[str, int], files: Mapping[str, File]
+) -> WorldStreams:
     present = present_robots(files)
     if not present:
         raise DatasetError(f"{world.path}: no RobotN_Odometry.dat in it; {EXPECTED}")
@@ -58,12 +62,15 @@ def _streams(world: UtiasWorld, robots: Sequence[str], files: Mapping[str, File]
     if not len(ids):
         notes.append("no landmark ground truth: the map's error can not be computed")
     delay_ns = round(world.odometry_delay_s * 1e9)
-    logs = [log_of(robot, files, subject_of, delay_ns) for robot in robots]
+    logs = [
+        log_of(robot, files, subject_of, delay_ns + offset_ns)
+        for robot, offset_ns in clocks.items()
+    ]
     if world.duration_s is not None:
         end_ns = min(log.start_ns for log in logs) + round(world.duration_s * 1e9)
         logs = [log.until(end_ns) for log in logs]
     return WorldStreams(
-        streams=tuple(_stream(log, world, robots, last_robot) for log in logs),
+        streams=tuple(_stream(log, world, clocks, last_robot) for log in logs),
         landmark_ids=ids,
         landmarks=positions if len(ids) else None,
         source=f"UTIAS data set {Path(world.path).name}",
@@ -91,7 +98,8 @@ def _landmarks(
     return survey[:, 0].astype(np.uint32), survey[:, 1:3].copy()
 
 
-def _stream(log: Log, world: UtiasWorld, robots: Sequence[str], last_robot: int) -> RobotStream:
+def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: int) -> RobotStream:
+    robots = list(clocks)
     numbers = np.array([int(robot[1:]) for robot in robots], dtype=np.uint32)
     log = log.without(log.readings.subjects == log.subject, "of itself")
     subjects = log.readings.subjects
@@ -111,6 +119,7 @@ def _stream(log: Log, world: UtiasWorld, robots: Sequence[str], last_robot: int)
         log.truth_ns if len(log.truth) else None,
         log.truth if len(log.truth) else None,
         (*log.notes, *_truth_notes(log)),
+        clocks[log.robot],
     )
 
 

@@ -68,14 +68,15 @@ def _write_robot(folder: Path, stream: RobotStream, number: Mapping[str, int], s
 
 
 def _odometry_rows(stream: RobotStream) -> list[Row]:
-    """A row where each interval begins, and one that ends the last."""
+    """A row where each interval begins, and one that ends the last, by the odometry's own clock."""
     intervals = stream.intervals
     if not len(intervals.end_ns):
         return []
-    begins = (intervals.end_ns - intervals.duration_ns).tolist()
+    ends_ns = intervals.end_ns - stream.clock_offset_ns
+    begins = (ends_ns - intervals.duration_ns).tolist()
     columns = zip(begins, intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
     rows: list[Row] = [(_seconds(begin_ns), v, w) for begin_ns, v, w in columns]
-    return [*rows, (_seconds(int(intervals.end_ns[-1])), 0.0, 0.0)]
+    return [*rows, (_seconds(int(ends_ns[-1])), 0.0, 0.0)]
 
 
 def _measured_rows(stream: RobotStream, number: Mapping[str, int], shift: int) -> list[Row]:

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float
 
-from team.config import MotionModel, MotionNoise, Sensor
+from team.config import Alphas, MotionModel, MotionNoise, Sensor
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Point, Pose, adjoint, compose, exponential, inverse, wrapped
 
@@ -72,12 +72,13 @@ def increment_of(
     """One odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
 
     With v = forward_scale·forward, ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
-    d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the independent noises
+    d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the noises
     a (forward, on d), b (turn, on φ), c (final turn), l (lateral):
-    "velocity":        Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al. table 5.3 and
-                       Ma & Ma eq. 1-4, with its limit φ → 0.
+    "velocity", "differential-drive": Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al.
+    table 5.3 and Ma & Ma eq. 1-4, with its limit φ → 0.
     "turn-then-drive": turn φ + b, drive d + a, then (0, l, c): the thesis, section 4.3.1.
-    Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|.
+    Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|, and what `_of_alphas` and
+    `_of_wheels` add; by the wheels alone are a and b correlated.
     """
     rate = motion.yaw_scale * yaw_rate
     if motion.yaw_rate_limit is not None:
@@ -86,17 +87,19 @@ def increment_of(
     logged = motion.forward_scale * forward * duration_s
     distance = math.copysign(max(abs(logged) - lost, 0.0), logged)
     turn = rate * duration_s + motion.veer * distance
-    kernel = _arc if motion.kind == "velocity" else _turn_then_drive
-    return Increment(
-        *kernel(
-            distance,
-            turn,
-            _variance(motion.forward, duration_s, distance, turn),
-            _variance(motion.turn, duration_s, distance, turn),
-            _variance(motion.final_turn, duration_s, distance, turn),
-            _variance(motion.lateral, duration_s, distance, turn),
-        )
-    )
+    forward_var = _variance(motion.forward, duration_s, distance, turn)
+    turn_var = _variance(motion.turn, duration_s, distance, turn)
+    final = _variance(motion.final_turn, duration_s, distance, turn)
+    both = 0.0
+    if motion.alphas is not None and duration_s > 0.0:
+        added = _of_alphas(motion.alphas, motion.alpha_interval_s, duration_s, distance, turn)
+        forward_var, turn_var, final = forward_var + added[0], turn_var + added[1], final + added[2]
+    if motion.wheel_base is not None:
+        added = _of_wheels(motion.wheel_base, motion.left_wheel, motion.right_wheel, distance, turn)
+        forward_var, turn_var, both = forward_var + added[0], turn_var + added[1], added[2]
+    lateral = _variance(motion.lateral, duration_s, distance, turn)
+    kernel = _turn_then_drive if motion.kind == "turn-then-drive" else _arc
+    return Increment(*kernel(distance, turn, forward_var, turn_var, both, final, lateral))
 
 
 def _variance(noise: MotionNoise, duration_s: float, distance: float, turn: float) -> float:
@@ -107,14 +110,53 @@ def _variance(noise: MotionNoise, duration_s: float, distance: float, turn: floa
     )
 
 
+def _of_alphas(
+    alphas: Alphas, interval_s: float, duration_s: float, distance: float, turn: float
+) -> tuple[float, float, float]:
+    """Variances of (forward [m²], turn [rad²], final turn [rad²]) by Ma & Ma's α₁ … α₆.
+
+    Their errors of v, ω and γ have the variances α₁v² + α₂ω², α₃v² + α₄ω², α₅v² + α₆ω² and are held
+    for one interval T (eq. 2-4): times T² on the way and the turns. As a density that is T·t.
+    """
+    v2, w2 = (distance / duration_s) ** 2, (turn / duration_s) ** 2
+    spread = interval_s * duration_s
+    a1, a2, a3, a4, a5, a6 = alphas
+    return (
+        (a1 * v2 + a2 * w2) * spread,
+        (a3 * v2 + a4 * w2) * spread,
+        (a5 * v2 + a6 * w2) * spread,
+    )
+
+
+def _of_wheels(
+    base: float, left: float, right: float, distance: float, turn: float
+) -> tuple[float, float, float]:
+    """(var d, var φ, cov(d, φ)) of the wheels' errors: J diag(V_l, V_r) Jᵀ, V = noise² |way|.
+
+    d = (s_r + s_l)/2 and φ = (s_r − s_l)/base (Downs eq. 2.3-2.4), so s = d ± φ base/2 and
+    J = [[1/2, 1/2], [−1/base, 1/base]] for (s_l, s_r).
+    """
+    half = 0.5 * base * turn
+    of_left, of_right = left * left * abs(distance - half), right * right * abs(distance + half)
+    total = of_left + of_right
+    return 0.25 * total, total / (base * base), 0.5 * (of_right - of_left) / base
+
+
 @compiled
 def _arc(
-    distance: float, turn: float, forward_var: float, turn_var: float, final: float, lateral: float
+    distance: float,
+    turn: float,
+    forward_var: float,
+    turn_var: float,
+    both: float,
+    final: float,
+    lateral: float,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
     """The two columns of SE(2)'s right Jacobian at (d, 0, φ) that the noises a and b act through.
 
     Jr₁ = (sin φ/φ, −(1 − cos φ)/φ, 0), Jr₃ = (d(φ − sin φ)/φ², d(1 − cos φ)/φ², 1); Solà et al.,
-    A micro Lie theory, eq. 163. Near φ = 0 the quotients are taken from their series.
+    A micro Lie theory, eq. 163. Near φ = 0 the quotients are taken from their series. `both` is the
+    covariance of a and b.
     """
     if abs(turn) < 1e-3:
         square = turn * turn
@@ -128,11 +170,11 @@ def _arc(
     ax, ay = sine, -turn * cosine
     bx, by = distance * cubic, distance * cosine
     covariance = np.empty((3, 3))
-    covariance[0, 0] = forward_var * ax * ax + turn_var * bx * bx
-    covariance[0, 1] = forward_var * ax * ay + turn_var * bx * by
-    covariance[1, 1] = forward_var * ay * ay + turn_var * by * by + lateral
-    covariance[0, 2] = turn_var * bx
-    covariance[1, 2] = turn_var * by
+    covariance[0, 0] = forward_var * ax * ax + turn_var * bx * bx + 2.0 * both * ax * bx
+    covariance[0, 1] = forward_var * ax * ay + turn_var * bx * by + both * (ax * by + ay * bx)
+    covariance[1, 1] = forward_var * ay * ay + turn_var * by * by + 2.0 * both * ay * by + lateral
+    covariance[0, 2] = turn_var * bx + both * ax
+    covariance[1, 2] = turn_var * by + both * ay
     covariance[2, 2] = turn_var + final
     covariance[1, 0] = covariance[0, 1]
     covariance[2, 0] = covariance[0, 2]
@@ -142,11 +184,19 @@ def _arc(
 
 @compiled
 def _turn_then_drive(
-    distance: float, turn: float, forward_var: float, turn_var: float, final: float, lateral: float
+    distance: float,
+    turn: float,
+    forward_var: float,
+    turn_var: float,
+    both: float,
+    final: float,
+    lateral: float,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
     """The noises (a, b) reach the end's tangent space by J = [[1, 0], [0, d], [0, 1]]."""
     covariance = np.zeros((3, 3))
     covariance[0, 0] = forward_var
+    covariance[0, 1] = covariance[1, 0] = both * distance
+    covariance[0, 2] = covariance[2, 0] = both
     covariance[1, 1] = turn_var * distance * distance + lateral
     covariance[1, 2] = turn_var * distance
     covariance[2, 1] = turn_var * distance

@@ -206,10 +206,11 @@ class RobotNode:
             out += self._leave_epoch()
             self._begin_epoch(reading)
         self._consumed = reading.reading + 1
-        self._now_ns = max(self._now_ns, reading.stamp_ns)
+        stamp_ns = self._team_time(reading)
+        self._now_ns = max(self._now_ns, stamp_ns)
         # What was seen at a stamp comes before the odometry that ends there, and may end a window.
         ahead = 0 if isinstance(reading, m.Odometry) else 1
-        self._passed_ns = max(self._passed_ns, reading.stamp_ns - ahead)
+        self._passed_ns = max(self._passed_ns, stamp_ns - ahead)
         match reading:
             case m.Start():
                 self._ledger["start pose"] += 1
@@ -222,6 +223,12 @@ class RobotNode:
         if self._pace.counted():
             out.append(self._progress())
         return out
+
+    def _team_time(self, reading: m.Reading) -> int:
+        """The reading's stamp; the odometry's put right."""
+        if isinstance(reading, m.Odometry):
+            return translate.motion_of(reading, self.config.clock_offset_s)[0]
+        return reading.stamp_ns
 
     def _begin_epoch(self, start: m.Start) -> None:
         pose, covariance = translate.pose_of(start)
@@ -257,11 +264,8 @@ class RobotNode:
             self._ledger["rejected: odometry over no time"] += 1
             return []
         self._ledger[self._member.used] += 1
-        return self._told(
-            self._member.drive(
-                reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
-            )
-        )
+        motion = translate.motion_of(reading, self.config.clock_offset_s)
+        return self._told(self._member.drive(*motion))
 
     # What goes out.
 

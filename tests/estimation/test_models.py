@@ -1,5 +1,6 @@
 """Motion and sensor models against central differences, samples and their limits."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,6 +22,7 @@ NOISES = {
     "lateral": MotionNoise(per_s=0.01),
 }
 SIGMAS = np.array([0.03, 0.05, 0.02, 0.01])
+ALPHAS = (0.001, 0.002, 0.003, 0.004, 0.0005, 0.0006)
 
 
 def driven(kind, distance, turn, final_turn, lateral):
@@ -33,26 +35,102 @@ def driven(kind, distance, turn, final_turn, lateral):
     return compose(end, np.array([0.0, lateral, final_turn]))
 
 
-@pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
-@quick
-@given(distance=distances, turn=turns)
-def test_the_motions_covariance_is_that_of_central_differences(kind, distance, turn):
-    increment = increment_of(MotionModel(kind=kind, **NOISES), 1.0, distance, turn)
-    np.testing.assert_allclose(increment.mean, driven(kind, distance, turn, 0.0, 0.0), atol=1e-6)
+def jacobian(kind, distance, turn):
+    """∂ log(end⁻¹ ∘ end')/∂(distance, turn, final turn, lateral) by central differences."""
+    end = driven(kind, distance, turn, 0.0, 0.0)
     J = np.empty((3, 4))
     for column in range(4):
         offset = 1e-4 * (np.arange(4) == column)
         ahead, behind = (
             logarithm(
                 compose(
-                    inverse(increment.mean),
+                    inverse(end),
                     driven(kind, distance + s * offset[0], turn + s * offset[1], *(s * offset[2:])),
                 )
             )
             for s in (1.0, -1.0)
         )
         J[:, column] = (ahead - behind) / 2e-4
+    return J
+
+
+@pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
+@quick
+@given(distance=distances, turn=turns | st.floats(-2e-3, 2e-3) | st.just(0.0))
+def test_the_motions_covariance_is_that_of_central_differences(kind, distance, turn):
+    increment = increment_of(MotionModel(kind=kind, **NOISES), 1.0, distance, turn)
+    np.testing.assert_allclose(increment.mean, driven(kind, distance, turn, 0.0, 0.0), atol=1e-6)
+    J = jacobian(kind, distance, turn)
     np.testing.assert_allclose(increment.covariance, (J * SIGMAS**2) @ J.T, atol=1e-7)
+
+
+@pytest.mark.parametrize("interval", [1.0, 0.1])
+@quick
+@given(
+    speed=st.floats(-2.0, 2.0),
+    yaw_rate=turns | st.floats(-1e-3, 1e-3),
+    parts=st.sampled_from([1, 2, 5]),
+)
+def test_the_alphas_are_those_of_the_source_at_their_interval_and_a_density_beside_it(
+    interval, speed, yaw_rate, parts
+):
+    model = MotionModel(alphas=ALPHAS, alpha_interval_s=interval)
+    duration = interval / parts
+    increment = increment_of(model, duration, speed, yaw_rate)
+    a = np.array(ALPHAS)
+    squares = np.array([speed**2, yaw_rate**2])
+    of_v, of_w, of_gamma = a.reshape(3, 2) @ squares * interval**2 / parts
+    J = jacobian("velocity", speed * duration, yaw_rate * duration)
+    variances = np.array([of_v, of_w, of_gamma, 0.0])
+    np.testing.assert_allclose(increment.covariance, (J * variances) @ J.T, atol=2e-7)
+    if parts > 1 and yaw_rate == 0.0:
+        whole = increment_of(model, interval, speed, yaw_rate)
+        np.testing.assert_allclose(parts * increment.covariance[0, 0], whole.covariance[0, 0])
+
+
+@quick
+@given(distance=st.floats(-5.0, 5.0), turn=turns | st.floats(-1e-3, 1e-3))
+def test_two_wheels_make_one_error_of_way_and_turn_that_is_correlated_where_they_differ(
+    distance, turn
+):
+    base, left, right = 0.4, 0.02, 0.05
+    model = MotionModel(
+        kind="differential-drive", wheel_base=base, left_wheel=left, right_wheel=right
+    )
+    increment = increment_of(model, 1.0, distance, turn)
+    ways = np.array([distance - base * turn / 2, distance + base * turn / 2])
+    of_wheels = np.array([[0.5, 0.5], [-1 / base, 1 / base]])
+    control = (of_wheels * np.array([left, right]) ** 2 * np.abs(ways)) @ of_wheels.T
+    J = jacobian("velocity", distance, turn)[:, :2]
+    np.testing.assert_allclose(increment.covariance, J @ control @ J.T, atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(
+        increment.mean, driven("velocity", distance, turn, 0.0, 0.0), atol=1e-6
+    )
+
+
+def test_equal_wheels_straight_on_err_in_way_and_turn_without_a_correlation():
+    equal = MotionModel(
+        kind="differential-drive", wheel_base=0.4, left_wheel=0.03, right_wheel=0.03
+    )
+    worn = msgspec.structs.replace(equal, right_wheel=0.06)
+    straight, pulled = (increment_of(each, 1.0, 2.0, 0.0).covariance for each in (equal, worn))
+    assert straight[0, 2] == 0.0
+    assert pulled[0, 2] == pytest.approx(0.5 * (0.06**2 - 0.03**2) * 2.0 / 0.4)
+    assert straight[2, 2] == pytest.approx(2 * 0.03**2 * 2.0 / 0.4**2)
+
+
+def test_standing_still_has_no_noise_of_ways_or_speeds():
+    model = MotionModel(
+        kind="differential-drive", wheel_base=0.4, left_wheel=0.1, right_wheel=0.1, alphas=(1,) * 6
+    )
+    np.testing.assert_array_equal(increment_of(model, 1.0, 0.0, 0.0).covariance, np.zeros((3, 3)))
+
+
+def test_noise_of_wheels_without_wheels_is_refused():
+    with pytest.raises(ValueError, match="differential-drive needs wheel_base"):
+        MotionModel(kind="differential-drive")
+    with pytest.raises(ValueError, match="noises of differential-drive, not of velocity"):
+        MotionModel(left_wheel=0.1)
 
 
 @quick

@@ -27,6 +27,8 @@ def written(folder: Path, text: str) -> Path:
 
 def test_the_built_in_scenarios_are_the_documented_ones() -> None:
     assert builtin_names() == (
+        "downs-10",
+        "downs-100",
         "large",
         "random-10",
         "random-3",
@@ -166,7 +168,7 @@ UTIAS = 'world = { kind = "utias" }\n'
         (SMALL + "[defaults.sensor]\nrange_sigma = nan", "expected a finite number, got nan at d"),
         (
             SMALL + "[defaults.motion]\nkind = 'velo'",
-            'expected one of "turn-then-drive", "velocity", got \'velo\' at defaults.motion.kind',
+            'expected one of "turn-then-drive", "velocity", "differential-drive", got ',
         ),
         (SMALL + "[central]\ntick_s = -1", "expected float > 0.0 at central.tick_s"),
         (SMALL + "[central", "not valid TOML: "),
@@ -195,9 +197,22 @@ UTIAS = 'world = { kind = "utias" }\n'
             "world.unknown_starts names r2, no such robot",
         ),
         ("world = { kind = 'simulated' }", "missing required field steps"),
+        (
+            SMALL + "[defaults.motion]\nkind = 'differential-drive'",
+            "differential-drive needs wheel_base, the distance of its wheels in metres at def",
+        ),
+        (SMALL + "[defaults.motion]\nleft_wheel = 0.1", "noises of differential-drive, not of vel"),
+        (
+            SMALL + "[defaults.motion]\nalphas = [0.1, 0.2]",
+            "expected array of length 6, got 2 at defaults.motion.alphas",
+        ),
+        (SMALL + "garbage_kind = 'rubbish'", 'expected one of "reading", "identity", "drop"'),
         (UTIAS + "[[robots]]\nid = 'alice'", "the robot alice: in a UTIAS world robots are r1, r2"),
         ("world = { kind = 'utias', start_sigma_m = 1 }", "are both 0 or both above 0"),
-        ("base = 'thesys'", "expected a built-in scenario, got 'thesys' at base; known: large, "),
+        (
+            "base = 'thesys'",
+            "expected a built-in scenario, got 'thesys' at base; known: downs-10, ",
+        ),
         ("estimator = 'hybrid-thesis'\n" + SMALL, "valid: hybrid + join, hybrid + kalman, "),
     ],
 )

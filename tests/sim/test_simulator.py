@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest
 
 from sim.paths import Limits, driven, followed, moved, wrapped
 from sim.scenario import Scenario, load, with_options
@@ -351,3 +351,91 @@ def test_readings_of_one_stamp_are_one_message() -> None:
     assert [seen.ids[seen.rows(i)].tolist() for i in range(3)] == [[0, 1], [2], [3, 4, 5]]
     nothing = grouped(stamps[:0], ids[:0], np.zeros(0), np.zeros(0))
     assert (len(nothing.stamps_ns), nothing.offsets.tolist()) == (0, [0])
+
+
+def errors_by_landmark(sensor: Sensor) -> list[np.ndarray]:
+    """Normalised (range, bearing) errors of a standing robot, a row per step, by landmark."""
+    world = SimulatedWorld(steps=4000, step_s=0.5, landmark_count=12, paths=(((0, 0), (1e-9, 0)),))
+    motion = MotionModel(kind="turn-then-drive")
+    streams = simulated(world, [RobotConfig("r1", motion, sensor)], 5)
+    stream = streams.streams[0]
+    true_range, true_bearing = true_detections(stream, streams.landmarks)
+    seen = stream.landmark_detections
+    errors = np.column_stack(
+        [
+            (seen.ranges - true_range) / sensor.range_sigma,
+            np.angle(np.exp(1j * (seen.bearings - true_bearing))) / sensor.bearing_sigma,
+        ]
+    )
+    return [errors[seen.ids == i] for i in range(1, 13)]
+
+
+def correlation(errors: list[np.ndarray], steps: int) -> np.ndarray:
+    """Of each error with the one so many steps later, in units of the declared variance."""
+    return np.mean([np.mean(e[:-steps] * e[steps:], axis=0) for e in errors], axis=0)
+
+
+def test_errors_that_persist_have_the_declared_variance_share_and_time() -> None:
+    sensor = Sensor(
+        range_white=0.2, bearing_white=0.6, range_correlation_s=5.0, bearing_correlation_s=2.0
+    )
+    errors = errors_by_landmark(sensor)
+    assert np.mean([np.var(e, axis=0) for e in errors], axis=0) == pytest.approx(1.0, abs=0.06)
+    for steps in (1, 4, 10):
+        after = 0.5 * steps
+        expected = [0.8 * np.exp(-after / 5.0), 0.4 * np.exp(-after / 2.0)]
+        assert correlation(errors, steps) == pytest.approx(expected, abs=0.05)
+    apart = np.mean([a[:, 0] @ b[:, 0] / len(a) for a, b in pairwise(errors)])
+    assert abs(apart) < 0.06, "each landmark has an error of its own"
+
+
+def test_errors_are_white_where_nothing_else_is_declared() -> None:
+    assert correlation(errors_by_landmark(Sensor()), 1) == pytest.approx(0.0, abs=0.03)
+
+
+@pytest.mark.parametrize("name", ["downs-10", "downs-100"])
+def test_downs_world_is_a_disc_seen_through_an_arc(name: str) -> None:
+    scenario = load(name)
+    world = world_of(scenario)
+    (stream,) = world.streams
+    assert len(world.landmarks) == int(name.removeprefix("downs-"))
+    assert np.hypot(*world.landmarks.T).max() <= 30.0
+    true_range, true_bearing = true_detections_from_start(stream, world.landmarks)
+    assert 0.2 <= true_range.min() < true_range.max() <= 10.0
+    assert true_range.max() > 9.5
+    assert np.abs(true_bearing).max() <= np.pi / 8
+    assert stream.landmark_detections.stamps_ns[0] == 0, "an observation before any motion"
+    assert np.array_equal(stream.truth[0], np.zeros(3))
+
+
+def test_the_radius_of_a_discs_places_is_uniform_not_their_density() -> None:
+    world = SimulatedWorld(steps=1, radius_m=30.0, landmark_count=4000)
+    landmarks = simulated(world, [RobotConfig("r1")], 2).landmarks
+    radius = np.hypot(*landmarks.T) / 30.0
+    assert kstest(radius, "uniform").pvalue > 1e-3
+    assert kstest(radius**2, "uniform").pvalue < 1e-9
+    assert kstest(np.arctan2(*landmarks.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-3
+
+
+def test_in_downs_world_a_step_turns_or_drives_and_the_hundredth_way_point_ends_it() -> None:
+    scenario = load("downs-10")
+    (stream,) = world_of(scenario).streams
+    chord = np.hypot(*np.diff(stream.truth[:, :2], axis=0).T)
+    turned = np.angle(np.exp(1j * np.diff(stream.truth[:, 2])))
+    assert not np.any((chord > 1e-9) & (np.abs(turned) > 1e-9))
+    assert chord.max() <= 1.0 + 1e-12
+    turning = np.flatnonzero(np.abs(turned) > 1e-9)
+    assert 90 <= len(turning) <= 110, "about one turn for each way-point"
+    assert len(stream.intervals.end_ns) < scenario.world.steps
+    assert chord[-1] > 0.0
+
+
+def true_detections_from_start(
+    stream: RobotStream, landmarks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `true_detections`, of a stream whose first message is before the first step."""
+    seen = stream.landmark_detections
+    step = np.repeat(np.arange(len(seen.offsets) - 1), np.diff(seen.offsets))
+    across = landmarks[seen.ids.astype(int) - 1] - stream.truth[step, :2]
+    bearing = np.arctan2(across[:, 1], across[:, 0]) - stream.truth[step, 2]
+    return np.hypot(*across.T), np.angle(np.exp(1j * bearing))

@@ -5,9 +5,12 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from sim.cli import app
 from sim.datasets import errata
 from sim.datasets.tables import DatasetError
 from sim.datasets.utias import utias
@@ -16,8 +19,10 @@ from sim.datasets.utias_writer import landmark_shift, write_utias
 from sim.scenario import load, with_options
 from sim.source import streams_of
 from sim.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
+from sim.world_node import WorldNode
 from sim.worlds import UtiasWorld
 from team.config import RobotConfig
+from team.wire import messages as m
 
 REAL = Path(__file__).parents[3] / "shared" / "utias"
 
@@ -136,6 +141,52 @@ def test_odometry_acts_later_by_its_delay(folder: Path) -> None:
     assert np.array_equal(late.intervals.forward, prompt.intervals.forward)
     seen, before = late.landmark_detections, prompt.landmark_detections
     assert np.array_equal(seen.ranges, before.ranges), "the camera's clock stays"
+
+
+def test_a_robots_clock_offset_orders_its_readings_and_leaves_its_stamps(folder: Path) -> None:
+    world = UtiasWorld(path=str(folder), odometry_delay_s=0.1)
+    robots = [msgspec.structs.replace(team(1)[0], clock_offset_s=0.4)]
+    (stream,) = utias(world, robots).streams
+    (late,) = read(folder, 1, odometry_delay_s=0.5).streams
+    assert np.array_equal(stream.stamps_ns, late.stamps_ns)
+    node = WorldNode(utias(world, robots), frozenset(), m.Configured(0, "world", 0, bytes(8), "{}"))
+    sent = [o.message for o in node.publish(0.0) if isinstance(o.message, m.Odometry)]
+    assert sent[0].stamp_ns == late.intervals.end_ns[0] - 400_000_000
+
+
+def test_a_simulated_clock_offset_is_written_as_the_odometry_stamps_it(
+    folder: Path, tmp_path: Path
+) -> None:
+    scenario = load("waypoints")
+    off = msgspec.structs.replace(scenario.robots[0], clock_offset_s=0.25)
+    late = msgspec.structs.replace(scenario, robots=(off, *scenario.robots[1:]))
+    write_utias(streams_of(late), tmp_path / "late")
+    first = [
+        float((each / "Robot1_Odometry.dat").read_text().splitlines()[2].split()[0])
+        for each in (folder, tmp_path / "late")
+    ]
+    assert first == [0.0, 0.0], "the world began 0.25 s later, the odometry's clock reads 0 there"
+    found = utias(UtiasWorld(path=str(tmp_path / "late")), [off, *team(3)[1:]])
+    given = streams_of(late)
+    assert_same_readings(given.streams[0], found.streams[0], 5)
+
+
+@pytest.mark.parametrize("name", ["waypoints", "downs-100"])
+def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(
+    name: str, tmp_path: Path
+) -> None:
+    done = CliRunner().invoke(app, ["simulate", name, "-o", str(tmp_path / "set")])
+    assert done.exit_code == 0
+    scenario = load(tmp_path / "set" / "scenario.toml")
+    source = load(name)
+    assert f"teamslam launch {tmp_path / 'set' / 'scenario.toml'}" in done.stdout
+    assert scenario.robots == source.robots
+    assert (scenario.central, scenario.seed) == (source.central, source.seed)
+    found, given = streams_of(scenario), streams_of(source)
+    for before, after in zip(given.streams, found.streams, strict=True):
+        assert np.allclose(before.start.pose, after.start.pose, atol=1e-8)
+        assert np.allclose(before.intervals.forward, after.intervals.forward, atol=1e-8)
+        assert len(before.landmark_detections.ids) == len(after.landmark_detections.ids)
 
 
 def test_the_start_pose_is_the_truth_with_the_given_sigmas(folder: Path) -> None:

@@ -1,0 +1,95 @@
+"""What the odometry of the simulated world tells of a true step, and how the robot slips besides.
+
+A step is a pair (distance [m], turn [rad]). What is told is the true step with the noise of the
+robot's motion model in it, taken back through its calibration. The formulas are written from the
+sources, not taken from the filter.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from team.config import MotionModel, MotionNoise
+
+Column = Float[np.ndarray, " K"]
+
+
+def deviation(noise: MotionNoise, seconds: Column, steps: Float[np.ndarray, "K 2"]) -> Column:
+    """σ = √(per_s² t + per_m² |distance| + per_rad² |turn|) of one noise in each step."""
+    distance, turn = np.abs(steps).T
+    per_s, per_m, per_rad = noise.per_s, noise.per_m, noise.per_rad
+    variance = per_s**2 * seconds + per_m**2 * distance + per_rad**2 * turn
+    sigma: Column = np.sqrt(variance)
+    return sigma
+
+
+def told(
+    motion: MotionModel,
+    steps: Float[np.ndarray, "K 2"],
+    seconds: Column,
+    normals: Float[np.ndarray, "K 2"],
+    wheel_normals: Float[np.ndarray, "K 2"],
+) -> tuple[Column, Column]:
+    """Forward speed [m/s] and yaw rate [rad/s] that are logged for the true steps.
+
+    The noises of forward and turn add to the way and the turn; those of the wheels to each wheel's
+    way, of which the two are made again. With the noisy d and φ, φ = ω t + veer·d and
+    |d| = (|v| − turn_drag·|ω|)·t give ω and v; the scales divide them.
+    """
+    of_way, of_turn, _ = _held(motion, steps, seconds)
+    forward = np.hypot(deviation(motion.forward, seconds, steps), of_way)
+    turn = np.hypot(deviation(motion.turn, seconds, steps), of_turn)
+    way = steps[:, 0] + forward * normals[:, 0]
+    turned = steps[:, 1] + turn * normals[:, 1]
+    if motion.wheel_base is not None:
+        left, right = _wheel_errors(motion, motion.wheel_base, steps, wheel_normals)
+        way = way + 0.5 * (right + left)
+        turned = turned + (right - left) / motion.wheel_base
+    yaw_rate = (turned - motion.veer * way) / seconds
+    speed = way / seconds
+    speed = speed + np.copysign(motion.turn_drag * np.abs(yaw_rate), speed)
+    return speed / motion.forward_scale, yaw_rate / motion.yaw_scale
+
+
+def slip(
+    motion: MotionModel, step: tuple[float, float], seconds: float, normals: Float[np.ndarray, "2"]
+) -> tuple[float, float]:
+    """The turn [rad] and the slip to the left [m] behind a step, which no odometry measures."""
+    steps, duration = np.array([step]), np.array([seconds])
+    _, _, of_turn = _held(motion, steps, duration)
+    turn = np.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
+    left = deviation(motion.lateral, duration, steps) * normals[1]
+    return turn.item(), left.item()
+
+
+def _held(
+    motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
+) -> tuple[Column, Column, Column]:
+    """σ of way, turn and final turn by Ma & Ma's α: errors of v, ω, γ, each held for an interval T.
+
+    In T the way errs by ε T with var ε = α₁v² + α₂ω². A step of t has t/T such intervals, each with
+    an error of its own: var = (α₁v² + α₂ω²) T² t/T.
+    """
+    if motion.alphas is None:
+        return (np.zeros(len(steps)),) * 3
+    v, w = steps.T / seconds
+    intervals = seconds / motion.alpha_interval_s
+    first, second, third = (
+        motion.alpha_interval_s * np.sqrt((a * v**2 + b * w**2) * intervals)
+        for a, b in zip(motion.alphas[::2], motion.alphas[1::2], strict=True)
+    )
+    return first, second, third
+
+
+def _wheel_errors(
+    motion: MotionModel,
+    base: float,
+    steps: Float[np.ndarray, "K 2"],
+    normals: Float[np.ndarray, "K 2"],
+) -> tuple[Column, Column]:
+    """What the left and the right wheel tell too much [m]: σ = noise √|way| of each wheel's way."""
+    distance, turn = steps.T
+    left, right = distance - 0.5 * base * turn, distance + 0.5 * base * turn
+    return (
+        motion.left_wheel * np.sqrt(np.abs(left)) * normals[:, 0],
+        motion.right_wheel * np.sqrt(np.abs(right)) * normals[:, 1],
+    )
