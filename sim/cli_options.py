@@ -2,15 +2,23 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, NoReturn, get_args
 
 import typer
 
 from sim.scenario import Scenario, load, loads
 from sim.scenario_checks import ScenarioError
+from team.config import Estimator, FusionRule
 
 WRONG_USE = 2
 FAILED = 1
+
+
+def _either(names: object) -> str:
+    """The values of a Literal as a sentence: `a, b or c.`"""
+    *first, last = get_args(names)
+    return f"{', '.join(first)} or {last}."
+
 
 ScenarioArgument = Annotated[
     str, typer.Argument(help="A built-in scenario, a .toml file, or a resolved .json.")
@@ -20,11 +28,8 @@ Connect = Annotated[
 ]
 Seed = Annotated[int | None, typer.Option(help="Seed of the world and of every estimator.", min=0)]
 Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 100.")]
-EstimatorOption = Annotated[str | None, typer.Option(help="hybrid or hybrid-thesis.")]
-FusionOption = Annotated[
-    str | None,
-    typer.Option(help="join, kalman, kalman-per-axis or covariance-intersection."),
-]
+EstimatorOption = Annotated[str | None, typer.Option(help=_either(Estimator))]
+FusionOption = Annotated[str | None, typer.Option(help=_either(FusionRule))]
 Dataset = Annotated[
     Path | None, typer.Option(help="A UTIAS data set: folder, or zip as distributed.")
 ]

@@ -8,6 +8,7 @@ from central.config import CentralConfig
 from central.node import CentralNode
 from sim.links import Conditions, Link
 from sim.scenario import Scenario
+from sim.source import tells_map
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from team import translate
@@ -63,7 +64,8 @@ class _Seat:
 def run_team(scenario: Scenario, streams: WorldStreams) -> Iterator[Sample]:
     """Run the team to its final map; everything that a recorder would take, in its order."""
     expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
-    world = WorldNode(streams, expected, translate.configured("world", 0, 0, scenario))
+    announced = translate.configured("world", 0, 0, scenario)
+    world = WorldNode(streams, expected, announced, tells_map=tells_map(scenario, streams))
     yield from run_nodes(scenario, world)
 
 
@@ -133,11 +135,12 @@ def _centre(
     central: Callable[[CentralConfig, list[str]], CentralNode],
 ) -> _Seat:
     names = [config.id for config in scenario.robots]
+    node = central(scenario.central, names)
     bus = MemoryBus(network)
-    for channel in CentralNode.listens:
+    for channel in node.listens:
         bus.subscribe(channel)
     bus.watch_alive()
-    return _Seat(central(scenario.central, names), bus, conditions.to_centre(names))
+    return _Seat(node, bus, conditions.to_centre(names))
 
 
 def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _Seat:

@@ -1,13 +1,16 @@
 """The centre's messages again: each recorded map from the set that it names."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import msgspec
 
 from central.config import CentralConfig
 from central.feedback_rule import FeedbackRule
 from central.join_rule import JoinRule, Tail
+from central.map_rules import AloneRule, LatestRule
 from sim.rerun_log import Identity, Recorded, Stream, identity
+from team.config import FusionRule
+from team.pairs import FEEDBACK
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -20,7 +23,7 @@ def retold_centre(log: Recorded) -> dict[Identity, m.Message]:
     if not maps and not finals:
         return {}
     config, digest = log.central_config()
-    retell = _joined if config.fusion == "join" else _exchanged
+    retell = _exchanged if config.fusion in FEEDBACK else _RETOLD[config.fusion]
     found: dict[Identity, m.Message] = {}
     for out in retell(log, config, digest, [*maps, *finals]):
         found.setdefault(identity(out.key, out.message), out.message)
@@ -91,3 +94,48 @@ def _exchanged(
             if named in own:
                 rule.take_map(own[named])
         yield from rule.advance(lambda _robot, _round: False, [])
+
+
+def _latest(
+    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """Each map from the own maps that it names; who has no place was known when it was said."""
+    own = _own_maps(log)
+    for fused in maps:
+        rule = LatestRule(config, digest)
+        for out in rule.retold(_named(own, fused), final=fused.final):
+            yield _with_reasons(out, fused)
+
+
+def _alone(
+    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """The final map from the own maps that it names."""
+    own = _own_maps(log)
+    for fused in maps:
+        rule = AloneRule(config, digest, log.robots)
+        yield from rule.retold(_named(own, fused), fused.stamp_ns)
+
+
+Named = tuple[str, int, int]
+"""(robot, epoch, sequence)."""
+
+
+def _own_maps(log: Recorded) -> dict[Named, m.MapEstimate]:
+    said = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
+    return {(x.robot, x.epoch, x.sequence): x for x in said}
+
+
+def _named(own: Mapping[Named, m.MapEstimate], fused: m.FusedMap) -> list[m.MapEstimate]:
+    names = [(x.robot, x.epoch, x.sequence) for x in fused.members]
+    return [own[name] for name in names if name in own]
+
+
+def _with_reasons(out: Outgoing, fused: m.FusedMap) -> Outgoing:
+    again = out.message
+    assert isinstance(again, m.FusedMap)
+    return Outgoing(out.channel, out.name, msgspec.structs.replace(again, reasons=fused.reasons))
+
+
+Retell = Callable[[Recorded, CentralConfig, bytes, list[m.FusedMap]], Iterator[Outgoing]]
+_RETOLD: Mapping[FusionRule, Retell] = {"join": _joined, "latest": _latest, "alone": _alone}

@@ -41,6 +41,7 @@ class Recorded:
     readings: by (robot, epoch) and counter. configured: the last announcement of each node.
     contradicted: readings that the log has twice with different content. reported: how many
     readings a robot had consumed by its own word. published: how many the world says there are.
+    known_map: what the robots were told of the landmarks, if they were.
     unsound: samples that no node would have let in.
     """
 
@@ -50,6 +51,7 @@ class Recorded:
     contradicted: list[m.Reading] = field(default_factory=list)
     reported: dict[Stream, int] = field(default_factory=dict)
     published: dict[Stream, int] = field(default_factory=dict)
+    known_map: m.KnownMap | None = None
     unsound: int = 0
 
     def take(self, sample: Sample) -> None:
@@ -69,6 +71,8 @@ class Recorded:
             case m.Progress():
                 consumed = self.reported.get((message.robot, message.epoch), 0)
                 self.reported[message.robot, message.epoch] = max(consumed, message.readings)
+            case m.KnownMap():
+                self.known_map = message
             case m.End():
                 self.published |= {(s.robot, s.epoch): s.readings for s in message.streams}
             case _ if channel.recomputable:
@@ -135,12 +139,8 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
         raise RerunError(f"{what} is not one of this version: {error}") from None
 
 
-INPUTS = tuple(
-    channel
-    for channel in ch.CHANNELS
-    if channel.recomputable
-    or channel in (*ch.SENSORS, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END)
-)
+_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END)
+INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_TOLD))
 """The channels whose samples are filed."""
 
 

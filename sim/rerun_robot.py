@@ -8,6 +8,7 @@ import msgspec
 
 from sim.rerun_log import Identity, Recorded, identity
 from team.config import RobotConfig
+from team.pairs import FEEDBACK
 from team.robot.node import RobotNode
 from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
@@ -55,9 +56,12 @@ def retold_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
     said = _poses_said(log, robot)
 
     def born() -> RetoldRobot:
-        return RetoldRobot(config, digest, said)
+        node = RetoldRobot(config, digest, said)
+        if log.known_map is not None:
+            node.handle(log.known_map, 0)
+        return node
 
-    lives = _in_lockstep if config.fusion != "join" else _alone
+    lives = _in_lockstep if config.fusion in FEEDBACK else _alone
     found: dict[Identity, m.Message] = {}
     for out in lives(log, robot, born):
         found.setdefault(identity(out.key, out.message), out.message)
@@ -79,7 +83,7 @@ def _poses_said(log: Recorded, robot: str) -> PosesSaid:
 
 
 def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
-    """Under `join` nothing from outside matters: each epoch by itself, each life that ended.
+    """Without feedback nothing from outside matters: each epoch by itself, each life that ended.
 
     A `Done` names the life that it closes: up to which reading, over how many steps. A life that
     began after a submap is computed from there, as a resumed robot does. Where a reading is not in
@@ -181,6 +185,8 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     """
     config, digest = log.robot_config(robot)
     node = RetoldRobot(config, digest, {})
+    if log.known_map is not None:
+        node.handle(log.known_map, 0)
     node.handle(m.Liveliness(0, "central", False), 0)
     readings = log.readings.get((robot, epoch), {})
     done = max((d.readings for d in _dones(log, robot, epoch)), default=None)

@@ -7,6 +7,7 @@ from typing import ClassVar
 from sim.rerun_log import RerunError
 from sim.scenario import Scenario, loads
 from team import translate
+from team.pairs import NEEDS_MAP
 from team.recording.reader import Log
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -71,13 +72,22 @@ class RecordedWorld:
         return loads(self._configured.configuration)
 
     def announce(self, scenario: Scenario) -> None:
-        """The scenario that `begin` will name."""
+        """The scenario that `begin` will name; raises RerunError if it needs a map there is not."""
+        if scenario.estimator in NEEDS_MAP:
+            truth = [o.message for o in self._said if isinstance(o.message, m.TruthLandmarks)]
+            if not truth:
+                raise RerunError(
+                    f"the estimator {scenario.estimator} needs a map of the landmarks, "
+                    "and the log has none"
+                )
+            told = m.KnownMap(truth[0].stamp_ns, truth[0].ids, truth[0].positions)
+            self._said.append(Outgoing(ch.KNOWN_MAP, "", told))
         self._said.insert(
             0, Outgoing(ch.WORLD_CONFIG, "", translate.configured("world", 0, 0, scenario))
         )
 
     def begin(self) -> list[Outgoing]:
-        """The scenario, and the true landmarks for the evaluator."""
+        """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
         return self._said
 
     def publish(self, clock_s: float) -> list[Outgoing]:

@@ -4,9 +4,11 @@ import hashlib
 
 from sim.datasets.utias import utias
 from sim.scenario import Scenario
+from sim.scenario_checks import ScenarioError
 from sim.simulator import simulated
 from sim.streams import WorldStreams
 from sim.worlds import SimulatedWorld
+from team.pairs import NEEDS_MAP
 
 
 def streams_of(scenario: Scenario) -> WorldStreams:
@@ -14,6 +16,17 @@ def streams_of(scenario: Scenario) -> WorldStreams:
     if isinstance(scenario.world, SimulatedWorld):
         return simulated(scenario.world, scenario.robots, noise_seed(scenario))
     return utias(scenario.world, scenario.robots)
+
+
+def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
+    """Whether the robots are told the landmarks; raises ScenarioError where nobody knows them."""
+    needed = scenario.estimator in NEEDS_MAP
+    if needed and streams.landmarks is None:
+        raise ScenarioError(
+            f"the estimator {scenario.estimator} needs a map of the landmarks, "
+            f"and {streams.source} has none: choose another estimator"
+        )
+    return needed
 
 
 def noise_seed(scenario: Scenario) -> int:

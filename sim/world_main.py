@@ -6,6 +6,7 @@ import time
 
 from sim.configurations import Configurations
 from sim.scenario import Scenario
+from sim.source import tells_map
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from team import translate
@@ -39,6 +40,7 @@ def run_world(
         speed,
         cache,
         Configurations(expected_configurations(scenario)),
+        tells_map(scenario, streams),
     )
     shell = Shell(bus, node, "world", stop)
     for channel in (*node.listens, *node.announcements):

@@ -106,6 +106,7 @@ class WorldNode:
     readings can be asked for again; None: all. Who asks for older ones gets a new epoch instead: a
     start at an unknown pose, and readings that count from there. configurations: what the others
     are to announce; the world does not begin while anyone has announced something else.
+    tells_map: the robots are told the landmarks, since they only localise themselves.
     """
 
     streams: WorldStreams
@@ -114,6 +115,7 @@ class WorldNode:
     speed: float = float("inf")
     cache: int | None = None
     configurations: Configurations = field(default_factory=lambda: Configurations({}))
+    tells_map: bool = False
     ended: bool = field(default=False, init=False)
     finished: bool = field(default=False, init=False)
 
@@ -150,7 +152,7 @@ class WorldNode:
         return sorted([*(self.expected - self._alive), *silent])
 
     def begin(self) -> list[Outgoing]:
-        """The scenario, and the true landmarks for the evaluator."""
+        """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
         out = [Outgoing(ch.WORLD_CONFIG, "", self.scenario)]
         if self.streams.landmarks is not None:
             order = np.argsort(self.streams.landmark_ids)
@@ -160,6 +162,9 @@ class WorldNode:
                 from_floats(self.streams.landmarks[order]),
             )
             out.append(Outgoing(ch.TRUTH_LANDMARKS, "", truth))
+            if self.tells_map:
+                told = m.KnownMap(self._first_ns, truth.ids, truth.positions)
+                out.append(Outgoing(ch.KNOWN_MAP, "", told))
         return out
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:

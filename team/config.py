@@ -15,9 +15,24 @@ NonNegative = Annotated[float, Meta(ge=0.0)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 
-Estimator = Literal["hybrid", "hybrid-thesis"]
 Bias = Literal["bearing", "forward_scale", "range_scale"]
-FusionRule = Literal["join", "kalman", "kalman-per-axis", "covariance-intersection"]
+Estimator = Literal[
+    "hybrid",
+    "hybrid-thesis",
+    "ekf-slam",
+    "fastslam1",
+    "fastslam2",
+    "localisation",
+    "dead-reckoning",
+]
+FusionRule = Literal[
+    "join",
+    "kalman",
+    "kalman-per-axis",
+    "covariance-intersection",
+    "latest",
+    "alone",
+]
 
 
 class MotionNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,5 +1,6 @@
 """Which estimator may feed which fusion rule, and the channel that the rule consumes."""
 
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal
 
@@ -7,23 +8,35 @@ from team.config import Estimator, FusionRule
 
 Channel = Literal["submap", "own/map"]
 
-PAIRS: MappingProxyType[tuple[Estimator, FusionRule], Channel] = MappingProxyType(
+MAPPERS: tuple[Estimator, ...] = ("hybrid", "hybrid-thesis", "ekf-slam", "fastslam1", "fastslam2")
+LOCALISERS: tuple[Estimator, ...] = ("localisation", "dead-reckoning")
+_CONSUMES: Mapping[FusionRule, tuple[Channel, tuple[Estimator, ...]]] = {
+    "join": ("submap", ("hybrid",)),
+    "kalman": ("own/map", ("hybrid",)),
+    "covariance-intersection": ("own/map", ("hybrid",)),
+    "kalman-per-axis": ("own/map", ("hybrid", "hybrid-thesis")),
+    "latest": ("own/map", MAPPERS),
+    "alone": ("own/map", (*MAPPERS, *LOCALISERS)),
+}
+
+PAIRS: Mapping[tuple[Estimator, FusionRule], Channel] = MappingProxyType(
     {
-        ("hybrid", "join"): "submap",
-        ("hybrid", "kalman"): "own/map",
-        ("hybrid", "covariance-intersection"): "own/map",
-        ("hybrid", "kalman-per-axis"): "own/map",
-        ("hybrid-thesis", "kalman-per-axis"): "own/map",
+        (estimator, fusion): channel
+        for fusion, (channel, estimators) in _CONSUMES.items()
+        for estimator in estimators
     }
 )
 """(estimator, rule) → what the centre subscribes to. `submap`: independent, each reading once.
-`own/map`: whole maps. A pair that is not here has no meaning: the thesis' estimator makes no
-submaps and no joint covariance, so only the rule per axis can take it.
+`own/map`: whole maps. A pair that is not here has no meaning: only `hybrid` makes submaps and can
+absorb a joint map, the thesis' estimator can absorb one per axis, and who only localises himself
+has no map to fuse.
 """
 FEEDBACK: frozenset[FusionRule] = frozenset(
     {"kalman", "kalman-per-axis", "covariance-intersection"}
 )
 """The rules whose map the robots absorb again, in lockstep."""
+NEEDS_MAP: frozenset[Estimator] = frozenset({"localisation"})
+"""The estimators that are told the landmarks."""
 
 
 def named_pairs() -> str:

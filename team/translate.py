@@ -225,10 +225,13 @@ def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray,
 
 
 def landmarks_of(
-    message: m.MapEstimate | m.FusedMap | m.TruthLandmarks,
+    message: m.MapEstimate | m.FusedMap | m.TruthLandmarks | m.KnownMap,
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
     """Identities and positions [m] of a map message."""
-    values = message.positions if isinstance(message, m.TruthLandmarks) else message.means
+    if isinstance(message, m.TruthLandmarks | m.KnownMap):
+        values = message.positions
+    else:
+        values = message.means
     return (
         ids(message.ids, "ids").astype(np.uint32),
         floats(values, "means").astype(np.float64).reshape(-1, 2),

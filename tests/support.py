@@ -133,6 +133,7 @@ def examples() -> Iterator[m.Message]:
     yield m.Sightings(3_000, "alpha", 1, 4, ("bravo",), from_floats([6.0]), from_floats([-3.0]))
     yield m.Truth(4_000, "alpha", from_stamps([0, 4_000]), from_floats(range(6)))
     yield m.TruthLandmarks(-5, two, means)
+    yield m.KnownMap(-5, two, means)
     yield m.Configured(0, "robot/alpha", 1, digest, '{"seed": 7}')
     yield m.Submap(
         9_000, "alpha", 1, 5, 10, 19, 8_000, digest, two, from_floats(range(10)), packed(spd(10)),
@@ -153,7 +154,7 @@ def examples() -> Iterator[m.Message]:
     yield m.Prior(9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)))
     yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))
     yield m.Progress(9_000, "central", "alpha", 1, 128, 6)
-    yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposed("in a submap", 200),))
+    yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposed("in a submap", 200),), 7)
     yield m.End(9_000, (m.StreamEnd("alpha", 1, 200),), ("gap of 3 s",))
     yield m.Status(9_000, "recorder", "recording", {"messages": 12.0}, ("slow disk",))
     yield m.Liveliness(0, "robot/alpha", True)

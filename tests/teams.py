@@ -187,10 +187,10 @@ class Team:
         """The process is there again: it takes over the submaps that the centre has."""
         name, node = ch.robot_node(robot.id), RobotNode(robot)
         self.nodes[name] = self.robots[robot.id] = node
-        submaps = self.centre._join.submaps(robot.id)
-        start = self.centre._join.start(robot.id, submaps[0].epoch) if submaps else None
-        if start is not None:
-            node.resume(start, submaps)
+        request = encoded(m.SubmapsWanted(0, robot.id))
+        kept = [decoded(reply) for reply in self.centre.answer_submaps(request)]
+        if kept:
+            node.resume(kept[0], kept[1:])
         self.queues[(name, "central/alive")] = deque([m.Liveliness(0, "central", True)])
         latest = [self.sent[c.key()][-1:] for c in (ch.END, ch.FUSED_MAP, ch.FINAL_MAP)]
         self.queues[(name, "latest")] = deque(x for kept in latest for x in kept)

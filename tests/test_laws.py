@@ -33,7 +33,6 @@ from team.wire.codec import encoded
 from tests.support import ROOT
 from tests.teams import Team, config, driven, of, published, stream, world_of
 
-NODES = (WorldNode, RobotNode, CentralNode)
 CENTRE = CentralConfig(tick_s=3.0, broadcast_s=3.0)
 PAIR = world_of(stream("r1", 12, off_ns=300_000_000), stream("r2", 10, y=1.0, seen_every=2))
 
@@ -274,14 +273,17 @@ def test_configurations_maps_priors_and_poses_name_their_inputs():
 # Law 4.
 
 
-@pytest.mark.parametrize("node", NODES)
+@pytest.mark.parametrize("node", [WorldNode, RobotNode])
 def test_no_node_listens_to_the_truth(node):
     assert not {ch.TRUTH, ch.TRUTH_LANDMARKS} & set(node.listens)
 
 
-def test_the_centre_listens_to_nothing_that_holds_the_fused_map():
+@pytest.mark.parametrize("fusion", sorted({fusion for _, fusion in PAIRS}))
+def test_the_centre_listens_to_nothing_that_holds_the_truth_or_the_fused_map(fusion):
     fused = {ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.TEAM_POSE}
-    assert not fused & set(CentralNode.listens)
+    listens = set(CentralNode(CentralConfig(fusion=fusion), ["r1"]).listens)
+    assert not {ch.TRUTH, ch.TRUTH_LANDMARKS} & listens
+    assert not fused & listens
 
 
 FORBIDDEN = {"time", "datetime", "zenoh", "mcap", "threading", "socket", "random", "os", "asyncio"}
@@ -345,7 +347,10 @@ def unequal(rng):
     )
 
 
-SEEDS = {"join": 50, "kalman": 20, "kalman-per-axis": 20, "covariance-intersection": 15}
+SEEDS = {
+    "join": 50, "kalman": 20, "kalman-per-axis": 20, "covariance-intersection": 15, "latest": 8,
+    "alone": 4,
+}  # fmt: skip
 
 
 def played(seed, estimator, fusion):

@@ -16,7 +16,8 @@ from team.config import RobotConfig
 from team.estimation.conditioning import team_pose
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.submap import LocalMap
-from team.pairs import FEEDBACK, PAIRS
+from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
+from team.robot.filters import NOTHING_KNOWN, KnownMap
 from team.robot.member import ClosedWindow, Driven
 from team.robot.members import Member, member_of
 from team.robot.pace import Pace
@@ -34,7 +35,15 @@ IN_SIGHTING = "in a sighting factor"
 class RobotNode:
     """One robot: `begin`, then `handle` for every message, until `finished`."""
 
-    listens = (*ch.SENSORS, ch.END, ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
+    listens = (
+        *ch.SENSORS,
+        ch.KNOWN_MAP,
+        ch.END,
+        ch.PRIOR,
+        ch.FUSED_MAP,
+        ch.FINAL_MAP,
+        ch.CENTRAL_PROGRESS,
+    )
 
     def __init__(self, config: RobotConfig) -> None:
         self.config = config
@@ -43,12 +52,14 @@ class RobotNode:
         self._announcement = translate.configured(ch.robot_node(config.id), 0, 0, config)
         self._consumer = PAIRS[config.estimator, config.fusion]
         self._pace = Pace(config.fusion in FEEDBACK, self._consumer == "submap")
+        self._known = NOTHING_KNOWN if config.estimator not in NEEDS_MAP else None
         self._member: Member = member_of(config, 0)
         self._locals: list[LocalMap] = []
         self._prior: m.Prior | None = None
         self._epoch = 0
         self._consumed = 0
         self._steps = 0
+        self._last_map = -1
         self._ledger: Counter[str] = Counter()
         self._sighted: set[int] = set()
         self._ended: list[m.Done] = []
@@ -130,6 +141,8 @@ class RobotNode:
                 self._inbox.put(message)
             case m.Prior():
                 self._prior = message
+            case m.KnownMap():
+                self._known = KnownMap(*translate.landmarks_of(message))
             case m.FusedMap():
                 return self._take_fused(message) + self._go_on()
             case m.Progress():
@@ -182,8 +195,8 @@ class RobotNode:
 
     @property
     def _blocked(self) -> bool:
-        """Waits for the centre: for its answer under a rule with feedback, else for its credit."""
-        return self._pace.holds(self.submaps)
+        """Waits for a map that it is to be told, or for the centre: its answer or its credit."""
+        return self._known is None or self._pace.holds(self.submaps)
 
     def _credit(self) -> list[Outgoing]:
         """A robot that waits for an exchange still reports what it has received."""
@@ -232,10 +245,11 @@ class RobotNode:
 
     def _begin_epoch(self, start: m.Start) -> None:
         pose, covariance = translate.pose_of(start)
-        self._member = member_of(self.config, start.epoch)
+        self._member = member_of(self.config, start.epoch, self._known or NOTHING_KNOWN)
         self._member.start(pose, covariance)
         self._member.consumed(start.reading)
         self._locals = []
+        self._last_map = -1
         self._ledger = Counter()
         self._epoch, self._consumed, self._steps = start.epoch, 0, 0
         self._pace.begin_epoch()
@@ -315,6 +329,7 @@ class RobotNode:
 
     def _exchange_map(self, stamp_ns: int) -> list[Outgoing]:
         self._exchange_ns = stamp_ns
+        self._last_map = self._member.sequence
         if self._pace.lockstep:
             self._pace.sent_map()
         return [self._own_map(stamp_ns)]
@@ -431,4 +446,5 @@ class RobotNode:
             self._steps,
             self.submaps,
             tuple(m.Disposed(k, n) for k, n in sorted(self._ledger.items()) if n),
+            self._last_map,
         )

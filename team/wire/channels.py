@@ -98,6 +98,8 @@ CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Pro
 
 WORLD_CONFIG = Channel("world_config", "world/config", m.Configured, "once", "latest", True, False,
                        "the scenario")  # fmt: skip
+KNOWN_MAP = Channel("known_map", "world/known_map", m.KnownMap, "once", "latest", True, False,
+                    "the map that robots are told that only localise themselves")  # fmt: skip
 END = Channel("end", "world/end", m.End, "once", "latest", True, False,
               "everything is published; the last counters")  # fmt: skip
 RECORDER_PROGRESS = Channel("recorder_progress", "recorder/progress/{robot}", m.Progress,

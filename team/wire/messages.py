@@ -135,6 +135,17 @@ class TruthLandmarks(Message, frozen=True, array_like=True, gc=False, tag="truth
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
 
 
+class KnownMap(Message, frozen=True, array_like=True, gc=False, tag="known_map/1"):
+    """A map that robots are told (`localisation`): L ids, L × 2 floats in the team's frame."""
+
+    ids: Ids
+    positions: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_ascending(self.ids, "ids")
+        check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
+
+
 class Configured(Message, frozen=True, array_like=True, gc=False, tag="configured/1"):
     """A node's configuration (JSON), announced once; `digest` is its 8-byte name elsewhere."""
 
@@ -395,7 +406,10 @@ class Disposed(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
-    """A robot has consumed every reading of its stream and sent its last submap."""
+    """A robot has consumed every reading of its stream and sent its last submap.
+
+    last_map: the sequence of its last own map, where the rule consumes own maps; −1: none.
+    """
 
     robot: Name
     epoch: Count
@@ -403,6 +417,7 @@ class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
     steps: Count
     submaps: Count
     ledger: tuple[Disposed, ...]
+    last_map: int = -1
 
 
 class StreamEnd(msgspec.Struct, frozen=True, array_like=True):

@@ -32,7 +32,8 @@ def test_the_thesis_team_ends_with_a_map_of_finite_values(estimator, fusion):
     assert fused.final
     ids, means = translate.landmarks_of(fused)
     covariance = translate.landmark_covariance_of(fused)
-    assert len(ids) > 10
+    assert (len(ids) > 10) == (fusion != "alone")
+    assert bool(fused.reasons) == (fusion in ("kalman", "kalman-per-axis", "alone"))
     assert np.isfinite(means).all()
     assert np.isfinite(covariance).all()
     assert (np.diag(covariance) > 0.0).all()

@@ -54,6 +54,12 @@ def test_appended_fields_are_ignored(tag: str) -> None:
     assert decoded(longer) == EXAMPLES[tag]
 
 
+def test_a_last_word_from_before_the_last_map_has_none() -> None:
+    done = m.Done(0, "alpha", 1, 2, 1, 1, ())
+    assert decoded(msgpack.packb(fields_of(done)[:-1])) == done
+    assert done.last_map == -1
+
+
 def test_a_submap_from_before_the_pose_nodes_has_none() -> None:
     shorter = msgpack.packb(fields_of(submap(0))[:-4])
     assert decoded(shorter) == submap(0)

@@ -1,0 +1,96 @@
+"""The rules on submaps as the node plays them: credit for each, and the watermark."""
+
+from collections.abc import Mapping, Sequence
+
+from central.config import CentralConfig
+from central.join_rule import JoinRule
+from central.roll import Roll
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+
+class SubmapRule:
+    """A set of submaps and the map that it gives; every submap is acknowledged."""
+
+    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
+
+    def __init__(self, rule: JoinRule) -> None:
+        self.joined = rule
+
+    @property
+    def landmarks(self) -> int:
+        """In the newest map."""
+        return self.joined.landmarks
+
+    @property
+    def submaps(self) -> int:
+        """In the fold's reach, or refused."""
+        return sum(self.joined.count(stream) for stream in self.joined.streams)
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """Refused submaps, and what the monitor has found."""
+        return {"refused": float(self.joined.refused)} | self.joined.finding.figures
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """The monitor's, in words."""
+        return self.joined.finding.warnings
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was refused, and why."""
+        return self.joined.warnings
+
+    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Admit a submap or a sighting; the last sighting of a submap completes it."""
+        match message:
+            case m.Start():
+                self.joined.take_start(message)
+            case m.Submap():
+                return _credit(message, self.joined.take_submap(message), now_ns)
+            case m.SightingFactor():
+                before = self.joined.count((message.robot, message.epoch))
+                count = self.joined.take_sighting(message)
+                return _credit(message, count, now_ns) if count > before else []
+            case _:
+                pass
+        return []
+
+    def dealt(self, done: m.Done) -> bool:
+        """Every submap that the robot has sent is in the fold's reach."""
+        return self.joined.count((done.robot, done.epoch)) >= done.submaps
+
+    def complete(self, end: m.End) -> bool:
+        """Only robots are waited for."""
+        return True
+
+    def advance(self, roll: Roll) -> list[Outgoing]:
+        """A broadcast, when one is due."""
+        watermark_ns = roll.watermark_ns(self.dealt, self.joined.count)
+        return self.joined.advance(watermark_ns, roll.now_ns)
+
+    def conclude(self, now_ns: int) -> list[Outgoing]:
+        """The final map of everything that is here."""
+        return self.joined.conclude(now_ns)
+
+    def chain(self, robot: str) -> tuple[m.Start, Sequence[m.Submap]] | None:
+        """The submaps of the robot's latest epoch, without a gap."""
+        submaps = self.joined.submaps(robot)
+        start = self.joined.start(robot, submaps[0].epoch) if submaps else None
+        return None if start is None else (start, submaps)
+
+    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
+        """It takes no readings."""
+        return []
+
+
+def submap_rule(config: CentralConfig, digest: bytes) -> SubmapRule:
+    """The rule on submaps that the configuration names."""
+    return SubmapRule(JoinRule(config, digest))
+
+
+def _credit(of: m.Submap | m.SightingFactor, count: int, now_ns: int) -> list[Outgoing]:
+    progress = m.Progress(now_ns, "central", of.robot, of.epoch, 0, count)
+    return [Outgoing(ch.CENTRAL_PROGRESS, of.robot, progress)]
