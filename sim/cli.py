@@ -17,6 +17,7 @@ from sim.cli_logs import app as log_commands  # noqa: E402
 from sim.cli_nodes import app as node_commands  # noqa: E402
 from sim.cli_options import FAILED, WRONG_USE  # noqa: E402
 from sim.cli_rerun import app as rerun_commands  # noqa: E402
+from sim.cli_view import app as view_commands  # noqa: E402
 
 app = typer.Typer(
     help="Multi-robot SLAM as real processes over Zenoh.",
@@ -25,7 +26,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _part in (launch_commands, node_commands, log_commands, rerun_commands, calibrate_commands):
+for _part in (
+    launch_commands, node_commands, log_commands, rerun_commands, view_commands, calibrate_commands,
+):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)
 app.add_typer(experiment_commands)

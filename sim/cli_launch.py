@@ -61,6 +61,9 @@ def launch(
         str, typer.Option(help="Where the router listens; port 0: any free one.")
     ] = "tcp/127.0.0.1:0",
     report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
+    views: Annotated[
+        bool, typer.Option(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
+    ] = True,
 ) -> None:
     """Launch a whole team here, watch it, and end with a report and a log.
 
@@ -90,7 +93,7 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     _prepare(resolved)
-    plan = Plan(resolved, folder, log, pace, listen)
+    plan = Plan(resolved, folder, log, pace, listen, views)
     try:
         with shown(f"{resolved.name}, seed {resolved.seed}") as show:
             outcome = launched(plan, show)

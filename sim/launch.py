@@ -79,6 +79,7 @@ class Plan:
     log: Path
     speed: float
     listen: str
+    views: bool = True
 
 
 def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
@@ -163,6 +164,7 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
         ("recorder", ["record", *common, "--output", str(plan.log)]),
         ("central", ["central", *common]),
         *robots,
+        *([("viewer", ["viewer", *common])] if plan.views else []),
         ("world", ["world", *common, "--speed", speed]),
     ]
 

@@ -13,7 +13,7 @@ from mcap.records import Channel, Schema
 from team.recording.reader import Log
 from team.recording.records import MALFORMED, Frame, LogError, expanded, frames, records
 from team.recording.schemas import schema_of
-from team.wire.channels import channel_of
+from team.wire.channels import VIEW, channel_of
 from team.wire.messages import Message, tag_of
 
 
@@ -53,7 +53,7 @@ def misdeclared(of: Declared) -> str | None:
     """
     row = channel_of(of.key)
     if row is None:
-        return None if of.key.startswith("view/") else "no channel has this key"
+        return None if VIEW.owner(of.key) is not None else "no channel has this key"
     kind = row[0].message
     if (of.encoding, of.schema) != ("msgpack", tag_of(kind)):
         said = f"{of.encoding or 'no encoding'}, {of.schema or 'no schema'}"

@@ -32,7 +32,7 @@ from team.recording.records import (
     records,
 )
 from team.wire.bus import Sample
-from team.wire.channels import Channel, channel_of
+from team.wire.channels import VIEW, Channel, channel_of
 
 __all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "open_log"]
 
@@ -128,7 +128,8 @@ class Log:
         if names is None:
             return key
         found = channel_of(key)
-        return key if found is not None and found[0].name in names else None
+        row = found[0] if found is not None else VIEW if VIEW.owner(key) is not None else None
+        return key if row is not None and row.name in names else None
 
 
 def open_log(path: str | Path) -> Log:

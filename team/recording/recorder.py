@@ -1,6 +1,7 @@
 """The recorder: samples into an MCAP file, their payload bytes as they came.
 
-Channel: the full key, encoding `msgpack`, the JSON Schema of its message. Log time: team time.
+Channel: the full key, encoding `msgpack`, the JSON Schema of its message; of a view, encoding and
+schema of the tools that draw it. Log time: team time.
 Publish time: the publisher's wall clock. Sequence: its counter modulo 2³². MCAP's times are
 unsigned: a stamp before zero is logged at zero, and its true value stays in the payload, where the
 reader takes it from. Who wrote the log and how stands in the metadata record "teamslam".
@@ -17,10 +18,8 @@ from typing import IO, NamedTuple, Self
 
 from mcap.writer import Writer
 
-from team.recording.schemas import schema_of
+from team.recording.schemas import declaration_of
 from team.wire.bus import Sample
-from team.wire.channels import channel_of
-from team.wire.messages import tag_of
 
 METADATA = "teamslam"
 FLUSH_S = 0.5
@@ -140,14 +139,14 @@ class Recorder:
         self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
 
     def _register(self, key: str) -> int:
-        found = channel_of(key)
-        if found is None:  # a viewer's own messages: kept as they are, verified by nobody
+        said = declaration_of(key)
+        if said is None:  # of no row: kept as it is, verified by nobody
             return self._writer.register_channel(self._prefix + key, "", 0)
-        tag = tag_of(found[0].message)
-        if tag not in self._schemas:
-            schema = schema_of(found[0].message)
-            self._schemas[tag] = self._writer.register_schema(tag, "jsonschema", schema)
-        return self._writer.register_channel(self._prefix + key, "msgpack", self._schemas[tag])
+        if said.schema not in self._schemas:
+            number = self._writer.register_schema(said.schema, said.schema_encoding, said.text)
+            self._schemas[said.schema] = number
+        number = self._schemas[said.schema]
+        return self._writer.register_channel(self._prefix + key, said.encoding, number)
 
 
 def _begun(file: IO[bytes], metadata: dict[str, str]) -> Writer:

@@ -6,10 +6,10 @@ from typing import NamedTuple
 from team.recording.reader import Log, LogError
 from team.recording.repair import salvaged
 from team.wire.bus import Sample
-from team.wire.channels import SENSORS, channel_of
+from team.wire.channels import SENSORS, VIEW, channel_of
 
 FOREIGN = "(no channel)"
-"""The channel of a key that no row of the table has, as those of a viewer."""
+"""The channel of a key that no row of the table has."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ def summarised(log: Log) -> Summary:
         for sample in chunk:
             if sample.key not in found:
                 row = channel_of(sample.key)
-                name = FOREIGN if row is None else row[0].name
+                name = row[0].name if row else VIEW.name if VIEW.owner(sample.key) else FOREIGN
                 found[sample.key] = KeySummary(
                     sample.key, name, 0, 0, sample.stamp_ns, sample.stamp_ns
                 )

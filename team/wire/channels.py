@@ -1,8 +1,9 @@
 """The table of channels: the only place where a key is spelt.
 
 Keys are relative to the team; a bus puts `team/<team name>/` before them. `{robot}` stands for a
-robot's name, `{node}` for `world`, `central`, `recorder` or `robot/<name>`. In the rates a life is
-one incarnation of a robot's stream (the messages' `epoch`), a keyframe one epoch of observation.
+robot's name, `{node}` for `world`, `central`, `recorder`, `viewer` or `robot/<name>`, `{view}` for a
+view (`team.wire.views`). In the rates a life is one incarnation of a robot's stream (the messages'
+`epoch`), a keyframe one epoch of observation.
 """
 
 import re
@@ -21,6 +22,9 @@ all:    a late joiner and a cut link get every one.
 """
 
 
+_PLACE = re.compile(r"\{(robot|node|view)\}")
+
+
 @dataclass(frozen=True)
 class Channel:
     """One row: what travels on a key, how often, how, and what a log does with it."""
@@ -36,12 +40,12 @@ class Channel:
 
     def key(self, name: str = "") -> str:
         """The key for one robot or node."""
-        return self.template.replace("{robot}", name).replace("{node}", name)
+        return _PLACE.sub(name, self.template)
 
     def owner(self, key: str) -> str | None:
         """The robot or node that `key` belongs to on this channel; None when it is another's."""
         pattern = re.escape(self.template).replace(r"\{robot\}", "(?P<name>[^/]+)")
-        match = re.fullmatch(pattern.replace(r"\{node\}", "(?P<name>.+)"), key)
+        match = re.fullmatch(re.sub(r"\\{(node|view)\\}", "(?P<name>.+)", pattern), key)
         return None if match is None else match.groupdict().get("name", "")
 
 
@@ -115,8 +119,13 @@ READINGS = Channel("readings", "world/readings/{robot}", m.ReadingsWanted, "quer
 SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "stream", False, False,
                   "a query; the replies are the submaps in the centre's set")  # fmt: skip
 
+VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "stream", True, False,
+               "what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
+
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
 QUERIES = (READINGS, SUBMAPS)
+UNOPENED = (*QUERIES, VIEW)
+"""Rows whose traffic is not opened: queries have no samples, a view is no message of ours."""
 EVERYTHING = "**"
 
 
@@ -129,6 +138,6 @@ def robot_node(robot: str) -> str:
 def channel_of(key: str) -> tuple[Channel, str] | None:
     """The channel that a relative key belongs to, and the robot or node in it."""
     for channel in CHANNELS:
-        if channel not in QUERIES and (name := channel.owner(key)) is not None:
+        if channel not in UNOPENED and (name := channel.owner(key)) is not None:
             return channel, name
     return None

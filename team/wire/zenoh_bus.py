@@ -282,7 +282,8 @@ class ZenohBus:
 
 
 def _every(channel: Channel, name: str) -> str:
-    return "**" if name == "*" and "{node}" in channel.template else name
+    """All names: a node's or a view's may have several parts."""
+    return "**" if name == "*" and "{robot}" not in channel.template else name
 
 
 def _kept(channel: Channel) -> int:

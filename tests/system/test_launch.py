@@ -30,7 +30,7 @@ def test_a_launch_ends_by_itself_with_every_process_at_status_zero(launched: Lau
     assert launched.exit == 0, launched.said
     processes = launched.result["processes"]
     assert {name: process["exit"] for name, process in processes.items()} == dict.fromkeys(
-        ["router", "recorder", "central", "robot-r1", "robot-r2", "world"], 0
+        ["router", "recorder", "central", "robot-r1", "robot-r2", "viewer", "world"], 0
     )
     assert len({process["pid"] for process in processes.values()}) == len(processes)
     assert launched.result["failures"] == []

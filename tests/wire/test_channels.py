@@ -6,6 +6,7 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import WireError, encoded
+from team.wire.views import PARTICLES, view_of
 from tests.support import odometry, submap
 
 
@@ -19,10 +20,10 @@ def test_every_key_leads_back_to_its_channel_and_name(channel: c.Channel) -> Non
         "robot/alpha"
         if "{node}" in channel.template
         else "alpha"
-        if "{" in channel.template
+        if "{robot}" in channel.template
         else ""
     )
-    if channel in c.QUERIES:
+    if channel in c.UNOPENED:
         assert c.channel_of(channel.key(name)) is None
     else:
         assert c.channel_of(channel.key(name)) == (channel, name)
@@ -50,6 +51,15 @@ def test_a_robots_message_on_another_robots_key_is_refused() -> None:
 def test_a_message_on_another_channels_key_is_refused() -> None:
     with pytest.raises(WireError, match="wrong tag: 'odometry/1' where 'submap/1' belongs"):
         opened(sample("robot/alpha/submap", odometry(0)))
+
+
+def test_a_view_is_of_its_row_and_is_opened_by_nobody() -> None:
+    assert c.VIEW.owner("view/particles/alpha") == "particles/alpha"
+    assert view_of("view/particles/alpha") is PARTICLES
+    assert view_of("view/nothing") is None
+    assert view_of("robot/alpha/particles") is None
+    with pytest.raises(WireError, match="no channel has the key 'view/map'"):
+        opened(Sample("view/map", b"", 0, 0, 0))
 
 
 def test_an_outgoing_message_knows_its_key() -> None:

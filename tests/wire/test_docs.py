@@ -10,6 +10,7 @@ import msgspec
 
 from team.wire import channels as c
 from team.wire import messages as m
+from team.wire import views as v
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
 from team.wire.zenoh_bus import ZenohBus, router
@@ -22,11 +23,24 @@ def channel_table() -> str:
     """The table of channels as Markdown; `python -m tests.wire.test_docs` prints it."""
     rows = ["| key | message | rate | delivery | recorded | meaning |", "|---|---|---|---|---|---|"]
     rows += [
-        f"| `{channel.template}` | `{m.tag_of(channel.message)}` | {channel.rate} | "
+        f"| `{channel.template}` | {_carried(channel)} | {channel.rate} | "
         f"{'query' if channel in c.QUERIES else channel.delivery} | "
         f"{'yes' if channel.recorded else 'no'} | {channel.meaning} |"
         for channel in c.CHANNELS
     ]
+    return "\n".join(rows)
+
+
+def _carried(channel: c.Channel) -> str:
+    return "see Views" if channel is c.VIEW else f"`{m.tag_of(channel.message)}`"
+
+
+def view_table() -> str:
+    """The table of views as Markdown."""
+    rows = ["| key | schema | rate | meaning |", "|---|---|---|---|"]
+    for view in v.VIEWS:
+        schema = view.schema if isinstance(view.schema, str) else f"teamslam.{view.schema.__name__}"
+        rows.append(f"| `{view.template}` | `{schema}` | {view.rate} | {view.meaning} |")
     return "\n".join(rows)
 
 
@@ -83,6 +97,10 @@ def test_the_page_has_the_table_of_channels() -> None:
     assert channel_table() in PAGE.read_text()
 
 
+def test_the_page_has_the_table_of_views() -> None:
+    assert view_table() in PAGE.read_text()
+
+
 def test_the_page_has_the_fields_of_every_message() -> None:
     assert message_table() in PAGE.read_text()
 
@@ -110,4 +128,4 @@ def test_the_pages_example_bytes_are_those_of_the_code() -> None:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(f"{channel_table()}\n\n{message_table()}\n")
+    sys.stdout.write(f"{channel_table()}\n\n{message_table()}\n\n{view_table()}\n")

@@ -1,0 +1,58 @@
+"""The views of a log that was recorded: what a viewer would have published, in their order."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from sim.view.node import ViewerNode
+from team.recording.reader import Log
+from team.recording.recorder import Recorder
+from team.wire import channels as ch
+from team.wire.bus import Sample, opened
+from team.wire.codec import WireError
+
+
+class Viewing:
+    """A viewer over samples: what arrives goes to the node, what it says comes out as samples."""
+
+    def __init__(self) -> None:
+        self.node = ViewerNode()
+        self._counters: dict[str, int] = {}
+        self._heard = {channel.name for channel in (*ViewerNode.listens, ch.ALIVE)}
+
+    def take(self, sample: Sample) -> list[Sample]:
+        """The views that this sample brings, with its wall clock and counters of their own."""
+        found = ch.channel_of(sample.key)
+        if found is None or found[0].name not in self._heard:
+            return []
+        try:
+            channel, _, message = opened(sample)
+        except WireError:
+            return []  # no node would have let it in
+        out = []
+        for shown in self.node.handle(channel, message):
+            counter = self._counters.get(shown.key, 0)
+            self._counters[shown.key] = counter + 1
+            out.append(Sample(shown.key, shown.payload, shown.stamp_ns, sample.wall_ns, counter))
+        return out
+
+
+def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
+    """The samples, and behind each the views that it brings; earlier views are left out."""
+    viewing = Viewing()
+    for sample in samples:
+        if ch.VIEW.owner(sample.key) is None:
+            yield sample
+            yield from viewing.take(sample)
+
+
+def export_views(log: Log, out: Path) -> int:
+    """Write a log with its views to a new log `out`; how many messages it has.
+
+    Raises `LogError` for a damaged log, `RecorderError` when `out` exists.
+    """
+    count = 0
+    with Recorder(out, log.team, log.metadata) as recorder:
+        for sample in with_views(log.samples()):
+            recorder.write([sample])
+            count += 1
+    return count

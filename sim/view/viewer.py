@@ -1,0 +1,30 @@
+"""The viewer's process: a bus around the node; what it publishes the recorder takes as it is."""
+
+import threading
+import time
+from dataclasses import replace
+
+from sim.view.export import Viewing
+from team.shell import WAIT_S
+from team.wire import channels as ch
+from team.wire.bus import Bus
+
+NODE = "viewer"
+
+
+def run_viewer(bus: Bus, stop: threading.Event) -> int:
+    """Publish the views of a team until its final map is shown, or until `stop`; how many."""
+    viewing = Viewing()
+    for channel in viewing.node.listens:
+        bus.subscribe(channel)
+    bus.watch_alive()
+    bus.declare_alive(NODE)
+    published = 0
+    while not (viewing.node.finished or stop.is_set()):
+        for sample in bus.receive(WAIT_S):
+            if ch.ALIVE.owner(sample.key) == NODE:
+                continue
+            for shown in viewing.take(sample):
+                bus.publish_raw(replace(shown, wall_ns=time.time_ns()))
+                published += 1
+    return published

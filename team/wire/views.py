@@ -1,0 +1,108 @@
+"""The table of views: what a viewer node publishes below `view/`, by the schemas of other tools.
+
+A view is no message of the team: nobody opens it, nothing is computed from it, and verification
+skips it. Foxglove, Lichtblick and Rerun know its schema, so that a log opens there with nothing to
+configure. Frames: `map` is the frame of the team's map, `robot/<name>` that of a robot; metres,
+radians, counter-clockwise; z = 0.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from team.wire.channels import VIEW
+
+MAP_FRAME = "map"
+
+
+class TeamFigures(msgspec.Struct, frozen=True):
+    """Figures of the team for plots; what is not known is left out.
+
+    Errors are of the map as it lies; map_nees_per_dof takes each landmark by itself (2 degrees of
+    freedom, 1 is right). status: the centre's own figures, the consistency monitor's among them.
+    """
+
+    team_time_s: float
+    landmarks: int
+    robots: int
+    map_rmse_m: float | UnsetType = UNSET
+    map_nees_per_dof: float | UnsetType = UNSET
+    status: dict[str, float] = msgspec.field(default_factory=dict)
+
+
+class RobotFigures(msgspec.Struct, frozen=True):
+    """Figures of one robot for plots: its running pose, and its errors with their 3σ bounds.
+
+    What is not known without the truth is left out. nees_per_dof: eᵀ P⁻¹ e / 3; 1 is right on
+    average. status: the robot's own figures.
+    """
+
+    team_time_s: float
+    x_m: float
+    y_m: float
+    heading_rad: float
+    three_sigma_x_m: float
+    three_sigma_y_m: float
+    three_sigma_heading_rad: float
+    error_x_m: float | UnsetType = UNSET
+    error_y_m: float | UnsetType = UNSET
+    error_heading_rad: float | UnsetType = UNSET
+    nees_per_dof: float | UnsetType = UNSET
+    status: dict[str, float] = msgspec.field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class View:
+    """One row: key, schema (of Foxglove by its name, of ours by its fields), rate, meaning."""
+
+    template: str
+    schema: str | type[msgspec.Struct]
+    rate: str
+    meaning: str
+
+    def key(self, robot: str = "") -> str:
+        """The relative key, for one robot where the view is of one."""
+        return self.template.replace("{robot}", robot)
+
+    def is_of(self, key: str) -> bool:
+        """Whether a relative key is one of this view."""
+        pattern = re.escape(self.template).replace(r"\{robot\}", "[^/]+")
+        return re.fullmatch(pattern, key) is not None
+
+
+MAP = View("view/map", "foxglove.SceneUpdate", "1 Hz, when it has changed",
+           "the team's landmarks with 95 % ellipses; the true ones")  # fmt: skip
+ROBOTS = View("view/robots", "foxglove.SceneUpdate", "1 Hz",
+              "the robots with 95 % ellipses and the last stretch of their paths")  # fmt: skip
+PATHS = View("view/paths", "foxglove.SceneUpdate", "0.1 Hz",
+             "whole paths, thinned: running, true, at the end smoothed")  # fmt: skip
+TRANSFORMS = View("view/transforms", "foxglove.FrameTransforms", "1 Hz",
+                  "the robots' frames in that of the map")  # fmt: skip
+POSE = View("view/pose/{robot}", "foxglove.PoseInFrame", "1 Hz", "a robot's running pose")
+LANDMARKS = View("view/landmarks", "foxglove.PointCloud", "as view/map",
+                 "the team's landmarks as points, with their numbers")  # fmt: skip
+PARTICLES = View("view/particles/{robot}", "foxglove.PointCloud", "1 Hz, when it has changed",
+                 "a robot's thinned particles with their weights")  # fmt: skip
+LOG = View("view/log", "foxglove.Log", "on change",
+           "who joined, was lost, was refused; what the nodes warn of")  # fmt: skip
+TEAM = View("view/team", TeamFigures, "1 Hz", "figures of the team")
+ROBOT = View("view/robot/{robot}", RobotFigures, "1 Hz", "figures of a robot")
+
+VIEWS: tuple[View, ...] = tuple(v for v in list(globals().values()) if isinstance(v, View))
+
+
+def view_of(key: str) -> View | None:
+    """The view that a relative key belongs to; None for a key of a channel, and of no row."""
+    if VIEW.owner(key) is None:
+        return None
+    return next((view for view in VIEWS if view.is_of(key)), None)
+
+
+def json_schema(of: type[msgspec.Struct]) -> dict[str, Any]:
+    """The JSON Schema of figures, without references: not every tool resolves them."""
+    (_,), components = msgspec.json.schema_components((of,), ref_template="#/$defs/{name}")
+    schema = components[of.__name__]
+    return {"title": of.__name__, **schema}
