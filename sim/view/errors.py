@@ -19,7 +19,7 @@ SPACING_NS = 100_000_000
 class MapFit(NamedTuple):
     """A map against the truth: RMSE [m] as it lies, NEES per degree of freedom of each landmark."""
 
-    count: int
+    landmarks: int
     rmse_m: float
     nees_per_dof: float
 

@@ -329,11 +329,18 @@ def _logged(event: Event) -> Shown:
 
 
 def _figures(robot: _Robot, now_ns: int) -> views.RobotFigures:
-    pose = robot.pose().tolist()
-    bounds = 3.0 * np.sqrt(np.diagonal(robot.covariance()))
+    x, y, heading = robot.pose().tolist()
+    to_x, to_y, to_heading = (3.0 * np.sqrt(np.diagonal(robot.covariance()))).tolist()
+    figures = views.RobotFigures(
+        now_ns * 1e-9, x, y, heading, to_x, to_y, to_heading, status=robot.status
+    )
     if robot.last_error is None:
-        return views.RobotFigures(now_ns * 1e-9, *pose, *bounds.tolist(), status=robot.status)
-    error, nees = robot.last_error
-    return views.RobotFigures(
-        now_ns * 1e-9, *pose, *bounds.tolist(), *error.tolist(), nees, robot.status
+        return figures
+    (ex, ey, turned), nees = robot.last_error
+    return msgspec.structs.replace(
+        figures,
+        error_x_m=float(ex),
+        error_y_m=float(ey),
+        error_heading_rad=float(turned),
+        nees_per_dof=nees,
     )
