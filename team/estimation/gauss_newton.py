@@ -4,6 +4,11 @@ Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start or bias − pri
 Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters with a wide
 scale that narrows with each iteration it has lived through, so a true loop closure is not taken for
 an outlier before the chain has bent.
+
+With a robust loss each landmark of a submap has a weight of its own besides, so that a landmark
+that was mistaken for another does not break the robot's chain: beyond the gate g its χ² counts
+g (1 + log(χ²/g)), whose slope, the weight, is g/χ². The weight enters as additional variance of
+that landmark alone (`joining_kernel.discounted_information`).
 """
 
 import math
@@ -24,6 +29,8 @@ from team.estimation.submap_graph import Graph
 Values = Float[np.ndarray, " _"]
 LEAST_DAMPING = 1e-4
 MOST_DAMPING = 1e8
+LEAST_WEIGHT = 1e-6
+"""No landmark is discounted more, so that each stays determined."""
 ROUNDING = 1e-10
 """A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
 
@@ -35,6 +42,8 @@ class JoinSettings:
     iterations_per_tick: Gauss-Newton iterations of `folded`.
     robust_c: Cauchy's scale on √(χ²/dim) of a factor; None for least squares. The scale begins at
         robust_start · c and is multiplied by robust_decay with each iteration until it is c.
+    landmark_gate: χ² (2 numbers) from which a submap's landmark is discounted by itself, when there
+        is a robust loss; it narrows like the scale.
     covariance_factor: every submap's covariance is taken times this.
     max_iterations, step_tolerance: a full solve ends when no unknown moves by more [m, rad].
     alignment_confidence: quantile of the χ² test before a free island is merged.
@@ -46,6 +55,7 @@ class JoinSettings:
     robust_c: float | None = None
     robust_start: float = 8.0
     robust_decay: float = 0.7
+    landmark_gate: float = 13.8
     covariance_factor: float = 1.0
     max_iterations: int = 50
     step_tolerance: float = 1e-6
@@ -87,10 +97,65 @@ class Island:
         return _scale_at(self.sighting_age, self.settings)
 
     @cached_property
+    def _landmark_chi2_and_gate(self) -> tuple[Values, Values]:
+        """χ² of each landmark of each submap by itself, and its gate."""
+        factors, settings = self.graph.factors, self.settings
+        if settings.robust_c is None:
+            return np.zeros(len(factors.block)), np.ones(len(factors.block))
+        chi2 = kernel.landmark_chi2(
+            self.state, self.graph.offset, factors, settings.covariance_factor
+        )
+        gate = settings.landmark_gate * (self.scale / settings.robust_c) ** 2
+        return chi2, np.repeat(gate, np.diff(factors.block_start))
+
+    @cached_property
+    def landmark_weight(self) -> Float[np.ndarray, " B"]:
+        """The weight of each landmark of each submap: 1 up to its gate, 1 without a robust loss."""
+        chi2, gate = self._landmark_chi2_and_gate
+        weight, beyond = np.ones(len(chi2)), chi2 > gate
+        weight[beyond] = np.maximum(gate[beyond] / chi2[beyond], LEAST_WEIGHT)
+        return weight
+
+    @cached_property
+    def factors(self) -> kernel.Factors:
+        """The submaps with their landmarks discounted."""
+        return self._discounted(self.landmark_weight)
+
+    def _discounted(self, weight: Values) -> kernel.Factors:
+        factors = self.graph.factors
+        if (weight == 1.0).all():
+            return factors
+        return factors._replace(information=kernel.discounted_information(factors, weight))
+
+    @cached_property
+    def dimensions(self) -> Float[np.ndarray, " F"]:
+        """Numbers in each submap, discounted ones as far as they count."""
+        factors = self.graph.factors
+        of = np.repeat(np.arange(len(self.graph.submaps)), np.diff(factors.block_start))
+        lost = np.bincount(of, 2.0 * (1.0 - self.landmark_weight), len(self.graph.submaps))
+        return self.graph.dimensions - lost.astype(np.float64)
+
+    @cached_property
     def chi2(self) -> Float[np.ndarray, " F"]:
-        """rᵀ(f P)⁻¹r of each submap."""
+        """rᵀ(f P)⁻¹r of each submap, landmarks discounted."""
+        factor = self.settings.covariance_factor
+        return kernel.costs(self.state, self.graph.offset, self.factors, factor)
+
+    @cached_property
+    def whole_chi2(self) -> Float[np.ndarray, " F"]:
+        """rᵀ(f P)⁻¹r of each submap, nothing discounted."""
         factor = self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, self.graph.factors, factor)
+
+    @cached_property
+    def counted_chi2(self) -> Float[np.ndarray, " F"]:
+        """χ² of each submap with each landmark's share w χ² counted w times.
+
+        That is how the share of its numbers counts in `dimensions`: what is discounted says
+        nothing of whether the rest agrees.
+        """
+        factors, factor = self._discounted(self.landmark_weight**2), self.settings.covariance_factor
+        return kernel.costs(self.state, self.graph.offset, factors, factor)
 
     @property
     def weight(self) -> Float[np.ndarray, " F"]:
@@ -113,6 +178,17 @@ class Island:
         """χ² of each prior on a start."""
         return np.array([_prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
 
+    def quadratic(self, state: Values) -> float:
+        """The cost of another state with the weights of this one: what an iteration lowers.
+
+        Its fall is a fall of the robust cost too, since each loss lies below its parabola.
+        """
+        other = replace(self, state=state)
+        factor, offset = self.settings.covariance_factor, self.graph.offset
+        chi2 = float((self.weight * kernel.costs(state, offset, self.factors, factor)).sum())
+        seen = float((self.sighting_weight * other.sighting_chi2).sum())
+        return chi2 + seen + float(other.prior_chi2.sum())
+
     @cached_property
     def cost(self) -> float:
         """What is minimised, at the present scales."""
@@ -121,6 +197,9 @@ class Island:
             return chi2 + float(self.sighting_chi2.sum())
         scale = self.scale**2 * self.graph.dimensions
         cost = float((scale * np.log1p(self.chi2 / scale)).sum() + self.prior_chi2.sum())
+        own, gate = self._landmark_chi2_and_gate
+        beyond = own > gate
+        cost += float((gate[beyond] * np.log(own[beyond] / gate[beyond])).sum())
         scale = 2.0 * self.sighting_scale**2
         return cost + float((scale * np.log1p(self.sighting_chi2 / scale)).sum())
 
@@ -132,7 +211,7 @@ class Island:
             self.state,
             graph.offset,
             graph.fixed,
-            graph.factors,
+            self.factors,
             self.settings.covariance_factor,
             self.scale,
             graph.entry,
@@ -214,13 +293,14 @@ def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
     """One iteration: the island, the damping for the next one, the largest change [m, rad]."""
     values, gradient = island.normal_equations
     diagonal = island.graph.diagonal
+    before = island.quadratic(island.state)
     while damping < MOST_DAMPING:
         damped = values.copy()
         damped[diagonal] *= 1.0 + damping
         cholesky = island.posterior if damping == 0.0 else _factorised(island.graph, damped)
         step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
         moved = _moved(island, step)
-        if moved.cost <= island.cost * (1.0 + ROUNDING) + ROUNDING:
+        if island.quadratic(moved.state) <= before * (1.0 + ROUNDING) + ROUNDING:
             eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
             largest = float(np.abs(step).max(initial=0.0))
             return aged(moved, 1), eased, largest

@@ -24,6 +24,7 @@ class Factors(NamedTuple):
     member[member_start[f] : member_start[f + 1]] are the nodes of submap f: start pose, end pose,
     pose nodes by stamp, landmarks by id, biases. mean, information (P⁻¹, row-major) and sensitivity
     (a row per bias) lie likewise from mean_start, information_start and sensitivity_start on.
+    block: each landmark's own covariance (xx, xy, yy), those of submap f from block_start[f] on.
     """
 
     member: Indices
@@ -34,6 +35,8 @@ class Factors(NamedTuple):
     information_start: Indices
     sensitivity: Values
     sensitivity_start: Indices
+    block: Float[np.ndarray, "B 3"]
+    block_start: Indices
 
 
 @compiled
@@ -110,6 +113,71 @@ def _places(offset: Indices, nodes: Indices) -> Indices:
     for k in range(len(nodes)):
         at[k] = offset[nodes[k]]
     return at
+
+
+@compiled
+def landmark_chi2(
+    state: Values, offset: Indices, factors: Factors, covariance_factor: float
+) -> Values:
+    """r_lᵀ (covariance_factor · P_ll)⁻¹ r_l of each landmark of each submap."""
+    result = np.empty(len(factors.block))
+    for f in range(len(factors.member_start) - 1):
+        at = _places(offset, factors.member[factors.member_start[f] : factors.member_start[f + 1]])
+        mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
+        sensitivity = _sensitivity(factors, f, len(mean))
+        members = at[: len(at) - len(sensitivity)]
+        residual, _ = submap_residual(state, members, shifted_mean(state, at, mean, sensitivity))
+        c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+        begin, end = factors.block_start[f], factors.block_start[f + 1]
+        row = len(mean) - 2 * (end - begin)
+        for block in range(begin, end):
+            x = c * residual[row] + s * residual[row + 1]
+            y = -s * residual[row] + c * residual[row + 1]
+            xx, xy, yy = factors.block[block]
+            determinant = (xx * yy - xy * xy) * covariance_factor
+            result[block] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
+            row += 2
+    return result
+
+
+@compiled
+def discounted_information(factors: Factors, weight: Values) -> Values:
+    """(P + blkdiag(0, (1/w_l − 1) P_ll))⁻¹ of each submap, in the layout of `information`.
+
+    A landmark with weight w_l counts as if its own error were that much larger; the rest of the
+    submap keeps what it says. By Woodbury's identity, a landmark after the other.
+    """
+    result = factors.information.copy()
+    for f in range(len(factors.member_start) - 1):
+        first = factors.block_start[f]
+        n = factors.mean_start[f + 1] - factors.mean_start[f]
+        row = n - 2 * (factors.block_start[f + 1] - first)
+        begin = factors.information_start[f]
+        metric = result[begin : begin + n * n].reshape(n, n)
+        for block in range(first, factors.block_start[f + 1]):
+            if weight[block] < 1.0:
+                _discount(metric, row + 2 * (block - first), factors.block[block], weight[block])
+    return result
+
+
+@compiled
+def _discount(
+    metric: Float[np.ndarray, "n n"], at: int, block: Float[np.ndarray, "3"], weight: float
+) -> None:
+    """A := A − A_·l (D⁻¹ + A_ll)⁻¹ A_l·, D = (1/w − 1) P_ll."""
+    xx, xy, yy = block
+    share = weight / ((1.0 - weight) * (xx * yy - xy * xy))
+    a = share * yy + metric[at, at]
+    b = metric[at, at + 1] - share * xy
+    d = share * xx + metric[at + 1, at + 1]
+    determinant = a * d - b * b
+    n = len(metric)
+    columns = metric[:, at : at + 2].copy()
+    for i in range(n):
+        x = (d * columns[i, 0] - b * columns[i, 1]) / determinant
+        y = (a * columns[i, 1] - b * columns[i, 0]) / determinant
+        for j in range(n):
+            metric[i, j] -= x * columns[j, 0] + y * columns[j, 1]
 
 
 @compiled

@@ -53,8 +53,9 @@ class BiasEstimate(NamedTuple):
 class SubmapCost(NamedTuple):
     """How one submap agrees with the rest: χ² should be near dof.
 
-    chi2 is unweighted; dof = dim − w tr(JᵀP⁻¹J Σ) is the part of its dimension that the solution
-    does not take up (its redundancy, Baarda 1968); weight w is robust, 1 without a robust loss.
+    chi2 is unweighted, nothing discounted; dof = dim − w tr(JᵀP⁻¹J Σ) is the part of its dimension
+    that the solution does not take up (its redundancy, Baarda 1968); weight w is robust, 1 without
+    a robust loss.
     """
 
     stream: Stream
@@ -67,9 +68,10 @@ class SubmapCost(NamedTuple):
 class Agreement(NamedTuple):
     """Joint cost Σ w χ² and its degrees of freedom, in all, per robot and per submap.
 
-    A sighting counts with its observer. Without a robust loss the joint dof is the sum of the
-    submaps' dimensions (and of the sightings' and the start priors') less the number of unknowns. A
-    lasting chi2/dof above 1.1 is a warning, above 1.3 the covariances are not to be trusted.
+    A sighting counts with its observer, a discounted landmark as far as it is believed. Without a
+    robust loss the joint dof is the sum of the submaps' dimensions (and of the sightings' and the
+    priors') less the number of unknowns. A lasting chi2/dof above 1.1 is a warning, above 1.3 the
+    covariances are not to be trusted.
     """
 
     chi2: float
@@ -154,21 +156,26 @@ def joint_cost(fold: Fold) -> Agreement:
     explained = kernel.explained(
         island.state,
         graph.offset,
-        graph.factors,
+        island.factors,
         island.settings.covariance_factor,
         graph.entry,
         graph.pattern.value_start,
         island.selected_covariance,
     )
     weight = island.weight
-    dof = graph.dimensions - weight * explained
+    taken = weight * explained
     submaps = tuple(
         SubmapCost(of.stream, of.sequence, float(chi2), float(own), float(w))
-        for (of, _), chi2, own, w in zip(graph.submaps, island.chi2, dof, weight, strict=True)
+        for (of, _), chi2, own, w in zip(
+            graph.submaps, island.whole_chi2, graph.dimensions - taken, weight, strict=True
+        )
+    )
+    counted = zip(
+        graph.submaps, weight * island.counted_chi2, island.dimensions - taken, strict=True
     )
     robots: dict[str, tuple[float, float]] = {}
     for robot, chi2, own in [
-        *((each.stream[0], each.weight * each.chi2, each.dof) for each in submaps),
+        *((of.robot, float(chi2), float(own)) for (of, _), chi2, own in counted),
         *_priors(island),
         *_sightings(island),
     ]:

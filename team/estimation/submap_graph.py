@@ -19,6 +19,7 @@ from team.estimation.joining_kernel import Factors, block_pattern
 from team.estimation.sighting import Sighting
 from team.estimation.sighting_kernel import Sightings
 from team.estimation.sparse import Analysis, Pattern, analysed
+from team.estimation.submap import LocalMap
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -83,6 +84,8 @@ class Graph:
             _starts([each.information.size for each in submaps]),
             np.concatenate([np.zeros(0), *(each.local.sensitivity.ravel() for each in submaps)]),
             _starts([each.local.sensitivity.size for each in submaps]),
+            np.concatenate([np.zeros((0, 3)), *(_blocks(each.local) for each in submaps)]),
+            _starts([len(each.local.ids) for each in submaps]),
         )
 
     @cached_property
@@ -165,6 +168,14 @@ class Graph:
 
 
 EMPTY_GRAPH = Graph({}, {}, {}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), (), ())
+
+
+def _blocks(local: LocalMap) -> Float[np.ndarray, "L 3"]:
+    """Each landmark's own covariance (xx, xy, yy)."""
+    first = len(local.mean) - 2 * len(local.ids)
+    x, y = np.arange(first, len(local.mean), 2), np.arange(first + 1, len(local.mean), 2)
+    P = local.covariance
+    return np.column_stack([P[x, x], P[x, y], P[y, y]])
 
 
 def _starts(lengths: Sequence[int]) -> Indices:
