@@ -188,7 +188,10 @@ def _conclude(
     from rich.console import Console
 
     from sim.evaluation import evaluate, to_json
-    from sim.report import summary_tables, write_report
+    from sim.history import history
+    from sim.report import summary_tables
+    from sim.report_page import write_report
+    from sim.report_run import Run, run_figures
     from team.recording.reader import LogError, open_log
 
     console = Console()
@@ -212,8 +215,8 @@ def _conclude(
         for note in evaluation.notes:
             console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         if report:
-            paths = write_report(evaluation, outcome.folder, log.metadata, figures)
-            for path in paths:
+            run = Run(evaluation, history(log.samples()), log.metadata)
+            for path in write_report(run, outcome.folder, {**figures, **run_figures(run)}):
                 console.print(f"wrote {path}", highlight=False, soft_wrap=True)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")

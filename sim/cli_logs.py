@@ -20,6 +20,7 @@ from sim.cli_options import (
 from sim.scenario import with_options
 
 if TYPE_CHECKING:
+    from sim.ledger import Ledger
     from team.recording.reader import Log
 
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
@@ -67,28 +68,61 @@ def report(
     log: LogArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the report.")],
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+    ledger: Annotated[
+        bool,
+        typer.Option(help="Prove the ledger: the robots consume the recorded readings again."),
+    ] = True,
 ) -> None:
-    """Pictures, tables and figures of a run, from its log alone."""
+    """A page, pictures, tables and figures of a run, from its log alone."""
     from rich.console import Console
 
     from sim.evaluation import evaluate, to_json
-    from sim.report import summary_tables, write_report
+    from sim.history import history
+    from sim.report import summary_tables
+    from sim.report_page import write_report
+    from sim.report_run import Run, run_figures
     from team.recording.reader import open_log
 
+    _check_folder(output)
     opened = open_log(log)
     evaluation = evaluate(opened.samples())
-    figures = to_json(evaluation, {"log": str(log), "complete": opened.complete})
+    found, why = _ledger(opened) if ledger else (None, Run.no_ledger)
+    run = Run(evaluation, history(opened.samples()), opened.metadata, found, why)
+    figures = to_json(
+        evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
+    )
     console = Console()
     for table in summary_tables(evaluation):
         console.print(table)
     for note in evaluation.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
-    output.mkdir(parents=True, exist_ok=True)
-    for path in write_report(evaluation, output, opened.metadata, figures):
+    if found is not None:
+        verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()
+        console.print(f"ledger: {verdict}", highlight=False, soft_wrap=True)
+    for path in write_report(run, output, figures):
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=2) + "\n")
     _hint_if_cut(opened)
+
+
+def _check_folder(path: Path) -> None:
+    """A folder that can not be made is found before the work, not after it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
+
+
+def _ledger(log: "Log") -> "tuple[Ledger | None, str]":
+    """The ledger of a log; without one, why."""
+    from sim.ledger import ledger
+    from sim.rerun_log import RerunError, recorded
+
+    try:
+        return ledger(recorded(log)), ""
+    except RerunError as error:
+        return None, str(error)
 
 
 @app.command()

@@ -28,7 +28,7 @@ _KEPT = frozenset(
 _OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE))
 
 
-class _Head(msgspec.Struct, array_like=True, gc=False):
+class Head(msgspec.Struct, array_like=True, gc=False):
     """The first fields of every reading; what follows is skipped."""
 
     tag: str
@@ -38,7 +38,15 @@ class _Head(msgspec.Struct, array_like=True, gc=False):
     reading: int
 
 
-_HEAD = msgspec.msgpack.Decoder(_Head)
+_HEAD = msgspec.msgpack.Decoder(Head)
+
+
+def head_of(sample: Sample) -> Head | None:
+    """The head of a reading; None of what is none."""
+    try:
+        return _HEAD.decode(sample.payload)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return None
 
 
 @dataclass
@@ -116,9 +124,8 @@ class Collected:
             self.kept[sample.key].append(sample)
 
     def _count(self, sample: Sample, robot: str, *, odometry: bool) -> None:
-        try:
-            head = _HEAD.decode(sample.payload)
-        except (msgspec.DecodeError, UnicodeDecodeError):
+        head = head_of(sample)
+        if head is None:
             self.unsound += 1
             return
         of_robot = self.readings[robot]

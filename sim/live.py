@@ -12,6 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from sim.history_events import without_figures
 from sim.launch import Watch
 from sim.live_truth import LiveErrors
 from team.wire import messages as m
@@ -43,8 +44,8 @@ class _Lines:
 
     def show(self, watch: Watch) -> None:
         for warning in _warnings(watch):
-            if warning not in self._said:
-                self._said.add(warning)
+            if without_figures(warning) not in self._said:
+                self._said.add(without_figures(warning))
                 self._print(watch, f"warning: {warning}")
         now = time.monotonic()
         if now < self._due or "world" not in watch.statuses:

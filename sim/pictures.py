@@ -34,7 +34,7 @@ def map_picture(evaluation: Evaluation, path: FilePath) -> bool:
     """Landmarks with 95 % ellipses, the truth, the paths; False where there is nothing to draw."""
     if evaluation.map is None and not evaluation.robots:
         return False
-    figure, axes = _figure(9.0, 9.0, 1, 1)
+    figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
     for i, (name, robot) in enumerate(evaluation.robots.items()):
         _draw_paths(axis, name, robot, ROBOT_COLOURS[i % len(ROBOT_COLOURS)], first=i == 0)
@@ -67,7 +67,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     if not names:
         return False
     start_ns = min(_first_ns(shown[name]) for name in names)
-    figure, axes = _figure(13.0, 1.0 + 2.3 * len(names), len(names), 3)
+    figure, axes = new_figure(13.0, 1.0 + 2.3 * len(names), len(names), 3)
     for row, name in enumerate(names):
         colour = ROBOT_COLOURS[row % len(ROBOT_COLOURS)]
         _draw_errors(axes[row], shown[name], colour, start_ns)
@@ -86,7 +86,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     return True
 
 
-def _figure(
+def new_figure(
     width: float, height: float, rows: int, columns: int
 ) -> "tuple[Figure, list[list[Axes]]]":
     """A figure on Agg without pyplot's global state, with its axes by row and column."""
@@ -198,7 +198,7 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
         axis.set_axisbelow(True)
         largest = 0.0
         if robot.online is not None:
-            kept = slice(None, None, max(1, len(robot.online.stamps_ns) // DRAWN_POINTS))
+            kept = thinning(len(robot.online.stamps_ns))
             time_s = (robot.online.stamps_ns[kept] - start_ns) * 1e-9
             bound = 3.0 * scale * robot.online.sigmas[kept, k]
             error = scale * robot.online.errors[kept, k]
@@ -226,8 +226,13 @@ def _first_ns(robot: RobotResult) -> int:
 
 
 def _thinned(path: Path) -> Path:
-    every = max(1, len(path.stamps_ns) // DRAWN_POINTS)
-    return Path(path.stamps_ns[::every], path.poses[::every])
+    kept = thinning(len(path.stamps_ns))
+    return Path(path.stamps_ns[kept], path.poses[kept])
+
+
+def thinning(count: int) -> slice:
+    """Every so many of a line's points, so that about DRAWN_POINTS are drawn at the most."""
+    return slice(None, None, max(1, count // DRAWN_POINTS))
 
 
 def _heading(evaluation: Evaluation) -> str:

@@ -1,7 +1,5 @@
 """Pictures and the report: drawn where there is something to draw, self-contained, readable."""
 
-import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from sim.pictures import (
     label_offsets,
     map_picture,
 )
-from sim.report import summary_tables, write_report
+from sim.report import summary_tables
 from sim.scenario import with_options
 from team.wire import channels as ch
 from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
@@ -74,28 +72,6 @@ def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path: Path) -> N
 
 def test_an_empty_run_draws_nothing(tmp_path: Path) -> None:
     assert not map_picture(evaluate([]), tmp_path / "map.png")
-
-
-def test_the_report_is_one_page_that_needs_nothing_else(run: Evaluation, tmp_path: Path) -> None:
-    paths = write_report(run, tmp_path / "new", {"seed": "1"}, to_json(run))
-    assert [path.name for path in paths] == ["report.html", "report.json", "map.png", "errors.png"]
-    page = paths[0].read_text("utf-8")
-    assert page.count("data:image/png;base64,") == 2
-    assert not re.findall(r'(?:src|href)="(?!data:)', page)
-    assert json.loads(paths[1].read_text("utf-8"))["landmarks"] == 8
-
-
-def test_what_a_log_says_can_not_become_markup(run: Evaluation, tmp_path: Path) -> None:
-    hostile = replace(run, notes=("<script>alert(1)</script> [red]x[/nothing]",))
-    page = write_report(hostile, tmp_path, {"commit": "<b>"}, {})[0].read_text("utf-8")
-    assert "<script>" not in page
-    assert "<td>&lt;b&gt;</td>" in page
-
-
-def test_a_run_that_was_cut_is_reported(tmp_path: Path) -> None:
-    cut = evaluate(world_log(scenario())[:30])
-    page = write_report(cut, tmp_path, {}, to_json(cut))[0].read_text("utf-8")
-    assert "did not come to its end" in page
 
 
 def test_the_tables_fit_a_terminal_of_80_columns_and_name_their_units(run: Evaluation) -> None:
