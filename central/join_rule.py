@@ -189,8 +189,9 @@ class JoinRule:
             covariance,
             chi2,
             round(dof),
-            tuple(fold.reasons[k] for k in sorted(fold.reasons)),
+            (*(fold.reasons[k] for k in sorted(fold.reasons)), *fold.doubts),
             tuple(m.BiasEstimate(*b.stream, b.bias, b.value, b.sigma) for b in biases),
+            tuple(fold.joined[k] for k in sorted(fold.joined)),
         )
 
     def _priors(self, fold: Fold, digest: bytes) -> list[Outgoing]:

@@ -77,6 +77,22 @@ def aligned(
     return Alignment(a_from_b, spread, chi2, 2 * n - 3, sigma)
 
 
+def at_heading(
+    in_a: Float[np.ndarray, "n 2"],
+    covariance_a: Float[np.ndarray, "m m"],
+    in_b: Float[np.ndarray, "n 2"],
+    covariance_b: Float[np.ndarray, "m m"],
+    heading: float,
+) -> tuple[Float[np.ndarray, "2"], float]:
+    """The translation [m] of a_from_b that fits best at this heading, and its χ²."""
+    pose = np.array([0.0, 0.0, heading])
+    residual, metric, jacobian = _linearised(pose, in_a, covariance_a, in_b, covariance_b)
+    J = jacobian[:, :2]
+    shift = np.linalg.solve(J.T @ metric @ J, J.T @ (metric @ residual))
+    left = residual - J @ shift
+    return shift, float(left @ metric @ left)
+
+
 def _shape_heading_sigma(
     in_b: Float[np.ndarray, "n 2"],
     jacobian: Float[np.ndarray, "m 3"],

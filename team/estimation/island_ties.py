@@ -20,6 +20,11 @@ from team.estimation.submap_graph import Graph, pose_node
 
 Points = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
 """n points [m] and their joint covariance, m = 2n."""
+HEADINGS = 24
+MOST_POINTS = 24
+"""More points than these do not fit at two headings, and would make the search slow."""
+HOPELESS = 100.0
+"""A heading whose χ² is higher by this much than the best one's is not looked at."""
 
 
 class Tie(NamedTuple):
@@ -79,3 +84,26 @@ def _points(island: Island, at: Sequence[tuple[int, Sighting | None]]) -> Points
             noise[rows, rows] = polar @ seen.covariance @ polar.T
         begin += int(island.graph.offset[node + 1] - island.graph.offset[node])
     return points, J @ covariance @ J.T + noise
+
+
+def headings_that_fit(
+    main: Island, other: Island, tied: Sequence[Tie]
+) -> list[Float[np.ndarray, "3"]]:
+    """Every main_from_other at whose heading the tied points fit better than at its neighbours'.
+
+    The best translation at each heading of a grid follows in closed form from the joint covariance
+    of the points. Hopeless headings are left out, and with many points all but the best one are.
+    """
+    if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
+        return []
+    in_main = _points(main, [(t.main, t.seen if t.from_main else None) for t in tied])
+    in_other = _points(other, [(t.other, None if t.from_main else t.seen) for t in tied])
+    grid = [2.0 * math.pi * k / HEADINGS - math.pi for k in range(HEADINGS)]
+    found = [alignment.at_heading(*in_main, *in_other, heading) for heading in grid]
+    costs = [chi2 for _, chi2 in found]
+    limit = min(costs) + HOPELESS
+    return [
+        np.array([*shift, heading])
+        for k, (heading, (shift, chi2)) in enumerate(zip(grid, found, strict=True))
+        if chi2 <= min(costs[k - 1], costs[(k + 1) % HEADINGS], limit)
+    ]

@@ -8,18 +8,17 @@ landmarks and sightings tie them to the main island.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
+from itertools import combinations, pairwise
 
 import numpy as np
-from jaxtyping import Int64
 
-from team.estimation import alignment
 from team.estimation.contribution import Contribution, Start, Stream, named
-from team.estimation.gauss_newton import Island, JoinSettings, aged, iterated, settled
-from team.estimation.island_ties import aligned_by, ties
+from team.estimation.gauss_newton import Island, JoinSettings, iterated
+from team.estimation.merging import Merge, ages, merge, sighted
+from team.estimation.minima import doubts, final_cost, searched, suspicious
 from team.estimation.sighting import Sighting
-from team.estimation.submap_graph import EMPTY_GRAPH, extended, merged, met
+from team.estimation.submap_graph import EMPTY_GRAPH, extended
 
 __all__ = [
     "EMPTY_FOLD",
@@ -38,8 +37,8 @@ __all__ = [
     "started",
 ]
 
-FULL_AGE = 1_000_000
-"""Iterations after which every robust scale has come to its end."""
+PATIENCE = 1.1
+"""What was searched in vain is searched again when there are so many times the submaps."""
 
 
 class NotCanonicalError(ValueError):
@@ -81,7 +80,11 @@ class Fold:
 
     home:       island (a key of `islands`) of each stream.
     reasons:    why an island other than the main one is not merged, by its frame.
+    joined:     how an island was merged into another one and how sure that is, by its old frame.
+    doubts:     of the full solution, what speaks for another minimum, in words.
     waiting:    sightings whose pose nodes are not both in one island, in canonical order.
+    judged, looked: the submaps of two islands, or of one, when they were last searched for a place
+                or a minimum in vain; with it why the two were not merged.
     iterations, change: of the main island's last full solution: how many, the last step [m, rad].
     """
 
@@ -93,6 +96,10 @@ class Fold:
     waiting: tuple[Sighting, ...] = ()
     iterations: int = 0
     change: float = 0.0
+    joined: Mapping[Stream, str] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
+    judged: Mapping[tuple[Stream, Stream], tuple[int, str]] = field(default_factory=dict)
+    looked: Mapping[Stream, int] = field(default_factory=dict)
 
     @property
     def main_key(self) -> Stream | None:
@@ -159,10 +166,10 @@ def folded(
     waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
     islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
     for key, taken in news.items():
-        island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), _new(0), _new(0), settings))
+        island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
         graph, state = extended(island.graph, island.state, taken, fold.starts, settings.bias_sigma)
-        age = np.concatenate([island.age, _new(len(taken))])
-        island, waiting = _sighted(replace(island, graph=graph, state=state, age=age), waiting)
+        age = np.concatenate([island.age, ages(len(taken))])
+        island, waiting = sighted(replace(island, graph=graph, state=state, age=age), waiting)
         islands[key] = iterated(island)
     grown = replace(
         fold,
@@ -171,24 +178,7 @@ def folded(
         home=home,
         waiting=waiting,
     )
-    return _with_merges(grown)
-
-
-def _new(count: int) -> Int64[np.ndarray, " count"]:
-    """The ages of so many new factors."""
-    return np.zeros(count, dtype=np.int64)
-
-
-def _sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[Sighting, ...]]:
-    """The island with the sightings that it has both pose nodes of, and those that still wait."""
-    candidates = [(each, met(island.graph, each)) for each in waiting]
-    found = [between for _, between in candidates if between is not None]
-    if not found:
-        return island, tuple(waiting)
-    graph = replace(island.graph, sightings=(*island.graph.sightings, *found))
-    age = np.concatenate([island.sighting_age, _new(len(found))])
-    left = tuple(each for each, between in candidates if between is None)
-    return replace(island, graph=graph, sighting_age=age), left
+    return _with_merges(_looked(grown))
 
 
 def lean(fold: Fold) -> Fold:
@@ -204,13 +194,25 @@ def lean(fold: Fold) -> Fold:
 
 
 def converged(fold: Fold, settings: JoinSettings) -> Fold:
-    """The full solution of every island; `iterations` and `change` tell how it ended."""
-    islands, iterations, change = {}, 0, 0.0
-    for key, island in fold.islands.items():
-        islands[key], count, last = settled(replace(island, settings=settings))
-        if key == fold.main_key:
-            iterations, change = count, last
-    return _with_merges(replace(fold, islands=islands, iterations=iterations, change=change))
+    """The full solution of every island; `iterations` and `change` tell how it ended.
+
+    Wrong minima are looked for; what is found stands in `doubts`.
+    """
+    if fold.main_key is None:
+        return fold
+    searches = {
+        key: searched([replace(island, settings=settings)]) for key, island in fold.islands.items()
+    }
+    main = searches[fold.main_key]
+    solved = replace(
+        fold,
+        islands={key: each.best.island for key, each in searches.items()},
+        iterations=main.best.iterations,
+        change=main.best.change,
+    )
+    merged = _with_merges(solved, at_last=True)
+    last = main if merged.main is main.best.island else searched([merged.main])
+    return replace(merged, doubts=tuple(doubts(last)))
 
 
 def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
@@ -226,45 +228,61 @@ def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
         expected[stream] = wanted + 1
 
 
-def _with_merges(fold: Fold) -> Fold:
-    """Merge islands into the main one while any can be; each merge is followed by a solution."""
+def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
+    """Merge islands while any two can be; the smallest frame stays, that of known starts before it.
+
+    A pair that was judged is judged again when it has grown by PATIENCE, or `at_last`.
+    """
     main_key = fold.main_key
-    reasons: dict[Stream, str] = {}
-    for key in sorted(fold.islands, key=lambda key: min(fold.islands[key].graph.streams)):
-        if main_key is None or key == main_key:
-            continue
-        main, other = fold.islands[main_key], fold.islands[key]
-        tied = ties(main.graph, other.graph, fold.waiting)
-        seen = sum(tie.seen is not None for tie in tied)
-        what = alignment.Shared(len(tied) - seen, seen)
-        found = aligned_by(main, other, tied)
-        settings = main.settings
-        why = alignment.refusal(what, found, settings.alignment_heading_sigma)
-        if found is not None and why is None:
-            merge = _merged(fold, main_key, key, found)
-            rise = _cost(merge.main) - _cost(main) - _cost(other)
-            why = alignment.disagreement(what, rise, settings.alignment_confidence)
-            if why is None:
-                return _with_merges(merge)
-        frame = min(other.graph.streams)
-        reasons[frame] = f"{named(frame)} not joined: {why}"
-    return replace(fold, reasons=reasons)
-
-
-def _cost(island: Island) -> float:
-    """The cost with every robust scale at its end, so that islands can be compared."""
-    return aged(island, FULL_AGE).cost
-
-
-def _merged(fold: Fold, main_key: Stream, key: Stream, found: alignment.Alignment) -> Fold:
-    main, other = fold.islands[main_key], fold.islands[key]
-    graph, state = merged(main.graph, main.state, other.graph, other.state, found.a_from_b)
-    ages = _new(len(graph.submaps)), _new(len(graph.sightings))
-    both, waiting = _sighted(Island(graph, state, *ages, main.settings), fold.waiting)
-    island, iterations, change = settled(both)
-    islands = {at: each for at, each in fold.islands.items() if at != key}
-    islands[main_key] = island
-    home = {stream: main_key if at == key else at for stream, at in fold.home.items()}
-    return replace(
-        fold, islands=islands, home=home, waiting=waiting, iterations=iterations, change=change
+    keys = sorted(
+        fold.islands, key=lambda key: (key != main_key, min(fold.islands[key].graph.streams))
     )
+    reasons: dict[Stream, str] = {}
+    judged = dict(fold.judged)
+    for key, other_key in combinations(keys, 2):
+        main, other = fold.islands[key], fold.islands[other_key]
+        size = len(main.graph.submaps) + len(other.graph.submaps)
+        before = judged.get((key, other_key))
+        if before is None or at_last or size >= PATIENCE * before[0]:
+            found = merge(main, other, fold.waiting)
+            if isinstance(found, Merge):
+                return _with_merges(_merged(replace(fold, judged=judged), key, other_key, found))
+            why = found.why
+            if found.after_search:
+                judged[key, other_key] = (size, why)
+        else:
+            why = before[1]
+        if key == main_key:
+            frame = min(other.graph.streams)
+            reasons[frame] = f"{named(frame)} not joined: {why}"
+    return replace(fold, reasons=reasons, judged=judged)
+
+
+def _merged(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
+    """The fold with one island less; how that came about stands under the frame that is gone."""
+    islands = {at: each for at, each in fold.islands.items() if at != other_key}
+    islands[key] = found.best.island
+    gone = min(fold.islands[other_key].graph.streams)
+    gone_keys = {key, other_key}
+    return replace(
+        fold,
+        islands=islands,
+        home={stream: key if at == other_key else at for stream, at in fold.home.items()},
+        waiting=found.waiting,
+        joined={**fold.joined, gone: found.words},
+        judged={pair: said for pair, said in fold.judged.items() if not gone_keys & {*pair}},
+        iterations=found.best.iterations,
+        change=found.best.change,
+    )
+
+
+def _looked(fold: Fold) -> Fold:
+    """Islands whose cost is suspicious are searched for a lower minimum, now and then."""
+    islands, looked = dict(fold.islands), dict(fold.looked)
+    for key, island in fold.islands.items():
+        size = len(island.graph.submaps)
+        if size < PATIENCE * looked.get(key, 0) or not suspicious(island, final_cost(island)):
+            continue
+        looked[key] = size
+        islands[key] = searched([island]).best.island
+    return replace(fold, islands=islands, looked=looked)

@@ -318,8 +318,9 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     (robot, epoch, sequence). digest: 8-byte name of the set (and of the rule and its settings).
     frame: "robot/epoch" whose start fixes it. provisional: some members lie ahead of the watermark.
     covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 where the rule has none.
-    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined. biases: by
-    robot, epoch and name, where submaps have sensitivities.
+    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined, and what
+    speaks for another minimum of the final map. biases: by robot, epoch and name, where submaps
+    have sensitivities. joined: how robots with an unknown start were joined, and how sure that is.
     """
 
     rule: Text
@@ -338,6 +339,7 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     dof: int
     reasons: tuple[Text, ...] = ()
     biases: tuple[BiasEstimate, ...] = ()
+    joined: tuple[Text, ...] = ()
 
     def check(self) -> None:  # noqa: D102
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)

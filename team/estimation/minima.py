@@ -1,0 +1,183 @@
+"""The search for wrong minima: the same island solved from several starts, the lowest cost kept.
+
+Headings make joining a problem with many minima: after a long way without a landmark Gauss-Newton
+may fold a chain wrongly and stay there. A cost far above its degrees of freedom betrays that; so
+does another start that ends lower. What ends about as low elsewhere is a second map that the same
+submaps allow.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import chdtri
+
+from team.estimation.gauss_newton import Island, NotDeterminedError, aged, settled
+from team.estimation.geometry import wrapped
+from team.estimation.relaxation import relaxed
+
+Values = Float[np.ndarray, " _"]
+
+LIKELY = 0.999
+"""Quantile of χ² that a cost must exceed to be suspicious, and a second minimum to be unlikely."""
+SUSPICIOUS = 1.3
+"""… and by this factor its degrees of freedom: submaps are Gaussian only nearly."""
+SETTLED_M = 1e-3
+"""A solution whose last step was longer [m, rad] is no minimum yet."""
+FULL_AGE = 1_000_000
+"""Iterations after which every robust scale has come to its end."""
+WIDE = 30.0
+"""Cauchy's scale at which the annealed start begins."""
+
+
+class Minimum(NamedTuple):
+    """A full solution, the iterations that it took, its last change [m, rad] and its cost."""
+
+    island: Island
+    iterations: int
+    change: float
+    cost: float
+
+
+class Search(NamedTuple):
+    """The lowest minimum; by how much it lies below the first start's, and below a second place.
+
+    second: None where no second minimum was found.
+    """
+
+    best: Minimum
+    gained: float
+    second: Minimum | None
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether a second minimum is about as likely as the best one."""
+        return self.second is not None and self.second.cost - self.best.cost < likely_rise()
+
+
+def final_cost(island: Island) -> float:
+    """The cost with every robust scale at its end, so that islands can be compared."""
+    return aged(island, FULL_AGE).cost
+
+
+def minimum(island: Island) -> Minimum:
+    """The full solution from the island's state."""
+    solved, iterations, change = settled(island)
+    return Minimum(solved, iterations, change, final_cost(solved))
+
+
+def degrees_of_freedom(island: Island) -> int:
+    """What is measured less what is unknown."""
+    graph = island.graph
+    priors = sum(len(prior.mean) for prior in graph.priors)
+    measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
+    return measured - graph.unknowns
+
+
+def suspicious(island: Island, cost: float) -> bool:
+    """Whether the cost is far above what its degrees of freedom allow."""
+    dof = degrees_of_freedom(island)
+    return dof > 0 and cost > max(SUSPICIOUS * dof, _quantile(dof))
+
+
+@lru_cache(maxsize=4096)
+def _quantile(dof: int) -> float:
+    return float(chdtri(dof, 1.0 - LIKELY))
+
+
+def likely_rise() -> float:
+    """A place in the plane whose cost is higher by more than this is unlikely: χ² of 3."""
+    return _quantile(3)
+
+
+def searched(starts: Sequence[Island]) -> Search:
+    """The lowest minimum from some starts of one graph, and from the relaxation of its headings.
+
+    The first start is the one that would be taken without a search. While the lowest cost is
+    suspicious, starts that leave the sightings out or doubt every factor are tried as well.
+    """
+    first = minimum(starts[0])
+    found = [first, *(minimum(start) for start in starts[1:])]
+    for start in _further(starts[0]):
+        found.append(minimum(start))
+        if not suspicious(starts[0], min(each.cost for each in found)):
+            break
+    best = min(found, key=lambda each: each.cost)
+    others = [each for each in found if each.change < SETTLED_M and _elsewhere(each, best)]
+    second = min(others, key=lambda each: each.cost, default=None)
+    return Search(best, first.cost - best.cost, second)
+
+
+def _further(island: Island) -> Iterator[Island]:
+    """Starts that owe nothing to the island's state, the most promising first."""
+    graph = island.graph
+    guess = relaxed(graph, island.state)
+    if guess is not None:
+        yield replace(island, state=guess)
+    if graph.sightings:
+        unseen = replace(
+            island, graph=replace(graph, sightings=()), sighting_age=island.sighting_age[:0]
+        )
+        alone = relaxed(unseen.graph, island.state)
+        if alone is not None:
+            with suppress(NotDeterminedError):  # where only sightings tie the robots
+                yield replace(island, state=minimum(replace(unseen, state=alone)).island.state)
+    if guess is not None and island.settings.robust_c is None:
+        doubting = replace(island.settings, robust_c=1.0, robust_start=WIDE)
+        doubted = minimum(replace(island, state=guess, settings=doubting)).island
+        yield replace(island, state=doubted.state)
+
+
+def _elsewhere(one: Minimum, best: Minimum) -> bool:
+    """Whether a minimum is another map, not one that the best one's covariance allows for.
+
+    With the difference d of the states and the information A at the best one, A alone would raise
+    the cost by dᵀAd on the way from one to the other.
+    """
+    difference = _difference(one.island, best.island)
+    return _quadratic(best.island, difference) > likely_rise()
+
+
+def _difference(one: Island, other: Island) -> Values:
+    difference: Values = one.state - other.state
+    headings = one.graph.headings
+    difference[headings] = [wrapped(float(turn)) for turn in difference[headings]]
+    return difference
+
+
+def _quadratic(island: Island, x: Values) -> float:
+    """xᵀAx with the information A of the island at its state."""
+    values, _ = island.normal_equations
+    pattern, offset = island.graph.pattern, island.graph.offset
+    total = 0.0
+    columns = pattern.columns.tolist()
+    for entry, (row, column) in enumerate(zip(pattern.rows.tolist(), columns, strict=True)):
+        here, there = x[offset[row] : offset[row + 1]], x[offset[column] : offset[column + 1]]
+        begin, end = pattern.value_start[entry], pattern.value_start[entry + 1]
+        block = values[begin:end].reshape(len(here), len(there))
+        total += (1.0 if row == column else 2.0) * float(here @ block @ there)
+    return total
+
+
+def doubts(search: Search) -> list[str]:
+    """What a map's user must know of its minimum, in words; empty where it is the only one."""
+    island, found = search.best.island, []
+    dof = degrees_of_freedom(island)
+    if suspicious(island, search.best.cost):
+        found.append(
+            f"the map does not fit its submaps: chi² {search.best.cost:.1f} with {dof} degrees of "
+            "freedom; it may be a wrong minimum, or the covariances are too small"
+        )
+    if search.second is not None and search.ambiguous:
+        away = _difference(search.second.island, island)
+        points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]
+        farthest = float(np.hypot(away[points], away[points + 1]).max())
+        found.append(
+            f"another map fits about as well: chi² {search.second.cost - search.best.cost:.1f} "
+            f"more, up to {farthest:.1f} m away"
+        )
+    return found
