@@ -41,6 +41,7 @@ class JoinRule:
         self.finding = NOTHING
         self.landmarks = 0
         self.warnings: list[str] = []
+        self.reasons: tuple[str, ...] = ()
         self.refused = 0
 
     def take_start(self, start: m.Start) -> None:
@@ -171,6 +172,7 @@ class JoinRule:
         self.landmarks = len(ids)
         biases = marginals.bias_estimates(fold)
         self.finding = self.finding.with_biases(biases)
+        self.reasons = (*(fold.reasons[k] for k in sorted(fold.reasons)), *fold.doubts)
         frame = fold.frame
         last_ns = fold.contributions[-1].end_ns if fold.contributions else 0
         return m.FusedMap(
@@ -189,7 +191,7 @@ class JoinRule:
             covariance,
             chi2,
             round(dof),
-            (*(fold.reasons[k] for k in sorted(fold.reasons)), *fold.doubts),
+            self.reasons,
             tuple(m.BiasEstimate(*b.stream, b.bias, b.value, b.sigma) for b in biases),
             tuple(fold.joined[k] for k in sorted(fold.joined)),
         )

@@ -35,8 +35,8 @@ class SubmapRule:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """The monitor's, in words."""
-        return self.joined.finding.warnings
+        """The monitor's, and why robots are not joined or the map is to be doubted, in words."""
+        return (*self.joined.finding.warnings, *self.joined.reasons)
 
     @property
     def warnings(self) -> list[str]:

@@ -59,6 +59,7 @@ class MapResult:
     errors: MapErrors | None
     cost_per_dof: float | None
     reasons: tuple[str, ...]
+    joined: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "final_map_sha256": None if fused is None else fused.payload_sha256,
         "final_map_frame": None if fused is None else fused.frame,
         "not_joined": [] if fused is None else list(fused.reasons),
+        "joined": [] if fused is None else list(fused.joined),
         "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},
         "channels": {
             key: {"messages": traffic.messages, "bytes": traffic.bytes}
@@ -261,6 +263,7 @@ def _map_result(
         else None,
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
         reasons=message.reasons,
+        joined=message.joined,
     )
 
 

@@ -47,6 +47,10 @@ class _Lines:
             if without_figures(warning) not in self._said:
                 self._said.add(without_figures(warning))
                 self._print(watch, f"warning: {warning}")
+        for words in () if watch.fused is None else watch.fused.joined:
+            if words not in self._said:
+                self._said.add(words)
+                self._print(watch, words)
         now = time.monotonic()
         if now < self._due or "world" not in watch.statuses:
             return
@@ -105,6 +109,7 @@ def _view(title: str, watch: Watch) -> Group:
     if robots:
         parts.append(_robots(robots, watch.errors))
     parts += [Text(line) for line in _map_lines(watch)]
+    parts += [Text(words) for words in (() if watch.fused is None else watch.fused.joined)]
     parts += [Text(w, style="yellow") for w in _warnings(watch)[-4:]]
     return Group(*parts)
 

@@ -71,6 +71,8 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("shape NEES/landmark", nees))
         rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
     rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
+    rows += [("joined", words) for words in fused.joined]
+    rows += [("note", words) for words in fused.reasons]
     rows.append(("final map, its set", f"{fused.digest}, frame {fused.frame or '–'}"))
     if evaluation.unsound:
         rows.append(("unsound messages", str(evaluation.unsound)))

@@ -122,9 +122,7 @@ def _page(run: Run, pictures: Mapping[str, Path]) -> str:
 
 
 def _notes(run: Run) -> str:
-    evaluation = run.evaluation
-    reasons = () if evaluation.map is None else evaluation.map.reasons
-    return "\n".join(f"<p>{escape(note)}</p>" for note in (*evaluation.notes, *reasons))
+    return "\n".join(f"<p>{escape(note)}</p>" for note in run.evaluation.notes)
 
 
 def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:

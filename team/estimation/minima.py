@@ -30,6 +30,8 @@ SETTLED_M = 1e-3
 """A solution whose last step was longer [m, rad] is no minimum yet."""
 FULL_AGE = 1_000_000
 """Iterations after which every robust scale has come to its end."""
+FEW_LANDMARKS = 6
+"""With so few a chain may fold wrongly at a cost that is not suspicious."""
 WIDE = 30.0
 """Cauchy's scale at which the annealed start begins."""
 
@@ -98,13 +100,15 @@ def searched(starts: Sequence[Island]) -> Search:
     """The lowest minimum from some starts of one graph, and from the relaxation of its headings.
 
     The first start is the one that would be taken without a search. While the lowest cost is
-    suspicious, starts that leave the sightings out or doubt every factor are tried as well.
+    suspicious, and always with few landmarks, starts that leave the sightings out or doubt every
+    factor are tried as well.
     """
+    few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
     first = minimum(starts[0])
     found = [first, *(minimum(start) for start in starts[1:])]
     for start in _further(starts[0]):
         found.append(minimum(start))
-        if not suspicious(starts[0], min(each.cost for each in found)):
+        if not few and not suspicious(starts[0], min(each.cost for each in found)):
             break
     best = min(found, key=lambda each: each.cost)
     others = [each for each in found if each.change < SETTLED_M and _elsewhere(each, best)]

@@ -92,7 +92,9 @@ def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
         spreads = variances[: 3 * count].reshape(-1, 3)
         points = np.concatenate([poses[:, :2], local.landmarks])
         spread = np.concatenate([spreads[:, :2], variances[3 * count :].reshape(-1, 2)])
-        yield _points(start, at[nodes[1 : len(points) + 1]], points, 1.0 / np.sqrt(spread.mean(axis=1)))
+        yield _points(
+            start, at[nodes[1 : len(points) + 1]], points, 1.0 / np.sqrt(spread.mean(axis=1))
+        )
         yield _turns(start, at[nodes[1 : count + 1]], poses[:, 2], 1.0 / np.sqrt(spreads[:, 2]))
     for sighting, observer, teammate in graph.sightings:
         distance, bearing = sighting.reading.tolist()
