@@ -70,7 +70,7 @@ class RobotResult:
     was there, given the team's map (`online_channel`: "team/pose"), or from its own readings alone
     where it never had that. aligned_rmse_m: of the smoothed positions after the rigid motion that
     aligns the map (`alignment`: "map"), or else their own ("trajectory"); online_aligned_rmse_m: of
-    the online ones after the map's.
+    the online ones after the map's. own_map: of the robot's last own map, as it lies.
     """
 
     consumption: Consumption
@@ -85,6 +85,7 @@ class RobotResult:
     aligned_rmse_m: float | None
     alignment: str | None
     online_aligned_rmse_m: float | None
+    own_map: MapErrors | None = None
 
     @property
     def uplink_bytes_per_step(self) -> float | None:
@@ -125,7 +126,11 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     uplink = None if scenario is None else UPLINK[PAIRS[scenario.estimator, scenario.fusion]]
     robots = {
         robot: _robot_result(
-            robot_log(log, robot), consumption(log, robot), _bytes(log, uplink, robot), fused
+            robot_log(log, robot),
+            consumption(log, robot),
+            _bytes(log, uplink, robot),
+            fused,
+            _own_map(log, robot, ids, positions),
         )
         for robot in log.robots
     }
@@ -192,6 +197,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
 
 def _robot_json(robot: RobotResult) -> dict[str, Any]:
     used, smoothed, online = robot.consumption, robot.smoothed, robot.online
+    own = robot.own_map
     return {
         "steps": used.steps,
         "readings_published": used.published,
@@ -212,6 +218,11 @@ def _robot_json(robot: RobotResult) -> dict[str, Any]:
         "online_pose_coverage_95": None if online is None else online.coverage,
         "online_position_rmse_aligned_m": robot.online_aligned_rmse_m,
         "online_channel": robot.online_channel,
+        "own_map_landmarks": None if own is None else own.count,
+        "own_map_rmse_m": None if own is None else own.rmse_m,
+        "own_map_rmse_aligned_m": None if own is None else own.aligned_rmse_m,
+        "own_map_nees_per_dof": None if own is None else own.nees_per_dof,
+        "own_map_nees_in_band": None if own is None else own.in_band,
         "uplink_bytes": robot.uplink_bytes,
         "uplink_bytes_per_step": robot.uplink_bytes_per_step,
     }
@@ -243,10 +254,7 @@ def _map_result(
         return None
     ids, means = translate.landmarks_of(message)
     covariance = translate.landmark_covariance_of(message)
-    truth = np.zeros((len(ids), 2))
-    known = np.isin(ids, true_ids)
-    truth[known] = positions[np.searchsorted(true_ids, ids[known])]
-    rows = np.flatnonzero(np.repeat(known, 2))
+    truth, known = _truth_of(ids, true_ids, positions)
     return MapResult(
         rule=message.rule,
         digest=message.digest.hex(),
@@ -258,17 +266,59 @@ def _map_result(
         joint=message.joint,
         truth=truth,
         known=known,
-        errors=map_errors(means[known], covariance[np.ix_(rows, rows)], truth[known])
-        if known.any()
-        else None,
+        errors=_errors(means, covariance, truth, known),
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
         reasons=message.reasons,
         joined=message.joined,
     )
 
 
+def _own_map(
+    log: Collected,
+    robot: str,
+    true_ids: UInt32[np.ndarray, " T"],
+    positions: Float[np.ndarray, "T 2"],
+) -> MapErrors | None:
+    """The errors of the robot's last own map."""
+    message = log.sound(log.latest.get(ch.OWN_MAP.key(robot)))
+    if not isinstance(message, m.MapEstimate):
+        return None
+    ids, means = translate.landmarks_of(message)
+    truth, known = _truth_of(ids, true_ids, positions)
+    return _errors(means, translate.landmark_covariance_of(message), truth, known)
+
+
+def _truth_of(
+    ids: UInt32[np.ndarray, " L"],
+    true_ids: UInt32[np.ndarray, " T"],
+    positions: Float[np.ndarray, "T 2"],
+) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
+    """The true positions of these landmarks, zero where there is none; where there is one."""
+    truth = np.zeros((len(ids), 2))
+    known = np.isin(ids, true_ids)
+    truth[known] = positions[np.searchsorted(true_ids, ids[known])]
+    return truth, known
+
+
+def _errors(
+    means: Float[np.ndarray, "L 2"],
+    covariance: Matrix,
+    truth: Float[np.ndarray, "L 2"],
+    known: Bool[np.ndarray, " L"],
+) -> MapErrors | None:
+    """The errors of the landmarks with truth, if there are any."""
+    rows = np.flatnonzero(np.repeat(known, 2))
+    if not known.any():
+        return None
+    return map_errors(means[known], covariance[np.ix_(rows, rows)], truth[known])
+
+
 def _robot_result(
-    log: RobotLog, used: Consumption, uplink_bytes: int | None, fused: MapResult | None
+    log: RobotLog,
+    used: Consumption,
+    uplink_bytes: int | None,
+    fused: MapResult | None,
+    own_map: MapErrors | None,
 ) -> RobotResult:
     smoothed = pose_errors(log.smoothed, log.smoothed_covariances, log.truth)
     ends_known = smoothed is not None and smoothed.stamps_ns[-1] == log.smoothed.stamps_ns[-1]
@@ -287,6 +337,7 @@ def _robot_result(
         aligned,
         alignment,
         None if map_motion is None else _moved_rmse(map_motion, log.online, log.truth),
+        own_map,
     )
 
 

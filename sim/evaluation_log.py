@@ -17,10 +17,10 @@ from team.wire.channels import Channel, channel_of
 from team.wire.codec import WireError
 
 _SENSORS = frozenset(channel.name for channel in ch.SENSORS)
-_LATEST = frozenset(
-    channel.name
-    for channel in (ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END, ch.STATUS)
-)
+_NEWEST = (
+    ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END, ch.STATUS, ch.OWN_MAP,
+)  # fmt: skip
+_LATEST = frozenset(channel.name for channel in _NEWEST)
 _KEPT = frozenset(
     channel.name
     for channel in (ch.TRUTH, ch.TRAJECTORY, ch.OWN_POSE, ch.TEAM_POSE, ch.SUBMAP, ch.ROBOT_DONE)

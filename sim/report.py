@@ -24,6 +24,13 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
         robots.add_column(Text(heading), justify="left" if heading == "robot" else "right")
     for name, robot in evaluation.robots.items():
         robots.add_row(*(Text(cell) for cell in robot_row(name, robot)))
+    if unfused(evaluation):
+        own = Table(caption=OWN_NOTE)
+        for heading in OWN_HEADINGS:
+            own.add_column(Text(heading), justify="left" if heading == "robot" else "right")
+        for row in own_rows(evaluation):
+            own.add_row(*(Text(cell) for cell in row))
+        return [team, robots, own]
     if all(robot.smoothed is None for robot in evaluation.robots.values()):
         return [team, robots]
     paths = Table(caption=PATH_NOTE)
@@ -48,6 +55,8 @@ def team_rows(evaluation: Evaluation) -> Rows:
     if fused is None:
         return [("final map", "none: the run did not come to its end")]
     errors = fused.errors
+    if not len(fused.ids) and fused.reasons:
+        return [("final map", f"empty: {'; '.join(fused.reasons)}")]
     rows = [("landmarks", str(len(fused.ids)))]
     if errors is None:
         rows.append(("landmark errors", "can not be computed: no true landmarks"))
@@ -140,6 +149,41 @@ def path_row(name: str, robot: RobotResult) -> tuple[str, ...]:
             shown(None if errors is None else errors.coverage, ".0%", ""),
         ]
     return tuple(cells)
+
+
+OWN_HEADINGS = (
+    "robot", "land-\nmarks", "RMSE\n[m]", "moved\n[m]", "NEES\n/dof", "95 % of it", "in\n95 %",
+)  # fmt: skip
+OWN_NOTE = "each robot's own last map; moved: to align it"
+
+
+def unfused(evaluation: Evaluation) -> bool:
+    """Whether only the robots have maps, and each its own."""
+    empty = evaluation.map is not None and not len(evaluation.map.ids)
+    return empty and any(robot.own_map is not None for robot in evaluation.robots.values())
+
+
+def own_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """Errors, NEES with its band, and coverage of every robot's own map."""
+    rows = []
+    for name, robot in evaluation.robots.items():
+        own = robot.own_map
+        if own is None:
+            rows.append((name, *["–"] * (len(OWN_HEADINGS) - 1)))
+            continue
+        low, high = own.band
+        rows.append(
+            (
+                name,
+                str(own.count),
+                f"{own.rmse_m:.3f}",
+                shown(own.aligned_rmse_m, ".3f", ""),
+                f"{own.nees_per_dof:.4g}",
+                f"{low:.2f}…{high:.2f}",
+                f"{own.coverage:.0%}",
+            )
+        )
+    return rows
 
 
 def shown(value: float | None, form: str, unit: str) -> str:

@@ -19,15 +19,19 @@ from sim.pictures_time import (
     traffic_picture,
 )
 from sim.report import (
+    OWN_HEADINGS,
+    OWN_NOTE,
     PATH_HEADINGS,
     PATH_NOTE,
     ROBOT_HEADINGS,
+    own_rows,
     path_row,
     robot_note,
     robot_row,
     shown,
     team_rows,
     title_of,
+    unfused,
 )
 from sim.report_run import Run
 from sim.trajectory_files import write_trajectories
@@ -99,7 +103,7 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
 def _page(run: Run, pictures: Mapping[str, Path]) -> str:
     title = escape(title_of(run.evaluation))
     sections = [
-        ("Map", [_image(pictures, "map", wide=False)]),
+        ("Map", [_image(pictures, "map", wide=False), *_own_maps(run)]),
         ("Robots", _robots(run, pictures)),
         ("Honesty", _honesty(run, pictures)),
         ("Paths", _paths(run)),
@@ -123,6 +127,13 @@ def _page(run: Run, pictures: Mapping[str, Path]) -> str:
 
 def _notes(run: Run) -> str:
     return "\n".join(f"<p>{escape(note)}</p>" for note in run.evaluation.notes)
+
+
+def _own_maps(run: Run) -> list[str]:
+    """Where there is no fused map: each robot's own."""
+    if not unfused(run.evaluation):
+        return []
+    return [_table(OWN_HEADINGS, own_rows(run.evaluation)), _note(OWN_NOTE)]
 
 
 def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:

@@ -16,6 +16,7 @@ from sim.rerun import Verification, verify
 from sim.rerun_change import changed_run
 from sim.rerun_log import RerunError
 from sim.scenario_checks import ScenarioError
+from team.pairs import LOCALISERS, PAIRS
 from team.recording.reader import Log
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -78,15 +79,38 @@ def test_every_recomputable_message_of_a_run_comes_out_again(log: Log) -> None:
 
 
 @pytest.mark.parametrize(
-    ("estimator", "fusion"), [("hybrid", "kalman"), ("hybrid-thesis", "kalman-per-axis")]
+    ("estimator", "fusion"), sorted(pair for pair in PAIRS if pair != ("hybrid", "join"))
 )
-def test_a_rule_with_feedback_comes_out_again_round_by_round(
+def test_what_every_other_pair_says_comes_out_again(
     estimator: str, fusion: str, tmp_path: Path
 ) -> None:
     samples = team_samples(thesis(30, estimator=estimator, fusion=fusion))
     result = verify(written(tmp_path / "log.mcap", samples))
     assert all_equal(result)
-    assert counts(result)["fused_map"][0] >= 3
+    assert counts(result)["own_pose"][0] >= 30
+    if fusion != "alone":
+        assert counts(result)["fused_map"][0] >= 2
+    if estimator not in LOCALISERS:
+        assert counts(result)["own_map"][0] >= 4
+
+
+@pytest.mark.parametrize("fusion", ["latest", "alone"])
+def test_a_tampered_own_map_is_found_and_so_is_what_was_made_of_it(
+    fusion: str, tmp_path: Path
+) -> None:
+    samples = team_samples(thesis(30, estimator="ekf-slam", fusion=fusion))
+    victim = messages(samples, ch.OWN_MAP, "r2")[-1]
+
+    def change(message: m.Message) -> m.Message:
+        if message != victim:
+            return message
+        means = floats(message.means, "means").copy()
+        means[0] += 0.25
+        return msgspec.structs.replace(message, means=from_floats(means))
+
+    result = verify(written(tmp_path / "log.mcap", changed(samples, ch.OWN_MAP, change)))
+    found = {c.channel: c.different for c in result.channels if c.different}
+    assert found == {"own_map": 1, "final_map": 1}
 
 
 def test_a_flipped_bit_of_one_odometry_reading_is_traced_to_its_submap(
