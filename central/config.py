@@ -22,14 +22,15 @@ class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The rule and its figures.
 
-    fusion: `join` keeps a set of submaps and joins them by least squares; the other three fuse
-    whole maps that the robots absorb again (feedback: their covariance counts readings more than
-    once, save `covariance-intersection`).
+    fusion: `join` keeps a set of submaps and joins them by least squares; `team.pairs` says what
+    the others consume. Under rules with feedback the robots absorb the map again: their covariance
+    counts readings more than once, save that of `covariance-intersection`.
     tick_s: the fold takes the submaps of this much team time at once.
     broadcast_s: at least this much team time lies between two broadcasts of the fused map.
     robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap; absent: plain squares.
     covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors
     are independent from reading to reading.
+    particles: of `joint-fastslam`.
     bias_sigma: of the errors that robots send their submaps' sensitivities for.
     """
 
@@ -40,3 +41,4 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     covariance_factor: Annotated[float, Meta(ge=1.0)] = 1.0
     gauss_newton_per_tick: Annotated[int, Meta(ge=1, le=50)] = 2
     bias_sigma: BiasSigmas = BiasSigmas()
+    particles: Annotated[int, Meta(ge=4, le=100_000)] = 1000

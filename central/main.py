@@ -11,10 +11,14 @@ from team.shell import WAIT_S, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids
-from team.wire.bus import Bus, Sample, opened
+from team.wire.bus import Bus, BusError, Sample, opened
+from team.wire.codec import decoded
 
 PATIENCE_S = 3.0
 """A robot whose token went has this long to come back before the team goes on without it."""
+GAP_PATIENCE_S = 0.5
+"""A reading that is missing for so long is asked for at its source."""
+ASK_TIMEOUT_S = 10.0
 FAREWELL_S = 10.0
 """The centre leaves after the others, at most this long after its final map."""
 _LOG = logging.getLogger("teamslam")
@@ -38,6 +42,7 @@ class CentralShell:
         self._lost: dict[str, tuple[float, Sample]] = {}
         self._alive: set[str] = set()
         self._stop = stop
+        self._gap_since: float | None = None
 
     def run(self) -> None:
         """Until the final map is out and the others have gone."""
@@ -49,6 +54,7 @@ class CentralShell:
         while self._shell.going:
             self._shell.take(self._patient(self._bus.receive(WAIT_S)))
             self._shell.take(self._given_up())
+            self._mend()
             self._shell.report()
         self._shell.report(last=True)
         final = self.node.final
@@ -81,6 +87,29 @@ class CentralShell:
         now = time.monotonic()
         gone = [n for n, (since, _) in self._lost.items() if now - since >= self._patience_s]
         return [self._lost.pop(node)[1] for node in gone]
+
+    def _mend(self) -> None:
+        """Ask for readings that have been missing for GAP_PATIENCE_S (rules on raw readings)."""
+        wanted, now = self.node.wanted(), time.monotonic()
+        if not wanted:
+            self._gap_since = None
+        elif self._gap_since is None:
+            self._gap_since = now
+        elif now - self._gap_since > GAP_PATIENCE_S:
+            self._gap_since = now
+            for each in wanted:
+                self._ask(each)
+
+    def _ask(self, wanted: m.ReadingsWanted) -> None:
+        named = f"readings {wanted.first} to {wanted.last} of {wanted.robot}"
+        _LOG.warning("%s are missing: asked for", named)
+        try:
+            replies = self._bus.ask(ch.READINGS, wanted.robot, wanted, ASK_TIMEOUT_S)
+        except BusError as error:
+            _LOG.warning("%s", error)
+            return
+        for reply in replies:
+            self._shell.publish(self.node.handle(decoded(reply), 0))
 
     def _leave_last(self) -> None:
         """Robots and world leave at the final map; whoever missed it may still ask for it."""

@@ -5,6 +5,7 @@ from typing import Protocol, runtime_checkable
 
 from central.config import CentralConfig
 from central.map_rules import AloneRule, ExchangeRule, LatestRule
+from central.reading_rules import JointFastSlamRule
 from central.roll import Roll
 from central.submap_rules import submap_rule
 from team.pairs import FEEDBACK
@@ -62,6 +63,8 @@ def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> Rule
         return ExchangeRule(config, digest)
     if config.fusion == "latest":
         return LatestRule(config, digest)
+    if config.fusion == "joint-fastslam":
+        return JointFastSlamRule(config, digest, robots)
     if config.fusion == "alone":
         return AloneRule(config, digest, robots)
     return submap_rule(config, digest)

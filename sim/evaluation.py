@@ -34,7 +34,11 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
 
-UPLINK = {"submap": (ch.SUBMAP, ch.SIGHTING_FACTOR), "own/map": (ch.OWN_MAP,)}
+UPLINK = {
+    "submap": (ch.SUBMAP, ch.SIGHTING_FACTOR),
+    "own/map": (ch.OWN_MAP,),
+    "readings": ch.SENSORS,
+}
 """The channels of each name in `PAIRS`."""
 
 

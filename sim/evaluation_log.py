@@ -23,7 +23,15 @@ _NEWEST = (
 _LATEST = frozenset(channel.name for channel in _NEWEST)
 _KEPT = frozenset(
     channel.name
-    for channel in (ch.TRUTH, ch.TRAJECTORY, ch.OWN_POSE, ch.TEAM_POSE, ch.SUBMAP, ch.ROBOT_DONE)
+    for channel in (
+        ch.TRUTH,
+        ch.TRAJECTORY,
+        ch.OWN_POSE,
+        ch.TEAM_POSE,
+        ch.CENTRAL_POSE,
+        ch.SUBMAP,
+        ch.ROBOT_DONE,
+    )
 )
 _OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE))
 

@@ -19,7 +19,7 @@ from team.wire.arrays import floats
 class RobotLog:
     """A robot's paths with their covariances, and the truth; each may be empty.
 
-    online_channel: "team/pose", or "own/pose" where there is none, or None.
+    online_channel: "team/pose", else "central/pose", else "own/pose", or None.
     """
 
     truth: Path
@@ -56,7 +56,8 @@ def robot_log(log: Collected, robot: str) -> RobotLog:
         [floats(t.covariances, "covariances") for t in trajectories],
     )
     online_channel = next(
-        (c for c in (ch.TEAM_POSE, ch.OWN_POSE) if log.kept.get(c.key(robot))), None
+        (c for c in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE) if log.kept.get(c.key(robot))),
+        None,
     )
     poses = [] if online_channel is None else log.messages(online_channel, robot)
     estimates = [p for p in poses if isinstance(p, m.PoseEstimate)]
@@ -105,7 +106,7 @@ def _disjoint(submaps: Sequence[m.Submap]) -> bool:
 
 
 def _short(channel: ch.Channel) -> str:
-    return channel.template.rpartition("{robot}/")[2]
+    return channel.template.removeprefix("robot/{robot}/").removesuffix("/{robot}")
 
 
 def _stacked(

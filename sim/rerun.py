@@ -29,6 +29,7 @@ PLATFORM = (
 CHECKED = (
     ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE, ch.ROBOT_DONE,
     ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
+    ch.CENTRAL_POSE,
 )  # fmt: skip
 """Causes before what follows from them."""
 

@@ -8,6 +8,8 @@ from central.config import CentralConfig
 from central.feedback_rule import FeedbackRule
 from central.join_rule import JoinRule, Tail
 from central.map_rules import AloneRule, LatestRule
+from central.reading_rules import JointFastSlamRule
+from central.roll import Roll
 from sim.rerun_log import Identity, Recorded, Stream, identity
 from team.config import FusionRule
 from team.pairs import FEEDBACK
@@ -117,6 +119,26 @@ def _alone(
         yield from rule.retold(_named(own, fused), fused.stamp_ns)
 
 
+def _heard(
+    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """Everything again from the raw readings and what the robots announced."""
+    nodes = sorted(node for node in log.configured if node.startswith("robot/"))
+    robots = [node.removeprefix("robot/") for node in nodes]
+    rule, roll = JointFastSlamRule(config, digest, robots), Roll.of(robots)
+    ends = [m.StreamEnd(*stream, count) for stream, count in log.published.items()]
+    streams = (log.readings[stream] for stream in sorted(log.readings))
+    for message in (
+        *(log.configured[node] for node in nodes),
+        *(stream[counter] for stream in streams for counter in sorted(stream)),
+        *([m.End(0, tuple(ends))] if ends else []),
+    ):
+        rule.take(message, 0)
+    yield from rule.advance(roll)
+    if ends:
+        yield from rule.conclude(0)
+
+
 Named = tuple[str, int, int]
 """(robot, epoch, sequence)."""
 
@@ -138,4 +160,9 @@ def _with_reasons(out: Outgoing, fused: m.FusedMap) -> Outgoing:
 
 
 Retell = Callable[[Recorded, CentralConfig, bytes, list[m.FusedMap]], Iterator[Outgoing]]
-_RETOLD: Mapping[FusionRule, Retell] = {"join": _joined, "latest": _latest, "alone": _alone}
+_RETOLD: Mapping[FusionRule, Retell] = {
+    "join": _joined,
+    "latest": _latest,
+    "alone": _alone,
+    "joint-fastslam": _heard,
+}

@@ -32,6 +32,7 @@ FusionRule = Literal[
     "covariance-intersection",
     "latest",
     "alone",
+    "joint-fastslam",
 ]
 
 

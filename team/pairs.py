@@ -6,7 +6,7 @@ from typing import Literal
 
 from team.config import Estimator, FusionRule
 
-Channel = Literal["submap", "own/map"]
+Channel = Literal["submap", "own/map", "readings"]
 
 MAPPERS: tuple[Estimator, ...] = ("hybrid", "hybrid-thesis", "ekf-slam", "fastslam1", "fastslam2")
 LOCALISERS: tuple[Estimator, ...] = ("localisation", "dead-reckoning")
@@ -17,6 +17,7 @@ _CONSUMES: Mapping[FusionRule, tuple[Channel, tuple[Estimator, ...]]] = {
     "kalman-per-axis": ("own/map", ("hybrid", "hybrid-thesis")),
     "latest": ("own/map", MAPPERS),
     "alone": ("own/map", (*MAPPERS, *LOCALISERS)),
+    "joint-fastslam": ("readings", ("hybrid", "dead-reckoning")),
 }
 
 PAIRS: Mapping[tuple[Estimator, FusionRule], Channel] = MappingProxyType(
@@ -27,9 +28,10 @@ PAIRS: Mapping[tuple[Estimator, FusionRule], Channel] = MappingProxyType(
     }
 )
 """(estimator, rule) → what the centre subscribes to. `submap`: independent, each reading once.
-`own/map`: whole maps. A pair that is not here has no meaning: only `hybrid` makes submaps and can
-absorb a joint map, the thesis' estimator can absorb one per axis, and who only localises himself
-has no map to fuse.
+`own/map`: whole maps. `readings`: the sensor channels; what the robots run is then for their own
+poses, so only the default and the cheapest are there. Any other pair has no meaning: only `hybrid`
+makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis, and who
+only localises himself has no map to fuse.
 """
 FEEDBACK: frozenset[FusionRule] = frozenset(
     {"kalman", "kalman-per-axis", "covariance-intersection"}

@@ -93,17 +93,8 @@ class RobotNode:
 
     def wanted(self) -> m.ReadingsWanted | None:
         """The readings that are missing and must be asked for at their source."""
-        gap = self._inbox.gap
-        if gap is not None:
-            return self._wanted(*gap)
-        end = self._end
-        if end is None or self._complete or self._inbox.waiting or end.epoch < self.epoch:
-            return None
-        first = self._inbox.next_reading if end.epoch == self.epoch else 0
-        return self._wanted(end.epoch, first, end.readings - 1)
-
-    def _wanted(self, epoch: int, first: int, last: int) -> m.ReadingsWanted:
-        return m.ReadingsWanted(self._now_ns, self.robot, epoch, first, last)
+        missing = self._inbox.missing(self._end)
+        return None if missing is None else m.ReadingsWanted(self._now_ns, self.robot, *missing)
 
     def begin(self) -> list[Outgoing]:
         """What the node says first: its configuration."""
@@ -207,11 +198,7 @@ class RobotNode:
 
     @property
     def _complete(self) -> bool:
-        end = self._end
-        return end is not None and (
-            end.readings == 0
-            or (self._inbox.epoch == end.epoch and self._inbox.next_reading >= end.readings)
-        )
+        return self._end is not None and self._inbox.complete(self._end)
 
     def _take(self, reading: m.Reading) -> list[Outgoing]:
         out: list[Outgoing] = []

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from team.wire.messages import Reading
+from team.wire.messages import Reading, StreamEnd
 
 
 class Inbox:
@@ -78,6 +78,20 @@ class Inbox:
         following = min(self._later)
         first = min(self._later[following])
         return (following, 0, first - 1) if first else None
+
+    def complete(self, end: StreamEnd) -> bool:
+        """Whether every reading up to the stream's last one has had its turn."""
+        return end.readings == 0 or (self.epoch == end.epoch and self.next_reading >= end.readings)
+
+    def missing(self, end: StreamEnd | None) -> tuple[int, int, int] | None:
+        """Epoch, first and last reading to ask the source for: a gap, or all up to the end."""
+        gap = self.gap
+        if gap is not None:
+            return gap
+        if end is None or self.complete(end) or self.waiting or end.epoch < self.epoch:
+            return None
+        first = self.next_reading if end.epoch == self.epoch else 0
+        return end.epoch, first, end.readings - 1
 
     @property
     def waiting(self) -> int:

@@ -97,6 +97,8 @@ FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", 
                     "the team's map with its joint covariance")  # fmt: skip
 TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per life of the stream",
                      "all", True, True, "smoothed end poses of the submaps")  # fmt: skip
+CENTRAL_POSE = Channel("central_pose", "central/pose/{robot}", m.PoseEstimate, "one per keyframe", "latest",
+                       True, True, "running pose by a rule on raw readings")  # fmt: skip
 CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress,
                            "one per submap", "latest", True, False, "credit for the robots")  # fmt: skip
 

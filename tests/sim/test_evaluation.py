@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sim.evaluation import evaluate, to_json
 from sim.evaluation_errors import Path, interpolated, map_errors, moved, pose_errors
+from sim.scenario import Scenario
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.translate import joint_bytes
 from team.wire import channels as ch
@@ -199,6 +200,32 @@ def test_a_log_whose_map_is_off_by_a_known_shift_says_so() -> None:
         # The map's own alignment takes its shift of (0.3, −0.3) off; (0.15, −0.15) is left.
         assert robot.aligned_rmse_m == pytest.approx(0.15 * np.sqrt(2.0))
         assert robot.online_aligned_rmse_m is None
+
+
+def own_map(shift: float, of: Scenario) -> Outgoing:
+    world = streams(of)
+    n = len(world.landmark_ids)
+    estimate = m.MapEstimate(
+        9, "r1", 1, 7, 0, True, from_ids(world.landmark_ids), from_floats(world.landmarks + shift),
+        joint_bytes(0.01 * np.eye(2 * n)),
+    )  # fmt: skip
+    return Outgoing(ch.OWN_MAP, "r1", estimate)
+
+
+def test_a_robots_last_own_map_is_held_against_the_truth() -> None:
+    of = scenario(robots=2)
+    nothing = final_map([], np.empty((0, 2)), np.empty((0, 0)))
+    said = [own_map(5.0, of), own_map(0.3, of), nothing]
+    run = evaluate([*world_log(of), *samples(said)])
+    own = run.robots["r1"].own_map
+    assert own is not None
+    assert own.rmse_m == pytest.approx(0.3 * np.sqrt(2.0))
+    assert own.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert own.nees_per_dof == pytest.approx(0.09 / 0.01)
+    assert run.robots["r2"].own_map is None
+    figures = to_json(run)["robots"]
+    assert figures["r1"]["own_map_rmse_m"] == own.rmse_m
+    assert figures["r2"]["own_map_nees_per_dof"] is None
 
 
 def test_a_reading_that_is_in_the_log_twice_is_counted_once() -> None:
