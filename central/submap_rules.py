@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from central.config import CentralConfig
 from central.join_rule import JoinRule
 from central.roll import Roll
+from central.svd_rule import SvdJoinRule
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -88,7 +89,8 @@ class SubmapRule:
 
 def submap_rule(config: CentralConfig, digest: bytes) -> SubmapRule:
     """The rule on submaps that the configuration names."""
-    return SubmapRule(JoinRule(config, digest))
+    rule = JoinRule if config.fusion == "join" else SvdJoinRule
+    return SubmapRule(rule(config, digest))
 
 
 def _credit(of: m.Submap | m.SightingFactor, count: int, now_ns: int) -> list[Outgoing]:

@@ -10,6 +10,7 @@ from central.join_rule import JoinRule, Tail
 from central.map_rules import AloneRule, LatestRule
 from central.reading_rules import JointFastSlamRule
 from central.roll import Roll
+from central.svd_rule import SvdJoinRule
 from sim.rerun_log import Identity, Recorded, Stream, identity
 from team.config import FusionRule
 from team.pairs import FEEDBACK
@@ -119,6 +120,24 @@ def _alone(
         yield from rule.retold(_named(own, fused), fused.stamp_ns)
 
 
+def _tied(
+    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """Each map from the submaps of its own version vector."""
+    submaps = log.submaps()
+    rule = SvdJoinRule(config, digest)
+    for readings in log.readings.values():
+        start = readings.get(0)
+        if isinstance(start, m.Start):
+            rule.take_start(start)
+    for fused in maps:
+        vector = {(x.robot, x.epoch): x.sequence for x in fused.members}
+        if _complete(vector, submaps):
+            chains = {s: [submaps[s][k] for k in range(n + 1)] for s, n in vector.items()}
+            channel = ch.FINAL_MAP if fused.final else ch.FUSED_MAP
+            yield Outgoing(channel, "", rule.retold_map(chains, final=fused.final))
+
+
 def _heard(
     log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
 ) -> Iterator[Outgoing]:
@@ -164,5 +183,7 @@ _RETOLD: Mapping[FusionRule, Retell] = {
     "join": _joined,
     "latest": _latest,
     "alone": _alone,
+    "svd-join": _tied,
+    "svd-join-spherical": _tied,
     "joint-fastslam": _heard,
 }

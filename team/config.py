@@ -32,6 +32,8 @@ FusionRule = Literal[
     "covariance-intersection",
     "latest",
     "alone",
+    "svd-join",
+    "svd-join-spherical",
     "joint-fastslam",
 ]
 

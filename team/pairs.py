@@ -17,6 +17,8 @@ _CONSUMES: Mapping[FusionRule, tuple[Channel, tuple[Estimator, ...]]] = {
     "kalman-per-axis": ("own/map", ("hybrid", "hybrid-thesis")),
     "latest": ("own/map", MAPPERS),
     "alone": ("own/map", (*MAPPERS, *LOCALISERS)),
+    "svd-join": ("submap", ("hybrid",)),
+    "svd-join-spherical": ("submap", ("hybrid",)),
     "joint-fastslam": ("readings", ("hybrid", "dead-reckoning")),
 }
 

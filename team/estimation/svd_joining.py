@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from team.estimation import joining
 from team.estimation.alignment import procrustes
 from team.estimation.contribution import Contribution, Start
 from team.estimation.gauss_newton import JoinSettings, joint_marginal
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
-from team.estimation.geometry import Pose
+from team.estimation.geometry import Pose, wrapped
 from team.estimation.joining import EMPTY_FOLD, Fold
 from team.estimation.models import located
 from team.estimation.submap import LocalMap
@@ -203,3 +203,69 @@ def _moved(
     G[0::2, 0] = G[1::2, 1] = 1.0
     G[0::2, 2], G[1::2, 2] = -turned[:, 1], turned[:, 0]
     return turned + a_from_b[:2], G
+
+
+ITERATIONS = 10
+"""Gauss-Newton steps of two maps' joint solution, at the most."""
+STANDS_STILL = 1e-9
+"""A step that moves no coordinate by more than this [m, rad] is the last."""
+
+
+def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> Exchange:
+    """Two independent maps as one in the frame of a, each with the covariance that it has.
+
+    argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over the points x and (t, θ), from the
+    turn and shift of `exchanged`; the covariance is (JᵀWJ)⁻¹. So Downs' exchange with what the maps
+    say of their errors: how far each has drifted as a whole is in it, as far as the maps know that.
+    Raises TooFewPointsError for fewer than two common landmarks, NotACovarianceError for a map
+    whose covariance is none.
+    """
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    if len(in_a) < NEEDED:
+        raise TooFewPointsError(len(in_a))
+    ids = np.union1d(a.ids, b.ids)
+    columns_a, columns_b = (3 + _points(np.searchsorted(ids, each.ids)) for each in (a, b))
+    a_from_b = procrustes(a.means[in_a], b.means[in_b], np.ones(len(in_a)))
+    state = np.zeros(3 + 2 * len(ids))
+    state[:3] = a_from_b
+    state[columns_b] = _moved(a_from_b, b.means)[0].ravel()
+    state[columns_a] = a.means.ravel()
+    of_a, of_b = information(a.covariance, "a map"), information(b.covariance, "a map")
+    for _ in range(ITERATIONS):
+        residual, J = _seen_from(state, columns_b)
+        residual -= b.means.ravel()
+        hessian = J.T @ of_b @ J
+        hessian[np.ix_(columns_a, columns_a)] += of_a
+        gradient = J.T @ (of_b @ residual)
+        gradient[columns_a] += of_a @ (state[columns_a] - a.means.ravel())
+        covariance = information(hessian, "two maps' joint solution")
+        step = covariance @ gradient
+        state -= step
+        state[2] = wrapped(state[2])
+        if np.abs(step).max() < STANDS_STILL:
+            break
+    return Exchange(
+        LandmarkGaussian(ids, state[3:].reshape(-1, 2), covariance[3:, 3:]),
+        PoseGaussian(state[:3], covariance[:3, :3]),
+    )
+
+
+def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    """Places of the coordinates of the points with these indices."""
+    return (2 * index[:, None] + np.arange(2)).ravel()
+
+
+def _seen_from(
+    state: Float[np.ndarray, " n"], columns: Int64[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    """Rᵀ(x − t) of the points in these columns, and its derivative by the whole (t, θ, x)."""
+    c, s = np.cos(state[2]), np.sin(state[2])
+    back = np.array([[c, s], [-s, c]])
+    offsets = state[columns].reshape(-1, 2) - state[:2]
+    seen = offsets @ back.T
+    J = np.zeros((len(columns), len(state)))
+    J[0::2, :2], J[1::2, :2] = -back[0], -back[1]
+    J[0::2, 2], J[1::2, 2] = seen[:, 1], -seen[:, 0]
+    for k in range(len(offsets)):
+        J[2 * k : 2 * k + 2, columns[2 * k : 2 * k + 2]] = back
+    return seen.ravel(), J

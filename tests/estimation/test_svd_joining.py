@@ -287,3 +287,62 @@ def test_the_same_submaps_give_the_same_bytes():
     made = team(6)
     once, twice = (svd_joining.landmark_gaussian(joined(made, "identity")) for _ in range(2))
     assert [part.tobytes() for part in once] == [part.tobytes() for part in twice]
+
+
+def full_maps(seed, common=4, sigma=0.05):
+    """The maps of `two_maps` with joint covariances of every kind, and errors drawn from them."""
+    (a, b), a_from_b, points = two_maps(seed, sigma=0.0, common=common)
+    rng = np.random.default_rng([seed, 1])
+    maps = []
+    for each in (a, b):
+        n = 2 * len(each.ids)
+        mixed = sigma * (np.eye(n) + 0.4 * rng.standard_normal((n, n)))
+        error = mixed @ rng.standard_normal(n)
+        means = each.means + error.reshape(-1, 2)
+        maps.append(LandmarkGaussian(each.ids, means, mixed @ mixed.T))
+    return maps, a_from_b, points
+
+
+@quick
+@given(st.integers(0, 10_000))
+def test_the_full_exchange_is_least_squares_in_both_maps_metrics(seed):
+    (a, b), _, _ = full_maps(seed)
+    merged = svd_joining.exchanged_fully(a, b)
+    ids = merged.landmarks.ids
+    of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
+    root_a, root_b = (np.linalg.inv(np.linalg.cholesky(x.covariance)) for x in (a, b))
+
+    def residuals(x):
+        points = x[3:].reshape(-1, 2)
+        c, s = np.cos(x[2]), np.sin(x[2])
+        seen = (points[of_b] - x[:2]) @ np.array([[c, -s], [s, c]])
+        left = (points[of_a] - a.means).ravel(), (seen - b.means).ravel()
+        return np.concatenate((root_a @ left[0], root_b @ left[1]))
+
+    start = np.concatenate((merged.a_from_b.mean, merged.landmarks.means), axis=None)
+    found = least_squares(residuals, start + 0.01, method="lm", xtol=1e-13, ftol=1e-13)
+    np.testing.assert_allclose(found.x, start, atol=1e-5)
+    P = np.linalg.inv(found.jac.T @ found.jac)
+    np.testing.assert_allclose(merged.landmarks.covariance, P[3:, 3:], rtol=1e-2, atol=1e-6)
+    np.testing.assert_allclose(merged.a_from_b.covariance, P[:3, :3], rtol=1e-2, atol=1e-6)
+
+
+def test_a_full_exchange_is_consistent_and_not_if_a_map_is_exchanged_twice():
+    honest, twice, dof = 0.0, 0.0, 0
+    for seed in range(200):
+        (a, b), _, points = full_maps(seed, common=6)
+        once = svd_joining.exchanged_fully(a, b).landmarks
+        again = svd_joining.exchanged_fully(once, b).landmarks
+        error = (once.means - points).ravel()
+        honest += nees(error, once.covariance)
+        twice += nees((again.means - points).ravel(), again.covariance)
+        dof += len(error)
+    low, high = chi2_interval(dof, 0.999, 1)
+    assert low < honest / dof < high
+    assert not low < twice / dof < high
+
+
+def test_a_full_exchange_of_maps_with_one_common_point_is_refused_with_the_number():
+    (a, b), _, _ = full_maps(0, common=1)
+    with pytest.raises(TooFewPointsError, match="1 common point of two maps, 2 needed"):
+        svd_joining.exchanged_fully(a, b)
