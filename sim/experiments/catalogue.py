@@ -6,6 +6,7 @@ from typing import NamedTuple
 class Entry(NamedTuple):
     """An experiment: its name on the command line, its module, a line about it.
 
+    module: one that has `tasks` and `outcome`, or `module:object` of an object that has them.
     seeds: how many there are by default, and with --quick.
     """
 
@@ -23,4 +24,9 @@ ENTRIES = (
         "The team against the batch optimiser: simulated worlds of all sizes, UTIAS sets, goals.",
         seeds=50,
     ),
+    Entry("xu-4.4", "xu_errors:FIGURE_4_4", "Thesis: pose error of EKF, FastSLAM, Hybrid."),
+    Entry("xu-4.5", "xu_errors:FIGURE_4_5", "Thesis: paths under low and high odometry noise."),
+    Entry("xu-4.6", "xu_errors:FIGURE_4_6", "Thesis: error of the first landmark over time."),
+    Entry("xu-5.2", "xu_errors:FIGURE_5_2", "Thesis: pose error, one robot against two."),
+    Entry("xu-5.3", "xu_errors:FIGURE_5_3", "Thesis: first landmark, one robot against two."),
 )

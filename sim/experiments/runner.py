@@ -48,7 +48,9 @@ Progress = Callable[[Sequence[Task], int], AbstractContextManager[Callable[[Done
 
 def planned(entry: Entry, options: Options) -> Plan:
     """The experiment's tasks; raises ScenarioError, DatasetError."""
-    experiment = cast(Experiment, import_module(f"sim.experiments.{entry.module}"))
+    name, _, attribute = entry.module.partition(":")
+    module = import_module(f"sim.experiments.{name}")
+    experiment = cast(Experiment, getattr(module, attribute) if attribute else module)
     return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
 
 

@@ -15,6 +15,7 @@ from sim.in_memory import run_nodes
 from sim.limit import Limit, LimitError, batch_map
 from sim.scenario import Scenario, loads, with_options
 from sim.source import streams_of
+from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from sim.worlds import SimulatedWorld
 from team import translate
@@ -96,8 +97,13 @@ class Times:
         }
 
 
-def timed_run(scenario: Scenario) -> tuple[list[Sample], Times]:
-    """Run the team in memory; its log, and what it cost."""
+def timed_run(
+    scenario: Scenario, streams: WorldStreams | None = None
+) -> tuple[list[Sample], Times]:
+    """Run the team in memory; its log, and what it cost.
+
+    streams: what the world says; None: as the scenario has it.
+    """
     times = Times()
 
     class TimedRobot(RobotNode):
@@ -115,7 +121,8 @@ def timed_run(scenario: Scenario) -> tuple[list[Sample], Times]:
             return out
 
     expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
-    world = WorldNode(streams_of(scenario), expected, translate.configured("world", 0, 0, scenario))
+    readings = streams_of(scenario) if streams is None else streams
+    world = WorldNode(readings, expected, translate.configured("world", 0, 0, scenario))
     return list(run_nodes(scenario, world, None, TimedRobot, TimedCentre)), times
 
 

@@ -1,0 +1,140 @@
+"""A run's errors over team time, as a task: online poses, and one landmark of the map.
+
+The landmark is the first that the first robot saw. Its error and its sigma are those of the newest
+map at each time: the fused one, or the robot's own where nothing is fused.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from sim.evaluation import evaluate
+from sim.evaluation_errors import Path, PoseErrors, pose_errors
+from sim.experiments.task import Task
+from sim.experiments.team_runs import Figures, named, timed_run
+from sim.scenario import Scenario, loads
+from sim.source import streams_of
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+from team.wire.bus import Sample, opened
+
+_COST_S = 2.5e-3
+DIGITS = 5
+"""Significant digits of a kept curve: a picture shows three."""
+
+
+def curves_task(scenario: Scenario, told: Scenario | None = None, label: str = "") -> Task:
+    """The curves of a run. told: the scenario that the team is told, where the world's differs."""
+    steps = getattr(scenario.world, "steps", 500)
+    return Task(
+        "sim.experiments.curves:curves_run",
+        {"world": msgspec.to_builtins(scenario)}
+        | ({} if told is None else {"told": msgspec.to_builtins(told)}),
+        f"{label or scenario.name}, {named(scenario.estimator, scenario.fusion)}, "
+        f"seed {scenario.seed}",
+        _COST_S * steps * len(scenario.robots),
+    )
+
+
+def curves_run(world: Mapping[str, Any], told: Mapping[str, Any] | None = None) -> Figures:
+    """The curves of every robot's pose, and of the first landmark."""
+    scenario = loads(msgspec.json.encode(world).decode())
+    team = scenario if told is None else loads(msgspec.json.encode(told).decode())
+    samples, _ = timed_run(team, streams_of(scenario))
+    evaluation = evaluate(samples)
+    true_landmarks = next(
+        translate.landmarks_of(message)
+        for message in messages(samples, ch.TRUTH_LANDMARKS.key())
+        if isinstance(message, m.TruthLandmarks)
+    )
+    first = scenario.robots[0].id
+    return {
+        "poses": {
+            name: _pose_curve(errors)
+            for name, robot in evaluation.robots.items()
+            if (errors := pose_errors(*online(samples, name), robot.truth)) is not None
+        },
+        "landmark": _landmark_curve(samples, first, dict(zip(*true_landmarks, strict=True))),
+    }
+
+
+def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
+    """The messages of one key, in their order."""
+    return (opened(sample)[2] for sample in samples if sample.key == key)
+
+
+def online(samples: Iterable[Sample], robot: str) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
+    """What a robot said of its pose when it was there: with the team's map once it had one."""
+    keys = (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
+    said: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
+    for sample in samples:
+        if sample.key in said:
+            message = opened(sample)[2]
+            if isinstance(message, m.PoseEstimate):
+                said[sample.key][message.stamp_ns] = message
+    newest = said[keys[0]] | said[keys[1]]
+    estimates = [newest[stamp_ns] for stamp_ns in sorted(newest)]
+    return Path(
+        np.array(sorted(newest), dtype=np.int64),
+        np.array([floats(p.pose, "pose") for p in estimates]).reshape(-1, 3),
+    ), np.array([floats(p.covariance, "covariance") for p in estimates]).reshape(-1, 3, 3)
+
+
+def _pose_curve(found: PoseErrors) -> Figures:
+    """Distance and heading error with their sigmas; √(σx² + σy²) is that of the distance."""
+    errors, sigmas = found.errors, found.sigmas
+    return {
+        "time_s": _short(found.stamps_ns * 1e-9),
+        "error_m": _short(np.hypot(errors[:, 0], errors[:, 1])),
+        "sigma_m": _short(np.hypot(sigmas[:, 0], sigmas[:, 1])),
+        "heading_error_deg": _short(np.degrees(np.abs(errors[:, 2]))),
+        "heading_sigma_deg": _short(np.degrees(sigmas[:, 2])),
+        "nees": _short(found.nees / 3.0),
+    }
+
+
+def _landmark_curve(
+    samples: Sequence[Sample], robot: str, truth: Mapping[int, Float[np.ndarray, "2"]]
+) -> Figures | None:
+    """The error of the first landmark that this robot saw; None if it saw none."""
+    landmark = next(
+        (
+            int(translate.scan_of(message)[0][0])
+            for message in messages(samples, ch.OBSERVATIONS.key(robot))
+            if isinstance(message, m.Observations) and message.ids
+        ),
+        None,
+    )
+    maps = list(messages(samples, ch.FUSED_MAP.key())) or list(
+        messages(samples, ch.OWN_MAP.key(robot))
+    )
+    if landmark is None or not maps:
+        return None
+    times, errors, sigmas = [], [], []
+    for fused in maps:
+        if not isinstance(fused, m.FusedMap | m.MapEstimate):
+            continue
+        ids, means = translate.landmarks_of(fused)
+        place = np.flatnonzero(ids == landmark)
+        if not len(place):
+            continue
+        k = int(place[0])
+        covariance = translate.landmark_covariance_of(fused)[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        times.append(fused.stamp_ns * 1e-9)
+        errors.append(float(np.hypot(*(means[k] - truth[landmark]))))
+        sigmas.append(float(np.sqrt(np.trace(covariance))))
+    return {
+        "id": landmark,
+        "time_s": _short(np.array(times)),
+        "error_m": _short(np.array(errors)),
+        "sigma_m": _short(np.array(sigmas)),
+    }
+
+
+def _short(values: Float[np.ndarray, " K"]) -> list[float]:
+    return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]
