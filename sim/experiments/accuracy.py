@@ -1,10 +1,15 @@
 """How accurate and how honest the team is, in every kind of world: all parts of it, one command."""
 
-from sim.experiments import accuracy_starts, accuracy_utias, accuracy_worlds
+from sim.experiments import accuracy_garbage, accuracy_starts, accuracy_utias, accuracy_worlds
 from sim.experiments.experiment import Experiment, Options, Outcome, Results, combined
 from sim.experiments.task import Task
 
-PARTS: tuple[Experiment, ...] = (accuracy_worlds, accuracy_starts, accuracy_utias)
+PARTS: tuple[Experiment, ...] = (
+    accuracy_worlds,
+    accuracy_starts,
+    accuracy_garbage,
+    accuracy_utias,
+)
 
 
 def tasks(options: Options) -> list[Task]:

@@ -66,7 +66,9 @@ def _pairs(world: str, options: Options) -> list[tuple[Task, Task]]:
     found = []
     for seed in options.seeds:
         scenario = with_options(load(world), seed=seed)
-        found.append((team_task(scenario, batch=True), team_task(_unknown(scenario))))
+        found.append(
+            (team_task(scenario, batch=True), team_task(_unknown(scenario), note="unknown starts"))
+        )
     return found
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from sim.evaluation import evaluate
 from sim.evaluation_errors import Path, PoseErrors, pose_errors
 from sim.experiments.task import Task
-from sim.experiments.team_runs import Figures, named, timed_run
+from sim.experiments.team_runs import Figures, TimedRun, named
 from sim.scenario import Scenario, loads
 from sim.source import streams_of
 from team import translate
@@ -45,7 +45,7 @@ def curves_run(world: Mapping[str, Any], told: Mapping[str, Any] | None = None) 
     """The curves of every robot's pose, and of the first landmark."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if told is None else loads(msgspec.json.encode(told).decode())
-    samples, _ = timed_run(team, streams_of(scenario))
+    samples = list(TimedRun().samples(team, streams_of(scenario)))
     evaluation = evaluate(samples)
     true_landmarks = next(
         translate.landmarks_of(message)

@@ -1,7 +1,7 @@
 """One run of a team in memory, judged against the truth and the batch optimiser, as a task."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from statistics import fmean, median
 from typing import Any, NamedTuple
 
@@ -34,8 +34,13 @@ _COST_S = 2.5e-3
 _UTIAS_COST_S = 40.0
 
 
-def team_task(scenario: Scenario, *, batch: bool = False, dataset: Dataset | None = None) -> Task:
-    """A run of this scenario. batch: with the batch MAP of the same readings beside it."""
+def team_task(
+    scenario: Scenario, *, batch: bool = False, dataset: Dataset | None = None, note: str = ""
+) -> Task:
+    """A run of this scenario. batch: with the batch MAP of the same readings beside it.
+
+    note: what the scenario's name does not say.
+    """
     world = scenario.world
     cost = (
         _COST_S * world.steps * len(scenario.robots)
@@ -44,6 +49,7 @@ def team_task(scenario: Scenario, *, batch: bool = False, dataset: Dataset | Non
     )
     pair = named(scenario.estimator, scenario.fusion)
     place = scenario.name if dataset is None else dataset.name
+    place += f", {note}" if note else ""
     return Task(
         "sim.experiments.team_runs:team_run",
         {"scenario": msgspec.to_builtins(scenario), "batch": batch}
@@ -67,8 +73,11 @@ def team_run(
     sha256: of the data set at `path`; it stands for it in the task's name.
     """
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
-    samples, times = timed_run(resolved)
-    figures = team_figures(evaluate(samples)) | times.figures(samples)
+    run = TimedRun()
+    # Provisional maps and priors are the bulk of a large team's log, and nobody looks at them here.
+    bulk = {ch.FUSED_MAP.key(), *(ch.PRIOR.key(robot.id) for robot in resolved.robots)}
+    samples = [sample for sample in run.samples(resolved) if sample.key not in bulk]
+    figures = team_figures(evaluate(samples)) | run.figures()
     if batch:
         try:
             figures["batch"] = limit_figures(batch_map(samples))
@@ -77,53 +86,57 @@ def team_run(
     return figures
 
 
-class Times:
-    """CPU time [s] that the robots and the centre spent on messages."""
+class TimedRun:
+    """A team in memory, and the CPU time [s] that its robots and its centre spend on messages."""
 
     def __init__(self) -> None:
-        self.robots = 0.0
-        self.centre = 0.0
+        self._robots = 0.0
+        self._centre = 0.0
+        self._steps = 0
+        self._fusions = 0
 
-    def figures(self, samples: Sequence[Sample]) -> Figures:
-        """Per odometry interval and per fused map."""
-        channels = [sample.key.rpartition("/")[2] for sample in samples]
-        fusions = sum(sample.key == ch.FUSED_MAP.key() for sample in samples)
-        steps = sum(channel == ch.ODOMETRY.template.rpartition("/")[2] for channel in channels)
+    def samples(
+        self, scenario: Scenario, streams: WorldStreams | None = None
+    ) -> Iterator[Sample]:
+        """Run the team; its log. streams: what the world says; None: as the scenario has it."""
+        readings = streams_of(scenario) if streams is None else streams
+        expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
+        world = WorldNode(readings, expected, translate.configured("world", 0, 0, scenario))
+        odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
+        robot, centre = self._nodes()
+        for sample in run_nodes(scenario, world, None, robot, centre):
+            self._steps += sample.key in odometry
+            self._fusions += sample.key == ch.FUSED_MAP.key()
+            yield sample
+
+    def figures(self) -> Figures:
+        """The times in all, per odometry interval and per fused map."""
         return {
-            "robot_seconds": self.robots,
-            "centre_seconds": self.centre,
-            "seconds_per_step": self.robots / steps if steps else None,
-            "seconds_per_fusion": self.centre / fusions if fusions else None,
+            "robot_seconds": self._robots,
+            "centre_seconds": self._centre,
+            "seconds_per_step": self._robots / self._steps if self._steps else None,
+            "seconds_per_fusion": self._centre / self._fusions if self._fusions else None,
         }
 
+    def _nodes(self) -> tuple[type[RobotNode], type[CentralNode]]:
+        """The nodes with a watch on what they do with a message."""
+        run = self
 
-def timed_run(
-    scenario: Scenario, streams: WorldStreams | None = None
-) -> tuple[list[Sample], Times]:
-    """Run the team in memory; its log, and what it cost.
+        class TimedRobot(RobotNode):
+            def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+                begin = time.process_time()
+                out = super().handle(message, now_ns)
+                run._robots += time.process_time() - begin
+                return out
 
-    streams: what the world says; None: as the scenario has it.
-    """
-    times = Times()
+        class TimedCentre(CentralNode):
+            def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+                begin = time.process_time()
+                out = super().handle(message, now_ns)
+                run._centre += time.process_time() - begin
+                return out
 
-    class TimedRobot(RobotNode):
-        def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-            begin = time.process_time()
-            out = super().handle(message, now_ns)
-            times.robots += time.process_time() - begin
-            return out
-
-    class TimedCentre(CentralNode):
-        def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-            begin = time.process_time()
-            out = super().handle(message, now_ns)
-            times.centre += time.process_time() - begin
-            return out
-
-    expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
-    readings = streams_of(scenario) if streams is None else streams
-    world = WorldNode(readings, expected, translate.configured("world", 0, 0, scenario))
-    return list(run_nodes(scenario, world, None, TimedRobot, TimedCentre)), times
+        return TimedRobot, TimedCentre
 
 
 def team_figures(evaluation: Evaluation) -> Figures:

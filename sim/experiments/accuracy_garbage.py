@@ -1,0 +1,82 @@
+"""Three readings in ten are garbage: how much worse is the map than without them.
+
+The clean run of the same seed leaves out the very readings that the others spoil, so it has as many
+good ones. A reading is spoilt to a uniform range and bearing, or to the identity of another
+landmark.
+"""
+
+import msgspec
+
+from sim.experiments.experiment import Goal, Options, Outcome, Results, Table
+from sim.experiments.task import Task
+from sim.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
+from sim.scenario import Scenario, load, with_options
+from sim.worlds import GarbageKind, SimulatedWorld
+
+WORLDS = ("thesis", "thesis-b")
+SHARE = 0.3
+KINDS: tuple[GarbageKind, ...] = ("drop", "reading", "identity")
+NAMES = {"drop": "clean", "reading": "random readings", "identity": "random identities"}
+MOST_SEEDS = 30
+MOST_RATIO = 1.2
+SHOWN: Shown = (
+    ("rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("ratio_clean", "÷ clean", "{:.2f}"),
+    ("rmse", "RMSE [m]", "{:.3f}"),
+    ("nees", "NEES/dof", "{:.3g}"),
+    ("in_band", "in band", "{:.0%}"),
+    ("not_joined", "not joined", "{:.0f}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """Each world, kind of garbage and seed."""
+    return [task for world in WORLDS for kind in KINDS for task in _tasks(world, kind, options)]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """Every kind of garbage beside the clean runs."""
+    figures: dict[str, dict[str, Figures]] = {}
+    goals = []
+    for world in WORLDS:
+        of_world = {}
+        for kind in KINDS:
+            runs = results.of_all(_tasks(world, kind, options))
+            of_kind = over_seeds(runs)
+            of_kind["not_joined"] = sum(bool(run["not_joined"]) for run in runs)
+            of_world[NAMES[kind]] = of_kind
+        clean = of_world[NAMES["drop"]].get("rmse_aligned")
+        for kind in KINDS[1:]:
+            of_kind = of_world[NAMES[kind]]
+            aligned = of_kind.get("rmse_aligned")
+            of_kind["ratio_clean"] = aligned / clean if aligned and clean else None
+            name = f"{world}, 30 % {NAMES[kind]}: ratio_clean"
+            goals.append(Goal(name, of_kind["ratio_clean"], 0.0, MOST_RATIO))
+        figures[world] = of_world
+    rows = tuple(
+        (f"{world}, {name}", *cells_of(of_kind, SHOWN))
+        for world, of_world in figures.items()
+        for name, of_kind in of_world.items()
+    )
+    table = Table(
+        f"30 % garbage, {len(options.seeds[:MOST_SEEDS])} seeds",
+        ("world", *(heading for _, heading, _ in SHOWN)),
+        rows,
+        "not joined: runs in which a robot is missing in the final map",
+    )
+    return Outcome("garbage", {"garbage": figures}, (table,), goals=tuple(goals))
+
+
+def _tasks(world: str, kind: GarbageKind, options: Options) -> list[Task]:
+    return [
+        team_task(_spoilt(with_options(load(world), seed=seed), kind), note=NAMES[kind])
+        for seed in options.seeds[:MOST_SEEDS]
+    ]
+
+
+def _spoilt(scenario: Scenario, kind: GarbageKind) -> Scenario:
+    """The scenario with garbage among its readings, and a centre that is robust to it."""
+    replace = msgspec.structs.replace
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = replace(scenario.world, garbage=SHARE, garbage_kind=kind)
+    return replace(scenario, world=world, central=replace(scenario.central, robust_c=1.0))
