@@ -95,9 +95,7 @@ class TimedRun:
         self._steps = 0
         self._fusions = 0
 
-    def samples(
-        self, scenario: Scenario, streams: WorldStreams | None = None
-    ) -> Iterator[Sample]:
+    def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
         """Run the team; its log. streams: what the world says; None: as the scenario has it."""
         readings = streams_of(scenario) if streams is None else streams
         expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
