@@ -154,13 +154,14 @@ def task(panel: Panel, method: Method, seed: int) -> Task:
 
 
 def with_particles(scenario: Scenario, particles: int) -> Scenario:
-    """The same with so many particles for every robot."""
+    """The same with so many particles for every robot, and for a filter at the centre."""
     replace = msgspec.structs.replace
     robots = tuple(
         replace(robot, front_end=replace(robot.front_end, particles=particles))
         for robot in scenario.robots
     )
-    return replace(scenario, robots=robots)
+    central = replace(scenario.central, particles=particles)
+    return replace(scenario, robots=robots, central=central)
 
 
 def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:

@@ -6,6 +6,7 @@ from sim.experiments.xu import (
     EKF,
     FASTSLAM,
     HYBRID,
+    MULTI_FASTSLAM,
     MULTI_HYBRID,
     OUR_TEAM,
     OURS,
