@@ -173,9 +173,9 @@ def _check_team(ids: list[str], world: World) -> None:
                 f"the robot {robot}: in a UTIAS world robots are r1, r2, …, "
                 "the number being the data set's"
             )
-    if isinstance(world, SimulatedWorld):
-        for robot in world.unknown_starts:
-            if robot not in ids:
-                raise ScenarioError(
-                    f"world.unknown_starts names {robot}, no such robot; known: {', '.join(ids)}"
-                )
+    for named in world.unknown_starts:
+        if named != "*" and named.removeprefix("!") not in ids:
+            raise ScenarioError(
+                f"world.unknown_starts names {named}, no such robot; known: {', '.join(ids)}, "
+                'and "*" for all of them'
+            )

@@ -26,7 +26,7 @@ from sim.streams import (
     grouped,
     robot_stream,
 )
-from sim.worlds import SimulatedWorld
+from sim.worlds import SimulatedWorld, starts_unknown
 from team.config import RobotConfig, Sensor
 
 
@@ -156,7 +156,8 @@ def _stream(
     seed: int,
 ) -> RobotStream:
     robot, drive = robots[index], drives[index]
-    start = None if robot.id in world.unknown_starts else StartPose(drive.poses[0].copy(), None)
+    unknown = starts_unknown(world, robot.id)
+    start = None if unknown else StartPose(drive.poses[0].copy(), None)
     return robot_stream(
         robot.id,
         int(stamps_ns[0]),

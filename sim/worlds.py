@@ -30,7 +30,8 @@ class SimulatedWorld(
     visible_from_m, visible_to_m: what lies at a *true* range between them is seen; absent: the
     limits of the robot's sensor. They are the world's, since a robot that gates its noisy readings
     at the same limits selects by the noise, and its map is biased.
-    unknown_starts: the robots whose start pose is not told to the team.
+    unknown_starts: the robots whose start pose is not told to the team; "*" is all of them, "!r1"
+    after it all but that one.
     garbage: the probability of each reading of a landmark to be spoilt. garbage_kind: "reading"
     gives it a uniform range and bearing of what can be seen, "identity" the identity of another of
     the world's landmarks; "drop" leaves out the very readings that the others spoil, all else
@@ -71,19 +72,27 @@ class UtiasWorld(
 
     path: its folder or zip. odometry_delay_s: odometry logged at t acts at t + odometry_delay_s on
     the camera's clock. start_sigma_m, start_sigma_rad: how well the start poses are known; both 0:
-    exactly. duration_s: only this much from the team's first reading. errata: repair known faults.
+    exactly. unknown_starts: as in a simulated world. duration_s: only this much from the team's
+    first reading. errata: repair known faults.
     """
 
     path: str = ""
     odometry_delay_s: NonNegative = 0.0
     start_sigma_m: NonNegative = 0.0
     start_sigma_rad: NonNegative = 0.0
+    unknown_starts: tuple[str, ...] = ()
     duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     errata: bool = True
 
     def __post_init__(self) -> None:
         if (self.start_sigma_m == 0.0) != (self.start_sigma_rad == 0.0):
             raise ValueError("start_sigma_m and start_sigma_rad are both 0 or both above 0")
+
+
+def starts_unknown(world: SimulatedWorld | UtiasWorld, robot: str) -> bool:
+    """Whether the team is not told where this robot starts."""
+    named = world.unknown_starts
+    return robot in named or ("*" in named and f"!{robot}" not in named)
 
 
 World = SimulatedWorld | UtiasWorld

@@ -17,7 +17,7 @@ from sim.datasets.tables import EXPECTED, DatasetError, File, opened, optional_t
 from sim.datasets.utias_log import Log, log_of, present_robots
 from sim.datasets.utias_rows import start_pose
 from sim.streams import RobotStream, StartPose, WorldStreams, grouped, robot_stream
-from sim.worlds import UtiasWorld
+from sim.worlds import UtiasWorld, starts_unknown
 from team.config import RobotConfig
 
 ROBOTS = 5
@@ -125,7 +125,7 @@ def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: 
 
 def _start(world: UtiasWorld, log: Log) -> StartPose | None:
     pose = start_pose(log.truth_ns, log.truth, log.start_ns)
-    if pose is None:
+    if pose is None or starts_unknown(world, log.robot):
         return None
     if world.start_sigma_m == 0.0:
         return StartPose(pose, None)

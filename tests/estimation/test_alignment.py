@@ -194,3 +194,48 @@ def test_merging_is_the_same_bytes_each_time():
     world = team(7, robots=3, submaps=6)
     one, other = (joined(world.submaps, world.starts[:1]) for _ in range(2))
     assert one.main.state.tobytes() == other.main.state.tobytes()
+
+
+# --- islands among themselves ---
+
+
+def test_two_free_islands_join_each_other_while_the_main_one_knows_neither():
+    world = team(8, robots=3, submaps=6)
+    apart = seeing_only(world.submaps, "r0", [])
+    fold = converged(joined(apart, world.starts[:1]), OPTIONS)
+    assert fold.frame == ("r0", 0)
+    assert len(fold.islands) == 2
+    assert fold.home[("r1", 0)] == fold.home[("r2", 0)]
+    assert set(fold.reasons) == {("r1", 0)}
+    assert "0 shared landmarks, 2 needed" in fold.reasons[("r1", 0)]
+    (words,) = fold.joined.values()
+    assert words.startswith("r2 (epoch 0) joined: ")
+    assert "per degree of freedom, transform sigma" in words
+    other = fold.island("r2", 0)
+    start = other.graph.streams[("r1", 0)][0]
+    assert other.graph.fixed[start], "the smaller frame stays"
+
+
+def test_with_no_start_known_the_whole_team_is_in_the_frame_of_the_smallest_stream():
+    world = team(9, robots=3, submaps=8)
+    fold = converged(joined(world.submaps, []), OPTIONS)
+    assert (fold.frame, len(fold.islands), len(fold.joined)) == (("r0", 0), 1, 2)
+    found, known = (
+        landmark_map(fold),
+        landmark_map(converged(joined(world.submaps, world.starts), OPTIONS)),
+    )
+    apart = (np.linalg.norm(m[:, None] - m[None], axis=2) for m in (found.means, known.means))
+    np.testing.assert_allclose(*apart, atol=0.6)
+
+
+@settings(deadline=None, max_examples=6)
+@given(st.randoms(use_true_random=False))
+def test_merges_and_their_words_are_the_same_for_every_order_of_arrival(random):
+    world = team(10, robots=3, submaps=5)
+    arrived = list(world.submaps)
+    random.shuffle(arrived)
+    one = joined(world.submaps, [])
+    other = joined(sorted(arrived, key=lambda each: each.key), [])
+    assert one.main.state.tobytes() == other.main.state.tobytes()
+    assert (one.joined, one.reasons) == (other.joined, other.reasons)
+    assert one.joined

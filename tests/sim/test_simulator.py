@@ -257,6 +257,16 @@ def test_a_start_pose_is_exact_or_not_told_at_all() -> None:
     assert streams[1].kinds[0] == START
 
 
+@pytest.mark.parametrize(
+    ("named", "unknown"),
+    [((), ""), (("*",), "abc"), (("*", "!a"), "bc"), (("c", "a"), "ac"), (("*", "!a", "!b"), "c")],
+)
+def test_unknown_starts_are_named_or_all_or_all_but_some(named: tuple, unknown: str) -> None:
+    robots = [RobotConfig(id=name) for name in "abc"]
+    streams = simulated(SimulatedWorld(steps=5, unknown_starts=named), robots, 1).streams
+    assert "".join(each.robot for each in streams if each.start is None) == unknown
+
+
 def test_a_slip_moves_the_robot_and_is_in_no_odometry() -> None:
     slipping = MotionModel(lateral=MotionNoise(per_s=0.2), final_turn=MotionNoise(per_s=0.02))
     world = SimulatedWorld(steps=400)

@@ -194,6 +194,12 @@ def test_the_start_pose_is_the_truth_with_the_given_sigmas(folder: Path) -> None
     assert np.allclose(start.covariance, np.diag([0.0025, 0.0025, 0.0009]))
 
 
+def test_the_start_poses_of_a_data_set_can_be_kept_from_the_team(folder: Path) -> None:
+    told = read(folder, unknown_starts=("*", "!r1")).streams
+    assert [each.start is None for each in told] == [False, True, True]
+    assert all(each.truth is not None for each in told)
+
+
 def test_a_start_heading_survives_the_fault_of_resampled_truth_at_the_wrap() -> None:
     stamps = 20_000_000 * np.arange(21)
     heading = np.full(21, 3.1415)
