@@ -25,7 +25,7 @@ from sim.scenario_document import (
 )
 from sim.worlds import SimulatedWorld, UtiasWorld, World
 from team.config import Estimator, FusionRule, RobotConfig
-from team.pairs import PAIRS, named_pairs
+from team.pairs import PAIRS, named_pairs, rules_for
 
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
            "with_options"]  # fmt: skip
@@ -147,8 +147,8 @@ def _filled(scenario: Scenario) -> Scenario:
     """The seed, the estimator and the rule handed to the robots and the centre; all of it valid."""
     if (scenario.estimator, scenario.fusion) not in PAIRS:
         raise ScenarioError(
-            f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}; "
-            f"valid: {named_pairs()}"
+            f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}, "
+            f"but {' or '.join(rules_for(scenario.estimator))}; valid: {named_pairs()}"
         )
     _check_team([robot.id for robot in scenario.robots], scenario.world)
     robots = tuple(

@@ -43,6 +43,11 @@ NEEDS_MAP: frozenset[Estimator] = frozenset({"localisation"})
 """The estimators that are told the landmarks."""
 
 
+def rules_for(estimator: Estimator) -> list[FusionRule]:
+    """The rules that an estimator can feed."""
+    return [fusion for each, fusion in PAIRS if each == estimator]
+
+
 def named_pairs() -> str:
     """The valid pairs as a user writes them: `hybrid + join, …`."""
     return ", ".join(f"{estimator} + {fusion}" for estimator, fusion in PAIRS)

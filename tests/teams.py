@@ -13,6 +13,7 @@ from central.node import CentralNode
 from sim.streams import Detections, Intervals, RobotStream, StartPose, WorldStreams, robot_stream
 from sim.world_node import WorldNode, expected_nodes
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.pairs import NEEDS_MAP
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -148,7 +149,12 @@ class Team:
         names = [c.id for c in self.configs]
         rule = msgspec.structs.replace(self.central, fusion=self.configs[0].fusion)
         announced = m.Configured(0, "world", 0, bytes(8), "{}")
-        self.world = WorldNode(self.streams, expected_nodes(names, recorder=False), announced)
+        self.world = WorldNode(
+            self.streams,
+            expected_nodes(names, recorder=False),
+            announced,
+            tells_map=self.configs[0].estimator in NEEDS_MAP,
+        )
         self.centre = CentralNode(rule, names)
         self.robots = {c.id: RobotNode(c) for c in self.configs}
         self.nodes = {"world": self.world, "central": self.centre}
@@ -192,7 +198,9 @@ class Team:
         if kept:
             node.resume(kept[0], kept[1:])
         self.queues[(name, "central/alive")] = deque([m.Liveliness(0, "central", True)])
-        latest = [self.sent[c.key()][-1:] for c in (ch.END, ch.FUSED_MAP, ch.FINAL_MAP)]
+        latest = [
+            self.sent[c.key()][-1:] for c in (ch.KNOWN_MAP, ch.END, ch.FUSED_MAP, ch.FINAL_MAP)
+        ]
         self.queues[(name, "latest")] = deque(x for kept in latest for x in kept)
         self.token(name, alive=True)
         self.send(name, node.begin())

@@ -127,7 +127,10 @@ def test_every_valid_pair_can_be_chosen(estimator: str, fusion: str) -> None:
     [
         ({"robots": 0}, "0 robots: a team has 1 to 100"),
         ({"robots": 101}, "101 robots: a team has 1 to 100"),
-        ({"estimator": "hybrid-thesis"}, "can not feed the rule join; valid: hybrid + join, "),
+        (
+            {"estimator": "hybrid-thesis"},
+            "can not feed the rule join, but kalman-per-axis or latest or alone; valid: ",
+        ),
         ({"fusion": "joyn"}, 'expected one of "join", "kalman", "kalman-per-axis", '),
         ({"seed": -1}, "expected int >= 0 at seed"),
         ({"dataset": "x.zip"}, "thesis: a simulated world takes no data set"),
