@@ -196,11 +196,17 @@ def _localisation_begun(
     known: KnownMap,
     generator: np.random.Generator,
 ) -> Localisation:
-    """At an unknown start anywhere within the known map."""
+    """At an unknown start anywhere from where the sensor may see a landmark of the known map.
+
+    That is the map's box widened by the sensor's reach, at most by half the box's longer side.
+    """
     front, landmarks = config.front_end, known.landmarks
     if pose is None and len(landmarks):
         lowest, highest = landmarks.min(axis=0), landmarks.max(axis=0)
-        state = localisation.begun_anywhere(lowest, highest, front.particles, *known, generator)
+        reach = min(config.sensor.max_range, 0.5 * float((highest - lowest).max()))
+        state = localisation.begun_anywhere(
+            lowest - reach, highest + reach, front.particles, *known, generator
+        )
         return replace(state, resample_below=front.resample_below)
 
     def at(start: np.ndarray) -> Localisation:

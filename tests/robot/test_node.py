@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team import translate
+from team.pairs import PAIRS
 from team.robot import pace
 from team.robot.node import RobotNode
 from team.wire import channels as ch
@@ -130,13 +131,14 @@ STREAMS = {
 
 @pytest.mark.parametrize("name", STREAMS)
 @pytest.mark.parametrize("keyframe_s", [0.0, 0.7])
-@pytest.mark.parametrize("estimator", ["hybrid", "hybrid-thesis"])
+@pytest.mark.parametrize("estimator", sorted({estimator for estimator, _ in PAIRS}))
 def test_every_reading_has_one_disposition(name, keyframe_s, estimator):
     readings = published(STREAMS[name])
     front_end = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
-    fusion = "join" if estimator == "hybrid" else "kalman-per-axis"
+    fusion = {"hybrid": "join", "hybrid-thesis": "kalman-per-axis"}.get(estimator, "alone")
     node = RobotNode(config(front_end=front_end, estimator=estimator, fusion=fusion))
     node.handle(m.Liveliness(0, "central", False), 0)
+    node.handle(m.KnownMap(0, from_ids([1, 2]), from_floats([5.0, 3.0, 9.0, -2.0])), 0)
     out = driven(node, readings)
     (done,) = of(out, ch.ROBOT_DONE)
     assert done.readings == len(readings)
@@ -145,9 +147,8 @@ def test_every_reading_has_one_disposition(name, keyframe_s, estimator):
     assert done.steps == sum(isinstance(r, m.Odometry) for r in readings)
     used = [e.readings for e in done.ledger if e.disposition.startswith("in ")]
     uncovered = [e.readings for e in done.ledger if "no odometry" in e.disposition]
-    assert (name in ("observations beyond the odometry", "nothing but observations")) == bool(
-        uncovered
-    )
+    beyond = name in ("observations beyond the odometry", "nothing but observations")
+    assert bool(uncovered) == (beyond and estimator != "dead-reckoning")
     submaps = of(out, ch.SUBMAP)
     assert done.submaps == len(submaps)
     if estimator == "hybrid" and submaps:
