@@ -1,7 +1,8 @@
 """`teamslam log`: look into a log, check it, repair it, part it, put logs together, export them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,9 @@ from sim.cli_options import FAILED, WRONG_USE, fail
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from team.recording.reader import Log
     from team.recording.summary import KeySummary
+    from team.recording.tables import Exported
     from team.wire.channels import Channel
 
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
@@ -30,6 +33,8 @@ class Format(StrEnum):
     """What a log is exported as."""
 
     CSV = "csv"
+    PARQUET = "parquet"
+    TUM = "tum"
     UTIAS = "utias"
 
 
@@ -147,30 +152,49 @@ def export(
     log: LogArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="A new folder.")],
     form: Annotated[
-        Format, typer.Option("--format", help="A table per channel, or a UTIAS data set.")
+        Format,
+        typer.Option(
+            "--format",
+            help="A table per channel (csv, parquet), the robots' paths (tum), a data set (utias).",
+        ),
     ] = Format.CSV,
     channels: ChannelNames = None,
 ) -> None:
-    """Write a log as CSV tables, or its readings and truth as a UTIAS data set."""
-    from sim.log_export import export_utias
-    from team.recording.csv_tables import export_csv
+    """Write a log as tables, its paths for evo, or its readings and truth as a UTIAS data set."""
+    from sim.log_export import export_tum, export_utias
     from team.recording.reader import open_log
 
     opened = open_log(log)
     chosen = _channels(channels)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         fail(f"{output} is there and not an empty folder: give a new one", WRONG_USE)
-    if form is Format.UTIAS:
+    if form in (Format.UTIAS, Format.TUM):
         if channels is not None:
-            fail("--channels is for CSV: the UTIAS format is of readings and truth", WRONG_USE)
+            fail(f"--channels is for tables: {form} is of all that the format has", WRONG_USE)
+        if form is Format.TUM:
+            for path in export_tum(opened, output):
+                typer.echo(path)
+            return
         for number, robot in enumerate(export_utias(opened, output), 1):
             typer.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
         return
-    exported = export_csv(opened, output, chosen)
+    exported = _exporter(form)(opened, output, chosen)
     for path, rows in exported.rows.items():
         typer.echo(f"{path}: {rows} rows")
     if exported.unsound:
         typer.echo(f"left out: {exported.unsound} unsound messages", err=True)
+
+
+def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Exported]":
+    """What writes the tables; ends the command where it is not installed."""
+    from team.recording.csv_tables import export_csv
+    from team.recording.parquet_tables import export_parquet
+
+    if form is Format.CSV:
+        return export_csv
+    if find_spec("pyarrow") is None:
+        fail("--format parquet needs pyarrow: pip install 'teamslam[parquet]'", WRONG_USE)
+    return export_parquet
 
 
 def _channels(names: str | None) -> "list[Channel] | None":

@@ -5,6 +5,7 @@ of a message but the numbers that are shown: some tens of bytes a message.
 """
 
 from array import array
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -20,8 +21,6 @@ from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
-_FARTHEST = 1_000_000
-"""Readings that may be missing before one: a counter beyond it is not believed."""
 _NO_SPAN = (2**63 - 1, -(2**63))
 _LOOKED_AT = (
     ch.START, ch.SUBMAP, ch.FUSED_MAP, ch.FINAL_MAP, ch.INNOVATION, ch.TRUTH_LANDMARKS, ch.STATUS,
@@ -117,6 +116,26 @@ class _Column:
         return Series(stamps[order], np.array(self.values, np.float64)[order])
 
 
+class _Clocks:
+    """The wall clocks [ns] of a stream's readings, 16 bytes each; one out of order is left out."""
+
+    def __init__(self) -> None:
+        self._readings = array("q")
+        self._clocks = array("q")
+
+    def take(self, reading: int, wall_ns: int) -> None:
+        """Of one reading."""
+        if abs(reading) < 2**63 and (not self._readings or reading > self._readings[-1]):
+            self._readings.append(reading)
+            self._clocks.append(min(wall_ns, 2**63 - 1))
+
+    def of(self, reading: int) -> int | None:
+        """None where it is not known."""
+        k = bisect_left(self._readings, reading)
+        known = k < len(self._readings) and self._readings[k] == reading
+        return self._clocks[k] if known else None
+
+
 @dataclass
 class _Submap:
     """A submap that no map has used yet: who waits for it."""
@@ -136,10 +155,7 @@ class _Gathering:
     map_cost: _Column = field(default_factory=_Column)
     robot_cost: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
     events: EventLog = field(default_factory=EventLog)
-    # The wall clock [ns] of every reading by stream and counter: 8 bytes each.
-    published: dict[tuple[str, int], "array[int]"] = field(
-        default_factory=lambda: defaultdict(lambda: array("q"))
-    )
+    published: dict[tuple[str, int], _Clocks] = field(default_factory=lambda: defaultdict(_Clocks))
     unused: dict[tuple[str, int], dict[int, _Submap]] = field(
         default_factory=lambda: defaultdict(dict)
     )
@@ -183,13 +199,7 @@ class _Gathering:
         reading = head_of(sample)
         if reading is None:
             return
-        clocks = self.published[reading.robot, reading.epoch]
-        gap = reading.reading - len(clocks)
-        if 0 <= gap < _FARTHEST:
-            clocks.extend([0] * gap)
-            clocks.append(sample.wall_ns)
-        elif 0 <= reading.reading < len(clocks):
-            clocks[reading.reading] = clocks[reading.reading] or sample.wall_ns
+        self.published[reading.robot, reading.epoch].take(reading.reading, sample.wall_ns)
         self.span = (min(self.span[0], sample.stamp_ns), max(self.span[1], sample.stamp_ns))
 
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
@@ -215,10 +225,10 @@ class _Gathering:
 
     def _arrived(self, robot: str, epoch: int, submap: _Submap, wall_ns: int) -> None:
         clocks = self.published[robot, epoch]
-        ends = (submap.first_reading, submap.last_reading)
-        if not all(k < len(clocks) and clocks[k] for k in ends):
+        first_ns, last_ns = clocks.of(submap.first_reading), clocks.of(submap.last_reading)
+        if first_ns is None or last_ns is None:
             return  # a part of a log: the reading was published before it
-        first, last = ((wall_ns - clocks[k]) * 1e-9 for k in ends)
+        first, last = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
         self.latencies[robot].append((submap.end_ns, first, last))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sim.rerun_log import Recorded, Stream
+from sim.rerun_log import Recorded, RerunError, Stream
 from sim.rerun_robot import dispositions
 from team.robot.node import IN_SIGHTING
 from team.wire import channels as ch
@@ -19,6 +19,8 @@ from team.wire import messages as m
 IN_SUBMAP = "in a submap"
 OPEN = "open"
 LOST = "lost"
+MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
+"""Readings that are missing need memory too: so many, or so many times those that are there."""
 SubmapName = tuple[str, int, int]
 """(robot, epoch, sequence)."""
 
@@ -121,6 +123,11 @@ def _entries(
     robot, epoch = stream
     readings = log.readings.get(stream, {})
     count = max(log.published.get(stream, 0), max(readings, default=-1) + 1)
+    if count > max(MOST_LOST, MOST_LOST_SHARE * len(readings)):
+        raise RerunError(
+            f"{count:,} readings of {robot}, epoch {epoch}, are spoken of, "
+            f"{len(readings):,} are in the log: not believed"
+        )
     holder: list[int | None] = [None] * count
     wrong = []
     for submap in submaps:

@@ -1,10 +1,12 @@
-"""A log's readings and truth as a data set in the UTIAS format."""
+"""A log as what other programs read: a UTIAS data set, paths in the TUM format."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 from sim.calibration_source import world_of
 from sim.datasets.utias_writer import write_utias
+from sim.evaluation import evaluate
+from sim.trajectory_files import write_trajectories
 from sim.world_node import FIRST_EPOCH
 from team.recording.reader import Log, LogError
 from team.wire import channels as ch
@@ -37,6 +39,18 @@ def export_utias(log: Log, folder: Path) -> list[str]:
         raise LogError(log.path, str(error), remedy) from None
     write_utias(world, folder)
     return [stream.robot for stream in world.streams]
+
+
+def export_tum(log: Log, folder: Path) -> list[Path]:
+    """Write every robot's paths in the TUM format; what was written.
+
+    Raises `LogError` for a log that has no path, as one of sensor readings alone.
+    """
+    written = write_trajectories(evaluate(log.samples()), folder)
+    if not written:
+        remedy = "`teamslam rerun` computes them, `--format csv` writes what there is"
+        raise LogError(log.path, "no robot's path in it", remedy)
+    return written
 
 
 def _sound(log: Log) -> Iterator[m.Message]:

@@ -84,9 +84,10 @@ def _declarations(log: Log) -> Iterator[Frame]:
                     yield frame
                 elif frame.opcode == Opcode.CHUNK:
                     try:
-                        inside = list(records(expanded(frame.body)))
+                        every = records(expanded(frame.body))
+                        inside = [each for each in every if each.opcode in wanted]
                     except (*MALFORMED, ValueError, zstandard.ZstdError):
                         continue
-                    yield from (each for each in inside if each.opcode in wanted)
+                    yield from inside
         except LogError:
             return

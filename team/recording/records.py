@@ -24,6 +24,8 @@ LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
 """Bytes of one chunk, expanded: the largest message behind a chunk that was almost full."""
 LARGEST_RATIO = 10_000
 """Of expanded to compressed bytes; a map of zeros reaches a thousand, a bomb ten thousands."""
+MOST_RECORDS = 250_000
+"""Records of one chunk: a recorder's chunk of a MiB has 34 000 of the smallest messages."""
 _FRAME = struct.Struct("<BQ")
 _BLOCK = 2**20
 FOOTER_SIZE = _FRAME.size + 20
@@ -99,9 +101,15 @@ def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterat
 
 
 def records(data: bytes) -> Iterator[Frame]:
-    """The records of an expanded chunk; ValueError where one ends beyond it."""
-    offset = 0
+    """The records of an expanded chunk; ValueError where one ends beyond it or there are too many.
+
+    Small records grow many times as Python's objects, so their number is bounded as the bytes are.
+    """
+    offset = count = 0
     while offset < len(data):
+        count += 1
+        if count > MOST_RECORDS:
+            raise ValueError(f"more than {MOST_RECORDS} records, which no recorder writes")
         opcode, length = _FRAME.unpack_from(data, offset)
         start = offset + _FRAME.size
         if start + length > len(data):

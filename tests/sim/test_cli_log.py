@@ -163,10 +163,10 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
         (["merge", "LOG", "nowhere.mcap", "-o", "new"], "nowhere.mcap: not found"),
         (["merge", "LOG", "-o", "LOG"], "exists: choose another name"),
         (["export", "LOG", "-o", "LOG/.."], "not an empty folder: give a new one"),
-        (["export", "LOG", "-o", "new", "--format", "parquet"], "'parquet' is not one of"),
+        (["export", "LOG", "-o", "new", "--format", "excel"], "'excel' is not one of"),
         (
             ["export", "LOG", "-o", "new", "--format", "utias", "--channels", "start"],
-            "--channels is for CSV",
+            "--channels is for tables",
         ),
     ],
 )

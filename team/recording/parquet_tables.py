@@ -1,0 +1,107 @@
+"""A log as Parquet: one typed table per channel, for pandas, Polars, DuckDB and the like.
+
+Arrays are lists of numbers, a digest is hexadecimal, a list or a table of parts JSON. pyarrow is
+the extra `parquet`: only this module imports it, and only when it is called.
+"""
+
+import json
+from collections.abc import Collection
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from team.recording.reader import Log
+from team.recording.tables import Exported, numbers_of, type_of_numbers
+from team.wire.channels import Channel
+from team.wire.messages import Digest, Message
+
+GROUP_ROWS = 20_000
+GROUP_BYTES = 32 * 2**20
+"""A row group is written when it has so many rows, or messages of so many payload bytes."""
+
+
+class _Table:
+    """One channel's file: rows are gathered by column and written as row groups."""
+
+    def __init__(self, path: Path, kind: type[Message]) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        self._fields = msgspec.structs.fields(kind)
+        types = {"key": pa.string(), "counter": pa.int64(), "wall_ns": pa.int64()}
+        for each in self._fields:
+            types[each.name] = _arrow_type(pa, each.name, each.type)
+        self._schema = pa.schema(list(types.items()))
+        self._pa = pa
+        self._writer = pq.ParquetWriter(path, self._schema, compression="zstd")
+        self._columns: list[list[Any]] = [[] for _ in types]
+        self._bytes = 0
+
+    def __enter__(self) -> "_Table":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._flush()
+        self._writer.close()
+
+    def add(self, head: tuple[str, int, int], message: Message, size: int) -> None:
+        values = [_value(f.name, f.type, getattr(message, f.name)) for f in self._fields]
+        for column, value in zip(self._columns, (*head, *values), strict=True):
+            column.append(value)
+        self._bytes += size
+        if len(self._columns[0]) >= GROUP_ROWS or self._bytes >= GROUP_BYTES:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._columns[0]:
+            arrays = [
+                self._pa.array(column, type=each.type)
+                for column, each in zip(self._columns, self._schema, strict=True)
+            ]
+            self._writer.write_table(self._pa.Table.from_arrays(arrays, schema=self._schema))
+        self._columns = [[] for _ in self._columns]
+        self._bytes = 0
+
+
+def export_parquet(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:
+    """Write `<channel>.parquet` of each channel (of all without) that has a message into `folder`.
+
+    Memory is bounded by a row group per channel. Raises `LogError` for a damaged log, OSError where
+    the folder can not be written, ImportError without pyarrow.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    exported = Exported()
+    with ExitStack() as files:
+        tables: dict[str, tuple[Path, _Table]] = {}
+        for sample, channel, message in exported.messages(log, channels):
+            if channel.name not in tables:
+                path = folder / f"{channel.name}.parquet"
+                tables[channel.name] = (path, files.enter_context(_Table(path, channel.message)))
+            path, table = tables[channel.name]
+            head = (sample.key, sample.counter, min(sample.wall_ns, 2**63 - 1))
+            table.add(head, message, len(sample.payload))
+            exported.rows[path] = exported.rows.get(path, 0) + 1
+    return exported
+
+
+def _arrow_type(pa: Any, name: str, kind: object) -> Any:
+    """The column type of a field, by the class under its annotation's bounds."""
+    of = getattr(kind, "__origin__", kind)
+    if of is bytes and kind != Digest:
+        return pa.list_(pa.from_numpy_dtype(type_of_numbers(name)))
+    scalars = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+    return scalars.get(of, pa.string()) if isinstance(of, type) else pa.string()
+
+
+def _value(name: str, kind: object, value: object) -> object:
+    match value:
+        case bytes() if kind == Digest:
+            return value.hex()
+        case bytes():
+            return numbers_of(name, value)
+        case tuple() | dict():
+            return json.dumps(msgspec.to_builtins(value))
+        case _:
+            return value

@@ -1,0 +1,61 @@
+"""A log as tables: one per channel, one row per message, whatever the file format.
+
+Columns: key, counter, wall_ns, then the message's fields by name.
+"""
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from team.recording.reader import Log
+from team.wire.arrays import floats, ids, stamps
+from team.wire.bus import Sample, opened
+from team.wire.channels import Channel, channel_of
+from team.wire.codec import WireError
+from team.wire.messages import Message
+
+HEAD = ("key", "counter", "wall_ns")
+_ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
+    "ids": ids,
+    "stamps": stamps,
+    "nodes": stamps,
+}
+"""How the bytes of a field are read by its name; all others are floats."""
+
+
+@dataclass
+class Exported:
+    """The rows of each file that was written, and messages that no file has: not sound."""
+
+    rows: dict[Path, int] = field(default_factory=dict)
+    unsound: int = 0
+
+    def messages(
+        self, log: Log, channels: Collection[Channel] | None
+    ) -> Iterator[tuple[Sample, Channel, Message]]:
+        """Every sound message of the given channels (of all without); the others are counted.
+
+        A viewer's own messages have no fields that this program knows: they are left out.
+        """
+        for sample in log.samples(channels):
+            if channel_of(sample.key) is None:
+                continue
+            try:
+                channel, _, message = opened(sample)
+            except WireError:
+                self.unsound += 1
+                continue
+            yield sample, channel, message
+
+
+def numbers_of(name: str, value: bytes) -> NDArray[Any]:
+    """The numbers in the bytes of a message's field."""
+    return _ARRAYS.get(name, floats)(value, name)
+
+
+def type_of_numbers(name: str) -> str:
+    """Their type as NumPy names it."""
+    return str(numbers_of(name, b"").dtype)

@@ -1,0 +1,108 @@
+"""Small files that are more than they seem: what an MCAP log can hide in 16 kB."""
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from random import Random
+
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, Message
+from mcap.writer import CompressionType, Writer
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.codec import encoded
+from tests.support import packed, spd
+
+LARGEST_FILE = 16 * 1024
+NOISE = 6200
+PRIVATE = 0x90
+"""An opcode of nobody's, which readers skip."""
+DIGEST = b"configur"
+
+
+def log_of(path: Path, *chunks: bytes) -> Path:
+    """A complete log of ours with chunks of these records."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        writer.add_metadata("teamslam", {"team": "demo"})
+        for k, chunk in enumerate(chunks):
+            # What does not compress makes the rest's ratio believable.
+            noise = Random(k).randbytes(NOISE)
+            records = struct.pack("<BQ", PRIVATE, NOISE) + noise + chunk
+            data = zstandard.compress(records, 19)
+            size = struct.pack("<QQQII", 0, 0, len(records), 0, 4) + b"zstd"
+            body = size + struct.pack("<Q", len(data)) + data
+            file.write(struct.pack("<BQ", Opcode.CHUNK, len(body)) + body)
+        writer.finish()
+    assert path.stat().st_size <= LARGEST_FILE
+    return path
+
+
+def records_of(told: Sequence[tuple[ch.Channel, str, bytes]]) -> bytes:
+    """Channel records, and a message record for each payload."""
+    out = RecordBuilder()
+    keys = [f"team/demo/{channel.key(name)}" for channel, name, _ in told]
+    numbers = {key: k + 1 for k, key in enumerate(dict.fromkeys(keys))}
+    for key, number in numbers.items():
+        Channel(id=number, topic=key, message_encoding="msgpack", metadata={}, schema_id=0).write(
+            out
+        )
+    for key, (_, _, payload) in zip(keys, told, strict=True):
+        Message(
+            channel_id=numbers[key], log_time=1, data=payload, publish_time=1, sequence=0
+        ).write(out)
+    return out.end()
+
+
+def expands(path: Path) -> Path:
+    """Half a gigabyte of zeros."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        writer.add_metadata("teamslam", {"team": "demo"})
+        data = zstandard.compress(bytes(500 * 10**6), 19)
+        body = struct.pack("<QQQII", 0, 0, 500 * 10**6, 0, 4) + b"zstd"
+        body += struct.pack("<Q", len(data)) + data
+        file.write(struct.pack("<BQ", Opcode.CHUNK, len(body)) + body)
+        writer.finish()
+    return path
+
+
+def many_small(path: Path) -> Path:
+    """Millions of the smallest messages: a few bytes each, some hundred as objects."""
+    told = records_of([(ch.OWN_POSE, "alpha", b"")] * 2)
+    channel = records_of([(ch.OWN_POSE, "alpha", b"")])[: -(9 + 22)]
+    one = told[len(channel) :][: 9 + 22]
+    return log_of(path, channel + one * (58_000_000 // len(one)))
+
+
+def few_large(path: Path) -> Path:
+    """Messages of as many zeros as a message may have."""
+    large = records_of([(ch.OWN_MAP, "alpha", bytes(58_000_000))])
+    return log_of(path, large, large)
+
+
+def far_counters(path: Path) -> Path:
+    """Sound messages whose counters speak of 10¹⁸ readings."""
+    far = 2**60
+    joint = from_floats([0.0] * 5)
+    submap = m.Submap(
+        9, "alpha", 1, 0, 0, far, 1, DIGEST, from_ids([1]), joint, packed(spd(5))
+    )  # fmt: skip
+    told: list[tuple[ch.Channel, str, m.Message]] = [
+        (ch.START, "alpha", m.Start(0, "alpha", 1, 0, b"", b"")),
+        (ch.ODOMETRY, "alpha", m.Odometry(5, "alpha", 1, 1, 5, 0.5, 0.1)),
+        (ch.ODOMETRY, "alpha", m.Odometry(2**61, "alpha", 1, far, 5, 0.5, 0.1)),
+        (ch.SUBMAP, "alpha", submap),
+        (ch.ROBOT_DONE, "alpha", m.Done(9, "alpha", 1, far, far, 1, ())),
+        (ch.END, "", m.End(2**61, (m.StreamEnd("alpha", 1, far),))),
+    ]
+    return log_of(path, records_of([(c, n, encoded(message)) for c, n, message in told]))
+
+
+KINDS = (expands, many_small, few_large, far_counters)

@@ -1,0 +1,99 @@
+"""A log as Parquet: every field reads back, typed, in row groups that bound the memory."""
+
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sim import cli_log
+from sim.cli import app
+from team.recording import parquet_tables
+from team.recording.parquet_tables import export_parquet
+from team.recording.reader import Log, open_log
+from team.recording.recorder import Recorder
+from team.recording.tables import numbers_of
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import encoded
+from tests.support import examples, odometry
+
+pq = pytest.importorskip("pyarrow.parquet", reason="pip install '.[parquet]'")
+
+
+def sampled(channel: c.Channel, message: m.Message, counter: int) -> Sample:
+    return Sample(channel.key("alpha"), encoded(message), message.stamp_ns, 7 + counter, counter)
+
+
+def recorded(path: Path, samples: list[Sample]) -> Log:
+    with Recorder(path, "demo", {}) as recorder:
+        recorder.write(samples)
+    return open_log(path)
+
+
+def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
+    by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
+    kept = [message for message in examples() if type(message) in by_class]
+    samples = [sampled(by_class[type(x)], x, i) for i, x in enumerate(kept)]
+    samples.append(Sample(samples[0].key, b"\x90", 0, 0, 99))
+    exported = export_parquet(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
+    assert exported.unsound == 1
+    assert len(exported.rows) == len({by_class[type(x)].name for x in kept})
+    for i, message in enumerate(kept):
+        table = pq.read_table(tmp_path / "out" / f"{by_class[type(message)].name}.parquet")
+        (row,) = [r for r in table.to_pylist() if r["counter"] == i]
+        assert row["key"] == samples[i].key
+        assert row["wall_ns"] == 7 + i
+        for field in msgspec.structs.fields(message):
+            value, back = getattr(message, field.name), row[field.name]
+            if isinstance(value, bytes) and field.type == m.Digest:
+                assert back == value.hex()
+            elif isinstance(value, bytes):
+                assert np.array_equal(back, numbers_of(field.name, value))
+            elif isinstance(value, tuple | dict):
+                assert json.loads(back) == json.loads(msgspec.json.encode(value))
+            else:
+                assert back == value
+                assert type(back) is type(value)
+
+
+def test_a_long_table_is_written_in_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet_tables, "GROUP_ROWS", 10)
+    samples = [sampled(c.ODOMETRY, odometry(k), k) for k in range(35)]
+    log = recorded(tmp_path / "log.mcap", samples)
+    assert export_parquet(log, tmp_path / "out", [c.ODOMETRY]).rows == {
+        tmp_path / "out" / "odometry.parquet": 35
+    }
+    file = pq.ParquetFile(tmp_path / "out" / "odometry.parquet")
+    assert file.num_row_groups == 4
+    assert file.read().column("reading").to_pylist() == list(range(35))
+    monkeypatch.setattr(parquet_tables, "GROUP_BYTES", 1)
+    export_parquet(log, tmp_path / "fine")
+    assert pq.ParquetFile(tmp_path / "fine" / "odometry.parquet").num_row_groups == 35
+
+
+def test_without_pyarrow_the_command_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, odometry(1), 1)]).path
+    command = ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "parquet"]
+    monkeypatch.setattr(cli_log, "find_spec", lambda name: None)
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == 2
+    assert "pip install 'teamslam[parquet]'" in refused.output
+    monkeypatch.undo()
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert "odometry.parquet: 1 rows" in done.output
+
+
+def test_paths_are_exported_and_a_log_without_any_says_so(tmp_path: Path) -> None:
+    log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, odometry(1), 1)]).path
+    refused = CliRunner().invoke(
+        app, ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "tum"]
+    )
+    assert refused.exit_code != 0
+    assert "no robot's path in it" in refused.output or "no robot's path" in str(refused.exception)
