@@ -18,7 +18,7 @@ from team.wire.codec import encoded
 from tests.support import packed, spd
 
 LARGEST_FILE = 16 * 1024
-NOISE = 6200
+NOISE = 4500
 PRIVATE = 0x90
 """An opcode of nobody's, which readers skip."""
 DIGEST = b"configur"
