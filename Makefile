@@ -29,6 +29,7 @@ run: $(VENV)/.runtime
 
 # loadgroup: what starts processes shares one worker, everything else is spread over both.
 test: $(VENV)/.dev
+	tests/get-chromium
 	$(BIN)/pytest --numprocesses 2 --dist loadgroup
 
 check: $(VENV)/.dev

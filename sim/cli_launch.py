@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from contextlib import nullcontext
 from datetime import datetime
 from importlib.resources import files
 from pathlib import Path
@@ -23,6 +24,7 @@ from sim.cli_options import (
     parsed_speed,
     scenario_of,
 )
+from sim.cli_view import FoxglovePort, Open, Port, shown_on_page
 from sim.scenario import Scenario, doubts, with_options
 
 if TYPE_CHECKING:
@@ -64,6 +66,12 @@ def launch(
     views: Annotated[
         bool, typer.Option(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
     ] = True,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
+    ] = False,
+    port: Port = 0,
+    foxglove_port: FoxglovePort = 8765,
+    browser: Open = None,
 ) -> None:
     """Launch a whole team here, watch it, and end with a report and a log.
 
@@ -94,13 +102,21 @@ def launch(
     _keep_earlier(log)
     _prepare(resolved)
     plan = Plan(resolved, folder, log, pace, listen, views)
-    try:
-        with shown(f"{resolved.name}, seed {resolved.seed}") as show:
-            outcome = launched(plan, show)
-    except KeyboardInterrupt:
-        kept = f"; {log} holds what was recorded" if log.exists() else ""
-        fail(f"interrupted: every process of the team was ended{kept}", FAILED)
-    _conclude(resolved, outcome, json_file, report=report)
+    page = (
+        shown_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
+        if view
+        else nullcontext()
+    )
+    with page as at:
+        try:
+            with shown(f"{resolved.name}, seed {resolved.seed}") as show:
+                outcome = launched(plan, show)
+        except KeyboardInterrupt:
+            kept = f"; {log} holds what was recorded" if log.exists() else ""
+            fail(f"interrupted: every process of the team was ended{kept}", FAILED)
+        _conclude(resolved, outcome, json_file, report=report)
+        if at is not None:
+            _keep_showing(at.url, log)
 
 
 @app.command()
@@ -122,6 +138,15 @@ def scenarios(
     for name in builtin_names():
         found = load(name)
         typer.echo(f"{name:12} {len(found.robots)} robots, {found.estimator} with {found.fusion}")
+
+
+def _keep_showing(url: str, log: Path) -> None:
+    """The page stays until somebody ends the command."""
+    from team.shell import process
+
+    typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
+    with process("launch", endless=True) as stop:
+        stop.wait()
 
 
 def _check_world(scenario: Scenario) -> None:

@@ -125,7 +125,8 @@ def test_the_wheel_holds_the_three_packages_their_scenarios_and_nothing_else(
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES
         for path in (ROOT / package).rglob("*")
-        if path.suffix in {".py", ".toml"} or path.name == "py.typed"
+        if path.suffix in {".py", ".toml", ".html", ".js", ".css", ".svg"}
+        or path.name == "py.typed"
     }
     assert shipped == expected
     assert {f"{package}/py.typed" for package in PACKAGES} <= shipped

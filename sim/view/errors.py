@@ -48,23 +48,33 @@ class RunningErrors:
     _truth: deque[Path] = field(default_factory=deque)
     _last_ns: int | None = None
 
-    def take_truth(self, message: m.Truth) -> PoseErrors | None:
-        """Take a batch of truth; the errors that it makes known."""
+    def take_truth(self, message: m.Truth) -> None:
+        """Take a batch of truth."""
         poses = floats(message.poses, "poses").astype(np.float64).reshape(-1, 3)
         times = stamps(message.stamps, "stamps").astype(np.int64)
         if len(times):
             self._truth.append(Path(times, poses))
-        return self._known()
 
-    def take_pose(self, message: m.PoseEstimate) -> PoseErrors | None:
-        """Take an estimate; the errors that it makes known."""
+    def take_pose(self, message: m.PoseEstimate) -> None:
+        """Take an estimate, if it is not too near to the last."""
         if self._last_ns is not None and message.stamp_ns < self._last_ns + SPACING_NS:
-            return None
+            return
         self._last_ns = message.stamp_ns
         pose = floats(message.pose, "pose").astype(np.float64)
         P = floats(message.covariance, "covariance").astype(np.float64).reshape(3, 3)
         self._poses.append((message.stamp_ns, pose, P))
-        return self._known()
+
+    def known(self) -> PoseErrors | None:
+        """The errors of the poses that the truth has reached since the last time."""
+        until = int(self._truth[-1].stamps_ns[-1]) if self._truth else None
+        due = []
+        while until is not None and self._poses and self._poses[0][0] <= until:
+            due.append(self._poses.popleft())
+        if not due:
+            return None
+        times, poses, covariances = zip(*due, strict=True)
+        path = Path(np.array(times, dtype=np.int64), np.array(poses))
+        return pose_errors(path, np.array(covariances), self._path(times[-1]))
 
     def truth_at(self, stamp_ns: int) -> Float[np.ndarray, "3"] | None:
         """The true pose at a time; None where it is not known."""
@@ -90,15 +100,3 @@ class RunningErrors:
         times = np.concatenate([batch.stamps_ns for batch in batches])
         times, first = np.unique(times, return_index=True)
         return Path(times, np.concatenate([batch.poses for batch in batches])[first])
-
-    def _known(self) -> PoseErrors | None:
-        """Compare the poses that the truth has reached."""
-        until = int(self._truth[-1].stamps_ns[-1]) if self._truth else None
-        due = []
-        while until is not None and self._poses and self._poses[0][0] <= until:
-            due.append(self._poses.popleft())
-        if not due:
-            return None
-        times, poses, covariances = zip(*due, strict=True)
-        path = Path(np.array(times, dtype=np.int64), np.array(poses))
-        return pose_errors(path, np.array(covariances), self._path(times[-1]))

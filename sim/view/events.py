@@ -29,10 +29,12 @@ class Chronicle:
     _reasons: set[str] = field(default_factory=set)
     _warnings: dict[str, set[str]] = field(default_factory=dict)
     _refused: int = 0
+    _begun: bool = False
     _ended: bool = False
 
     def take(self, message: m.Message, now_ns: int) -> list[Event]:
         """The events that a message brings; `now_ns` is the team time."""
+        self._begun = self._begun or isinstance(message, m.PoseEstimate | m.Truth | m.FusedMap)
         match message:
             case m.Liveliness():
                 return self._liveliness(message, now_ns)
@@ -96,6 +98,8 @@ class Chronicle:
             text = f"the centre refused {refused - self._refused} submaps"
             events.append(Event(now_ns, "refused", "central", text))
             self._refused = refused
+        if not self._begun:  # everyone says whom they wait for
+            return events
         said = self._warnings.setdefault(status.node, set())
         for warning in status.warnings:
             gist = re.sub(r"[\d.]+", "#", warning)  # a figure that moves is no news

@@ -7,8 +7,23 @@ from sim.view.node import ViewerNode
 from team.recording.reader import Log
 from team.recording.recorder import Recorder
 from team.wire import channels as ch
+from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
+
+_HEARD = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
+
+
+def heard(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
+    """What a viewer hears in a sample; None in what is not for it, or not sound."""
+    found = ch.channel_of(sample.key)
+    if found is None or found[0].name not in _HEARD:
+        return None
+    try:
+        channel, _, message = opened(sample)
+    except WireError:
+        return None  # no node would have let it in
+    return channel, message
 
 
 class Viewing:
@@ -17,19 +32,11 @@ class Viewing:
     def __init__(self) -> None:
         self.node = ViewerNode()
         self._counters: dict[str, int] = {}
-        self._heard = {channel.name for channel in (*ViewerNode.listens, ch.ALIVE)}
 
-    def take(self, sample: Sample) -> list[Sample]:
-        """The views that this sample brings, with its wall clock and counters of their own."""
-        found = ch.channel_of(sample.key)
-        if found is None or found[0].name not in self._heard:
-            return []
-        try:
-            channel, _, message = opened(sample)
-        except WireError:
-            return []  # no node would have let it in
+    def take(self, sample: Sample, said: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
+        """The views that a sample and what was heard in it bring, with counters of their own."""
         out = []
-        for shown in self.node.handle(channel, message):
+        for shown in [] if said is None else self.node.handle(*said):
             counter = self._counters.get(shown.key, 0)
             self._counters[shown.key] = counter + 1
             out.append(Sample(shown.key, shown.payload, shown.stamp_ns, sample.wall_ns, counter))
@@ -42,7 +49,7 @@ def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
             yield sample
-            yield from viewing.take(sample)
+            yield from viewing.take(sample, heard(sample))
 
 
 def export_views(log: Log, out: Path) -> int:

@@ -4,6 +4,7 @@ z is height: the plane of the map is z = 0. Directions are turns about z, (0, 0,
 """
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -240,6 +241,7 @@ def _turn(theta: float) -> fox.Quaternion:
     return fox.Quaternion(x=0.0, y=0.0, z=float(np.sin(0.5 * theta)), w=float(np.cos(0.5 * theta)))
 
 
+@lru_cache(maxsize=256)
 def _colour(shade: Shade) -> fox.Color:
     r, g, b = (int(shade[0][i : i + 2], 16) / 255.0 for i in (1, 3, 5))
     return fox.Color(r=r, g=g, b=b, a=shade[1])

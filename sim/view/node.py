@@ -85,7 +85,8 @@ class _Robot:
             self.estimate = self.coming.popleft()
             x, y, _ = self.pose().tolist()
             self.track.take(self.estimate.stamp_ns, x, y)
-            self.note(self.errors.take_pose(self.estimate))
+            self.errors.take_pose(self.estimate)
+        self.note(self.errors.known())
         true = self.errors.truth_at(now_ns)
         if true is not None:
             self.true_track.take(now_ns, float(true[0]), float(true[1]))
@@ -161,8 +162,7 @@ class ViewerNode:
             case m.PoseEstimate():
                 self._take_pose(message, by_team=channel is ch.TEAM_POSE)
             case m.Truth():
-                robot = self._of(message.robot)
-                robot.note(robot.errors.take_truth(message))
+                self._of(message.robot).errors.take_truth(message)
             case m.TruthLandmarks():
                 places = floats(message.positions, "positions").reshape(-1, 2)
                 names = ids(message.ids, "ids").tolist()

@@ -4,7 +4,7 @@ import threading
 import time
 from dataclasses import replace
 
-from sim.view.export import Viewing
+from sim.view.export import Viewing, heard
 from team.shell import WAIT_S
 from team.wire import channels as ch
 from team.wire.bus import Bus
@@ -24,7 +24,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
         for sample in bus.receive(WAIT_S):
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
-            for shown in viewing.take(sample):
+            for shown in viewing.take(sample, heard(sample)):
                 bus.publish_raw(replace(shown, wall_ns=time.time_ns()))
                 published += 1
     return published

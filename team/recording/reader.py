@@ -85,7 +85,7 @@ class Log:
             for frame in frames(file, self.path):
                 if frame.opcode == Opcode.CHUNK:
                     try:
-                        yield self._samples(frame, names, keys)
+                        yield self.samples_in(frame, keys, names)
                     except (*MALFORMED, ValueError, zstandard.ZstdError) as error:
                         what = f"damaged chunk at offset {frame.offset}: {error}"
                         yield DamagedChunkError(self.path, what, REPAIR)
@@ -106,9 +106,10 @@ class Log:
         channel = LogChannel.read(ReadDataStream(BytesIO(body)))
         keys[channel.id] = self._key(channel.topic, names)
 
-    def _samples(
-        self, frame: Frame, names: set[str] | None, keys: dict[int, str | None]
+    def samples_in(
+        self, frame: Frame, keys: dict[int, str | None], names: set[str] | None = None
     ) -> list[Sample]:
+        """The samples of a chunk, on channels of these names; `keys` learns what it introduces."""
         samples = []
         for record in records(expanded(frame.body)):
             if record.opcode == Opcode.CHANNEL:

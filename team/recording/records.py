@@ -28,7 +28,8 @@ MOST_RECORDS = 250_000
 """Records of one chunk: a recorder's chunk of a MiB has 34 000 of the smallest messages."""
 _FRAME = struct.Struct("<BQ")
 _BLOCK = 2**20
-FOOTER_SIZE = _FRAME.size + 20
+FRAME_SIZE = _FRAME.size
+FOOTER_SIZE = FRAME_SIZE + 20
 MALFORMED = (McapError, UnicodeDecodeError, OverflowError, struct.error)
 """What mcap raises where a record is not what its opcode says."""
 REPAIR = "`teamslam repair` saves the rest"

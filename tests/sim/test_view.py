@@ -224,9 +224,11 @@ def test_an_error_is_known_as_soon_as_pose_and_truth_are_there(truth_first):
         lambda: errors.take_truth(truth([0.0, 1.0, 2.0])),
         lambda: errors.take_pose(pose(1.5, 2)),
     ]
-    first, second = steps if truth_first else steps[::-1]
-    assert first() is None
-    found = second()
+    for step in steps if truth_first else steps[::-1]:
+        assert errors.known() is None
+        step()
+    found = errors.known()
+    assert found is not None
     np.testing.assert_allclose(found.errors, [[0.5, 0.0, 0.0]])
     np.testing.assert_allclose(found.nees, [1.0])
 
@@ -234,8 +236,9 @@ def test_an_error_is_known_as_soon_as_pose_and_truth_are_there(truth_first):
 def test_truth_that_is_far_ahead_is_kept_for_the_estimates():
     errors = RunningErrors()
     for begin in range(0, 300, 10):
-        assert errors.take_truth(truth([float(begin + i) for i in range(11)])) is None
-    found = errors.take_pose(pose(3.0, 3.25))
+        errors.take_truth(truth([float(begin + i) for i in range(11)]))
+    errors.take_pose(pose(3.0, 3.25))
+    found = errors.known()
     np.testing.assert_allclose(found.errors[0, 0], 0.25)
     errors.forget(250 * S)
     assert errors.truth_at(3 * S) is None
@@ -341,7 +344,9 @@ def test_a_warning_whose_figures_move_is_told_once_and_a_refusal_is_one():
     def status(refused: int, *warnings: str) -> m.Status:
         return m.Status(0, "central", "joining", {"refused": float(refused)}, warnings)
 
-    assert told(status(0, "cost 1.2"), status(0, "cost 1.3"), status(2, "refused: overlap")) == [
+    begun = pose(0, 0)
+    said = (status(0, "cost 1.2"), status(0, "cost 1.3"), status(2, "refused: overlap"))
+    assert told(status(0, "waits"), begun, *said) == [
         ("warning", "central: cost 1.2"),
         ("refused", "the centre refused 2 submaps"), ("refused", "central: refused: overlap"),
     ]  # fmt: skip

@@ -1,0 +1,403 @@
+// The page: the stream of frames into the store, the time, and what is shown at it.
+
+import { LAYERS, MapView, gridStep } from './mapview.js';
+import { Plot, colour } from './plots.js';
+import { Store, upTo } from './store.js';
+
+const WARN = 1.1, FAIL = 1.3;  // of the joint cost per degree of freedom, as the centre's monitor
+const TEXT_MS = 120;           // between two looks of tables
+const TRAFFIC_ROWS = 40;
+const $ = (id) => document.getElementById(id);
+
+const store = new Store();
+const map = new MapView($('map'), store);
+const state = { time: 0, playing: false, speed: 10, following: true, chosen: null, picked: false, touched: false };
+const plots = ['plot-x', 'plot-y', 'plot-heading', 'plot-cost'].map((id) => new Plot($(id), seek));
+
+function end() { return Math.max(store.now, 1e-9); }
+
+function seek(time) {
+  state.time = Math.min(Math.max(time, 0), end());
+  state.following = !store.complete && state.time >= end() - 1e-6;
+  state.touched = true;
+}
+
+function play(playing) {
+  state.playing = playing;
+  state.touched = true;
+  if (playing && state.time >= end() - 1e-6) {
+    if (store.complete) state.time = 0; else state.following = true;
+  }
+}
+
+// The stream.
+
+let attempts = 0;
+function connect() {
+  const socket = new WebSocket(`${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/stream`);
+  socket.onmessage = (event) => {
+    attempts = 0;
+    document.body.dataset.state = 'open';
+    for (const frame of JSON.parse(event.data)) store.take(frame);
+    if (!state.picked && store.robots.size) choose([...store.robots.keys()][0]);
+  };
+  socket.onclose = () => {
+    document.body.dataset.state = 'closed';
+    if (!store.complete) setTimeout(connect, Math.min(500 * 2 ** attempts++, 8000));
+  };
+}
+
+// The controls.
+
+function pick(name) {
+  state.picked = true;
+  choose(name);
+}
+
+function choose(name) {
+  if (state.chosen === name) return;
+  state.chosen = map.chosen = name;
+  lookedAt = 0;
+}
+
+for (const [name, text] of LAYERS) {
+  const button = document.createElement('button');
+  button.textContent = text;
+  button.setAttribute('aria-pressed', 'true');
+  button.addEventListener('click', () => {
+    map.on[name] = !map.on[name];
+    button.setAttribute('aria-pressed', map.on[name]);
+  });
+  $('layers').append(button);
+}
+$('zoom-in').addEventListener('click', () => map.zoom(1.4));
+$('zoom-out').addEventListener('click', () => map.zoom(1 / 1.4));
+$('fit').addEventListener('click', () => { map.follow = null; map.fit(); });
+$('play').addEventListener('click', () => play(!moving()));
+$('speed').addEventListener('change', () => { state.speed = Number($('speed').value); });
+$('live').addEventListener('click', () => { state.following = true; state.playing = false; });
+$('slider').addEventListener('input', () => { state.playing = false; seek(($('slider').value / 1000) * end()); });
+addEventListener('keydown', (event) => {
+  if (event.target.matches('select') || event.ctrlKey || event.metaKey || event.altKey) return;
+  const step = event.shiftKey ? 10 : 1;
+  const done = {
+    ' ': () => play(!moving()), f: () => { map.follow = null; map.fit(); }, '+': () => map.zoom(1.4), '-': () => map.zoom(1 / 1.4),
+    ArrowRight: () => { state.playing = false; seek(state.time + step); },
+    ArrowLeft: () => { state.playing = false; seek(state.time - step); },
+  }[event.key];
+  if (done && !(event.key === ' ' && event.target.matches('button'))) { event.preventDefault(); done(); }
+});
+matchMedia('(prefers-color-scheme: light)').addEventListener('change', () => {
+  map.readColours();
+  for (const plot of plots) plot.key = '';
+});
+
+function moving() { return state.playing || (state.following && !store.complete); }
+
+// Time.
+
+let before = performance.now();
+let lookedAt = 0;
+let drawn = '';
+function turn(now) {
+  requestAnimationFrame(turn);
+  const passed = Math.min((now - before) / 1000, 0.25);
+  before = now;
+  if (!store.hello) return;
+  if (store.complete && !state.touched) state.time = end();
+  else if (state.following && !store.complete) {
+    state.playing = false;
+    state.time += (end() - state.time) * Math.min(1, 5 * passed);
+    if (end() - state.time < 1e-3) state.time = end();
+  } else if (state.playing) {
+    state.time = Math.min(state.time + passed * state.speed, end());
+    if (state.time >= end()) {
+      state.playing = false;
+      state.following = !store.complete;
+    }
+  }
+  const wanted = `${state.time}|${store.version}|${map.centre}|${map.scale}|${map.chosen}|${map.fitted}|${Object.values(map.on)}|${innerWidth}|${innerHeight}`;
+  if (wanted !== drawn || map.pending || map.canvas.width !== Math.round(map.canvas.clientWidth * map.ratio)) {
+    drawn = wanted;
+    map.draw(state.time);
+    drawPlots();
+    const share = (1000 * state.time) / end();
+    if (document.activeElement !== $('slider') || moving()) $('slider').value = share;
+    $('now').textContent = state.time.toFixed(1);
+  }
+  if (now - lookedAt > TEXT_MS) {
+    lookedAt = now;
+    look();
+  }
+}
+
+// What is written.
+
+let written = '';
+function look() {
+  const key = `${state.time.toFixed(2)}|${store.version}|${state.chosen}|${moving()}|${document.body.dataset.state}|${map.scale}`;
+  if (key === written) return;
+  written = key;
+  const { hello } = store;
+  $('team').textContent = hello.title;
+  document.title = `${hello.team} · teamslam`;
+  const live = !store.complete;
+  const lost = live && document.body.dataset.state === 'closed';
+  $('badge').hidden = false;
+  $('badge').className = lost ? 'lost' : live ? '' : 'log';
+  $('badge').textContent = lost ? 'CONNECTION LOST' : live ? 'LIVE' : 'LOG';
+  $('live').hidden = !live;
+  $('live').setAttribute('aria-pressed', String(state.following));
+  $('play').setAttribute('aria-label', moving() ? 'pause' : 'play');
+  $('play').querySelector('path').setAttribute('d', moving() ? 'M7 4h4v16H7zM14 4h4v16h-4z' : 'M7 4l13 8-13 8z');
+  $('end').textContent = end().toFixed(0);
+  $('empty').hidden = [...store.robots.values()].some((robot) => robot.pose.length) || store.maps.length > 0;
+  lookAtMap();
+  lookAtRobots();
+  lookAtEvents();
+  lookAtTraffic();
+  const metres = gridStep(map.scale) * 2;
+  $('scale').firstElementChild.style.width = `${metres * map.scale}px`;
+  $('scale').lastElementChild.textContent = metres >= 1 ? `${metres} m` : `${Math.round(metres * 100)} cm`;
+}
+
+function put(id, text, level = '') {
+  $(id).textContent = text;
+  $(id).className = level;
+}
+
+function levelOf(cost) { return cost > FAIL ? 'bad' : cost > WARN ? 'warn' : ''; }
+
+function lookAtMap() {
+  const shown = store.mapAt(state.time);
+  put('landmarks', shown ? shown.ids.length : '0');
+  const here = [...store.robots.values()].filter((r) => r.pose.at(state.time) >= 0);
+  put('robot-count', here.filter((r) => store.stateAt(r, state.time) !== 'lost').length);
+  $('rmse-box').hidden = $('nees-box').hidden = !store.trueMap;
+  put('rmse', shown && shown.rmse !== null ? metresText(shown.rmse) : '–');
+  put('nees', shown && shown.nees !== null ? shown.nees.toFixed(2) : '–', '');
+  const figures = store.figuresAt('central', state.time);
+  const cost = figures && figures.joint_cost_per_dof;
+  $('cost-box').hidden = !store.figures.has('central');
+  put('cost', cost ? cost.toFixed(2) : '–', cost ? levelOf(cost) : '');
+}
+
+function metresText(v) { return v < 0.995 ? `${(100 * v).toFixed(v < 0.0995 ? 1 : 0)} cm` : `${v.toFixed(2)} m`; }
+
+const rows = new Map();
+function lookAtRobots() {
+  const body = $('robots').tBodies[0];
+  const known = [...store.robots.values()];
+  if (known.length !== rows.size) {
+    rows.clear();
+    body.replaceChildren(...known.map((robot) => {
+      const row = document.createElement('tr');
+      row.dataset.robot = robot.name;
+      row.tabIndex = 0;
+      row.title = 'show its errors; twice: follow it';
+      const cells = Array.from({ length: 6 }, () => row.insertCell());
+      const dot = document.createElement('i');
+      dot.className = 'dot';
+      const note = document.createElement('small');
+      cells[0].append(dot, robot.name, note);
+      row.addEventListener('click', () => pick(robot.name));
+      row.addEventListener('dblclick', () => { map.follow = robot.name; });
+      row.addEventListener('keydown', (event) => { if (event.key === 'Enter') pick(robot.name); });
+      rows.set(robot.name, { row, cells, dot, note });
+      return row;
+    }));
+    $('error-tabs').replaceChildren(...known.map((robot) => {
+      const tab = document.createElement('button');
+      tab.textContent = robot.name;
+      tab.dataset.robot = robot.name;
+      tab.setAttribute('role', 'tab');
+      tab.addEventListener('click', () => pick(robot.name));
+      return tab;
+    }));
+    $('error-tabs').hidden = known.length < 2;
+  }
+  const errors = known.some((robot) => robot.error.length);
+  $('error-head').textContent = errors ? 'error [m]' : '';
+  for (const robot of known) {
+    const { row, cells, dot, note } = rows.get(robot.name);
+    row.classList.toggle('chosen', robot.name === state.chosen);
+    dot.style.background = robot.colour;
+    const now = store.stateAt(robot, state.time);
+    note.textContent = now === 'lost' ? 'lost' : now === 'done' || now === 'left' ? 'done' : '';
+    note.className = now === 'lost' ? '' : 'done';
+    const i = robot.pose.at(state.time);
+    const texts = i < 0 ? ['–', '–', '–', '–', ''] : poseTexts(robot, i);
+    texts.forEach((text, k) => { cells[k + 1].textContent = text; });
+    const e = robot.error.at(state.time);
+    const out = e >= 0 && (Math.abs(robot.error.get(e, 0)) > robot.error.get(e, 3) || Math.abs(robot.error.get(e, 1)) > robot.error.get(e, 4));
+    cells[5].textContent = e < 0 || i < 0 ? '' : Math.hypot(robot.error.get(e, 0), robot.error.get(e, 1)).toFixed(2);
+    cells[5].className = out ? 'bad' : '';
+  }
+  for (const tab of $('error-tabs').children) tab.setAttribute('aria-selected', String(tab.dataset.robot === state.chosen));
+}
+
+function poseTexts(robot, i) {
+  const [x, y, heading, xx, xy, yy] = [0, 1, 2, 3, 4, 5].map((k) => robot.pose.get(i, k));
+  const worst = 3 * Math.sqrt((xx + yy) / 2 + Math.hypot((xx - yy) / 2, xy));
+  return [x.toFixed(2), y.toFixed(2), `${((heading * 180) / Math.PI).toFixed(0)}°`, worst.toFixed(2), ''];
+}
+
+let listed = null;
+function lookAtEvents() {
+  const list = $('events');
+  if (listed !== store.events.length || list.store !== store.hello) {
+    listed = store.events.length;
+    list.store = store.hello;
+    list.replaceChildren(...store.events.map((event) => {
+      const item = document.createElement('li');
+      const time = document.createElement('time');
+      time.textContent = `${event.t.toFixed(0)} s`;
+      const text = document.createElement('span');
+      text.textContent = event.x;
+      text.className = event.e;
+      item.append(time, text);
+      item.addEventListener('click', () => { state.playing = false; seek(event.t); });
+      return item;
+    }));
+    drawTicks();
+  }
+  if (ticked !== end()) drawTicks();
+  let last = null;
+  store.events.forEach((event, i) => {
+    const future = event.t > state.time + 1e-6;
+    list.children[i].classList.toggle('future', future);
+    if (!future) last = list.children[i];
+  });
+  if (last && moving()) list.scrollTop = last.offsetTop - list.clientHeight + last.clientHeight + 8;
+}
+
+let ticked = 0;
+function drawTicks() {
+  ticked = end();
+  const canvas = $('ticks'), ratio = Math.min(devicePixelRatio || 1, 2);
+  canvas.width = canvas.clientWidth * ratio;
+  canvas.height = canvas.clientHeight * ratio;
+  const g = canvas.getContext('2d'), half = 8 * ratio;
+  const marks = { lost: 'bad', refused: 'bad', withdrawn: 'bad', warning: 'warn', map: 'good', joined: 'good' };
+  for (const event of store.events) {
+    if (!marks[event.e]) continue;
+    g.fillStyle = colour(marks[event.e]);
+    g.fillRect(half + (event.t / end()) * (canvas.width - 2 * half) - ratio, 0, 2 * ratio, 6 * ratio);
+  }
+}
+
+function lookAtTraffic() {
+  const found = [];
+  let total = 0;
+  for (const [key, of] of store.traffic) {
+    const i = upTo(of.t, state.time) - 1;
+    if (i >= 0) { found.push([key, of.m[i], of.b[i]]); total += of.b[i]; }
+  }
+  found.sort((a, b) => b[2] - a[2]);
+  const rate = state.time > 0 ? ` · ${bytesText(total / state.time)}/s` : '';
+  $('traffic-total').textContent = found.length ? `${bytesText(total)}${rate} of ${found.length} keys` : '';
+  const body = $('traffic').tBodies[0];
+  const shown = found.slice(0, TRAFFIC_ROWS);
+  while (body.rows.length > shown.length) body.deleteRow(-1);
+  while (body.rows.length < shown.length) { const row = body.insertRow(); row.insertCell(); row.insertCell(); row.insertCell(); }
+  shown.forEach(([key, messages, bytes], i) => {
+    const [name, count, size] = body.rows[i].cells;
+    name.textContent = name.title = key;
+    name.style.setProperty('--share', `${(100 * bytes) / shown[0][2]}%`);
+    count.textContent = messages.toLocaleString('en');
+    size.textContent = bytesText(bytes);
+  });
+}
+
+function bytesText(n) {
+  if (n < 1000) return `${n.toFixed(0)} B`;
+  return n < 1e6 ? `${(n / 1e3).toFixed(n < 1e4 ? 1 : 0)} kB` : `${(n / 1e6).toFixed(n < 1e7 ? 2 : 1)} MB`;
+}
+
+// What is plotted.
+
+const DEGREES = 180 / Math.PI;
+function drawPlots() {
+  const robot = store.robots.get(state.chosen);
+  if (robot) {
+    $('errors-of').textContent = robot.name;
+    const { error, pose } = robot;
+    const known = error.length > 0;
+    $('no-truth').hidden = known;
+    [['x', 'm', 1], ['y', 'm', 1], ['heading', '°', DEGREES]].forEach(([name, unit, factor], k) => {
+      const variance = [3, 5, 6][k];
+      const band = known
+        ? { count: error.length, t: (i) => error.t[i], v: (i) => factor * error.get(i, 3 + k) }
+        : { count: pose.length, t: (i) => pose.t[i], v: (i) => 3 * factor * Math.sqrt(pose.get(i, variance)) };
+      const high = reach(robot, name, band, known ? { count: error.length, v: (i) => factor * error.get(i, k) } : null);
+      plots[k].draw({
+        key: `${robot.name}|${error.length}|${pose.length}|${robot.colour}`, title: unit === '°' ? 'heading [°]' : `${name} [m]`, unit: '', end: end(), time: state.time,
+        low: -high, high, band,
+        lines: known ? [{ colour: robot.colour, width: 1.5, count: error.length, t: (i) => error.t[i], v: (i) => factor * error.get(i, k) }] : [],
+      });
+    });
+  }
+  drawConsistency();
+}
+
+/** Half the height of an error's plot: twice the middle bound, or the largest error if that is more. */
+const reaches = new Map();
+function reach(robot, name, band, line) {
+  const key = `${robot.name} ${name}`, known = reaches.get(key);
+  if (known && known.count === band.count && known.hello === store.hello) return known.high;
+  const bounds = Array.from({ length: band.count }, (_, i) => band.v(i)).sort((a, b) => a - b);
+  let high = bounds.length ? 1.7 * bounds[Math.floor(0.8 * (bounds.length - 1))] : 1;
+  for (let i = 0; line && i < line.count; i++) high = Math.max(high, 1.1 * Math.abs(line.v(i)));
+  high = Math.max(high, 1e-3);
+  reaches.set(key, { count: band.count, high, hello: store.hello });
+  return high;
+}
+
+function drawConsistency() {
+  const found = store.figures.get('central');
+  const costs = found ? found.f.map((f) => f.joint_cost_per_dof) : [];
+  const lines = [];
+  const legend = [];
+  const line = (t, v, options) => lines.push({ count: t.length, t: (i) => t[i], v: (i) => v[i], ...options });
+  let high = 1.5;
+  if (found) {
+    for (const robot of store.robots.values()) {
+      const name = `joint_cost_per_dof.${robot.name}`;
+      const kept = found.t.map((t, i) => [t, found.f[i][name]]).filter(([, v]) => v !== undefined);
+      line(kept.map((k) => k[0]), kept.map((k) => k[1]), { colour: robot.colour, width: 1, alpha: 0.7 });
+    }
+    const kept = found.t.map((t, i) => [t, costs[i]]).filter(([, v]) => v !== undefined);
+    line(kept.map((k) => k[0]), kept.map((k) => k[1]), { colour: colour('text'), width: 1.8 });
+    if (kept.length) legend.push(['text', 'joint cost of the team, of each robot']);
+    for (const [, v] of kept) high = Math.max(high, Math.min(1.15 * v, 5));
+  }
+  const fits = store.maps.filter((m) => m.nees !== null);
+  if (fits.length) {
+    line(fits.map((m) => m.t), fits.map((m) => m.nees), { colour: colour('landmark'), width: 1.5 });
+    legend.push(['landmark', 'map NEES']);
+    for (const m of fits) high = Math.max(high, Math.min(1.15 * m.nees, 5));
+  }
+  const i = found ? upTo(found.t, state.time) - 1 : -1;
+  const cost = i < 0 ? undefined : costs[i];
+  $('consistency-says').textContent = cost === undefined ? 'per degree of freedom; 1 is right'
+    : cost > FAIL ? `${cost.toFixed(2)}: its covariances are not to be trusted` : cost > WARN ? `${cost.toFixed(2)}: its covariances are too small` : `${cost.toFixed(2)} per degree of freedom; 1 is right`;
+  const key = `${found ? found.t.length : 0}|${store.maps.length}|${store.robots.size}`;
+  plots[3].draw({
+    key, title: 'per degree of freedom', unit: '', end: end(), time: state.time, low: 0, high, lines,
+    levels: [{ v: 1, colour: 'good' }, { v: WARN, colour: 'warn' }, { v: FAIL, colour: 'bad' }],
+  });
+  if ($('cost-legend').dataset.key !== String(legend)) {
+    $('cost-legend').dataset.key = String(legend);
+    $('cost-legend').replaceChildren(...legend.map(([name, text]) => {
+      const item = document.createElement('span');
+      item.style.setProperty('--c', colour(name));
+      item.textContent = text;
+      return item;
+    }));
+  }
+}
+
+addEventListener('resize', drawTicks);
+window.teamslam = { store, state, map, seek, play };  // for the console and the tests
+connect();
+requestAnimationFrame(turn);

@@ -1,0 +1,401 @@
+// The map: landmarks with ellipses, robots, paths, truth. The still parts are painted once into
+// layers of their own; while time goes on, only what has been added to a path is painted.
+
+import { upTo } from './store.js';
+
+const ELLIPSE = Math.sqrt(5.991);  // 95 % of a Gaussian in the plane
+const LABELS = 400;                // more landmarks than these have no numbers until they are near
+
+export const LAYERS = [
+  ['ellipses', '95 % ellipses'], ['labels', 'numbers'], ['paths', 'paths'], ['truth', 'truth'],
+  ['particles', 'particles'],
+];
+
+export class MapView {
+  constructor(canvas, store) {
+    this.canvas = canvas;
+    this.context = canvas.getContext('2d');
+    this.store = store;
+    this.on = Object.fromEntries(LAYERS.map(([name]) => [name, true]));
+    this.scale = 20;             // pixels per metre
+    this.centre = [0, 0];        // metres
+    this.fitted = true;          // until somebody moves the map
+    this.follow = null;          // a robot's name
+    this.chosen = null;
+    this.landmarks = new OffscreenCanvas(1, 1);
+    this.paths = new OffscreenCanvas(1, 1);
+    this.painted = {};           // what the layers hold
+    this.paintedAt = this.movedAt = -1e9;
+    this.cost = 0;               // of painting them [ms]
+    this.pending = false;
+    this.frames = 0;
+    this.readColours();
+    this.listen();
+  }
+
+  readColours() {
+    const style = getComputedStyle(document.documentElement);
+    const of = (name) => style.getPropertyValue(`--${name}`).trim();
+    this.colours = {
+      ground: of('ground'), grid: of('grid'), strong: of('grid-strong'), landmark: of('landmark'),
+      truth: of('truth'), text: of('text'), soft: of('soft'),
+    };
+    this.painted = {};
+  }
+
+  resize() {
+    const ratio = Math.min(devicePixelRatio || 1, 2);
+    const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
+    const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      for (const each of [this.canvas, this.landmarks, this.paths]) {
+        each.width = width;
+        each.height = height;
+      }
+      this.painted = {};
+    }
+    this.ratio = ratio;
+  }
+
+  fit() {
+    const [left, bottom, right, top] = this.store.box;
+    if (!(right >= left)) return;
+    const width = Math.max(right - left, 1), height = Math.max(top - bottom, 1);
+    this.resize();
+    const w = this.canvas.width / this.ratio, h = this.canvas.height / this.ratio;
+    const above = 46, room = 34;  // the chips are above
+    this.scale = Math.min((w - 2 * room) / width, (h - above - 2 * room) / height, 400);
+    this.centre = [(left + right) / 2, (bottom + top) / 2 + above / 2 / this.scale];
+    this.fitted = true;
+  }
+
+  screen(x, y) {
+    return [
+      (x - this.centre[0]) * this.scale * this.ratio + this.canvas.width / 2,
+      (this.centre[1] - y) * this.scale * this.ratio + this.canvas.height / 2,
+    ];
+  }
+
+  zoom(factor, at = null) {
+    const w = this.canvas.clientWidth / 2, h = this.canvas.clientHeight / 2;
+    const [px, py] = at || [w, h];
+    const x = this.centre[0] + (px - w) / this.scale, y = this.centre[1] - (py - h) / this.scale;
+    this.scale = Math.min(Math.max(this.scale * factor, 0.05), 5000);
+    this.centre = [x - (px - w) / this.scale, y + (py - h) / this.scale];
+    this.fitted = false;
+  }
+
+  listen() {
+    const fingers = new Map();
+    let distance = 0;
+    const canvas = this.canvas;
+    canvas.addEventListener('wheel', (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(-event.deltaY * 0.0015), [event.offsetX, event.offsetY]);
+    }, { passive: false });
+    canvas.addEventListener('pointerdown', (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
+      distance = 0;
+    });
+    canvas.addEventListener('pointermove', (event) => {
+      const before = fingers.get(event.pointerId);
+      if (!before) return;
+      const now = [event.offsetX, event.offsetY];
+      fingers.set(event.pointerId, now);
+      this.centre = [
+        this.centre[0] - (now[0] - before[0]) / this.scale / fingers.size,
+        this.centre[1] + (now[1] - before[1]) / this.scale / fingers.size,
+      ];
+      this.fitted = false;
+      this.follow = null;
+      if (fingers.size === 2) {
+        const [a, b] = [...fingers.values()];
+        const apart = Math.hypot(a[0] - b[0], a[1] - b[1]);
+        if (distance) this.zoom(apart / distance, [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]);
+        distance = apart;
+      }
+    });
+    for (const end of ['pointerup', 'pointercancel']) {
+      canvas.addEventListener(end, (event) => { fingers.delete(event.pointerId); distance = 0; });
+    }
+    canvas.addEventListener('dblclick', () => { this.follow = null; this.fit(); });
+  }
+
+  draw(time) {
+    this.resize();
+    if (this.fitted) this.fit();
+    if (this.follow) {
+      const robot = this.store.robots.get(this.follow);
+      const i = robot ? robot.pose.at(time) : -1;
+      if (i >= 0) { this.centre = [robot.pose.get(i, 0), robot.pose.get(i, 1)]; this.fitted = false; }
+    }
+    const g = this.context;
+    this.paintLayers(time);
+    this.blit(g);
+    if (this.on.particles) this.paintParticles(g, time);
+    for (const robot of this.store.robots.values()) this.paintRobot(g, robot, time);
+    this.frames++;
+  }
+
+  /**
+   * Paint the layers where they are not up to date, but not so often that nothing else is done:
+   * meanwhile they are shown moved and scaled as they are. `pending`: they are to be painted yet.
+   */
+  paintLayers(time) {
+    const shape = `${this.canvas.width},${this.canvas.height},${Object.values(this.on)}`;
+    const view = `${this.centre},${this.scale},${shape}`;
+    const now = performance.now();
+    const due = now - this.paintedAt > Math.min(4 * this.cost, 500);
+    const moved = this.painted.view !== undefined && this.painted.view !== view;
+    if (moved && this.movedTo !== view) { this.movedTo = view; this.movedAt = now; }
+    const still = now - this.movedAt > 120;
+    const stretched = this.painted.scale && (this.scale / this.painted.scale > 2 || this.painted.scale / this.scale > 2);
+    const fresh = this.painted.view === undefined || this.painted.shape !== shape;
+    this.pending = false;
+    if (moved && !fresh && !(due && (still || stretched || this.cost < 8 || now - this.paintedAt > 250))) {
+      this.pending = true;
+      return;
+    }
+    const map = this.store.mapAt(time);
+    const news = this.painted.map !== map || this.painted.trueMap !== this.store.trueMap;
+    const began = performance.now();
+    this.fast = moved && !still && this.cost > 8;
+    if (moved || fresh || this.painted.fast || (news && due)) {
+      if (this.painted.fast && !this.fast) this.painted.paths = null;
+      this.paintLandmarks(map);
+      this.painted = {
+        ...this.painted, view, shape, map, trueMap: this.store.trueMap, scale: this.scale, centre: [...this.centre],
+        fast: this.fast,
+      };
+      this.paintedAt = began;
+    } else if (news) this.pending = true;
+    this.paintPaths(time, view);
+    if (this.paintedAt === began) this.cost = performance.now() - began;
+    if (this.fast) this.pending = true;
+  }
+
+  blit(g) {
+    const k = this.scale / this.painted.scale, { width, height } = this.canvas;
+    const x = (this.painted.centre[0] - this.centre[0]) * this.scale * this.ratio + (width / 2) * (1 - k);
+    const y = (this.centre[1] - this.painted.centre[1]) * this.scale * this.ratio + (height / 2) * (1 - k);
+    if (k !== 1 || x || y) {
+      g.fillStyle = this.colours.ground;
+      g.fillRect(0, 0, width, height);
+    }
+    g.drawImage(this.landmarks, x, y, k * width, k * height);
+    g.drawImage(this.paths, x, y, k * width, k * height);
+  }
+
+  paintGrid(g) {
+    g.fillStyle = this.colours.ground;
+    g.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    const metres = gridStep(this.scale);
+    const step = metres * this.scale * this.ratio;
+    const [ox, oy] = this.screen(0, 0);
+    for (const [offset, size, vertical] of [[ox, this.canvas.width, true], [oy, this.canvas.height, false]]) {
+      const first = Math.ceil(-offset / step);
+      for (let k = first; offset + k * step < size; k++) {
+        const at = Math.round(offset + k * step) + 0.5;
+        g.strokeStyle = k % 5 === 0 ? this.colours.strong : this.colours.grid;
+        g.lineWidth = 1;
+        g.beginPath();
+        if (vertical) { g.moveTo(at, 0); g.lineTo(at, this.canvas.height); } else { g.moveTo(0, at); g.lineTo(this.canvas.width, at); }
+        g.stroke();
+      }
+    }
+  }
+
+  paintLandmarks(map) {
+    const g = this.landmarks.getContext('2d');
+    this.paintGrid(g);
+    const r = this.ratio;
+    if (this.on.truth && this.store.trueMap) {
+      g.strokeStyle = this.colours.truth;
+      g.lineWidth = 1.2 * r;
+      g.beginPath();
+      const { xy } = this.store.trueMap, arm = 4 * r;
+      for (let i = 0; i < xy.length; i += 2) {
+        const [x, y] = this.screen(xy[i], xy[i + 1]);
+        if (x < -9 || y < -9 || x > this.canvas.width + 9 || y > this.canvas.height + 9) continue;
+        g.moveTo(x - arm, y - arm); g.lineTo(x + arm, y + arm);
+        g.moveTo(x - arm, y + arm); g.lineTo(x + arm, y - arm);
+      }
+      g.stroke();
+    }
+    if (!map) return;
+    const count = map.ids.length, k = this.scale * r;
+    const seen = [];
+    for (let i = 0; i < count; i++) {
+      const [x, y] = this.screen(map.xy[2 * i], map.xy[2 * i + 1]);
+      if (x > -40 && y > -40 && x < this.canvas.width + 40 && y < this.canvas.height + 40) seen.push([x, y, i]);
+    }
+    if (this.on.ellipses) {
+      g.strokeStyle = this.colours.landmark;
+      g.fillStyle = this.colours.landmark;
+      g.lineWidth = 1.2 * r;
+      for (const [x, y, i] of seen) {  // one by one: a path of thousand ellipses takes twice as long
+        const [major, minor, turn] = ellipse(map.c[3 * i], map.c[3 * i + 1], map.c[3 * i + 2]);
+        g.beginPath();
+        g.ellipse(x, y, Math.max(major * k, 2 * r), Math.max(minor * k, 2 * r), -turn, 0, 2 * Math.PI);
+        if (!this.fast) { g.globalAlpha = 0.16; g.fill(); }
+        g.globalAlpha = 0.85; g.stroke();
+      }
+      g.globalAlpha = 1;
+    }
+    g.fillStyle = this.colours.landmark;
+    const dot = (count > 300 ? 1.8 : 2.6) * r;
+    for (const [x, y] of seen) {
+      if (count > 300) { g.fillRect(x - dot, y - dot, 2 * dot, 2 * dot); continue; }
+      g.beginPath();
+      g.arc(x, y, dot, 0, 2 * Math.PI);
+      g.fill();
+    }
+    if (this.on.labels && seen.length <= LABELS) {
+      g.font = `${11 * r}px system-ui, "DejaVu Sans", sans-serif`;
+      g.fillStyle = this.colours.soft;
+      for (const [x, y, i] of seen) g.fillText(map.ids[i], x + 6 * r, y - 5 * r);
+    }
+  }
+
+  paintPaths(time, view) {
+    const g = this.paths.getContext('2d');
+    const sameView = this.painted.paths === view && time >= this.painted.time && this.painted.store === this.store.hello;
+    if (!sameView) {
+      g.clearRect(0, 0, this.canvas.width, this.canvas.height);
+      this.painted.ends = new Map();
+    }
+    this.painted.paths = view;
+    this.painted.time = time;
+    this.painted.store = this.store.hello;
+    if (!this.on.paths) return;
+    const r = this.ratio;
+    g.lineJoin = 'bevel';
+    for (const robot of this.store.robots.values()) {
+      if (this.on.truth) this.extendPath(g, robot, 'truth', robot.truth, time, this.colours.truth, 1 * r, 0.55);
+      this.extendPath(g, robot, 'pose', robot.pose, time, robot.colour, 2 * r, 0.75);
+    }
+  }
+
+  extendPath(g, robot, what, series, time, colour, width, alpha) {
+    const key = `${what} ${robot.name}`;
+    const from = this.painted.ends.get(key) || 0;
+    const to = series.at(time);
+    if (to <= from) return;
+    g.strokeStyle = colour;
+    g.lineWidth = this.fast ? 1 : width;
+    g.globalAlpha = alpha;
+    g.beginPath();
+    let drawn = 0;
+    let [x, y] = this.screen(series.get(from, 0), series.get(from, 1));
+    g.moveTo(x, y);
+    for (let i = from + 1; i <= to; i++) {
+      const [nx, ny] = this.screen(series.get(i, 0), series.get(i, 1));
+      if (i < to && Math.abs(nx - x) + Math.abs(ny - y) < 1.5) continue;  // nobody could see it
+      if (Math.hypot(nx - x, ny - y) > 2.5 * this.scale * this.ratio + 400) g.moveTo(nx, ny); else g.lineTo(nx, ny);
+      [x, y] = [nx, ny];
+      if (++drawn % 30 === 0) { g.stroke(); g.beginPath(); g.moveTo(x, y); }  // short ones are faster
+    }
+    g.stroke();
+    g.globalAlpha = 1;
+    this.painted.ends.set(key, to);
+  }
+
+  paintParticles(g, time) {
+    const r = this.ratio;
+    for (const robot of this.store.robots.values()) {
+      const i = upTo(robot.cloudTimes, time) - 1;
+      if (i < 0 || time - robot.cloudTimes[i] > 30) continue;
+      const points = robot.clouds[i];
+      g.fillStyle = robot.colour;
+      g.globalAlpha = 0.5;
+      g.beginPath();
+      for (let k = 0; k < points.length; k += 2) {
+        const [x, y] = this.screen(points[k], points[k + 1]);
+        g.rect(x - r, y - r, 2 * r, 2 * r);
+      }
+      g.fill();
+      g.globalAlpha = 1;
+    }
+  }
+
+  paintRobot(g, robot, time) {
+    const r = this.ratio;
+    if (this.on.truth) {
+      const i = robot.truth.at(time);
+      if (i >= 0) {
+        const place = between(robot.truth, i, time);
+        const [x, y] = this.screen(place[0], place[1]);
+        this.arrow(g, x, y, place[2], 9 * r);
+        g.strokeStyle = this.colours.truth;
+        g.lineWidth = 1.3 * r;
+        g.stroke();
+      }
+    }
+    const i = robot.pose.at(time);
+    if (i < 0) return;
+    const [px, py, heading] = between(robot.pose, i, time);
+    const [x, y] = this.screen(px, py);
+    const lost = this.store.stateAt(robot, time) === 'lost';
+    const [major, minor, turn] = ellipse(robot.pose.get(i, 3), robot.pose.get(i, 4), robot.pose.get(i, 5));
+    const k = this.scale * r;
+    g.beginPath();
+    g.ellipse(x, y, Math.max(major * k, r), Math.max(minor * k, r), -turn, 0, 2 * Math.PI);
+    g.fillStyle = g.strokeStyle = robot.colour;
+    g.globalAlpha = 0.18; g.fill();
+    g.globalAlpha = 0.8; g.lineWidth = 1.2 * r; g.stroke();
+    g.globalAlpha = lost ? 0.4 : 1;
+    if (robot.name === this.chosen) {
+      g.beginPath(); g.arc(x, y, 17 * r, 0, 2 * Math.PI); g.lineWidth = 1.5 * r; g.stroke();
+    }
+    this.arrow(g, x, y, heading, 11 * r);
+    g.fill();
+    g.lineWidth = 1.5 * r;
+    g.strokeStyle = this.colours.ground;
+    g.stroke();
+    g.font = `600 ${12 * r}px system-ui, "DejaVu Sans", sans-serif`;
+    const text = lost ? `${robot.name} lost` : robot.name;
+    g.lineWidth = 3.5 * r;
+    g.strokeText(text, x + 13 * r, y + 15 * r);
+    g.fillStyle = robot.colour;
+    g.fillText(text, x + 13 * r, y + 15 * r);
+    g.globalAlpha = 1;
+  }
+
+  arrow(g, x, y, heading, size) {
+    const at = (turn, length) => [x + length * Math.cos(heading + turn), y - length * Math.sin(heading + turn)];
+    g.beginPath();
+    g.moveTo(...at(0, 1.15 * size));
+    g.lineTo(...at(2.5, size));
+    g.lineTo(...at(Math.PI, 0.45 * size));
+    g.lineTo(...at(-2.5, size));
+    g.closePath();
+  }
+}
+
+/** Half axes of the 95 % ellipse [m] and the direction of the major one [rad]. */
+export function ellipse(xx, xy, yy) {
+  const middle = (xx + yy) / 2, half = (xx - yy) / 2, root = Math.hypot(half, xy);
+  return [ELLIPSE * Math.sqrt(middle + root), ELLIPSE * Math.sqrt(Math.max(middle - root, 0)), Math.atan2(xy, half) / 2];
+}
+
+/** The pose between entry i and the next, straight and along the shorter arc; over gaps, entry i. */
+function between(series, i, time) {
+  const pose = [series.get(i, 0), series.get(i, 1), series.get(i, 2)];
+  if (i + 1 >= series.length) return pose;
+  const gap = series.t[i + 1] - series.t[i];
+  if (!(gap > 0 && gap < 2.5)) return pose;
+  const share = (time - series.t[i]) / gap;
+  const turn = series.get(i + 1, 2) - pose[2];
+  return [
+    pose[0] + share * (series.get(i + 1, 0) - pose[0]),
+    pose[1] + share * (series.get(i + 1, 1) - pose[1]),
+    pose[2] + share * Math.atan2(Math.sin(turn), Math.cos(turn)),
+  ];
+}
+
+/** Metres between two lines of the grid: 1, 2 or 5 times a power of ten, some 40 pixels or more. */
+export function gridStep(scale) {
+  const least = 34 / scale, power = 10 ** Math.floor(Math.log10(least));
+  return power * [1, 2, 5, 10].find((step) => step * power >= least);
+}

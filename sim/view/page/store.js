@@ -1,0 +1,164 @@
+// What the server has told of a team, in the order of team time; t is seconds since the start.
+
+/** The number of entries of ascending `t` that are not later than `time`. */
+export function upTo(t, time) {
+  let low = 0, high = t.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (t[middle] <= time) low = middle + 1; else high = middle;
+  }
+  return low;
+}
+
+/** Rows of `width` numbers by time; rows that are older than the last are left out. */
+export class Series {
+  constructor(width) { this.width = width; this.t = []; this.rows = []; }
+  get length() { return this.t.length; }
+  push(times, values) {
+    for (let i = 0; i < times.length; i++) {
+      if (this.t.length && times[i] < this.t[this.t.length - 1]) continue;
+      this.t.push(times[i]);
+      for (let k = 0; k < this.width; k++) this.rows.push(values[i * this.width + k]);
+    }
+  }
+  at(time) { return upTo(this.t, time) - 1; }
+  get(i, k) { return this.rows[i * this.width + k]; }
+}
+
+const POSE = 7;   // x, y, heading, xx, xy, yy, heading's variance
+const ERROR = 7;  // x, y, heading, their 3σ, NEES per degree of freedom
+const TRUTH = 3;
+
+function floats(text) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  return new Float32Array(bytes.buffer);
+}
+
+function names(text) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  return new Uint32Array(bytes.buffer);
+}
+
+export class Store {
+  constructor() { this.clear(); }
+
+  clear() {
+    this.hello = null;
+    this.robots = new Map();
+    this.maps = [];
+    this.mapTimes = [];
+    this.trueMap = null;
+    this.figures = new Map();
+    this.traffic = new Map();
+    this.events = [];
+    this.now = 0;
+    this.complete = false;
+    this.version = 0;
+    this.box = [Infinity, Infinity, -Infinity, -Infinity];
+  }
+
+  robot(name) {
+    let found = this.robots.get(name);
+    if (!found) {
+      found = {
+        name, pose: new Series(POSE), error: new Series(ERROR), truth: new Series(TRUTH),
+        clouds: [], cloudTimes: [], smoothed: null, states: [], stateTimes: [], colour: '#888',
+      };
+      this.robots.set(name, found);
+      this.robots = new Map([...this.robots].sort((a, b) => (a[0] < b[0] ? -1 : 1)));
+      [...this.robots.values()].forEach((robot, i) => { robot.colour = this.hello.colours[i % this.hello.colours.length]; });
+    }
+    return found;
+  }
+
+  extend(values, width) {
+    const box = this.box;
+    for (let i = 0; i + 1 < values.length; i += width) {
+      box[0] = Math.min(box[0], values[i]); box[1] = Math.min(box[1], values[i + 1]);
+      box[2] = Math.max(box[2], values[i]); box[3] = Math.max(box[3], values[i + 1]);
+    }
+  }
+
+  take(frame) {
+    this.version++;
+    switch (frame.k) {
+      case 'hello': this.clear(); this.hello = frame; break;
+      case 'now': this.now = Math.max(this.now, frame.t); break;
+      case 'eof': this.complete = frame.complete; break;
+      case 'pose': this.robot(frame.r).pose.push(frame.t, frame.v); this.extend(frame.v, POSE); break;
+      case 'err': this.robot(frame.r).error.push(frame.t, frame.v); break;
+      case 'truth': this.robot(frame.r).truth.push(frame.t, frame.v); this.extend(frame.v, TRUTH); break;
+      case 'truth_map':
+        this.trueMap = { ids: frame.ids, xy: frame.xy };
+        this.extend(frame.xy, 2);
+        break;
+      case 'map': this.takeMap(frame); break;
+      case 'cloud': {
+        const robot = this.robot(frame.r);
+        robot.clouds.push(floats(frame.v));
+        robot.cloudTimes.push(frame.t);
+        break;
+      }
+      case 'path': this.robot(frame.r).smoothed = frame; break;
+      case 'fig': {
+        if (!this.figures.has(frame.n)) this.figures.set(frame.n, { t: [], f: [] });
+        const found = this.figures.get(frame.n);
+        if (!found.t.length || frame.t >= found.t[found.t.length - 1]) {
+          found.t.push(frame.t);
+          found.f.push(frame.f);
+        }
+        break;
+      }
+      case 'bytes':
+        for (const [key, t, messages, bytes] of frame.v) this.takeTraffic(key, t, messages, bytes);
+        break;
+      case 'ev': this.takeEvent(frame); break;
+    }
+  }
+
+  takeMap(frame) {
+    const map = { ...frame, ids: names(frame.ids), xy: floats(frame.xy), c: floats(frame.c) };
+    const last = this.mapTimes[this.mapTimes.length - 1];
+    this.maps.push(map);
+    this.mapTimes.push(last === undefined ? frame.t : Math.max(frame.t, last));
+    this.extend(map.xy, 2);
+  }
+
+  takeTraffic(key, t, messages, bytes) {
+    let found = this.traffic.get(key);
+    if (!found) this.traffic.set(key, found = { t: [], m: [], b: [] });
+    const last = found.t.length - 1;
+    found.t.push(last < 0 ? t : Math.max(t, found.t[last]));
+    found.m.push((last < 0 ? 0 : found.m[last]) + messages);
+    found.b.push((last < 0 ? 0 : found.b[last]) + bytes);
+  }
+
+  takeEvent(event) {
+    let i = this.events.length;
+    while (i > 0 && this.events[i - 1].t > event.t) i--;
+    this.events.splice(i, 0, event);
+    if (event.n.startsWith('robot/') && ['joined', 'lost', 'left', 'done'].includes(event.e)) {
+      const robot = this.robot(event.n.slice(6));
+      robot.states.push(event.e);
+      robot.stateTimes.push(event.t);
+    }
+  }
+
+  /** The map that was the newest at a time; null before the first. */
+  mapAt(time) {
+    const i = upTo(this.mapTimes, time) - 1;
+    return i < 0 ? null : this.maps[i];
+  }
+
+  stateAt(robot, time) {
+    const i = upTo(robot.stateTimes, time) - 1;
+    return i < 0 ? '' : robot.states[i];
+  }
+
+  figuresAt(node, time) {
+    const found = this.figures.get(node);
+    if (!found) return null;
+    const i = upTo(found.t, time) - 1;
+    return i < 0 ? null : found.f[i];
+  }
+}

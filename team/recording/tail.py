@@ -1,0 +1,69 @@
+"""The tail of a log: its samples as its recorder writes them, chunk by chunk."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zstandard
+from mcap.opcode import Opcode
+
+from team.recording.reader import Log, LogError, open_log
+from team.recording.records import FRAME_SIZE, MALFORMED, frames
+from team.wire.bus import Sample
+
+MOST = 20_000
+"""Samples at a time, so that a long log is told in parts."""
+
+
+@dataclass
+class Tail:
+    """Reads a log that may still grow, or is not there yet; what was read is not read again.
+
+    log: once there is one. ended: its recorder has finished it, and all is read. damaged: chunks
+    that could not be read.
+    """
+
+    path: Path
+    log: Log | None = None
+    ended: bool = False
+    damaged: int = 0
+    _offset: int | None = None
+    _keys: dict[int, str | None] = field(default_factory=dict)
+
+    def more(self) -> list[Sample]:
+        """What whole chunks have come since; at most about MOST. Raises `LogError` for no log."""
+        if self.ended or (self.log is None and not self._opened()):
+            return []
+        assert self.log is not None
+        found: list[Sample] = []
+        with self.path.open("rb") as file:
+            start = () if self._offset is None else (self._offset,)
+            for frame in frames(file, self.path, *start):
+                self._offset = frame.offset + FRAME_SIZE + len(frame.body)
+                if frame.opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                    self.ended = True
+                    break
+                if frame.opcode != Opcode.CHUNK:
+                    continue
+                try:
+                    found += self.log.samples_in(frame, self._keys)
+                except (*MALFORMED, ValueError, zstandard.ZstdError):
+                    self.damaged += 1
+                if len(found) >= MOST:
+                    break
+        return found
+
+    def _opened(self) -> bool:
+        """Whether the log is there; its recorder writes its head at once."""
+        if not self.path.exists() or self.path.stat().st_size == 0:
+            return False
+        try:
+            self.log = open_log(self.path)
+        except LogError:
+            if self.path.stat().st_size > _HEAD:
+                raise
+            return False
+        return True
+
+
+_HEAD = 65_536
+"""A file that is larger and no log will not become one."""

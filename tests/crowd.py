@@ -1,0 +1,72 @@
+"""A large team's log, made up: robots among landmarks, for what has to draw them."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import Outgoing, Sample
+from team.wire.codec import encoded
+
+S = 1_000_000_000
+
+
+def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[Sample]:
+    """Poses and truth at 5 Hz, a map every 5 s in which ever more of the landmarks are known."""
+    rng = np.random.default_rng(seed)
+    size_m = 6.0 * np.sqrt(landmarks)
+    places = rng.uniform(0.0, size_m, (landmarks, 2))
+    counters: dict[str, int] = {}
+
+    def sample(out: Outgoing) -> Sample:
+        counter = counters[out.key] = counters.get(out.key, -1) + 1
+        stamp_ns = out.message.stamp_ns
+        return Sample(out.key, encoded(out.message), stamp_ns, stamp_ns, counter)
+
+    names = [f"r{i}" for i in range(1, robots + 1)]
+    yield sample(
+        Outgoing(
+            ch.TRUTH_LANDMARKS,
+            "",
+            m.TruthLandmarks(0, from_ids(range(landmarks)), from_floats(places)),
+        )
+    )
+    for name in names:
+        yield sample(Outgoing(ch.ALIVE, f"robot/{name}", m.Liveliness(0, f"robot/{name}", True)))
+        yield sample(Outgoing(ch.START, name, m.Start(0, name, 1, 0, from_floats([0, 0, 0]), b"")))
+    phase = rng.uniform(0.0, 2.0 * np.pi, robots)
+    reach = rng.uniform(0.1, 0.45, robots) * size_m
+    P = from_floats(np.diag([0.04, 0.09, 1e-3]))
+    for k in range(5 * seconds):
+        at = k * S // 5
+        for i, name in enumerate(names):
+            angle = phase[i] + k / (5.0 * reach[i])
+            true = [
+                size_m / 2 + reach[i] * np.cos(angle),
+                size_m / 2 + reach[i] * np.sin(1.3 * angle),
+                np.arctan2(1.3 * np.cos(1.3 * angle), -np.sin(angle)),
+            ]
+            said = np.array(true) + rng.normal(size=3) * [0.2, 0.3, 0.03]
+            truth = m.Truth(at, name, from_stamps([at]), from_floats(true))
+            pose = m.PoseEstimate(at, name, 1, 0, b"12345678", from_floats(said), P)
+            yield sample(Outgoing(ch.TRUTH, name, truth))
+            yield sample(Outgoing(ch.TEAM_POSE, name, pose))
+        if k % 25 == 24:
+            yield sample(Outgoing(ch.FUSED_MAP, "", _map(rng, places, at, k / (3.0 * seconds))))
+    last = 5 * seconds * S // 5
+    yield sample(Outgoing(ch.FINAL_MAP, "", _map(rng, places, last, 1.0, final=True)))
+
+
+def _map(
+    rng: np.random.Generator, places: np.ndarray, at: int, share: float, *, final: bool = False
+) -> m.FusedMap:
+    count = max(1, int(min(share, 1.0) * len(places)))
+    sigma = 0.1 + 0.4 * (1.0 - min(share, 1.0))
+    blocks = np.tile([sigma**2, 0.3 * sigma**2, 0.6 * sigma**2], (count, 1))
+    means = places[:count] + sigma * rng.normal(size=(count, 2))
+    return m.FusedMap(
+        at, "join", bytes(8), "r1/1", final, not final, 0, (), (), False,
+        from_ids(range(count)), from_floats(means), from_floats(blocks), 0.0, 0,
+    )  # fmt: skip

@@ -1,0 +1,177 @@
+"""The page in a real browser: a recorded log, and a team while it runs.
+
+Skipped where there is no Chromium; `make test` installs one where it may (tests/get-chromium).
+"""
+
+import asyncio
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sim.view.session import session
+from team.recording.recorder import Recorder
+from tests.browser import Page, browsing, chromium
+from tests.crowd import crowd
+from tests.system.processes import Processes, until
+from tests.system.scenarios import short
+
+PROGRAM = chromium()
+pytestmark = pytest.mark.skipif(
+    PROGRAM is None, reason="no Chromium on this machine (Debian: apt install chromium)"
+)
+ROBOTS, LANDMARKS, SECONDS = 3, 40, 60
+READY = "window.teamslam !== undefined && teamslam.store.complete && teamslam.map.frames > 0"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Page]:
+    with browsing(PROGRAM or "") as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    path = tmp_path_factory.mktemp("page") / "log.mcap"
+    with Recorder(path, "crowd", {}) as recorder:
+        recorder.write(crowd(ROBOTS, LANDMARKS, SECONDS))
+    with session(path, "127.0.0.1", 0, 0, growing=False) as shown:
+        yield shown.url
+
+
+@pytest.fixture
+def page(browser: Page, url: str) -> Page:
+    """The page on a recorded log, fully read, on a desktop."""
+    browser.errors.clear()
+    browser.size(1280, 800)
+    browser.open(url)
+    browser.wait(READY)
+    browser.wait(f"document.querySelector('#landmarks').textContent === '{LANDMARKS}'")
+    return browser
+
+
+def now(page: Page) -> float:
+    return float(page.text("#now"))
+
+
+def place_of(page: Page, robot: str) -> tuple[float, float]:
+    cells = [page.text(f"[data-robot={robot}] td:nth-child({k})") for k in (2, 3)]
+    return (float(cells[0]), float(cells[1]))
+
+
+def seek(page: Page, time: float) -> None:
+    page.ask(f"teamslam.seek({time})")
+    page.wait(f"document.querySelector('#now').textContent === '{time:.1f}'")
+    page.ask("new Promise((done) => setTimeout(done, 200))")  # the tables follow a little later
+
+
+def test_a_log_is_shown_with_its_last_map_and_where_every_robot_is(page):
+    assert now(page) == pytest.approx(SECONDS, abs=0.5)
+    assert page.text("#badge") == "LOG"
+    assert page.text("#robot-count") == str(ROBOTS)
+    true = page.ask("[...teamslam.store.robots.get('r2').truth.rows.slice(-3)]")
+    x, y = place_of(page, "r2")
+    assert abs(x - true[0]) < 1.5
+    assert abs(y - true[1]) < 1.5
+    assert page.errors == []
+
+
+def test_the_slider_goes_back_in_time_to_a_smaller_map_and_other_places(page):
+    late = place_of(page, "r1")
+    box = page.ask("(() => { const b = document.querySelector('#slider').getBoundingClientRect();"
+                   "return [b.left, b.right, b.top + b.height / 2]; })()")  # fmt: skip
+    left, right, y = box
+    page.drag((right - 9, y), (left + (right - left) / 2, y))
+    page.wait("Number(document.querySelector('#now').textContent) < 40")
+    page.wait(f"Number(document.querySelector('#landmarks').textContent) < {LANDMARKS}")
+    assert 20.0 < now(page) < 40.0
+    assert int(page.text("#landmarks")) >= 1
+    assert place_of(page, "r1") != late
+
+
+def test_it_plays_and_pauses_and_ends_at_the_end(page):
+    seek(page, 10)
+    page.ask("document.querySelector('#speed').value = '5'; "
+             "document.querySelector('#speed').dispatchEvent(new Event('change'))")  # fmt: skip
+    page.click("#play")
+    page.wait("Number(document.querySelector('#now').textContent) > 15")
+    page.click("#play")
+    page.wait("!teamslam.state.playing")
+    paused = now(page)
+    page.ask("new Promise((done) => setTimeout(done, 300))")
+    assert now(page) == paused
+    page.ask("document.querySelector('#speed').value = '100'; "
+             "document.querySelector('#speed').dispatchEvent(new Event('change'))")  # fmt: skip
+    page.click("#play")
+    page.wait(f"Number(document.querySelector('#now').textContent) >= {SECONDS - 0.1}")
+    page.wait("!teamslam.state.playing")
+
+
+def test_an_event_leads_to_its_time(page):
+    page.wait("document.querySelectorAll('#events li').length > 3")
+    page.ask("document.querySelector('#events li').click()")
+    page.wait("document.querySelector('#now').textContent === '0.0'")
+
+
+def test_every_layer_can_be_switched_off(page):
+    def painted() -> str:
+        page.ask("new Promise((done) => setTimeout(done, 400))")
+        return str(page.ask("document.querySelector('#map').toDataURL().slice(-20000)"))
+
+    seek(page, 30)
+    before = painted()
+    for name in ("95 % ellipses", "numbers", "paths", "truth"):
+        page.ask(f"[...document.querySelectorAll('#layers button')]"
+                 f".find((b) => b.textContent === '{name}').click()")  # fmt: skip
+        after = painted()
+        assert after != before, name
+        before = after
+
+
+def test_traffic_and_errors_are_told(page):
+    page.wait("document.querySelectorAll('#traffic tbody tr').length >= 10")
+    assert "keys" in page.text("#traffic-total")
+    page.ask("document.querySelector('[data-robot=r3]').click()")
+    page.wait("document.querySelector('#errors-of').textContent === 'r3'")
+    assert 0.0 < float(page.text("[data-robot=r3] td:nth-child(6)")) < 2.0
+
+
+def test_it_fits_a_phone(page):
+    page.size(390, 844, 2.0, touch=True)
+    page.ask("new Promise((done) => setTimeout(done, 300))")
+    assert page.ask("document.documentElement.scrollWidth") <= 390
+    inside = page.ask(
+        "['#play', '#slider', '#speed', '#map', '#landmarks'].every((s) => {"
+        "const b = document.querySelector(s).getBoundingClientRect();"
+        "return b.left >= 0 && b.right <= 390 && b.bottom <= 844 && b.width > 10; })"
+    )
+    assert inside
+
+
+async def test_a_live_team_is_followed_and_the_page_stays_until_ctrl_c(
+    team: Processes, tmp_path: Path, browser: Page
+) -> None:
+    launch = await team.start(
+        *("launch", short(tmp_path), "--speed", "10", "--output", tmp_path / "run"),
+        *("--view", "--no-browser", "--foxglove-port", "0", "--no-report"),
+    )
+    await launch.says("page  ")
+    found = re.search(r"page\s+(http://\S+)", launch.said())
+    assert found is not None
+    browser.errors.clear()
+    browser.size(1280, 800)
+    await asyncio.to_thread(browser.open, found[1])
+    await asyncio.to_thread(
+        browser.wait, "Number(document.querySelector('#landmarks').textContent) > 0", 120.0
+    )
+    seen = now(browser)
+    await asyncio.to_thread(browser.wait, "window.teamslam.store.complete", 120.0)
+    await asyncio.to_thread(browser.wait, "document.querySelector('#badge').textContent === 'LOG'")
+    assert now(browser) >= seen > 0.0
+    assert "final map" in browser.text("#events")
+    assert browser.errors == []
+    await until(lambda: "until Ctrl-C" in launch.said(), "the launch has ended", 120.0)
+    launch.signal(signal.SIGINT)
+    assert await launch.ended() == 0
