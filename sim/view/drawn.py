@@ -1,5 +1,7 @@
 """What is drawn of a team's messages: ellipses, thinned paths, colours."""
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,9 +21,19 @@ PALETTE = (
 """Robots' colours in the order of their names; told apart on dark and on light ground."""
 
 
+def in_order(names: Iterable[str]) -> list[str]:
+    """Robots' names as people count them: r2 before r10."""
+    return sorted(
+        names, key=lambda name: [int(p) if p.isdigit() else p for p in _DIGITS.split(name)]
+    )
+
+
 def colour_of(number: int) -> str:
     """The colour of the robot with this number, as #rrggbb; the eleventh takes the first again."""
     return PALETTE[number % len(PALETTE)]
+
+
+_DIGITS = re.compile("([0-9]+)")
 
 
 @dataclass(frozen=True)

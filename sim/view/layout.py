@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 
-from sim.view.drawn import colour_of
+from sim.view.drawn import colour_of, in_order
 from team.wire import views
 from team.wire.views import MAP_FRAME
 
@@ -11,7 +11,7 @@ from team.wire.views import MAP_FRAME
 def layout(team: str, robots: Sequence[str]) -> str:
     """The layout of a team's log or run, as JSON to be imported there."""
     prefix = f"team/{team}"
-    ordered = sorted(robots)
+    ordered = in_order(robots)
     configs = {
         "3D!scene": _scene(prefix, ordered),
         "RosOut!events": {"topicToRender": f"{prefix}/{views.LOG.key()}", "minLogLevel": 1},

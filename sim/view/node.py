@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from sim.evaluation_errors import PoseErrors
 from sim.view import foxglove_scene as fox
-from sim.view.drawn import Landmarks, Track, colour_of, landmarks_of
+from sim.view.drawn import Landmarks, Track, colour_of, in_order, landmarks_of
 from sim.view.errors import RunningErrors, map_fit
 from sim.view.events import Chronicle, Event
 from team.wire import channels as ch
@@ -185,6 +185,9 @@ class ViewerNode:
             case _:
                 pass
 
+    def _in_order(self) -> list[tuple[str, _Robot]]:
+        return [(name, self._robots[name]) for name in in_order(self._robots)]
+
     def _of(self, robot: str) -> _Robot:
         return self._robots.setdefault(robot, _Robot())
 
@@ -227,7 +230,7 @@ class ViewerNode:
     def _views(self, now_ns: int, *, last: bool = False) -> list[Shown]:
         self._go_to(now_ns, last=last)
         size = self._size_m()
-        seen = {n: r for n, r in sorted(self._robots.items()) if r.estimate is not None}
+        seen = {n: r for n, r in self._in_order() if r.estimate is not None}
         out = self._of_map(now_ns, size) if self._map_is_new else []
         self._map_is_new = False
         out.append(Shown(views.ROBOTS.key(), now_ns, self._scene(now_ns, size)))
@@ -271,7 +274,7 @@ class ViewerNode:
 
     def _scene(self, now_ns: int, size_m: float) -> bytes:
         entities = []
-        for number, (name, robot) in enumerate(sorted(self._robots.items())):
+        for number, (name, robot) in enumerate(self._in_order()):
             true = robot.errors.truth_at(now_ns)
             if true is not None:
                 entities.append(fox.true_robot_entity(now_ns, name, true, size_m))
@@ -287,7 +290,7 @@ class ViewerNode:
 
     def _paths(self, now_ns: int) -> bytes:
         entities = []
-        for number, (name, robot) in enumerate(sorted(self._robots.items())):
+        for number, (name, robot) in enumerate(self._in_order()):
             colour = colour_of(number)
             for what, points, shade, pixels in (
                 ("true path", robot.true_track.points, (fox.TRUTH[0], 0.5), 1.0),
@@ -301,7 +304,7 @@ class ViewerNode:
 
     def _clouds(self, now_ns: int) -> list[Shown]:
         out = []
-        for name, robot in sorted(self._robots.items()):
+        for name, robot in self._in_order():
             if robot.cloud is not None:
                 points = floats(robot.cloud.poses, "poses").astype(np.float64).reshape(-1, 3)
                 weights = floats(robot.cloud.weights, "weights").astype(np.float64)

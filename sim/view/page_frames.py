@@ -3,10 +3,10 @@
 t: seconds of team time since the first reading. Poses and errors come as rows of numbers, maps and
 particles as base64 of little-endian float32 and uint32. Frames, by `k`:
 
-hello: team, title, colours. now: how far all robots at work are. pose: rows x, y, heading, xx, xy,
-yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of freedom.
-truth: rows x, y, heading. truth_map, map, cloud, path: what they are called. fig: a node's figures.
-bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been read.
+hello: team, title, colours, live. now: how far all robots at work are. pose: rows x, y, heading, xx,
+xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of
+freedom. truth: rows x, y, heading. truth_map, map, cloud, path: what they are called. fig: a node's
+figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been read.
 """
 
 import base64
@@ -73,9 +73,10 @@ class PageFrames:
         self._figures_s: dict[str, int] = {}
         self._newest_ns = 0
 
-    def hello(self, team: str, metadata: Mapping[str, str], name: str) -> None:
-        """The first frame."""
-        self._say("hello", team=team, title=title_of(team, metadata, name), colours=PALETTE)
+    def hello(self, team: str, metadata: Mapping[str, str], name: str, *, live: bool) -> None:
+        """The first frame; live: the log is being recorded."""
+        title = title_of(team, metadata, name)
+        self._say("hello", team=team, title=title, colours=PALETTE, live=live)
 
     def take(self, sample: Sample, said: tuple[ch.Channel, m.Message] | None) -> None:
         """Take one sample of the log, and what a viewer hears in it."""

@@ -24,7 +24,7 @@ from sim.view.export import Viewing, heard
 from sim.view.page_frames import PageFrames
 from team.recording.reader import LogError
 from team.recording.tail import Tail
-from team.wire.bus import Sample
+from team.wire.bus import BusError, Sample
 
 STREAM = "/stream"
 LOOK_S = 0.2
@@ -40,7 +40,7 @@ _POLICY = "default-src 'self'; connect-src 'self' ws: wss:; style-src 'self' 'un
 _LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
-class ServerError(OSError):
+class ServerError(BusError):
     """The page can not be served there."""
 
 
@@ -95,7 +95,8 @@ class Feed:
             self._greeted = True
             if self.audience is not None:
                 self.audience.begin(self.tail.log.team)
-            self._page.hello(self.tail.log.team, self.tail.log.metadata, self.tail.path.name)
+            log = self.tail.log
+            self._page.hello(log.team, log.metadata, self.tail.path.name, live=growing)
         for sample in samples:
             said = heard(sample)
             self._page.take(sample, said)

@@ -14,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from sim.in_memory import final_map, run_team
 from sim.scenario import load, with_options
 from sim.source import streams_of
-from sim.view.drawn import PATH_POINTS, Track, ellipses, landmarks_of
+from sim.view.drawn import PATH_POINTS, Track, ellipses, in_order, landmarks_of
 from sim.view.errors import RunningErrors, map_fit
 from sim.view.events import Chronicle
 from sim.view.export import export_views, with_views
@@ -193,6 +193,17 @@ def test_an_ellipse_has_the_axes_of_its_covariance():
     P = R @ np.diag([9.0, 0.25]) @ R.T
     (major,), (minor,), (direction,) = ellipses(np.array([[P[0, 0], P[0, 1], P[1, 1]]]))
     np.testing.assert_allclose([major, minor, direction], [3 * 5.991**0.5, 0.5 * 5.991**0.5, theta])
+
+
+def test_robots_are_in_the_order_in_which_people_count() -> None:
+    assert in_order(["r10", "alpha", "r2", "r1", "7", "r"]) == [
+        "7",
+        "alpha",
+        "r",
+        "r1",
+        "r2",
+        "r10",
+    ]
 
 
 def test_a_long_path_keeps_its_ends_and_few_points():

@@ -58,6 +58,11 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
         (["robot", "thesis", "r9"], ["thesis has no robot 'r9'", "r1, r2"]),
         (["launch", "thesis", "--record", "/dev/null"], ["/dev/null: not a regular file"]),
         (["replay", "nowhere.mcap"], ["nowhere.mcap: not found"]),
+        (["view", "nowhere.mcap"], ["nowhere.mcap: not found"]),
+        (
+            ["view", "nowhere.mcap", "--follow", "--layout", "x"],
+            ["nowhere.mcap: not found", "need"],
+        ),
         (["report", "nowhere.mcap", "-o", "out"], ["nowhere.mcap: not found"]),
         (["router", "--listen", "banana"], ["can not listen at banana"]),
         (["router", "--listen", "tcp/203.0.113.1:7447"], ["can not listen", "not this machine's"]),

@@ -141,11 +141,11 @@ function look() {
   const { hello } = store;
   $('team').textContent = hello.title;
   document.title = `${hello.team} · teamslam`;
-  const live = !store.complete;
-  const lost = live && document.body.dataset.state === 'closed';
+  const live = hello.live && !store.complete;
+  const lost = !store.complete && document.body.dataset.state === 'closed';
   $('badge').hidden = false;
   $('badge').className = lost ? 'lost' : live ? '' : 'log';
-  $('badge').textContent = lost ? 'CONNECTION LOST' : live ? 'LIVE' : 'LOG';
+  $('badge').textContent = lost ? 'CONNECTION LOST' : live ? 'LIVE' : store.complete ? 'LOG' : 'READING';
   $('live').hidden = !live;
   $('live').setAttribute('aria-pressed', String(state.following));
   $('play').setAttribute('aria-label', moving() ? 'pause' : 'play');
@@ -340,14 +340,17 @@ function drawPlots() {
   drawConsistency();
 }
 
-/** Half the height of an error's plot: twice the middle bound, or the largest error if that is more. */
+/** Half the height of an error's plot: a glitch of the truth, one in 200, may lie beyond. */
 const reaches = new Map();
 function reach(robot, name, band, line) {
   const key = `${robot.name} ${name}`, known = reaches.get(key);
   if (known && known.count === band.count && known.hello === store.hello) return known.high;
   const bounds = Array.from({ length: band.count }, (_, i) => band.v(i)).sort((a, b) => a - b);
   let high = bounds.length ? 1.7 * bounds[Math.floor(0.8 * (bounds.length - 1))] : 1;
-  for (let i = 0; line && i < line.count; i++) high = Math.max(high, 1.1 * Math.abs(line.v(i)));
+  if (line) {
+    const sizes = Array.from({ length: line.count }, (_, i) => Math.abs(line.v(i))).sort((a, b) => a - b);
+    high = Math.max(high, 1.15 * sizes[Math.floor(0.995 * (sizes.length - 1))]);
+  }
   high = Math.max(high, 1e-3);
   reaches.set(key, { count: band.count, high, hello: store.hello });
   return high;

@@ -25,6 +25,7 @@ export class Series {
   get(i, k) { return this.rows[i * this.width + k]; }
 }
 
+const inOrder = new Intl.Collator('en', { numeric: true });  // r2 before r10
 const POSE = 7;   // x, y, heading, xx, xy, yy, heading's variance
 const ERROR = 7;  // x, y, heading, their 3σ, NEES per degree of freedom
 const TRUTH = 3;
@@ -65,7 +66,7 @@ export class Store {
         clouds: [], cloudTimes: [], smoothed: null, states: [], stateTimes: [], colour: '#888',
       };
       this.robots.set(name, found);
-      this.robots = new Map([...this.robots].sort((a, b) => (a[0] < b[0] ? -1 : 1)));
+      this.robots = new Map([...this.robots].sort((a, b) => inOrder.compare(a[0], b[0])));
       [...this.robots.values()].forEach((robot, i) => { robot.colour = this.hello.colours[i % this.hello.colours.length]; });
     }
     return found;
