@@ -3,7 +3,8 @@
 t: seconds of team time since the first reading. Poses and errors come as rows of numbers, maps and
 particles as base64 of little-endian float32 and uint32. Frames, by `k`:
 
-hello: team, title, colours, live. now: how far all robots at work are. pose: rows x, y, heading, xx,
+hello: team, title, colours, live.
+now: how far all robots at work are. pose: rows x, y, heading, xx,
 xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of
 freedom. truth: rows x, y, heading. truth_map, map, cloud, path: what they are called. fig: a node's
 figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been read.
