@@ -158,6 +158,8 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window, so that sightings of teammates are factors between poses; 0: none, sightings unused.
     sighting_s: a sighting is used if such a time is no farther from it than this. teammate_speed:
     how fast a teammate may move in between [m/s].
+    garbage: the share of readings that may have nothing to do with their landmark; above 0 a window
+    takes only readings that others of it confirm (`team.estimation.consensus`).
     biases: the errors shared by all of the robot's windows that the centre estimates; each submap
     carries its derivative by each of them.
     """
@@ -170,6 +172,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     node_s: NonNegative = 0.0
     sighting_s: NonNegative = 0.5
     teammate_speed: NonNegative = 0.2
+    garbage: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     biases: tuple[Bias, ...] = ()
 
     def __post_init__(self) -> None:

@@ -92,8 +92,9 @@ def submap_message(
     config: bytes,
     local: LocalMap,
     sightings: int = 0,
+    gated: int = 0,
 ) -> m.Submap:
-    """A local map with the names of its inputs, and how many sightings belong to it."""
+    """A local map with the names of its inputs, how many sightings belong to it, what was gated."""
     return m.Submap(
         span_ns[1],
         robot,
@@ -110,6 +111,7 @@ def submap_message(
         sightings,
         local.biases,
         from_floats(local.sensitivity),
+        gated,
     )
 
 

@@ -138,6 +138,7 @@ def examples() -> Iterator[m.Message]:
     yield m.Submap(
         9_000, "alpha", 1, 5, 10, 19, 8_000, digest, two, from_floats(range(10)), packed(spd(10)),
         from_stamps([8_500]), 1, ("bearing", "range_scale"), from_floats(np.arange(20) / 16.0),
+        3,
     )  # fmt: skip
     yield m.SightingFactor(
         8_500, "alpha", 1, 5, digest, "bravo", 6.0, -3.0, packed(spd(2)), (12, 14)

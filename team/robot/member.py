@@ -16,6 +16,7 @@ from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import WholeMap, absorbed, begun, joined
 from team.estimation.window import Window
+from team.robot.gate import Gate
 from team.stream.pose_grid import Looks, NodeSighting, PoseGrid
 from team.stream.segmenter import Epoch, Segmenter
 
@@ -36,7 +37,8 @@ class Cloud(NamedTuple):
 class ClosedWindow:
     """A submap with the names of its inputs, and the sightings from its pose nodes.
 
-    innovation: of the window's readings that were predicted.
+    innovation: of the window's readings that were predicted. gated: readings that no others of the
+    window confirmed, and that are not in the submap.
     """
 
     sequence: int
@@ -48,6 +50,7 @@ class ClosedWindow:
     sightings: tuple[NodeSighting, ...] = ()
     cloud: Cloud | None = None
     innovation: Innovation = NOTHING
+    gated: int = 0
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,8 @@ class HybridMember:
         self._segmenter = Segmenter(
             config.motion, config.sensor, config.front_end.keyframe_s, self._grid
         )
+        garbage = config.front_end.garbage
+        self._gate = Gate(config.sensor, garbage) if garbage else None
         self.sequence = 0
         self._first_reading = 0
         self._last_reading = -1
@@ -176,6 +181,9 @@ class HybridMember:
         return self._innovation.plus(self._window.innovation)
 
     def _advance(self, epoch: Epoch) -> None:
+        self._take(epoch if self._gate is None else self._gate.admitted(epoch))
+
+    def _take(self, epoch: Epoch) -> None:
         self._window = windows.advanced(
             self._window,
             epoch.increment,
@@ -193,6 +201,7 @@ class HybridMember:
         epochs, rest = self._segmenter.cut(stamp_ns)
         for epoch in epochs:
             self._advance(epoch)
+        gated = 0 if self._gate is None else self._settle(self._gate)
         if rest.mean.any() or rest.covariance.any():
             forward = self._segmenter.rest_forward
             self._window = windows.moved(self._window, rest, self._generator, forward)
@@ -208,11 +217,25 @@ class HybridMember:
             () if self._grid is None else self._grid.sightings(),
             self._cloud(),
             self._window.innovation,
+            gated,
         )
         self._innovation = self._innovation.plus(closed.innovation)
         self.whole = joined(self.whole, local)
         self._begin_window(self.sequence + 1, self._last_reading + 1, stamp_ns)
         return closed
+
+    def _settle(self, gate: Gate) -> int:
+        """The window once more with the readings that all of it confirms; how many it does not."""
+        self._reopen()
+        for epoch in gate.settled():
+            self._take(epoch)
+        return gate.gated
+
+    def _reopen(self) -> None:
+        """The window at its start; its random numbers too."""
+        config = self._config
+        self._window = windows.opened(config.front_end, config.sensor)
+        self._generator = generator(config.seed, config.id, self._epoch, self.sequence)
 
     def _cloud(self) -> Cloud:
         """Every so many particles, in their order, placed where the window began."""
@@ -230,6 +253,7 @@ class HybridMember:
         self._last_reading = first_reading - 1
         self._start_ns = stamp_ns
         self._segmenter.begin(stamp_ns)
-        self._window = windows.opened(self._config.front_end, self._config.sensor)
-        self._generator = generator(self._config.seed, self._config.id, self._epoch, sequence)
+        if self._gate is not None:
+            self._gate.begin()
+        self._reopen()
         self.last_epoch_ns = None

@@ -162,6 +162,8 @@ class RobotNode:
         nis = self._member.innovation
         if nis.per_dof is not None:
             figures |= {"nis_per_dof": nis.per_dof, "nis_dof": float(nis.dof)}
+        if self.config.front_end.garbage:
+            figures["gated"] = float(self._gated)
         state = "done" if self._done else "mapping" if self._inbox.next_reading else "waiting"
         node = ch.robot_node(self.robot)
         waiting = ("no readings of this team yet",) if state == "waiting" else ()
@@ -171,6 +173,7 @@ class RobotNode:
     # The stream.
 
     _pose_sigma = 0.0
+    _gated = 0
 
     def _go_on(self) -> list[Outgoing]:
         out: list[Outgoing] = []
@@ -287,6 +290,7 @@ class RobotNode:
         out.append(self._speaker.submap(closed))
         out += self._speaker.cloud(closed)
         out.append(self._speaker.innovation(closed))
+        self._gated += closed.gated
         out += self._poses(closed.end_ns)
         out += self._mapped(closed.end_ns)
         return [*out, self._progress()]

@@ -36,6 +36,7 @@ class Speaker:
             self.config,
             closed.local,
             len(closed.sightings),
+            closed.gated,
         )
         return Outgoing(ch.SUBMAP, self.robot, message)
 

@@ -165,6 +165,7 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     SightingFactor messages belong to it. biases: errors that the robot's submaps share, B of them,
     ascending; sensitivity: B × n floats, the mean's derivative by each: given the error b of the
     bearings [rad], of the scale of the ranges or of the speed, the mean is mean + b · sensitivity.
+    gated: so many of its landmark readings no others of the window confirmed; they are not in it.
     """
 
     robot: Name
@@ -181,6 +182,7 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     sightings: Count = 0
     biases: tuple[Bias, ...] = ()
     sensitivity: Floats = b""
+    gated: Count = 0
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")

@@ -61,15 +61,21 @@ def test_a_last_word_from_before_the_last_map_has_none() -> None:
 
 
 def test_a_submap_from_before_the_pose_nodes_has_none() -> None:
-    shorter = msgpack.packb(fields_of(submap(0))[:-4])
+    shorter = msgpack.packb(fields_of(submap(0))[:-5])
     assert decoded(shorter) == submap(0)
     assert (submap(0).nodes, submap(0).sightings) == (b"", 0)
 
 
 def test_a_submap_from_before_the_sensitivities_has_none() -> None:
-    shorter = msgpack.packb(fields_of(submap(0))[:-2])
+    shorter = msgpack.packb(fields_of(submap(0))[:-3])
     assert decoded(shorter) == submap(0)
     assert (submap(0).biases, submap(0).sensitivity) == ((), b"")
+
+
+def test_a_submap_from_before_the_gate_has_all_its_readings() -> None:
+    shorter = msgpack.packb(fields_of(submap(0))[:-1])
+    assert decoded(shorter) == submap(0)
+    assert submap(0).gated == 0
 
 
 @pytest.mark.parametrize(
@@ -85,7 +91,7 @@ def test_a_submap_whose_sensitivities_do_not_fit_is_refused(
     biases: tuple[str, ...], numbers: int, why: str
 ) -> None:
     fields = fields_of(submap(0))
-    fields[-2:] = [biases, from_floats(np.zeros(numbers))]
+    fields[-3:-1] = [biases, from_floats(np.zeros(numbers))]
     assert reason_of(msgpack.packb(fields)) == why
 
 
@@ -229,7 +235,7 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("wrong field", with_fields(SUBMAP, stamp_ns=2**62), None),
         ("wrong field", with_fields(EXAMPLES["status/1"], figures={"x": float("nan")}), None),
         ("wrong field", with_fields(EXAMPLES["odometry/1"], forward=float("nan")), None),
-        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-5]), None),
+        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-6]), None),
     ],
 )
 def test_an_unsound_payload_is_refused_for_its_reason(

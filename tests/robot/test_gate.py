@@ -1,0 +1,133 @@
+"""A robot whose readings are in part garbage: its submaps do without it, and it says how much."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from sim.evaluation import evaluate
+from sim.in_memory import run_team
+from sim.scenario import Scenario, load
+from sim.source import streams_of
+from sim.streams import RobotStream
+from team.config import RobotConfig
+from team.robot.node import RobotNode
+from team.wire import messages as m
+from team.wire.arrays import ids
+from tests.teams import config, driven, published, stream
+
+
+def robot(garbage: float) -> RobotConfig:
+    """The small robot with a gate; windows of five steps."""
+    plain = config()
+    front_end = msgspec.structs.replace(plain.front_end, garbage=garbage, window_s=5.0)
+    return msgspec.structs.replace(plain, front_end=front_end)
+
+
+def spoilt(given: RobotStream) -> RobotStream:
+    """Every fifth reading of the stream is somewhere else."""
+    seen = given.landmark_detections
+    rows = np.arange(len(seen.ids)) % 5 == 2
+    ranges = np.where(rows, 2.0 + seen.ranges, seen.ranges)
+    bearings = np.where(rows, 0.8 - seen.bearings, seen.bearings)
+    return replace(given, landmark_detections=replace(seen, ranges=ranges, bearings=bearings))
+
+
+def submaps(of: RobotConfig, readings: list[m.Reading]) -> list[m.Submap]:
+    sent = driven(RobotNode(of), readings)
+    return [each.message for each in sent if isinstance(each.message, m.Submap)]
+
+
+def test_a_submap_is_as_if_the_garbage_had_never_been_read() -> None:
+    clean = stream("r1", 20)
+    seen = clean.landmark_detections
+    rows = np.arange(len(seen.ids)) % 5 == 2
+    kept = np.concatenate(([0], np.cumsum(~rows)))
+    less = replace(
+        clean,
+        landmark_detections=replace(
+            seen, offsets=kept[seen.offsets], ids=seen.ids[~rows], ranges=seen.ranges[~rows],
+            bearings=seen.bearings[~rows],
+        ),
+    )  # fmt: skip
+    found, expected = (submaps(robot(0.2), published(each)) for each in (spoilt(clean), less))
+    assert [(s.ids, s.mean, s.covariance) for s in found] == [
+        (s.ids, s.mean, s.covariance) for s in expected
+    ]
+    assert sum(s.gated for s in found) - sum(s.gated for s in expected) == np.count_nonzero(rows)
+
+
+def test_of_clean_readings_only_what_stands_alone_is_gated_and_the_rest_is_as_without_a_gate() -> (
+    None
+):
+    readings = published(stream("r1", 20))
+    gated, plain = (submaps(robot(garbage), readings) for garbage in (0.05, 0.0))
+    assert sum(s.gated for s in plain) == 0
+    for one, other in zip(gated, plain, strict=True):
+        if not one.gated:
+            assert (one.ids, one.mean) == (other.ids, other.mean)
+        else:
+            assert set(ids(one.ids, "ids").tolist()) < set(ids(other.ids, "ids").tolist())
+    assert any(not s.gated and len(s.ids) for s in gated)
+
+
+def test_a_robot_that_was_started_again_gates_the_same_readings() -> None:
+    readings = published(spoilt(stream("r1", 20)))
+    of = robot(0.2)
+    whole = submaps(of, readings)
+    node = RobotNode(of)
+    node.resume(readings[0], whole[:2])
+    sent = driven(node, readings[whole[1].last_reading + 1 :])
+    again = [each.message for each in sent if isinstance(each.message, m.Submap)]
+    assert again == whole[2:]
+
+
+def test_the_status_tells_how_many_readings_were_gated() -> None:
+    node = RobotNode(robot(0.2))
+    driven(node, published(spoilt(stream("r1", 20))))
+    assert node.status().figures["gated"] >= 5.0
+    plain = RobotNode(robot(0.0))
+    driven(plain, published(stream("r1", 20)))
+    assert "gated" not in plain.status().figures
+
+
+def world_with(kind: str, gate: float, steps: int = 200) -> Scenario:
+    """The thesis' world B in longer steps, three in ten readings garbage, robust at the centre."""
+    scenario = load("thesis-b")
+    world = msgspec.structs.replace(scenario.world, steps=steps, garbage=0.3, garbage_kind=kind)
+    robots = tuple(
+        msgspec.structs.replace(
+            each,
+            front_end=msgspec.structs.replace(each.front_end, garbage=gate, particles=60),
+            pose_s=1000.0,
+        )
+        for each in scenario.robots
+    )
+    central = msgspec.structs.replace(scenario.central, robust_c=2.0)
+    return msgspec.structs.replace(scenario, world=world, robots=robots, central=central)
+
+
+def aligned_rmse(scenario: Scenario) -> float:
+    found = evaluate(list(run_team(scenario, streams_of(scenario)))).map
+    assert found is not None
+    assert found.errors is not None
+    assert found.errors.aligned_rmse_m is not None
+    return found.errors.aligned_rmse_m
+
+
+@pytest.fixture(scope="module")
+def clean_rmse() -> float:
+    """Of the run in which the same readings are left out."""
+    return aligned_rmse(world_with("drop", 0.0))
+
+
+@pytest.mark.parametrize("kind", ["reading", "identity"])
+def test_with_garbage_the_map_is_nearly_that_of_the_good_readings(
+    kind: str, clean_rmse: float
+) -> None:
+    assert aligned_rmse(world_with(kind, 0.3)) < 1.3 * clean_rmse
+
+
+def test_without_a_gate_garbage_ruins_the_map(clean_rmse: float) -> None:
+    assert aligned_rmse(world_with("reading", 0.0, 80)) > 3.0 * clean_rmse
