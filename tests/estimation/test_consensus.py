@@ -36,16 +36,16 @@ class Drive:
         return by(self.motions, self.epochs, self.ids, self.readings, SENSOR, garbage)
 
 
-def drive(seed: int, steps: int = 10) -> Drive:
-    """A robot on an arc that sees four landmarks in every step, with the noise that is declared."""
+def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
+    """A robot on an arc of ten steps that sees all places in each, with the declared noise."""
     rng = np.random.default_rng(seed)
     motions, rows, pose = [], [], np.zeros(3)
-    for k in range(steps):
+    for k in range(10):
         true_step = increment_of(MOTION, 1.0, 1.0, 0.15)
         pose = compose(pose, true_step.mean)
         odometry = (1.0 + 0.03 * rng.normal(), 0.15 + 0.02 * rng.normal())
         motions.append(increment_of(MOTION, 1.0, *odometry))
-        for i, place in enumerate(PLACES):
+        for i, place in enumerate(places):
             r, b = predicted(pose, place)
             rows.append((k, i + 1, r + 0.1 * rng.normal(), b + 0.02 * rng.normal()))
     table = np.array(rows)
@@ -88,9 +88,7 @@ def test_a_landmark_under_another_ones_name_is_not_taken():
 
 
 def test_a_landmark_beside_another_one_is_taken():
-    window = drive(2)
-    window.ids[4:40:8] = 50
-    window.readings[4:40:8] += [0.6, 0.1]
+    window = drive(2, np.vstack([PLACES, PLACES[0] + [0.4, -0.3]]))
     assert window.judged().all()
 
 
