@@ -27,6 +27,11 @@ STILL = np.zeros(3)
 POSE_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
 
+POSE_DEGREES = 5.0
+"""p + 2 of a pose's p = 3 numbers; see `moments`."""
+MOST_SQUARE = 0.1
+"""Particles that are thinner than ten of equal weight are taken for ten: see `moments`."""
+
 SOLVED = 1e-6
 """A Gauss-Newton step of squared Mahalanobis length below this changes nothing that matters."""
 
@@ -312,10 +317,16 @@ def moments(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
     """Mean and covariance of the mixture Σ wᵢ N(μᵢ, blkdiag(0, Σ₁, …, Σ_L)), n = p + 2L.
 
-    Each particle has p/3 poses (x, y, theta), one behind the other.
+    Each particle has p/3 poses (x, y, theta), one behind the other. The scatter between the
+    particles is that of a sample: N = 1/Σ wᵢ² of them estimate their own mean, and what joining
+    takes is the inverse, which a sample of q-dimensional normals makes too large by
+    ν/(ν − q − 1), ν = N − 1 (Anderson 2003, section 7.7). So the scatter is taken times
+    N/(N − q − 2), with the q = 3 numbers of a pose: the directions in which no particle has a
+    covariance of its own.
     """
     count, p = poses.shape
     n = p + 2 * means.shape[1]
+    between = 1.0 / (1.0 - POSE_DEGREES * min(float(np.sum(weights * weights)), MOST_SQUARE))
     deviations = np.empty((count, n))
     deviations[:, :p] = poses
     deviations[:, p::2] = means[:, :, 0]
@@ -333,7 +344,7 @@ def moments(
         for heading in range(2, p, 3):
             deviations[i, heading] = wrapped(deviations[i, heading])
         for j in range(n):
-            scaled = weights[i] * deviations[i, j]
+            scaled = between * weights[i] * deviations[i, j]
             for k in range(j + 1):
                 P[j, k] += scaled * deviations[i, k]
         for landmark in range(means.shape[1]):
