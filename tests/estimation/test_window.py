@@ -314,11 +314,17 @@ def test_headings_about_half_a_turn_have_their_mean_there():
     assert abs(local.covariance[2, 2] - 0.01) < 0.002
 
 
-def test_a_reading_that_is_not_a_number_gives_an_error_that_names_the_submap():
-    window = windows.opened(FrontEnd(), ACCURATE)
-    for z in (8.0, np.nan):
-        window = windows.advanced(
-            window, DRIVEN, SIGHT[0], np.array([z]), SIGHT[2], generator(2, "a", 0, 0)
-        )
-    with pytest.raises(NotACovarianceError, match="the submap of a window"):
-        windows.gaussian(window)
+@pytest.mark.parametrize(
+    ("ranges", "named"),
+    [((np.nan,), "the submap of a window"), ((8.0, np.nan), "the prediction of readings")],
+)
+def test_a_reading_that_is_not_a_number_gives_an_error_that_names_the_matrix(ranges, named):
+    def taken():
+        window = windows.opened(FrontEnd(), ACCURATE)
+        for z in ranges:
+            scan = SIGHT[0], np.array([z]), SIGHT[2]
+            window = windows.advanced(window, DRIVEN, *scan, generator(2, "a", 0, 0))
+        return windows.gaussian(window)
+
+    with pytest.raises(NotACovarianceError, match=named):
+        taken()
