@@ -1,0 +1,217 @@
+"""The recorder under load: is everything that was published in the log, and what does it cost?
+
+    python benchmarks/recorder.py [--robots 10] [--hz 100] [--seconds 60] [--json FILE]
+
+Real processes in real time: a router, `teamslam record`, and publishers that send each robot's
+odometry and observations at this rate. Then, per key, published = recorded, and the log is sound.
+The figures are held against benchmarks/recorder.json (what they were, which way is good, how far
+they may be off); exit status 1 if something was lost or a figure is worse.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.scenario import dumps, load, with_options
+from team.recording.check import checked
+from team.recording.reader import open_log
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+from team.wire.zenoh_bus import ZenohBus
+
+BASELINE = Path(__file__).with_suffix(".json")
+PUBLISHERS = 2
+LANDMARKS = 5
+"""Seen in one observation."""
+_COMMAND = [sys.executable, "-m", "sim"]
+
+
+def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds: float) -> None:
+    """A publisher's process: each robot's readings at its time; prints what it published by key."""
+    rng = np.random.default_rng(0)
+    period_ns = round(1e9 / hz)
+    counts: dict[str, int] = {}
+    late_s = 0.0
+    with ZenohBus(team, endpoint) as bus:
+        for robot in robots:
+            bus.declare_alive(ch.robot_node(robot))
+        time.sleep(1.0)
+        began = time.monotonic()
+        for k in range(round(hz * seconds)):
+            wait = began + k / hz - time.monotonic()
+            late_s = max(late_s, -wait)
+            if wait > 0.0:
+                time.sleep(wait)
+            for robot in robots:
+                values = rng.uniform(1.0, 10.0, LANDMARKS)
+                head = (k * period_ns, robot, 1)
+                for channel, message in (
+                    (ch.ODOMETRY, m.Odometry(*head, 2 * k, period_ns, 0.5, 0.1)),
+                    (
+                        ch.OBSERVATIONS,
+                        m.Observations(
+                            *head, 2 * k + 1, from_ids(range(LANDMARKS)), from_floats(values),
+                            from_floats(values / 10.0),
+                        ),
+                    ),
+                ):  # fmt: skip
+                    bus.publish(Outgoing(channel, robot, message))
+                    key = channel.key(robot)
+                    counts[key] = counts.get(key, 0) + 1
+        took_s = time.monotonic() - began
+    print(json.dumps({"counts": counts, "took_s": took_s, "late_s": late_s}))
+
+
+def cpu_s(pid: int) -> float:
+    """User and system time of a process so far; Linux."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def peak_mib(pid: int) -> float:
+    """The most memory that it had."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    (line,) = [line for line in lines if line.startswith("VmHWM")]
+    return int(line.split()[1]) / 1024.0
+
+
+def measured(robots: int, hz: float, seconds: float, folder: Path) -> dict[str, Any]:
+    """One run; the figures."""
+    scenario = with_options(load("thesis"), robots=robots)
+    told = folder / "scenario.json"
+    told.write_text(dumps(scenario))
+    log = folder / "log.mcap"
+    names = [robot.id for robot in scenario.robots]
+    router = subprocess.Popen(
+        [*_COMMAND, "router", "--listen", "tcp/127.0.0.1:0"], stdout=subprocess.PIPE, text=True
+    )
+    children = [router]
+    try:
+        assert router.stdout is not None
+        line = next(line for line in router.stdout if line.startswith("listening at "))
+        endpoint = line.removeprefix("listening at ").strip()
+        recorder = subprocess.Popen(
+            [*_COMMAND, "record", str(told), "--connect", endpoint, "--output", str(log)],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        children.append(recorder)
+        with ZenohBus(scenario.team, endpoint) as bus:
+            _wait_for_recorder(bus)
+            bus.declare_alive("central")
+            began_cpu, began = cpu_s(recorder.pid), time.monotonic()
+            publishers = [
+                subprocess.Popen(
+                    [sys.executable, __file__, "--publish", endpoint, scenario.team,
+                     *names[k::PUBLISHERS], "--hz", str(hz), "--seconds", str(seconds)],
+                    stdout=subprocess.PIPE, text=True,
+                )
+                for k in range(PUBLISHERS)
+            ]  # fmt: skip
+            children += publishers
+            while any(each.poll() is None for each in publishers):
+                used_cpu, memory = cpu_s(recorder.pid), peak_mib(recorder.pid)
+                elapsed = time.monotonic() - began
+                time.sleep(0.2)
+            said = [json.loads(each.communicate()[0].splitlines()[-1]) for each in publishers]
+            bus.publish(Outgoing(ch.FINAL_MAP, "", _no_map()))
+        recorder.wait(timeout=60)
+    finally:
+        for child in children:
+            if child.poll() is None:
+                child.terminate()
+                child.wait(timeout=20)
+    return _figures(log, said, (used_cpu - began_cpu) / elapsed, memory)
+
+
+def _figures(log: Path, said: list[dict[str, Any]], cpu: float, memory: float) -> dict[str, Any]:
+    published = {key: n for each in said for key, n in each["counts"].items()}
+    opened = open_log(log)
+    counts = opened.counts()
+    lost = {
+        key: [n, counts[key].messages if key in counts else 0]
+        for key, n in published.items()
+        if key not in counts or counts[key].messages != n
+    }
+    took_s = max(each["took_s"] for each in said)
+    total, size = sum(published.values()), sum(c.bytes for c in counts.values())
+    readings = set(published)
+    return {
+        "published": total,
+        "recorded": sum(counts[key].messages for key in readings if key in counts),
+        "lost": lost,
+        "findings": [str(f) for f in checked(opened)],
+        "messages_per_s": total / took_s,
+        "publishers_late_s": max(each["late_s"] for each in said),
+        "payload_bytes": size,
+        "file_bytes": log.stat().st_size,
+        "recorder_cpu": cpu,
+        "recorder_peak_mib": memory,
+        "cpu_us_per_message": cpu * 1e6 * took_s / total,
+    }
+
+
+def _wait_for_recorder(bus: ZenohBus) -> None:
+    """Until the recorder says that it is there."""
+    bus.subscribe(ch.STATUS)
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        if any(s.key == ch.STATUS.key("recorder") for s in bus.receive(0.2)):
+            return
+    raise TimeoutError("the recorder did not come up within 60 s")
+
+
+def _no_map() -> m.FusedMap:
+    """The message after which a recorder ends when nobody is left."""
+    empty = from_floats([])
+    return m.FusedMap(
+        0, "join", bytes(8), "", True, False, 0, (), (), True, from_ids([]), empty, empty, 0.0, 0
+    )
+
+
+def worse(figures: dict[str, Any]) -> list[str]:
+    """What is worse than the baseline allows, in words."""
+    found = []
+    for name, of in json.loads(BASELINE.read_text())["figures"].items():
+        value, was, share = figures[name], of["value"], of["tolerance"]
+        bound = was * (1.0 + share) if of["better"] == "less" else was * (1.0 - share)
+        if (value > bound) if of["better"] == "less" else (value < bound):
+            found.append(f"{name} is {value:.4g}, it was {was:.4g} and may be {bound:.4g}")
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--robots", type=int, default=10)
+    parser.add_argument("--hz", type=float, default=100.0)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--publish", nargs="+", help=argparse.SUPPRESS)
+    told = parser.parse_args()
+    if told.publish:
+        endpoint, team, *robots = told.publish
+        publish(endpoint, team, robots, told.hz, told.seconds)
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        figures = measured(told.robots, told.hz, told.seconds, Path(folder))
+    print(json.dumps(figures, indent=1))
+    if told.json:
+        told.json.write_text(json.dumps(figures, indent=1) + "\n")
+    problems = [*figures["findings"], *(f"{k}: {v}" for k, v in figures["lost"].items())]
+    problems += worse(figures) if BASELINE.exists() else []
+    print("\n".join(problems) or "nothing lost, nothing worse", file=sys.stderr)
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

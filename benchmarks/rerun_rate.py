@@ -1,0 +1,68 @@
+"""How fast a log is computed again, against how fast it can be read at all.
+
+    python benchmarks/rerun_rate.py LOG … [--json FILE]
+
+For each log: `rerun --verify` in readings per second and as a multiple of real time, and the rate
+at which the mcap library alone reads the same file's messages (one core each, file in the cache).
+Exit status 1 if anything differs or if five robots are computed slower than 20 × real time.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from mcap.reader import make_reader
+
+from sim.rerun import verify
+from team.recording.reader import open_log
+
+LEAST = 20.0
+"""× real time for a team of five."""
+
+
+def plain(path: Path) -> tuple[int, float]:
+    """Messages in the file and the seconds that the mcap library takes to read them."""
+    began = time.process_time()
+    with path.open("rb") as file:
+        count = sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))
+    return count, time.process_time() - began
+
+
+def figures(path: Path) -> dict[str, Any]:
+    """Of one log; CPU time of this process, which is that of one core."""
+    messages, reading_s = plain(path)
+    began = time.process_time()
+    result = verify(open_log(path))
+    rerun_s = time.process_time() - began
+    return {
+        "log": path.name,
+        "team_time_s": result.span_s,
+        "readings": result.readings,
+        "verified": result.messages,
+        "equal": result.first is None,
+        "rerun_cpu_s": rerun_s,
+        "times_real_time": result.span_s / rerun_s,
+        "readings_per_s": result.readings / rerun_s,
+        "plain_messages": messages,
+        "plain_messages_per_s": messages / reading_s,
+        "share_of_plain": (result.readings / rerun_s) / (messages / reading_s),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("logs", nargs="+", type=Path)
+    parser.add_argument("--json", type=Path)
+    told = parser.parse_args()
+    found = [figures(path) for path in told.logs]
+    print(json.dumps(found, indent=1))
+    if told.json:
+        told.json.write_text(json.dumps(found, indent=1) + "\n")
+    return int(any(not f["equal"] or f["times_real_time"] < LEAST for f in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
