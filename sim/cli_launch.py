@@ -216,7 +216,7 @@ def _conclude(
     from sim.history import history
     from sim.report import summary_tables
     from sim.report_page import write_report
-    from sim.report_run import Run, run_figures
+    from sim.report_run import Run, nis_line, run_figures
     from team.recording.reader import LogError, open_log
 
     console = Console()
@@ -241,6 +241,8 @@ def _conclude(
             console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         if report:
             run = Run(evaluation, history(log.samples()), log.metadata)
+            if (line := nis_line(run)) is not None:
+                console.print(line, highlight=False, soft_wrap=True)
             for path in write_report(run, outcome.folder, {**figures, **run_figures(run)}):
                 console.print(f"wrote {path}", highlight=False, soft_wrap=True)
         if evaluation.map is None:

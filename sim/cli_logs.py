@@ -80,7 +80,7 @@ def report(
     from sim.history import history
     from sim.report import summary_tables
     from sim.report_page import write_report
-    from sim.report_run import Run, run_figures
+    from sim.report_run import Run, nis_line, run_figures
     from team.recording.reader import open_log
 
     _check_folder(output)
@@ -96,6 +96,8 @@ def report(
         console.print(table)
     for note in evaluation.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    if (line := nis_line(run)) is not None:
+        console.print(line, highlight=False, soft_wrap=True)
     if found is not None:
         verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()
         console.print(f"ledger: {verdict}", highlight=False, soft_wrap=True)

@@ -37,6 +37,13 @@ class Run:
         return found
 
 
+def nis_line(run: Run) -> str | None:
+    """NIS per degree of freedom of every robot in one line; None where nothing was predicted."""
+    told = {name: of.per_dof for name, of in run.history.innovations.items()}
+    parts = [f"{name} {value:.2f}" for name, value in told.items() if value is not None]
+    return f"NIS per dof: {', '.join(parts)}" if parts else None
+
+
 def run_figures(run: Run) -> dict[str, Any]:
     """What a report adds to an evaluation's figures; angles in radians, times in seconds."""
     history, ledger = run.history, run.ledger

@@ -347,3 +347,21 @@ def test_its_status_says_what_it_is_doing():
 def test_out_of_its_messages_none_is_on_another_robots_key():
     out: list[Outgoing] = driven(RobotNode(config()), READINGS)
     assert {o.name for o in out} == {"r1"}
+
+
+def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
+    node = RobotNode(config())
+    assert "nis_per_dof" not in node.status().figures
+    windows = of(driven(node, READINGS[:-8], end=False), ch.INNOVATION)
+    submaps = of(driven(RobotNode(config()), READINGS[:-8], end=False), ch.SUBMAP)
+    assert [(w.sequence, w.stamp_ns) for w in windows] == [
+        (s.sequence, s.stamp_ns) for s in submaps
+    ]
+    figures = node.status().figures
+    closed = sum(window.dof for window in windows)
+    assert figures["nis_dof"] > closed > 0
+    total = figures["nis_per_dof"] * figures["nis_dof"]
+    assert total > sum(window.squared for window in windows) > 0.0
+    rest = of(driven(node, READINGS[-8:]), ch.INNOVATION)
+    figures = node.status().figures
+    assert figures["nis_dof"] == closed + sum(window.dof for window in rest)

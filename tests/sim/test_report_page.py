@@ -104,6 +104,7 @@ def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: 
     done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     assert "has exactly one disposition" in done.output
+    assert re.search(r"^NIS per dof: r1 [\d.]+, r2 [\d.]+$", done.output, re.MULTILINE)
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert re.search(r'class="good">Ledger: each of \d+ readings has exactly one', page)
     figures = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
