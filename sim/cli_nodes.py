@@ -122,7 +122,7 @@ def robot(
         )
     with process(f"robot-{name}") as stop, ZenohBus(resolved.team, connect) as bus:
         _connected(resolved, connect)
-        RobotShell(bus, configs[name], stop).run()
+        RobotShell(bus, configs[name], stop, exchange=resolved.exchange).run()
 
 
 @app.command()

@@ -12,7 +12,7 @@ from sim.source import tells_map
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from team import translate
-from team.config import RobotConfig
+from team.config import Exchange, RobotConfig
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -73,7 +73,7 @@ def run_nodes(
     scenario: Scenario,
     world: World,
     conditions: Conditions | None = None,
-    robot: Callable[[RobotConfig], RobotNode] = RobotNode,
+    robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
     central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
 ) -> Iterator[Sample]:
     """Run the scenario's robots and centre in a world, until nothing is on its way any more.
@@ -93,7 +93,9 @@ def run_nodes(
         source.bus.subscribe(channel)
     source.bus.watch_alive()
     centre = _centre(network, scenario, conditions, central)
-    robots = [_robot(network, robot(config), conditions) for config in scenario.robots]
+    robots = [
+        _robot(network, robot(config, scenario.exchange), conditions) for config in scenario.robots
+    ]
     _enter(source, "world")
     _enter(centre, "central")
     for name, seat in zip(names, robots, strict=True):
@@ -147,6 +149,8 @@ def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _
     bus = MemoryBus(network)
     for channel in RobotNode.listens:
         bus.subscribe(channel, node.robot)
+    for channel in node.overhears:
+        bus.subscribe(channel)
     bus.watch_alive("central")
     return _Seat(node, bus, conditions.to_robot(node.robot))
 

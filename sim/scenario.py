@@ -24,7 +24,7 @@ from sim.scenario_document import (
     resolved,
 )
 from sim.worlds import SimulatedWorld, UtiasWorld, World
-from team.config import Estimator, FusionRule, RobotConfig
+from team.config import Estimator, Exchange, FusionRule, RobotConfig
 from team.pairs import PAIRS, named_pairs, rules_for
 
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
@@ -39,6 +39,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A resolved scenario: the robots and the centre carry the seed, the estimator and the rule.
 
     team: the chunk of the keys `team/<team>/…` that keeps two teams on one network apart.
+    exchange: with "rendezvous" a robot sends its submaps only when it sees a teammate or is seen.
     """
 
     name: KeyChunk
@@ -49,6 +50,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
     estimator: Estimator = "hybrid"
     fusion: FusionRule = "join"
+    exchange: Exchange = "continuous"
 
 
 def load(name_or_path: str | Path) -> Scenario:
@@ -134,7 +136,11 @@ def _converted(fields: Fields) -> Scenario:
         known = ", ".join(f'"{each}"' for each in WORLDS)
         raise ScenarioError(f"expected one of {known}, got {kind!r} at world.kind")
     check_fields(world, WORLDS[kind], "world")
-    for choice, declared in (("estimator", Estimator), ("fusion", FusionRule)):
+    for choice, declared in (
+        ("estimator", Estimator),
+        ("fusion", FusionRule),
+        ("exchange", Exchange),
+    ):
         if choice in fields:
             check_fields(fields[choice], declared, choice)
     try:
@@ -149,6 +155,11 @@ def _filled(scenario: Scenario) -> Scenario:
         raise ScenarioError(
             f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}, "
             f"but {' or '.join(rules_for(scenario.estimator))}; valid: {named_pairs()}"
+        )
+    if scenario.exchange == "rendezvous" and PAIRS[scenario.estimator, scenario.fusion] != "submap":
+        raise ScenarioError(
+            f"the rule {scenario.fusion} needs a continuous exchange: at a rendezvous submaps are "
+            'sent, which the rule "join" takes'
         )
     _check_team([robot.id for robot in scenario.robots], scenario.world)
     robots = tuple(

@@ -1,7 +1,7 @@
 """A user's TOML document → the plain fields of a resolved scenario.
 
 base = "thesis"            # optional: a built-in scenario that this file changes
-name, team, seed, estimator, fusion
+name, team, seed, estimator, fusion, exchange
 [world]      kind = "simulated" | "utias", then the fields of sim.worlds
 [defaults]   fields of every robot (team.config.RobotConfig)
 [[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS

@@ -17,7 +17,7 @@ def data_set_scenario(scenario: Scenario) -> str:
 
     The robots are called r1, r2, … as in every UTIAS world. What is as by default is left out.
     """
-    head = {name: getattr(scenario, name) for name in ("name", *SAID_ONCE)}
+    head = {name: getattr(scenario, name) for name in ("name", *SAID_ONCE, "exchange")}
     robots = [
         {"id": f"r{i}"} | _chosen(robot, RobotConfig, ("id", *SAID_ONCE))
         for i, robot in enumerate(scenario.robots, 1)

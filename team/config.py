@@ -25,6 +25,8 @@ Estimator = Literal[
     "localisation",
     "dead-reckoning",
 ]
+Exchange = Literal["continuous", "rendezvous"]
+"""When robots send: each submap as it is closed, or what they hold when one sees another."""
 FusionRule = Literal[
     "join",
     "kalman",

@@ -155,6 +155,7 @@ def examples() -> Iterator[m.Message]:
     yield m.Prior(9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)))
     yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))
     yield m.Progress(9_000, "central", "alpha", 1, 128, 6)
+    yield m.Rendezvous(9_000, "alpha", 1, ("bravo",), 3, 12.5)
     yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposed("in a submap", 200),), 7)
     yield m.End(9_000, (m.StreamEnd("alpha", 1, 200),), ("gap of 3 s",))
     yield m.Status(9_000, "recorder", "recording", {"messages": 12.0}, ("slow disk",))

@@ -12,7 +12,7 @@ from central.config import CentralConfig
 from central.node import CentralNode
 from sim.streams import Detections, Intervals, RobotStream, StartPose, WorldStreams, robot_stream
 from sim.world_node import WorldNode, expected_nodes
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.pairs import NEEDS_MAP
 from team.robot.node import RobotNode
 from team.wire import channels as ch
@@ -143,6 +143,7 @@ class Team:
     rng: random.Random
     central: CentralConfig = field(default_factory=CentralConfig)
     queues: dict[tuple[str, str], deque[m.Message]] = field(default_factory=dict)
+    exchange: Exchange = "continuous"
     sent: dict[str, list[m.Message]] = field(default_factory=lambda: defaultdict(list))
 
     def __post_init__(self) -> None:
@@ -156,7 +157,7 @@ class Team:
             tells_map=self.configs[0].estimator in NEEDS_MAP,
         )
         self.centre = CentralNode(rule, names)
-        self.robots = {c.id: RobotNode(c) for c in self.configs}
+        self.robots = {c.id: RobotNode(c, self.exchange) for c in self.configs}
         self.nodes = {"world": self.world, "central": self.centre}
         self.nodes |= {ch.robot_node(name): node for name, node in self.robots.items()}
         for name in list(self.nodes):
@@ -174,7 +175,8 @@ class Team:
             self.sent[o.key].append(o.message)
             for to, node in self.nodes.items():
                 mine = not to.startswith("robot/") or o.name in ("", node.robot)
-                if to != source and o.channel in node.listens and mine:
+                overheard = to.startswith("robot/") and o.channel in node.overhears
+                if to != source and ((o.channel in node.listens and mine) or overheard):
                     self.queues.setdefault((to, o.key), deque()).append(o.message)
 
     def kill(self, robot: str, *, patience: bool = False) -> None:
@@ -191,7 +193,7 @@ class Team:
 
     def resume(self, robot: RobotConfig) -> None:
         """The process is there again: it takes over the submaps that the centre has."""
-        name, node = ch.robot_node(robot.id), RobotNode(robot)
+        name, node = ch.robot_node(robot.id), RobotNode(robot, self.exchange)
         self.nodes[name] = self.robots[robot.id] = node
         request = encoded(m.SubmapsWanted(0, robot.id))
         kept = [decoded(reply) for reply in self.centre.answer_submaps(request)]

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 
-from team.config import RobotConfig
+from team.config import Exchange, RobotConfig
 from team.robot.node import RobotNode
 from team.shell import Shell
 from team.wire import channels as ch
@@ -33,11 +33,12 @@ class RobotShell:
         config: RobotConfig,
         stop: threading.Event,
         patience_s: float = SECOND_PATIENCE_S,
+        exchange: Exchange = "continuous",
     ) -> None:
         self._bus = bus
         self._stop = stop
         self._patience_s = patience_s
-        self.node = RobotNode(config)
+        self.node = RobotNode(config, exchange)
         self._shell = Shell(bus, self.node, ch.robot_node(config.id), stop)
         self._gap_since: float | None = None
 
@@ -47,6 +48,8 @@ class RobotShell:
         self._be_the_only_one()
         for channel in self.node.listens:
             self._bus.subscribe(channel, name)
+        for channel in self.node.overhears:
+            self._bus.subscribe(channel)
         self._bus.watch_alive("central")
         if self._resume():
             self._catch_up()

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from team import translate
-from team.config import RobotConfig
+from team.config import Exchange, RobotConfig
 from team.estimation.conditioning import team_pose
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.submap import LocalMap
@@ -21,6 +21,7 @@ from team.robot.filters import NOTHING_KNOWN, KnownMap
 from team.robot.member import ClosedWindow, Driven
 from team.robot.members import Member, member_of
 from team.robot.pace import Pace
+from team.robot.rendezvous import Held
 from team.robot.statements import Speaker
 from team.stream.inbox import Inbox
 from team.stream.pose_grid import NO_NODE
@@ -45,8 +46,9 @@ class RobotNode:
         ch.CENTRAL_PROGRESS,
     )
 
-    def __init__(self, config: RobotConfig) -> None:
+    def __init__(self, config: RobotConfig, exchange: Exchange = "continuous") -> None:
         self.config = config
+        self._held = Held(exchange == "rendezvous")
         self.robot = config.id
         self._inbox = Inbox()
         self._announcement = translate.configured(ch.robot_node(config.id), 0, 0, config)
@@ -89,7 +91,12 @@ class RobotNode:
     @property
     def submaps(self) -> int:
         """How many submaps of this epoch have been sent, in this life or an earlier one."""
-        return len(self._locals)
+        return len(self._locals) - self._held.submaps
+
+    @property
+    def overhears(self) -> tuple[ch.Channel, ...]:
+        """The channels of teammates to subscribe to."""
+        return (ch.RENDEZVOUS,) if self._held.waits else ()
 
     def wanted(self) -> m.ReadingsWanted | None:
         """The readings that are missing and must be asked for at their source."""
@@ -145,6 +152,8 @@ class RobotNode:
                     self._pace.centre_alive = message.alive
             case m.End():
                 self._take_end(message)
+            case m.Rendezvous():
+                return self._met(message) + self._go_on()
             case _:
                 self.warnings.append(f"no use for a {type(message).__name__}")
         return self._go_on()
@@ -160,6 +169,8 @@ class RobotNode:
             "pose_sigma_m": self._pose_sigma,
         }
         nis = self._member.innovation
+        if self._held.waits:
+            figures["held_submaps"] = float(self._held.submaps)
         if nis.per_dof is not None:
             figures |= {"nis_per_dof": nis.per_dof, "nis_dof": float(nis.dof)}
         if self.config.front_end.garbage:
@@ -222,7 +233,7 @@ class RobotNode:
             case m.Observations():
                 self._observe(reading)
             case m.Sightings():
-                self._sight(reading)
+                out += self._sight(reading)
         if self._pace.counted():
             out.append(self._progress())
         return out
@@ -252,13 +263,14 @@ class RobotNode:
         reason = self._member.observe(reading.stamp_ns, translate.scan_of(reading))
         self._ledger[self._member.used if reason is None else f"rejected: {reason}"] += 1
 
-    def _sight(self, reading: m.Sightings) -> None:
+    def _sight(self, reading: m.Sightings) -> list[Outgoing]:
         self._member.consumed(reading.reading)
         looks = translate.looks_of(reading)
         reason = self._member.sight(reading.stamp_ns, reading.reading, looks)
         if reason is None:
             self._sighted.add(reading.reading)
         self._ledger[IN_SIGHTING if reason is None else f"rejected: {reason}"] += 1
+        return self._release(reading.teammates)
 
     def _drive(self, reading: m.Odometry) -> list[Outgoing]:
         self._steps += 1
@@ -286,13 +298,27 @@ class RobotNode:
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
         self._locals.append(closed.local)
-        out = self._sightings(closed)
-        out.append(self._speaker.submap(closed))
+        out = self._held.put([*self._sightings(closed), self._speaker.submap(closed)])
         out += self._speaker.cloud(closed)
         out.append(self._speaker.innovation(closed))
         self._gated += closed.gated
         out += self._poses(closed.end_ns)
         out += self._mapped(closed.end_ns)
+        return [*out, self._progress()]
+
+    def _met(self, rendezvous: m.Rendezvous) -> list[Outgoing]:
+        """A teammate sends what it holds: who is seen by it does so too."""
+        return self._release(()) if self.robot in rendezvous.teammates else []
+
+    def _release(self, seen: tuple[str, ...]) -> list[Outgoing]:
+        """Send what is held; `seen`: who is to do so too."""
+        ended_ns, submaps = self._held.ended_ns(), self._held.submaps
+        waited_s = 0.0 if ended_ns is None else max(0.0, 1e-9 * (self._now_ns - ended_ns))
+        if not self._held.waits or not (submaps or set(seen) - self._held.greeted):
+            return []
+        self._held.greeted.update(seen)
+        told = m.Rendezvous(self._now_ns, self.robot, self._epoch, seen, submaps, waited_s)
+        out = [Outgoing(ch.RENDEZVOUS, self.robot, told), *self._held.released()]
         return [*out, self._progress()]
 
     def _sightings(self, closed: ClosedWindow | None) -> list[Outgoing]:
@@ -372,7 +398,7 @@ class RobotNode:
             ch.ROBOT_PROGRESS,
             self.robot,
             m.Progress(
-                self._passed_ns,
+                self._passed_ns if self._held.since_ns is None else self._held.since_ns,
                 ch.robot_node(self.robot),
                 self.robot,
                 self._epoch,
@@ -414,6 +440,7 @@ class RobotNode:
             return []
         self._passed_ns = self._now_ns
         out = self._close_epoch()
+        out += self._release(())
         self._ended.append(self._epoch_done())
         return [*out, self._progress()]
 
@@ -425,6 +452,7 @@ class RobotNode:
         exchanged = self._consumer != "own/map" or self._map_ns == self._exchange_ns
         if self._map_ns is not None and not exchanged:
             out += self._exchange_map(self._map_ns)
+        out += self._release(())
         dones = [self._epoch_done(), *self._ended]
         return [*out, self._progress(), *(Outgoing(ch.ROBOT_DONE, self.robot, d) for d in dones)]
 

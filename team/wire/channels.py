@@ -71,6 +71,9 @@ SUBMAP = Channel("submap", "robot/{robot}/submap", m.Submap, "one per window", "
 SIGHTING_FACTOR = Channel("sighting_factor", "robot/{robot}/sighting_factor", m.SightingFactor,
                           "0-1 per teammate and node", "all", True, True,
                           "a teammate seen from a pose node; what the rule `join` consumes")  # fmt: skip
+RENDEZVOUS = Channel("rendezvous", "robot/{robot}/rendezvous", m.Rendezvous,
+                     "0-1 per window and meeting", "all", True, False,
+                     "held submaps are sent, since a teammate is seen; who is seen sends too")  # fmt: skip
 OWN_MAP = Channel("own_map", "robot/{robot}/own/map", m.MapEstimate, "one per window or exchange",
                   "latest", True, True,
                   "running landmark means and covariances; consumed by rules with feedback")  # fmt: skip

@@ -402,6 +402,19 @@ class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"
     submaps: Count
 
 
+class Rendezvous(Message, frozen=True, array_like=True, gc=False, tag="rendezvous/1"):
+    """A robot that holds its submaps back sends them: submaps of them, the oldest since waited_s.
+
+    teammates: whom it sees, so that they send too; empty for one that was seen, or is home.
+    """
+
+    robot: Name
+    epoch: Count
+    teammates: tuple[Name, ...]
+    submaps: Count
+    waited_s: Annotated[float, Meta(ge=0.0, le=1e12)]
+
+
 class Disposed(msgspec.Struct, frozen=True, array_like=True):
     """How many readings of a robot ended in one way: in a submap, rejected for a reason, lost…"""
 
