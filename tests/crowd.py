@@ -66,7 +66,8 @@ def _map(
     sigma = 0.1 + 0.4 * (1.0 - min(share, 1.0))
     blocks = np.tile([sigma**2, 0.3 * sigma**2, 0.6 * sigma**2], (count, 1))
     means = places[:count] + sigma * rng.normal(size=(count, 2))
+    members = (m.Member("r1", 1, 0),)
     return m.FusedMap(
-        at, "join", bytes(8), "r1/1", final, not final, 0, (), (), False,
+        at, "join", bytes(8), "r1/1", final, not final, 0, members, (), False,
         from_ids(range(count)), from_floats(means), from_floats(blocks), 0.0, 0,
     )  # fmt: skip

@@ -3,9 +3,8 @@
 t: seconds of team time since the first reading. Poses and errors come as rows of numbers, maps and
 particles as base64 of little-endian float32 and uint32. Frames, by `k`:
 
-hello: team, title, colours, live.
-now: how far all robots at work are. pose: rows x, y, heading, xx,
-xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of
+hello: team, title, colours, live. now: how far all robots at work are. pose: rows x, y, heading,
+xx, xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of
 freedom. truth: rows x, y, heading. truth_map, map, cloud, path: what they are called. fig: a node's
 figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been read.
 """
@@ -124,9 +123,10 @@ class PageFrames:
         return round(max(stamp_ns - self._origin_ns, 0) * 1e-9, 3)
 
     def _take(self, channel: ch.Channel, message: m.Message) -> None:
-        if not isinstance(message, m.Liveliness | m.Status | m.Truth | m.TruthLandmarks):
+        if isinstance(message, m.PoseEstimate | m.FusedMap):  # the world runs ahead of all others
             self._newest_ns = max(self._newest_ns, message.stamp_ns)
-        at_ns = max(message.stamp_ns, self._newest_ns)
+        timeless = isinstance(message, m.Liveliness | m.Status)
+        at_ns = self._newest_ns if timeless else message.stamp_ns
         for event in self._chronicle.take(message, at_ns):
             self._say("ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text)
         match message:
@@ -207,7 +207,8 @@ class PageFrames:
 
     def _take_status(self, message: m.Status) -> None:
         second = int(self._t(message.stamp_ns))
-        if message.node == "central" and self._figures_s.get(message.node) != second:
+        told = message.node == "central" or message.node.startswith("robot/")
+        if told and self._figures_s.get(message.node) != second:
             self._figures_s[message.node] = second
             figures = {name: _short(value) for name, value in message.figures.items()}
             self._say("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)

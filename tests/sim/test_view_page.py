@@ -26,7 +26,9 @@ from team.recording.reader import LogError
 from team.recording.recorder import Recorder
 from team.recording.tail import Tail
 from team.wire import channels as ch
+from team.wire import messages as m
 from team.wire.bus import Sample
+from team.wire.codec import encoded
 from tests.crowd import crowd
 from tests.support import ROOT, wait_until
 
@@ -114,6 +116,16 @@ def test_the_page_is_told_who_joined_and_the_end(frames):
     texts = [event["x"] for event in frames["ev"]]
     assert texts[:3] == ["r1 joined", "r2 joined", "r3 joined"]
     assert texts[-1] == f"final map of {LANDMARKS} landmarks"
+
+
+def test_an_event_is_at_the_time_of_what_it_is_about(samples, tmp_path):
+    ended = m.End(SECONDS * 10**9, ())
+    early = [*samples[:8], Sample(ch.END.key(), encoded(ended), ended.stamp_ns, 0, 0), *samples[8:]]
+    with Recorder(tmp_path / "early.mcap", "crowd", {}) as recorder:
+        recorder.write(early)
+    times = {f["x"]: f["t"] for f in told(tmp_path / "early.mcap") if f["k"] == "ev"}
+    assert times["the world has ended"] == SECONDS
+    assert times["r1 is in the team's map"] == 4.8
 
 
 def test_a_damaged_chunk_costs_the_page_no_more_than_itself(log, tmp_path):

@@ -12,7 +12,7 @@ const $ = (id) => document.getElementById(id);
 const store = new Store();
 const map = new MapView($('map'), store);
 const state = { time: 0, playing: false, speed: 10, following: true, chosen: null, picked: false, touched: false };
-const plots = ['plot-x', 'plot-y', 'plot-heading', 'plot-cost'].map((id) => new Plot($(id), seek));
+const plots = ['plot-x', 'plot-y', 'plot-heading', 'plot-cost', 'plot-nis'].map((id) => new Plot($(id), seek));
 
 function end() { return Math.max(store.now, 1e-9); }
 
@@ -152,6 +152,7 @@ function look() {
   $('play').querySelector('path').setAttribute('d', moving() ? 'M7 4h4v16H7zM14 4h4v16h-4z' : 'M7 4l13 8-13 8z');
   $('end').textContent = end().toFixed(0);
   $('empty').hidden = [...store.robots.values()].some((robot) => robot.pose.length) || store.maps.length > 0;
+  $('empty').textContent = store.complete ? 'This log has no poses and no map.' : 'waiting for the team …';
   lookAtMap();
   lookAtRobots();
   lookAtEvents();
@@ -380,6 +381,7 @@ function drawConsistency() {
     legend.push(['landmark', 'map NEES']);
     for (const m of fits) high = Math.max(high, Math.min(1.15 * m.nees, 5));
   }
+  drawInnovations();
   const i = found ? upTo(found.t, state.time) - 1 : -1;
   const cost = i < 0 ? undefined : costs[i];
   $('consistency-says').textContent = cost === undefined ? 'per degree of freedom; 1 is right'
@@ -397,6 +399,28 @@ function drawConsistency() {
       item.textContent = text;
       return item;
     }));
+  }
+}
+
+/** NIS of each robot: how well its readings agree with what it expected of them. */
+function drawInnovations() {
+  const lines = [];
+  let high = 2, count = 0;
+  for (const robot of store.robots.values()) {
+    const found = store.figures.get(`robot/${robot.name}`);
+    if (!found) continue;
+    const kept = found.t.map((t, i) => [t, found.f[i].nis_per_dof]).filter(([, v]) => v !== undefined);
+    if (!kept.length) continue;
+    count += kept.length;
+    for (const [, v] of kept) high = Math.max(high, Math.min(1.15 * v, 6));
+    lines.push({ count: kept.length, t: (i) => kept[i][0], v: (i) => kept[i][1], colour: robot.colour, width: 1.3 });
+  }
+  $('plot-nis').hidden = !lines.length;
+  if (lines.length) {
+    plots[4].draw({
+      key: `${count}|${lines.length}`, title: "NIS per degree of freedom, of each robot's readings", unit: '', end: end(),
+      time: state.time, low: 0, high, lines, levels: [{ v: 1, colour: 'good' }],
+    });
   }
 }
 
