@@ -360,6 +360,8 @@ def played(seed, estimator, fusion):
     if rng.random() < 0.4:
         for _ in range(rng.randrange(10, 150)):
             team.step()
+        while team.world._began_at is None:  # a world that has not begun waits for everyone
+            team.step()
         victim = rng.choice(sorted(team.robots))
         team.kill(victim)
         for _ in range(rng.randrange(30)):

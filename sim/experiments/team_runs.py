@@ -14,7 +14,7 @@ from sim.experiments.task import Task
 from sim.in_memory import run_nodes
 from sim.limit import Limit, LimitError, batch_map
 from sim.scenario import Scenario, loads, with_options
-from sim.source import streams_of
+from sim.source import streams_of, tells_map
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from sim.worlds import SimulatedWorld
@@ -99,7 +99,8 @@ class TimedRun:
         """Run the team; its log. streams: what the world says; None: as the scenario has it."""
         readings = streams_of(scenario) if streams is None else streams
         expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
-        world = WorldNode(readings, expected, translate.configured("world", 0, 0, scenario))
+        announced = translate.configured("world", 0, 0, scenario)
+        world = WorldNode(readings, expected, announced, tells_map=tells_map(scenario, readings))
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
         robot, centre = self._nodes()
         for sample in run_nodes(scenario, world, None, robot, centre):
@@ -138,15 +139,19 @@ class TimedRun:
 
 
 def team_figures(evaluation: Evaluation) -> Figures:
-    """The figures of a run; None where there is nothing to judge. Means are over the robots."""
+    """The figures of a run; None where there is nothing to judge. Means are over the robots.
+
+    Where nothing is fused, error and NEES are those of the robots' own maps.
+    """
     robots = list(evaluation.robots.values())
     errors = None if evaluation.map is None else evaluation.map.errors
+    own = [r.own_map for r in robots if r.own_map is not None and errors is None]
     steps = sum(r.consumption.steps for r in robots)
     sent = sum(r.uplink_bytes or 0 for r in robots)
     return {
-        "rmse": None if errors is None else errors.rmse_m,
+        "rmse": rms(x.rmse_m for x in own) if errors is None else errors.rmse_m,
         "rmse_aligned": None if errors is None else errors.aligned_rmse_m,
-        "nees": None if errors is None else errors.nees_per_dof,
+        "nees": mean(x.nees_per_dof for x in own) if errors is None else errors.nees_per_dof,
         "in_band": None if errors is None else errors.in_band,
         "landmarks": None if errors is None else errors.count,
         "coverage_raw": None if errors is None else errors.coverage,

@@ -17,7 +17,7 @@ from sim.experiments.store import Store
 from sim.experiments.task import Task, sources_of
 from sim.experiments.team_runs import team_run, team_task
 from sim.experiments.workers import Done, run
-from sim.scenario import Scenario, load
+from sim.scenario import Scenario, load, with_options
 from sim.worlds import SimulatedWorld
 
 WORK = "json:loads"
@@ -33,6 +33,17 @@ def short(steps: int) -> Scenario:
     assert isinstance(scenario.world, SimulatedWorld)
     world = msgspec.structs.replace(scenario.world, steps=steps)
     return msgspec.structs.replace(scenario, world=world)
+
+
+@pytest.mark.parametrize("estimator", ["localisation", "ekf-slam"])
+def test_a_team_that_fuses_nothing_has_the_figures_of_its_robots(estimator: str) -> None:
+    scenario = with_options(short(20), estimator=estimator, fusion="alone")
+    figures = team_run(msgspec.to_builtins(scenario), batch=False)
+    assert figures["final_map_sha256"] is not None, "it came to its end"
+    assert figures["each_once"]
+    assert 0.1 < figures["online_pose_nees"] < 5.0
+    assert figures["in_band"] is None
+    assert (figures["rmse"] is None) == (figures["nees"] is None) == (estimator == "localisation")
 
 
 class Mean:

@@ -103,9 +103,14 @@ async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, ob
 
 @pytest.mark.parametrize(
     ("estimator", "rule"),
-    [("hybrid-thesis", "kalman-per-axis"), ("hybrid", "covariance-intersection")],
+    [
+        ("hybrid-thesis", "kalman-per-axis"),
+        ("hybrid", "covariance-intersection"),
+        ("hybrid", "joint-fastslam"),
+        ("ekf-slam", "latest"),
+    ],
 )
-async def test_a_rule_that_feeds_the_map_back_ends_with_the_bytes_of_a_team_in_memory(
+async def test_every_kind_of_pair_ends_with_the_bytes_of_a_team_in_memory(
     estimator: str, rule: str, team: Processes
 ) -> None:
     scenario = short(team.folder, more=f'estimator = "{estimator}"\nfusion = "{rule}"', steps=30)
