@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
 
+LONG_BYTES = 5_000_000
+"""A report of a log of this size takes a while, and says so."""
 app = typer.Typer()
 
 
@@ -85,6 +87,9 @@ def report(
 
     _check_folder(output)
     opened = open_log(log)
+    if log.stat().st_size > LONG_BYTES:
+        text = "this log is long: proving its ledger takes most of the time"
+        typer.echo(f"{text}, --no-ledger leaves it out" if ledger else "this log is long", err=True)
     evaluation = evaluate(opened.samples())
     found, why = _ledger(opened) if ledger else (None, Run.no_ledger)
     run = Run(evaluation, history(opened.samples()), opened.metadata, found, why)
