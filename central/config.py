@@ -32,6 +32,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     are independent from reading to reading.
     particles: of `joint-fastslam`.
     bias_sigma: of the errors that robots send their submaps' sensitivities for.
+    withdraw_above: a robot of whose submaps the half and more cost above this per degree of freedom
+    is withdrawn if the rest of the team agrees without it; absent: by an operator only.
     """
 
     fusion: FusionRule = "join"
@@ -42,3 +44,4 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gauss_newton_per_tick: Annotated[int, Meta(ge=1, le=50)] = 2
     bias_sigma: BiasSigmas = BiasSigmas()
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 1000
+    withdraw_above: Annotated[float, Meta(ge=2.0)] | None = 4.0

@@ -1,5 +1,6 @@
 """The rule `join`: the team's map is a pure function of the set of submaps."""
 
+from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
@@ -8,9 +9,11 @@ from central.config import CentralConfig
 from central.monitor import NOTHING, finding
 from central.submap_set import Stream, SubmapSet
 from central.tick_fold import TickFold
+from central.withdrawal import convicted, suspects
 from team import translate
 from team.estimation import marginals
 from team.estimation.joining import Fold, converged
+from team.estimation.marginals import Agreement
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -40,6 +43,7 @@ class JoinRule:
         self._quiet_ns: int | None = None
         self.finding = NOTHING
         self.landmarks = 0
+        self._tried_at = 0
         self.warnings: list[str] = []
         self.reasons: tuple[str, ...] = ()
         self.refused = 0
@@ -66,6 +70,14 @@ class JoinRule:
         self._judge(sighting, self._set.admit_sighting(sighting))
         self._enter(stream)
         return self._dealt_with(stream, self._set.count(stream))
+
+    def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
+        """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
+        robot = withdrawal.robot
+        if robot not in self._ticks.withdrawn:
+            self._ticks.withdraw(robot)
+            said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
+            self.warnings.append(said)
 
     def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
         """A refused submap, or one with a refused sighting, may never be in the map."""
@@ -119,7 +131,8 @@ class JoinRule:
         since = None if self._broadcast_ns is None else newest_ns - self._broadcast_ns
         due = since is None or since >= self._config.broadcast_s * 1e9
         if taken and due:
-            return self._broadcast(self._ticks.fold, "closed", newest_ns)
+            said = self._withdrawals(self._ticks.fold, newest_ns)
+            return [*said, *self._broadcast(self._ticks.fold, "closed", newest_ns)]
         if not any(self._entered.values()):
             return []
         if self._quiet_ns is None:
@@ -131,16 +144,41 @@ class JoinRule:
 
     def conclude(self, newest_ns: int) -> list[Outgoing]:
         """The final map: everything folded, solved until it stands still, with what it says."""
+        fold = self._solved()
+        said = self._withdrawals(fold, newest_ns)
+        return [*said, *self._broadcast(self._solved() if said else fold, "final", newest_ns)]
+
+    def _solved(self) -> Fold:
         self._ticks.take_until(float("inf"))
         fold = self._ticks.fold
-        if fold.contributions:
-            fold = converged(fold, self._ticks.settings)
-        return self._broadcast(fold, "final", newest_ns)
+        return converged(fold, self._ticks.settings) if fold.contributions else fold
+
+    def _withdrawals(self, fold: Fold, now_ns: int) -> list[Outgoing]:
+        """Who is wrong beyond doubt goes; looked at again when the set has grown by a quarter."""
+        limit, count = self._config.withdraw_above, len(fold.contributions)
+        if limit is None or count < 1.25 * self._tried_at:
+            return []
+        agreement = marginals.joint_cost(fold)
+        if not suspects(agreement, limit):
+            return []
+        self._tried_at = count
+        found = convicted(agreement, limit, self._agreement_without)
+        if found is None:
+            return []
+        robot, reason = found
+        withdrawal = m.Withdrawal(now_ns, robot, "central", reason)
+        self.take_withdrawal(withdrawal)
+        self._tried_at = 0
+        return [Outgoing(ch.WITHDRAWAL, robot, withdrawal)]
+
+    def _agreement_without(self, robots: Collection[str]) -> Agreement | None:
+        fold = self._ticks.without(robots).fold
+        return marginals.joint_cost(converged(fold, self._ticks.settings)) if fold.home else None
 
     def retold(self, tail: Tail) -> list[Outgoing]:
         """What a map of everything that is here says, whatever the watermark: law 2, for reruns."""
         if tail == "final":
-            return self.conclude(0)
+            return self._broadcast(self._solved(), tail, 0)
         self._ticks.take_until(float("inf"))
         return self._broadcast(self._ticks.fold, tail, 0)
 
@@ -194,6 +232,7 @@ class JoinRule:
             self.reasons,
             tuple(m.BiasEstimate(*b.stream, b.bias, b.value, b.sigma) for b in biases),
             tuple(fold.joined[k] for k in sorted(fold.joined)),
+            self._ticks.withdrawn,
         )
 
     def _priors(self, fold: Fold, digest: bytes) -> list[Outgoing]:

@@ -14,7 +14,7 @@ from team.wire.bus import Outgoing
 class SubmapRule:
     """A set of submaps and the map that it gives; every submap is acknowledged."""
 
-    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
+    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.WITHDRAWAL)
 
     def __init__(self, rule: JoinRule) -> None:
         self.joined = rule
@@ -55,6 +55,8 @@ class SubmapRule:
                 before = self.joined.count((message.robot, message.epoch))
                 count = self.joined.take_sighting(message)
                 return _credit(message, count, now_ns) if count > before else []
+            case m.Withdrawal():
+                self.joined.take_withdrawal(message)
             case _:
                 pass
         return []

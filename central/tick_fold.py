@@ -4,8 +4,9 @@ Tick b takes the submaps that end in (b·tick, (b + 1)·tick]. Behind the waterm
 tick is there, so the fold is final; what comes late rolls it back to the checkpoint before.
 """
 
+import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from central.config import CentralConfig
 from team import translate
@@ -43,7 +44,9 @@ class TickFold:
     """Holds the contributions by tick and the fold after each tick that has been taken."""
 
     def __init__(self, config: CentralConfig) -> None:
+        self._config = config
         self.settings = join_settings(config)
+        self._withdrawn: set[str] = set()
         self._tick_ns = round(config.tick_s * 1e9)
         self._ticks: dict[int, dict[tuple[int, str, int, int], Contribution]] = defaultdict(dict)
         self._sightings: dict[tuple[int, str, int, int], list[Sighting]] = {}
@@ -60,11 +63,64 @@ class TickFold:
 
         The fold goes back to before that tick if it was taken.
         """
+        if submap.robot in self._withdrawn:
+            return
         contribution = translate.contribution_of(submap)
         tick = self._tick_of(submap.stamp_ns)
         self._ticks[tick][contribution.key] = contribution
-        self._sightings[contribution.key] = [translate.sighting_of(each) for each in sightings]
+        self._sightings[contribution.key] = [
+            translate.sighting_of(each)
+            for each in sightings
+            if each.teammate not in self._withdrawn
+        ]
         self._digests[contribution.key] = digest
+        self._roll_back(tick)
+
+    def withdraw(self, robot: str) -> None:
+        """Forget a robot's submaps, and the sightings by it or of it, now and in future.
+
+        What is left is what there would be had the robot never been; the fold goes back to the
+        checkpoint before it first said something, or was first seen, and takes the ticks again.
+        """
+        if robot in self._withdrawn:
+            return
+        self._withdrawn.add(robot)
+        until_ns = (self._taken[-1][0] + 1) * self._tick_ns if self._taken else -math.inf
+        for tick in sorted(self._ticks):
+            touched = [key for key in self._ticks[tick] if self._forget(tick, key, robot)]
+            if touched:
+                self._roll_back(tick)
+            if not self._ticks[tick]:
+                del self._ticks[tick]
+        self.take_until(until_ns)
+
+    def _forget(self, tick: int, key: tuple[int, str, int, int], robot: str) -> bool:
+        """Whether the robot had to do with this submap."""
+        if key[1] == robot:
+            del self._ticks[tick][key], self._sightings[key], self._digests[key]
+            return True
+        kept = [each for each in self._sightings[key] if each.teammate != robot]
+        touched = len(kept) < len(self._sightings[key])
+        self._sightings[key] = kept
+        return touched
+
+    def without(self, robots: Collection[str]) -> "TickFold":
+        """Another one of the same submaps without some robots' that has taken the same ticks."""
+        other = TickFold(self._config)
+        other._ticks = defaultdict(dict, {t: dict(found) for t, found in self._ticks.items()})
+        other._sightings, other._digests = dict(self._sightings), dict(self._digests)
+        other._starts, other._withdrawn = dict(self._starts), set(self._withdrawn)
+        for robot in robots:
+            other.withdraw(robot)
+        other.take_until((self._taken[-1][0] + 1) * self._tick_ns if self._taken else -math.inf)
+        return other
+
+    @property
+    def withdrawn(self) -> tuple[str, ...]:
+        """The robots that the team goes on without."""
+        return tuple(sorted(self._withdrawn))
+
+    def _roll_back(self, tick: int) -> None:
         while self._taken and self._taken[-1][0] >= tick:
             self._taken.pop()
 
@@ -123,7 +179,8 @@ class TickFold:
             if (robot, epoch) in fold.home
         ]
         members = [self._digests[c.key] for c in fold.contributions]
-        return translate.digest_of(*more, *starts, *members)
+        gone = [f"without {robot}".encode() for robot in self.withdrawn]
+        return translate.digest_of(*more, *gone, *starts, *members)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """The version vector: the last sequence of each stream in the fold."""

@@ -37,12 +37,14 @@ class Entry:
 class Ledger:
     """Every reading's entry by stream and counter, every submap's maps, and what is wrong.
 
-    maps: the digests of the maps that used a submap, in the order of the log.
+    maps: the digests of the maps that used a submap, in the order of the log. withdrawn: the robots
+    that the last map goes without; what is in their submaps is in no map any more.
     """
 
     entries: Mapping[Stream, tuple[Entry, ...]]
     maps: Mapping[SubmapName, tuple[str, ...]]
     offenders: tuple[str, ...]
+    withdrawn: tuple[str, ...] = ()
 
     @property
     def readings(self) -> int:
@@ -62,7 +64,13 @@ class Ledger:
     def statement(self) -> str:
         """The proof in one sentence."""
         parts = ", ".join(f"{count:,} {name}" for name, count in self.totals().items())
-        return f"each of {self.readings:,} readings has exactly one disposition: {parts}"
+        said = f"each of {self.readings:,} readings has exactly one disposition: {parts}"
+        gone = sum(self.totals(robot).get(IN_SUBMAP, 0) for robot in self.withdrawn)
+        if not self.withdrawn:
+            return said
+        return (
+            f"{said}; {gone:,} of those in submaps are withdrawn with {', '.join(self.withdrawn)}"
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Totals, offenders, and of each submap how many readings and which maps."""
@@ -81,6 +89,7 @@ class Ledger:
                 {"robot": n[0], "epoch": n[1], "sequence": n[2], "readings": held[n], "maps": maps}
                 for n, maps in sorted(self.maps.items())
             ],
+            "withdrawn": self.withdrawn,
             "offenders": self.offenders,
         }
 
@@ -95,7 +104,13 @@ def ledger(log: Recorded) -> Ledger:
         entries[stream], more = _entries(log, stream, intervals)
         offenders += [*wrong, *more, *_contradictions(log, stream, entries[stream])]
     maps, unknown = _maps(log)
-    return Ledger(entries, maps, (*offenders, *unknown))
+    return Ledger(entries, maps, (*offenders, *unknown), _withdrawn(log))
+
+
+def _withdrawn(log: Recorded) -> tuple[str, ...]:
+    """By the last map's word."""
+    last = next(iter(reversed((*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)))), None)
+    return last.withdrawn if isinstance(last, m.FusedMap) else ()
 
 
 def _named(reading: m.Reading) -> str:
@@ -190,6 +205,11 @@ def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
         streams = Counter((x.robot, x.epoch) for x in fused.members)
         wrong += [
             f"map {digest} counts {s[0]}, epoch {s[1]} twice" for s, n in streams.items() if n > 1
+        ]
+        wrong += [
+            f"map {digest} uses submaps of {robot}, which it says is withdrawn"
+            for robot, _ in streams
+            if robot in fused.withdrawn
         ]
         for member in fused.members:
             for sequence in range(member.sequence + 1):

@@ -44,12 +44,18 @@ def _joined(
     submaps, sightings = log.submaps(), log.sightings()
     rule = JoinRule(config, digest)
     inside: dict[Stream, int] = {}
+    gone: set[str] = set()
     for fused in maps:
         vector = {(x.robot, x.epoch): x.sequence for x in fused.members}
         if not _complete(vector, submaps):
             continue
-        if any(vector.get(stream, -1) < sequence for stream, sequence in inside.items()):
+        shrunk = any(vector.get(stream, -1) < sequence for stream, sequence in inside.items())
+        if shrunk or not gone <= set(fused.withdrawn):
             rule, inside = JoinRule(config, digest), {}
+        gone = set(fused.withdrawn)
+        for robot in fused.withdrawn:
+            if robot in log.withdrawals:
+                rule.take_withdrawal(log.withdrawals[robot])
         for stream, sequence in sorted(vector.items()):
             start = starts.get(stream)
             if isinstance(start, m.Start):

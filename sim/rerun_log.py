@@ -42,6 +42,7 @@ class Recorded:
     contradicted: readings that the log has twice with different content. reported: how many
     readings a robot had consumed by its own word. published: how many the world says there are.
     known_map: what the robots were told of the landmarks, if they were.
+    withdrawals: of robots that the team went on without, the first word on each.
     unsound: samples that no node would have let in.
     """
 
@@ -52,6 +53,7 @@ class Recorded:
     reported: dict[Stream, int] = field(default_factory=dict)
     published: dict[Stream, int] = field(default_factory=dict)
     known_map: m.KnownMap | None = None
+    withdrawals: dict[str, m.Withdrawal] = field(default_factory=dict)
     unsound: int = 0
 
     def take(self, sample: Sample) -> None:
@@ -75,6 +77,8 @@ class Recorded:
                 self.reported[message.robot, message.epoch] = max(consumed, message.readings)
             case m.KnownMap():
                 self.known_map = message
+            case m.Withdrawal():
+                self.withdrawals.setdefault(message.robot, message)
             case m.End():
                 self.published |= {(s.robot, s.epoch): s.readings for s in message.streams}
             case _ if channel.recomputable:
@@ -141,7 +145,7 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
         raise RerunError(f"{what} is not one of this version: {error}") from None
 
 
-_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END)
+_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END, ch.WITHDRAWAL)
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_TOLD))
 """The channels whose samples are filed."""
 
@@ -175,7 +179,12 @@ def identity(key: str, message: m.Message) -> Identity:
         case m.Prior() | m.Trajectory():
             names = (message.epoch, message.digest)
         case m.FusedMap():
-            names = (message.exchange, message.provisional, message.members)
+            names = (
+                message.exchange,
+                message.provisional,
+                message.members,
+                message.withdrawn,
+            )
         case _:
             names = (message.stamp_ns,)
     return (key, *names)

@@ -143,6 +143,7 @@ def examples() -> Iterator[m.Message]:
     yield m.SightingFactor(
         8_500, "alpha", 1, 5, digest, "bravo", 6.0, -3.0, packed(spd(2)), (12, 14)
     )
+    yield m.Withdrawal(9_000, "charlie", "operator", "its wheel is flat")
     yield m.MapEstimate(9_000, "alpha", 1, 5, 0, False, two, means, blocks)
     yield m.PoseEstimate(9_000, "alpha", 1, 5, digest, three, from_floats(spd(3)))
     yield m.ParticleCloud(9_000, "alpha", from_floats(range(6)), from_floats([0.25, 0.75]))
@@ -150,7 +151,7 @@ def examples() -> Iterator[m.Message]:
     yield m.FusedMap(
         9_000, "join", digest, "alpha/1", True, False, 0, (member,), (m.Member("bravo", 0, 2),),
         True, two, means, packed(spd(4)), 12.5, 14, ("bravo: 1 shared landmark, 2 needed",),
-        (m.BiasEstimate("alpha", 1, "bearing", 0.25, 0.125),), ("charlie joined: 5 landmarks",),
+        (m.BiasEstimate("alpha", 1, "bearing", 0.25, 0.125),), ("charlie joined: 5 landmarks",), ("charlie",),
     )  # fmt: skip
     yield m.Prior(9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)))
     yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))

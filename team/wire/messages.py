@@ -229,6 +229,18 @@ class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sight
             raise ValueError("out of bounds: a robot sees itself")
 
 
+class Withdrawal(Message, frozen=True, array_like=True, gc=False, tag="withdrawal/1"):
+    """The team goes on without a robot: the map is that of the set without its submaps, and without
+    the sightings by it or of it. A member of the set like a submap: there is no way back.
+
+    by: "operator" or "central". reason: in words.
+    """
+
+    robot: Name
+    by: Text
+    reason: Text
+
+
 class MapEstimate(Message, frozen=True, array_like=True, gc=False, tag="map/1"):
     """A robot's own running map in the team's frame: landmark means and covariances.
 
@@ -323,6 +335,7 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined, and what
     speaks for another minimum of the final map. biases: by robot, epoch and name, where submaps
     have sensitivities. joined: how robots with an unknown start were joined, and how sure that is.
+    withdrawn: the robots that the team goes on without, ascending.
     """
 
     rule: Text
@@ -342,8 +355,11 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     reasons: tuple[Text, ...] = ()
     biases: tuple[BiasEstimate, ...] = ()
     joined: tuple[Text, ...] = ()
+    withdrawn: tuple[Name, ...] = ()
 
     def check(self) -> None:  # noqa: D102
+        if any(a >= b for a, b in pairwise(self.withdrawn)):
+            raise ValueError("not ascending: withdrawn")
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
 
 

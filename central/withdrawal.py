@@ -1,0 +1,64 @@
+"""Which robot contradicts the rest beyond doubt, so that the team goes on without it.
+
+A robot's disagreement is the median over its submaps of χ²/dof at the joint estimate: near or below
+1 for a robot whose covariances are true, whatever a few of its submaps say. One robot that is wrong
+bends the map and makes others disagree too, so it is found by leaving out: it goes only if without
+it the rest agree among themselves; and with one other robot left only if it contradicts itself when
+it is alone, since two that disagree do not say which of them is wrong.
+"""
+
+from collections.abc import Callable, Collection
+from statistics import median
+
+from team.estimation.marginals import Agreement
+
+LEAST_SUBMAPS = 8
+"""A robot is judged by so many submaps or more."""
+AGREEING = 0.5
+"""The rest agree if nobody's disagreement is above this part of the limit."""
+TRIED = 3
+"""Robots that are left out for a trial at the most, the most suspect first."""
+
+Without = Callable[[Collection[str]], Agreement | None]
+"""The agreement of the team without some robots; None: nothing is left."""
+
+
+def disagreement(agreement: Agreement) -> dict[str, float]:
+    """The median of χ²/dof over the submaps of each robot that has enough of them."""
+    ratios: dict[str, list[float]] = {}
+    for each in agreement.submaps:
+        if each.dof >= 1.0:
+            ratios.setdefault(each.stream[0], []).append(each.chi2 / each.dof)
+    return {r: median(ratios[r]) for r in sorted(ratios) if len(ratios[r]) >= LEAST_SUBMAPS}
+
+
+def suspects(agreement: Agreement, limit: float) -> list[str]:
+    """The robots whose disagreement is above the limit, the most suspect first."""
+    found = disagreement(agreement)
+    wrong = sorted((-value, robot) for robot, value in found.items() if value > limit)
+    return [robot for _, robot in wrong]
+
+
+def convicted(agreement: Agreement, limit: float, without: Without) -> tuple[str, str] | None:
+    """The robot that is wrong beyond doubt and why, in words; None if there is no such."""
+    found = disagreement(agreement)
+    verdicts = []
+    for robot in suspects(agreement, limit)[:TRIED]:
+        rest = without({robot})
+        if rest is None:
+            continue
+        others = disagreement(rest)
+        if not others or max(others.values()) > AGREEING * limit:
+            continue
+        if len(others) == 1:
+            alone = without(others)
+            if alone is None or disagreement(alone).get(robot, 0.0) <= limit:
+                continue
+        verdicts.append((max(others.values()), robot))
+    if not verdicts:
+        return None
+    agreed, robot = min(verdicts)
+    return robot, (
+        f"its submaps contradict the rest: median cost {found[robot]:.1f} per degree of freedom; "
+        f"without it the others' is {agreed:.1f} or less"
+    )
