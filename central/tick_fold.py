@@ -87,7 +87,7 @@ class TickFold:
         self._withdrawn.add(robot)
         until_ns = (self._taken[-1][0] + 1) * self._tick_ns if self._taken else -math.inf
         for tick in sorted(self._ticks):
-            touched = [key for key in self._ticks[tick] if self._forget(tick, key, robot)]
+            touched = [key for key in [*self._ticks[tick]] if self._forget(tick, key, robot)]
             if touched:
                 self._roll_back(tick)
             if not self._ticks[tick]:

@@ -1,12 +1,14 @@
 """One process each: router, world, robot, central, record. `launch` starts these very commands."""
 
 import logging
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from sim.cli_options import (
+    FAILED,
     WRONG_USE,
     Connect,
     Dataset,
@@ -21,6 +23,7 @@ from sim.cli_options import (
     scenario_of,
 )
 from sim.scenario import Scenario, doubts, with_options
+from team.wire.arrays import ids
 
 LOOPBACK = "tcp/127.0.0.1:7447"
 _LOG = logging.getLogger("teamslam")
@@ -177,3 +180,34 @@ def record(
         _connected(resolved, connect)
         written = record_until_end(bus, recorder, expected, stop=stop)
         _LOG.info("wrote %s, %d messages", output, written)
+
+
+@app.command()
+def withdraw(
+    robot: Annotated[str, typer.Argument(help="The robot's name, as r3.")],
+    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    connect: Connect = LOOPBACK,
+    reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
+    ] = 60.0,
+) -> None:
+    """Let a running team go on without a robot: its map is that of a team that never had it.
+
+    The order is recorded, and there is no way back.
+    """
+    from sim.withdraw import WithdrawError
+    from sim.withdraw import withdraw as order
+    from team.wire.zenoh_bus import ZenohBus
+
+    if not re.fullmatch("[a-z][a-z0-9_]{0,31}", robot):
+        fail(f"{robot!r} is no robot's name", WRONG_USE)
+    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
+        fail(f"{team!r} is no team's name", WRONG_USE)
+    with ZenohBus(team, connect) as bus:
+        try:
+            fused = order(bus, robot, reason, patience)
+        except WithdrawError as error:
+            fail(str(error), FAILED)
+    landmarks = len(ids(fused.ids, "ids"))
+    typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")

@@ -1,0 +1,65 @@
+"""An operator's order to a running team: go on without a robot."""
+
+import time
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Bus, Outgoing, opened
+
+CENTRE_S = 10.0
+"""A living centre and robot are heard of within this time."""
+LOOK_S = 0.05
+
+
+class WithdrawError(RuntimeError):
+    """The order could not be given, or was not followed: why, and what to do."""
+
+
+def withdraw(bus: Bus, robot: str, reason: str, patience_s: float) -> m.FusedMap:
+    """Order a robot's withdrawal and wait for the first map without it.
+
+    Raises WithdrawError where there is no centre, no such robot, no rule that can withdraw, or no
+    such map within the time.
+    """
+    for channel in (ch.ROBOT_CONFIG, ch.FUSED_MAP, ch.FINAL_MAP):
+        bus.subscribe(channel)
+    bus.watch_alive()
+    robots: set[str] = set()
+    _await_team(bus, robot, robots)
+    order = m.Withdrawal(0, robot, "operator", reason)
+    bus.publish(Outgoing(ch.WITHDRAWAL, robot, order))
+    until = time.monotonic() + patience_s
+    while time.monotonic() < until:
+        for fused in _maps(bus, robots):
+            if robot in fused.withdrawn:
+                return fused
+            if fused.rule != "join":
+                raise WithdrawError(f"the rule {fused.rule} can not withdraw; only join can")
+            if fused.final:
+                raise WithdrawError("the final map was out before the order; run the log again")
+    raise WithdrawError(f"no map without {robot} within {patience_s:g} s; the order stands")
+
+
+def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
+    until = time.monotonic() + CENTRE_S
+    while time.monotonic() < until:
+        _maps(bus, robots)
+        if bus.is_alive("central") and robot in robots:
+            return
+    if not bus.is_alive("central"):
+        raise WithdrawError("no centre answers; is the team running there? see --team, --connect")
+    known = ", ".join(sorted(robots)) or "none"
+    raise WithdrawError(f"the team has no robot {robot}; heard of: {known}")
+
+
+def _maps(bus: Bus, robots: set[str]) -> list[m.FusedMap]:
+    """The maps that have come; the robots that anything speaks of are noted."""
+    found = []
+    for sample in bus.receive(LOOK_S):
+        channel, name, message = opened(sample)
+        if channel is ch.ROBOT_CONFIG:
+            robots.add(name)
+        elif isinstance(message, m.FusedMap):
+            robots |= {member.robot for member in message.members} | set(message.withdrawn)
+            found.append(message)
+    return found

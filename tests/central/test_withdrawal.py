@@ -1,0 +1,237 @@
+"""A robot that goes wrong is withdrawn: the map is, bit for bit, that of a team without it."""
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.config import CentralConfig
+from central.join_rule import JoinRule
+from central.tick_fold import TickFold
+from central.withdrawal import convicted, disagreement
+from sim.in_memory import final_map, run_team
+from sim.ledger import ledger
+from sim.rerun import verify
+from sim.rerun_log import recorded
+from sim.scenario import Scenario, with_options
+from sim.simulator import simulated
+from sim.worlds import SimulatedWorld
+from team import translate
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.estimation.joining import converged
+from team.estimation.marginals import Agreement, SubmapCost, landmark_map
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from tests.sim.reruns import written
+
+SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
+MOTION = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02))
+
+
+def scenario(robots: int = 3, steps: int = 60, **central: object) -> Scenario:
+    """A small world in which robots meet; each submap has a pose node or two."""
+    front = FrontEnd(particles=20, window_s=5.0, node_s=5.0)
+    world = SimulatedWorld(
+        steps=steps, size_m=25.0, landmark_count=15, visible_from_m=1.0, visible_to_m=10.0
+    )
+    team = tuple(RobotConfig(f"r{i + 1}", MOTION, SENSOR, front, pose_s=1e4) for i in range(robots))
+    centre = CentralConfig(tick_s=10.0, broadcast_s=10.0, **central)
+    return with_options(Scenario("small", "small", world, team, centre), seed=3)
+
+
+def run(of: Scenario, wrong: str = "") -> list[Sample]:
+    """r3 has wheels that are a third too large, a bent camera, or one that reads too far."""
+    motion, sensor = MOTION, SENSOR
+    if wrong == "bearing":
+        sensor = msgspec.structs.replace(SENSOR, bearing_offset=0.3)
+    if wrong == "range":
+        sensor = msgspec.structs.replace(SENSOR, range_scale=1.25)
+    robots = [msgspec.structs.replace(r, sensor=sensor) if r.id == "r3" else r for r in of.robots]
+    streams = simulated(of.world, robots, of.seed)
+    if wrong == "odometry":
+        streams = replace(
+            streams,
+            streams=tuple(
+                replace(s, intervals=replace(s.intervals, forward=1.3 * s.intervals.forward))
+                if s.robot == "r3"
+                else s
+                for s in streams.streams
+            ),
+        )
+    assert motion is MOTION
+    return list(run_team(of, streams))
+
+
+@cache
+def team_run(wrong: str = "") -> tuple[Sample, ...]:
+    return tuple(run(scenario(), wrong))
+
+
+def messages(samples: tuple[Sample, ...], kind: type[m.Message]) -> list[m.Message]:
+    return [each for _, _, each in map(opened, samples) if isinstance(each, kind)]
+
+
+def of_set(samples: tuple[Sample, ...], without: str = "") -> TickFold:
+    """The fold over a run's submaps; without a robot: as if it had never been."""
+    ticks = TickFold(scenario().central)
+    for start in messages(samples, m.Start):
+        ticks.know_start(translate.start_of(start))
+    sightings = messages(samples, m.SightingFactor)
+    for each in messages(samples, m.Submap):
+        if each.robot != without:
+            name = (each.robot, each.epoch, each.sequence)
+            own = [s for s in sightings if (s.robot, s.epoch, s.sequence) == name]
+            ticks.add(each, bytes(8), [s for s in own if s.teammate != without])
+    return ticks
+
+
+def bits(ticks: TickFold) -> bytes:
+    ticks.take_until(math.inf)
+    fold = converged(ticks.fold, ticks.settings)
+    found = landmark_map(fold)
+    return b"".join(x.tobytes() for x in (fold.main.state, *found))
+
+
+@pytest.mark.parametrize("when", ["before", "in the middle", "at the end"])
+def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(when: str) -> None:
+    samples = team_run()
+    met = messages(samples, m.SightingFactor)
+    assert any(s.robot == "r3" for s in met)
+    assert any(s.teammate == "r3" for s in met)
+    whole = of_set(samples)
+    if when == "before":
+        whole = TickFold(scenario().central)
+        whole.withdraw("r3")
+        for start in messages(samples, m.Start):
+            whole.know_start(translate.start_of(start))
+        for each in messages(samples, m.Submap):
+            own = [s for s in met if (s.robot, s.sequence) == (each.robot, each.sequence)]
+            whole.add(each, bytes(8), own)
+    else:
+        whole.take_until(30e9 if when == "in the middle" else math.inf)
+        whole.withdraw("r3")
+    assert whole.withdrawn == ("r3",)
+    assert bits(whole) == bits(of_set(samples, without="r3"))
+    assert bits(whole) != bits(of_set(samples))
+
+
+def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was() -> None:
+    samples = team_run()
+    ticks = of_set(samples)
+    ticks.take_until(30e9)
+    other = ticks.without({"r3"})
+    assert {c.robot for c in other.fold.contributions} == {"r1", "r2"}
+    assert {c.robot for c in ticks.fold.contributions} == {"r1", "r2", "r3"}
+    assert bits(ticks) == bits(of_set(samples))
+
+
+def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> JoinRule:
+    rule = JoinRule(scenario(withdraw_above=None).central, bytes(8))
+    for message in (*messages(samples, m.Start), *withdrawals):
+        take = rule.take_start if isinstance(message, m.Start) else rule.take_withdrawal
+        take(message)
+    for sighting in messages(samples, m.SightingFactor):
+        rule.take_sighting(sighting)
+    for submap in messages(samples, m.Submap):
+        rule.take_submap(submap)
+    return rule
+
+
+def test_a_map_names_who_was_withdrawn_in_its_digest_too() -> None:
+    samples = team_run()
+    orders = [m.Withdrawal(k, "r3", "operator", f"reason {k}") for k in range(2)]
+    plain, once, twice = (rule_with(samples, *orders[:k]) for k in range(3))
+    maps = [rule.conclude(0)[-1].message for rule in (plain, once, twice)]
+    assert [fused.withdrawn for fused in maps] == [(), ("r3",), ("r3",)]
+    assert maps[1] == maps[2]
+    assert maps[0].digest != maps[1].digest
+    assert {member.robot for member in maps[1].members} == {"r1", "r2"}
+    assert once.warnings == ["r3 withdrawn by operator: reason 0"]
+
+
+@pytest.mark.parametrize("wrong", ["odometry", "bearing", "range"])
+def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong: str) -> None:
+    samples = team_run(wrong)
+    final = final_map(list(samples))
+    assert final.withdrawn == ("r3",)
+    (said,) = messages(samples, m.Withdrawal)
+    assert (said.robot, said.by) == ("r3", "central")
+    never = of_set(samples, without="r3")
+    never.take_until(math.inf)
+    found = landmark_map(converged(never.fold, never.settings))
+    assert final.means == found.means.tobytes()
+    assert final.covariance == translate.joint_bytes(found.covariance)
+
+
+def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong() -> None:
+    samples = team_run()
+    assert final_map(list(samples)).withdrawn == ()
+    assert messages(samples, m.Withdrawal) == []
+
+
+def test_a_robot_whose_withdrawal_only_an_operator_may_order_stays() -> None:
+    samples = tuple(run(scenario(withdraw_above=None), "odometry"))
+    assert final_map(list(samples)).withdrawn == ()
+
+
+def test_a_log_with_a_withdrawal_is_computed_again_and_its_ledger_tells_of_it(
+    tmp_path: Path,
+) -> None:
+    log = written(tmp_path / "log.mcap", list(team_run("odometry")))
+    result = verify(log)
+    assert result.first is None, str(result.first)
+    assert all(c.equal == c.messages for c in result.channels)
+    found = ledger(recorded(log))
+    assert found.offenders == ()
+    assert found.withdrawn == ("r3",)
+    held = found.totals("r3")["in a submap"]
+    assert f"{held:,} of those in submaps are withdrawn with r3" in found.statement()
+
+
+# --- the verdict ---
+
+
+def agreement(**ratios: float) -> Agreement:
+    submaps = tuple(
+        SubmapCost((robot, 0), k, 5.0 * ratio * (0.8 + 0.04 * k), 5.0, 1.0)
+        for robot, ratio in ratios.items()
+        for k in range(10)
+    )
+    return Agreement(0.0, 1.0, {}, submaps)
+
+
+def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | None:
+    found = convicted(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots)))
+    return None if found is None else found[0]
+
+
+def test_who_is_wrong_is_whose_absence_makes_the_rest_agree() -> None:
+    without = {
+        frozenset({"a"}): agreement(b=9.0, c=8.0),
+        frozenset({"b"}): agreement(a=1.0, c=1.2),
+    }
+    assert verdict(without, a=9.5, b=9.0, c=3.0) == "b"
+
+
+def test_nobody_is_wrong_where_the_rest_never_agree() -> None:
+    without = {frozenset({r}): agreement(**{o: 3.0 for o in "abc" if o != r}) for r in "abc"}
+    assert verdict(without, a=9.5, b=9.0, c=6.0) is None
+
+
+def test_of_two_that_disagree_the_one_that_contradicts_itself_is_wrong() -> None:
+    without = {frozenset({"a"}): agreement(b=1.0), frozenset({"b"}): agreement(a=1.0)}
+    assert verdict(without, a=9.0, b=9.0) is None
+    without[frozenset({"b"})] = agreement(a=6.0)
+    assert verdict(without, a=9.0, b=9.0) == "a"
+
+
+def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
+    costs = list(agreement(a=1.0).submaps)
+    costs[:4] = [each._replace(chi2=500.0) for each in costs[:4]]
+    assert disagreement(Agreement(0.0, 1.0, {}, tuple(costs)))["a"] < 2.0
+    assert np.isclose(disagreement(agreement(a=3.0))["a"], 3.0 * 0.98)
+    assert disagreement(Agreement(0.0, 1.0, {}, agreement(a=9.0).submaps[:7])) == {}
