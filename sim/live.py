@@ -84,10 +84,21 @@ def _done(world: Mapping[str, float]) -> float:
 
 
 def _warnings(watch: Watch) -> list[str]:
-    """Failures and what the nodes warn of; that some are not there yet is none for a while."""
-    texts = []
-    if time.monotonic() - watch.began > PATIENCE_S:
-        texts = [f"{node}: {w}" for node, s in sorted(watch.statuses.items()) for w in s.warnings]
+    """Failures and what the nodes warn of; that some are not there yet is none for a while.
+
+    While the team starts everyone misses everyone: the world says it for all of them.
+    """
+    if time.monotonic() - watch.began <= PATIENCE_S:
+        return list(watch.failures)
+    world = watch.statuses.get("world")
+    said = sorted(watch.statuses.items())
+    if world is None:
+        said = [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
+        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in said if s.warnings]
+    elif world.state == "waiting":
+        texts = [f"world: {w}" for w in world.warnings]
+    else:
+        texts = [f"{node}: {w}" for node, status in said for w in status.warnings]
     return [*watch.failures, *texts]
 
 

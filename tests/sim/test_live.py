@@ -83,3 +83,32 @@ def test_a_large_team_is_cut_before_the_terminal_cuts_it() -> None:
     lines = printed(told(20, truth=False), 100)
     assert any("8 more" in line for line in lines)
     assert len(lines) < 24
+
+
+def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "PATIENCE_S", -1.0)
+    watch = Watch(robots=2)
+    missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
+    watch.statuses["recorder"] = m.Status(0, "recorder", "recording", {}, missing)
+    late = m.Status(0, "robot/r1", "waiting", {}, ("no readings of this team yet",))
+    watch.statuses["robot/r1"] = late
+    assert live._warnings(watch) == [f"recorder: {'; '.join(missing)}"]
+    watch.statuses["world"] = m.Status(0, "world", "waiting", {}, ("waiting for robot/r2",))
+    assert live._warnings(watch) == ["world: waiting for robot/r2"]
+    watch.statuses["world"] = m.Status(0, "world", "publishing", {}, ())
+    assert "robot/r1: no readings of this team yet" in live._warnings(watch)
+    watch.failures.append("robot-r2 (pid 7) was killed")
+    assert live._warnings(watch)[0] == "robot-r2 (pid 7) was killed"
+
+
+def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "PATIENCE_S", -1.0)
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=100))
+    watch = Watch(robots=1)
+    watch.statuses["world"] = status("world", "publishing", readings=1.0, of=2.0)
+    for cost in ("8.8", "9.1", "9.4"):
+        warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
+        watch.statuses["central"] = m.Status(0, "central", "joining", {}, (warning,))
+        lines.show(watch)
+    assert out.getvalue().count("submap 20 disagrees") == 1
