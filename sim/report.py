@@ -82,6 +82,9 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
     rows += [("joined", words) for words in fused.joined]
     rows += [("note", words) for words in fused.reasons]
+    meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]
+    if meetings:
+        rows.append(("rendezvous", f"{sum(meetings)} times a robot sent what it held or was to"))
     rows.append(("final map, its set", f"{fused.digest}, frame {fused.frame or '–'}"))
     if evaluation.unsound:
         rows.append(("unsound messages", str(evaluation.unsound)))

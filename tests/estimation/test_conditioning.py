@@ -156,3 +156,33 @@ def test_the_team_pose_is_consistent_and_counting_a_submap_twice_is_not():
     low, high = chi2_interval(3, 0.999, runs)
     assert low < honest < high
     assert twice > high
+
+
+def test_the_team_pose_is_consistent_whatever_the_lag_of_the_last_broadcast():
+    """Broadcasts come late and some not at all; the mutant counts the robot's submaps twice."""
+    runs, honest, twice = 120, 0.0, 0.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        world = team(seed + 1000, submaps=6)
+        known = int(rng.integers(1, 6))  # the windows of r0 in the newest broadcast that it has
+        of_others = int(rng.integers(0, known + 1))  # its teammate's come later still
+        pending = [
+            each.local for each in world.submaps if each.robot == "r0" and each.sequence >= known
+        ]
+        inside = [
+            each
+            for each in world.submaps
+            if each.sequence < (known if each.robot == "r0" else of_others)
+        ]
+        prior = prior_for(joined(inside, world.starts), "r0", 0)
+        for times in (1, 2):
+            told = prior._replace(covariance=prior.covariance / times)
+            again = [LocalMap(x.ids, x.mean, x.covariance / times) for x in pending]
+            pose, spread = team_pose(told, again, None)
+            error = pose - world.paths["r0"][5]
+            error[2] = wrap(error[2])
+            share = nees(error, spread) / 3 / runs
+            honest, twice = (honest + share, twice) if times == 1 else (honest, twice + share)
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < honest < high
+    assert twice > high
