@@ -14,7 +14,7 @@ from sim.experiments.task import Task
 from sim.in_memory import run_nodes
 from sim.limit import Limit, LimitError, batch_map
 from sim.scenario import Scenario, loads, with_options
-from sim.source import streams_of, tells_map
+from sim.source import streams_of
 from sim.streams import WorldStreams
 from sim.world_node import WorldNode, expected_nodes
 from sim.worlds import SimulatedWorld
@@ -77,7 +77,7 @@ def team_run(
     # Provisional maps and priors are the bulk of a large team's log, and nobody looks at them here.
     bulk = {ch.FUSED_MAP.key(), *(ch.PRIOR.key(robot.id) for robot in resolved.robots)}
     samples = [sample for sample in run.samples(resolved) if sample.key not in bulk]
-    figures = team_figures(evaluate(samples)) | run.figures()
+    figures: Figures = {"seed": resolved.seed} | team_figures(evaluate(samples)) | run.figures()
     if batch:
         try:
             figures["batch"] = limit_figures(batch_map(samples))
@@ -99,8 +99,7 @@ class TimedRun:
         """Run the team; its log. streams: what the world says; None: as the scenario has it."""
         readings = streams_of(scenario) if streams is None else streams
         expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
-        announced = translate.configured("world", 0, 0, scenario)
-        world = WorldNode(readings, expected, announced, tells_map=tells_map(scenario, readings))
+        world = WorldNode(readings, expected, translate.configured("world", 0, 0, scenario))
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
         robot, centre = self._nodes()
         for sample in run_nodes(scenario, world, None, robot, centre):
@@ -141,24 +140,24 @@ class TimedRun:
 def team_figures(evaluation: Evaluation) -> Figures:
     """The figures of a run; None where there is nothing to judge. Means are over the robots.
 
-    Where nothing is fused, error and NEES are those of the robots' own maps.
+    Without a fused map those of a map are over the robots' own.
     """
     robots = list(evaluation.robots.values())
-    errors = None if evaluation.map is None else evaluation.map.errors
-    own = [r.own_map for r in robots if r.own_map is not None and errors is None]
+    fused = evaluation.map
+    own = [r.own_map for r in robots if r.own_map is not None] if fused is None else []
+    maps = own if fused is None or fused.errors is None else [fused.errors]
+    shapes = [errors.shape for errors in maps if errors.shape is not None]
     steps = sum(r.consumption.steps for r in robots)
     sent = sum(r.uplink_bytes or 0 for r in robots)
     return {
-        "rmse": rms(x.rmse_m for x in own) if errors is None else errors.rmse_m,
-        "rmse_aligned": None if errors is None else errors.aligned_rmse_m,
-        "nees": mean(x.nees_per_dof for x in own) if errors is None else errors.nees_per_dof,
-        "in_band": None if errors is None else errors.in_band,
-        "landmarks": None if errors is None else errors.count,
-        "coverage_raw": None if errors is None else errors.coverage,
-        "shape_nees": None
-        if errors is None or errors.shape is None
-        else errors.shape.nees_per_landmark,
-        "coverage": None if errors is None or errors.shape is None else errors.shape.coverage,
+        "rmse": rms(errors.rmse_m for errors in maps),
+        "rmse_aligned": rms(errors.aligned_rmse_m for errors in maps),
+        "nees": mean(errors.nees_per_dof for errors in maps),
+        "in_band": mean(float(errors.in_band) for errors in maps),
+        "landmarks": mean(float(errors.count) for errors in maps),
+        "coverage_raw": mean(errors.coverage for errors in maps),
+        "shape_nees": mean(shape.nees_per_landmark for shape in shapes),
+        "coverage": mean(shape.coverage for shape in shapes),
         "cost_per_dof": None if evaluation.map is None else evaluation.map.cost_per_dof,
         "position_rmse": rms(r.smoothed.position_rmse_m for r in robots if r.smoothed),
         "position_rmse_aligned": rms(r.aligned_rmse_m for r in robots),
@@ -171,7 +170,7 @@ def team_figures(evaluation: Evaluation) -> Figures:
             for r in robots
         ),
         "final_map_sha256": None if evaluation.map is None else evaluation.map.payload_sha256,
-        "not_joined": [] if evaluation.map is None else list(evaluation.map.reasons),
+        "not_joined": [] if fused is None else [r for r in fused.reasons if "not joined" in r],
         "robots": {name: _robot_figures(robot) for name, robot in evaluation.robots.items()},
     }
 
