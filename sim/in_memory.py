@@ -61,12 +61,17 @@ class _Seat:
         return bool(samples)
 
 
-def run_team(scenario: Scenario, streams: WorldStreams) -> Iterator[Sample]:
+def run_team(
+    scenario: Scenario,
+    streams: WorldStreams,
+    robot: Callable[[RobotConfig], RobotNode] = RobotNode,
+    central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
+) -> Iterator[Sample]:
     """Run the team to its final map; everything that a recorder would take, in its order."""
-    expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
+    expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
     announced = translate.configured("world", 0, 0, scenario)
     world = WorldNode(streams, expected, announced, tells_map=tells_map(scenario, streams))
-    yield from run_nodes(scenario, world)
+    yield from run_nodes(scenario, world, None, robot, central)
 
 
 def run_nodes(

@@ -24,6 +24,7 @@ ENTRIES = (
         "The team against the batch optimiser: simulated worlds of all sizes, UTIAS sets, goals.",
         seeds=50,
     ),
+    Entry("survey", "survey", "All estimators and rules on the same readings; tables 2.1, 2.2."),
     Entry("xu-4.4", "xu_errors:FIGURE_4_4", "Thesis: pose error of EKF, FastSLAM, Hybrid."),
     Entry("xu-4.5", "xu_errors:FIGURE_4_5", "Thesis: paths under low and high odometry noise."),
     Entry("xu-4.6", "xu_errors:FIGURE_4_6", "Thesis: error of the first landmark over time."),

@@ -11,14 +11,12 @@ from central.node import CentralNode
 from sim.evaluation import Evaluation, RobotResult, evaluate
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
-from sim.in_memory import run_nodes
+from sim.in_memory import run_team
 from sim.limit import Limit, LimitError, batch_map
 from sim.scenario import Scenario, loads, with_options
 from sim.source import streams_of
 from sim.streams import WorldStreams
-from sim.world_node import WorldNode, expected_nodes
 from sim.worlds import SimulatedWorld
-from team import translate
 from team.config import Estimator, FusionRule
 from team.robot.node import RobotNode
 from team.wire import channels as ch
@@ -98,11 +96,8 @@ class TimedRun:
     def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
         """Run the team; its log. streams: what the world says; None: as the scenario has it."""
         readings = streams_of(scenario) if streams is None else streams
-        expected = expected_nodes([robot.id for robot in scenario.robots], recorder=False)
-        world = WorldNode(readings, expected, translate.configured("world", 0, 0, scenario))
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
-        robot, centre = self._nodes()
-        for sample in run_nodes(scenario, world, None, robot, centre):
+        for sample in run_team(scenario, readings, *self._nodes()):
             self._steps += sample.key in odometry
             self._fusions += sample.key == ch.FUSED_MAP.key()
             yield sample
@@ -144,7 +139,7 @@ def team_figures(evaluation: Evaluation) -> Figures:
     """
     robots = list(evaluation.robots.values())
     fused = evaluation.map
-    own = [r.own_map for r in robots if r.own_map is not None] if fused is None else []
+    own = [robot.own_map for robot in robots if robot.own_map is not None]
     maps = own if fused is None or fused.errors is None else [fused.errors]
     shapes = [errors.shape for errors in maps if errors.shape is not None]
     steps = sum(r.consumption.steps for r in robots)
