@@ -64,7 +64,7 @@ class _Seat:
 def run_team(
     scenario: Scenario,
     streams: WorldStreams,
-    robot: Callable[[RobotConfig], RobotNode] = RobotNode,
+    robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
     central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
 ) -> Iterator[Sample]:
     """Run the team to its final map; everything that a recorder would take, in its order."""
