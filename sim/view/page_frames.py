@@ -12,7 +12,7 @@ figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the 
 import base64
 import json
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,9 +107,11 @@ class PageFrames:
         out, self._out = self._out, []
         return out
 
-    def end(self, *, complete: bool) -> list[str]:
-        """The last frames: there is nothing more."""
+    def end(self, notes: Sequence[str] = (), *, complete: bool) -> list[str]:
+        """The last frames: there is nothing more; notes: what was wrong with the log."""
         out = self.flush(self._newest_ns)
+        for note in notes:
+            self._say("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
         self._say("eof", complete=complete)
         return out + self.flush()
 

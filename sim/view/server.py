@@ -107,10 +107,25 @@ class Feed:
             self.frames += self._page.flush(self._viewing.node.now_ns)
         elif self.tail.ended or not growing:
             self.ended = True
-            if self.audience is not None:
-                self.audience.end()
-            self.frames += self._page.end(complete=True)
+            try:
+                if self.audience is not None:
+                    self.audience.end()
+            except (
+                BusError
+            ) as error:  # its port was taken meanwhile: the page is shown all the same
+                self.error = str(error)
+            self.frames += self._page.end(self._wrong(), complete=True)
         return bool(samples)
+
+    def _wrong(self) -> list[str]:
+        """What of the log could not be read."""
+        found = [] if self.error is None else [self.error]
+        if self.tail.damaged:
+            found.append(
+                f"{self.tail.damaged} damaged parts of the log were left out; "
+                "`teamslam log check` names them"
+            )
+        return found
 
 
 class PageServer:

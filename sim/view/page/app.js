@@ -5,7 +5,7 @@ import { Plot, colour } from './plots.js';
 import { Store, upTo } from './store.js';
 
 const WARN = 1.1, FAIL = 1.3;  // of the joint cost per degree of freedom, as the centre's monitor
-const TEXT_MS = 120;           // between two looks of tables
+const TEXT_MS = 160;           // between two looks of tables
 const TRAFFIC_ROWS = 40;
 const $ = (id) => document.getElementById(id);
 

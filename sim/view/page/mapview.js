@@ -146,7 +146,7 @@ export class MapView {
     const shape = `${this.canvas.width},${this.canvas.height},${Object.values(this.on)}`;
     const view = `${this.centre},${this.scale},${shape}`;
     const now = performance.now();
-    const due = now - this.paintedAt > Math.min(4 * this.cost, 500);
+    const due = now - this.paintedAt > Math.min(8 * this.cost, 700);
     const moved = this.painted.view !== undefined && this.painted.view !== view;
     if (moved && this.movedTo !== view) { this.movedTo = view; this.movedAt = now; }
     const still = now - this.movedAt > 120;
