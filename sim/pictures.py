@@ -26,6 +26,8 @@ DRAWN_ROBOTS = 12
 """Rows of the error picture at the most."""
 DRAWN_POINTS = 4000
 """Of one line; longer paths are thinned."""
+DRAWN_BARS = 60
+"""Smoothed poses with a bar, evenly among all; more would hide the online ones."""
 LABELLED_LANDMARKS = 60
 DPI = 120
 
@@ -196,7 +198,7 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
         axis.axhline(0.0, color="#bbbbbb", linewidth=0.7)
         axis.grid(color="#eeeeee", linewidth=0.6)
         axis.set_axisbelow(True)
-        largest = 0.0
+        shown, largest = [np.empty(0)], 0.0
         if robot.online is not None:
             kept = thinning(len(robot.online.stamps_ns))
             time_s = (robot.online.stamps_ns[kept] - start_ns) * 1e-9
@@ -207,17 +209,35 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
                 time_s, -bound, bound, color=colour, alpha=0.18, linewidth=0.0, label="±3σ online"
             )
             axis.plot(time_s, error, color=colour, linewidth=0.9, label=label)
-            largest = max(float(np.abs(error).max()), float(np.quantile(bound, 0.98)))
+            shown.append(scale * np.abs(robot.online.errors[:, k]))
+            largest = float(np.quantile(bound, 0.98))
         if robot.smoothed is not None:
-            time_s = (robot.smoothed.stamps_ns - start_ns) * 1e-9
-            error, sigma = scale * robot.smoothed.errors[:, k], scale * robot.smoothed.sigmas[:, k]
+            every = slice(None, None, -(-len(robot.smoothed.stamps_ns) // DRAWN_BARS))
+            time_s = (robot.smoothed.stamps_ns[every] - start_ns) * 1e-9
+            error = scale * robot.smoothed.errors[every, k]
+            sigma = scale * robot.smoothed.sigmas[every, k]
             axis.errorbar(
                 time_s, error, 3.0 * sigma, color=MAP_COLOUR, linestyle="", marker=".",
                 markersize=3, elinewidth=0.6, label="smoothed, ±3σ",
             )  # fmt: skip
-            largest = max(largest, float(np.abs(error).max()), float(np.quantile(3 * sigma, 0.98)))
-        if largest > 0.0:
-            axis.set_ylim(-1.1 * largest, 1.1 * largest)
+            shown.append(scale * np.abs(robot.smoothed.errors[:, k]))
+            largest = max(largest, float(np.quantile(3 * sigma, 0.98)))
+        _fit(axis, np.concatenate(shown), largest)
+
+
+def _fit(axis: "Axes", errors: Float[np.ndarray, " n"], bound: float) -> None:
+    """The axis ends where all but one error in 500 lie within; it says how many do not."""
+    most = float(errors.max(initial=0.0))
+    limit = 1.1 * max(bound, float(np.quantile(errors, 0.998)) if len(errors) else 0.0)
+    if most <= 1.5 * limit:
+        limit = max(limit, 1.1 * most)
+    if limit <= 0.0:
+        return
+    axis.set_ylim(-limit, limit)
+    beyond = int(np.count_nonzero(errors > limit))
+    if beyond:
+        text = f"{beyond} beyond, up to {most:.3g}"
+        axis.text(0.99, 0.97, text, transform=axis.transAxes, ha="right", va="top", fontsize=8)
 
 
 def _first_ns(robot: RobotResult) -> int:

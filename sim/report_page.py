@@ -207,19 +207,10 @@ def _paths(run: Run) -> list[str]:
 def _readings(run: Run) -> list[str]:
     ledger = run.ledger
     if ledger is None:
-        rows = [
-            (name, disposition, f"{readings:,}")
-            for name, robot in run.evaluation.robots.items()
-            for disposition, readings in robot.consumption.ledger.items()
-        ]
-        said = [_table(("robot", "disposition", "readings"), rows)] if rows else []
+        told = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
+        said = [_dispositions(told)] if any(told.values()) else []
         return [*said, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
     robots = sorted({robot for robot, _ in ledger.entries})
-    of_robots = [ledger.totals(robot) for robot in robots]
-    table = [
-        (disposition, *(f"{totals.get(disposition, 0):,}" for totals in of_robots), f"{count:,}")
-        for disposition, count in ledger.totals().items()
-    ]
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())
     if ledger.offenders:
@@ -227,9 +218,18 @@ def _readings(run: Run) -> list[str]:
         verdict = f"{len(ledger.offenders)} offenders: {'; '.join(ledger.offenders[:5])}"
     return [
         f'<p class="{kind}">Ledger: {escape(verdict)}.</p>',
-        _table(("disposition", *robots, "all"), table),
+        _dispositions({robot: ledger.totals(robot) for robot in robots}),
         _note(f"{len(ledger.maps)} submaps, {used} of them in a map"),
     ]
+
+
+def _dispositions(told: Mapping[str, Mapping[str, int]]) -> str:
+    """A row for each disposition, a column for each robot."""
+    rows = []
+    for disposition in sorted(set().union(*told.values())):
+        counts = [of.get(disposition, 0) for of in told.values()]
+        rows.append((disposition, *(f"{count:,}" for count in (*counts, sum(counts)))))
+    return _table(("disposition", *told, "all"), rows)
 
 
 def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
