@@ -9,6 +9,7 @@ from sim.rerun_unsafe import UnsafeRobot
 from sim.rerun_world import RecordedWorld
 from sim.scenario import Scenario, with_options
 from sim.scenario_checks import ScenarioError
+from team.pairs import FEEDBACK
 from team.recording.reader import Log
 from team.robot.node import RobotNode
 from team.wire.bus import Sample
@@ -50,8 +51,9 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
     )
     links = changes.loss or changes.delay_s or changes.no_centre or changes.partitions
     if changed.fusion != "join" and (links or changes.unsafe_feedback):
+        why = "runs in lockstep" if changed.fusion in FEEDBACK else "is for comparison"
         raise ScenarioError(
-            f"the rule {changed.fusion} runs in lockstep: loss, delay, partition, a missing centre "
+            f"the rule {changed.fusion} {why}: loss, delay, partition, a missing centre "
             "and unsafe feedback are for the rule join"
         )
     return changed

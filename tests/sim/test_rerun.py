@@ -322,6 +322,7 @@ def test_unsafe_feedback_ruins_the_covariance_before_the_error(tmp_path: Path) -
         (Changes(without=("r9",)), "no robot r9"),
         (Changes(without=("r1", "r2")), "without robots"),
         (Changes(fusion="kalman", delay_s=1.0), "lockstep"),
+        (Changes(fusion="latest", delay_s=1.0), "the rule latest is for comparison"),
         (Changes(estimator="hybrid-thesis"), "can not feed"),
     ],
 )
