@@ -308,7 +308,11 @@ class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovatio
 
 
 class Member(msgspec.Struct, frozen=True, array_like=True):
-    """One entry of a version vector: all submaps of (robot, epoch) up to `sequence` are in."""
+    """One entry of a version vector: all submaps of (robot, epoch) up to `sequence` are in.
+
+    Of a rule on whole maps it is the robot's map of that sequence, of one on raw readings the
+    robot's readings up to that counter.
+    """
 
     robot: Name
     epoch: Count
