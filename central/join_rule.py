@@ -44,6 +44,7 @@ class JoinRule:
         self.finding = NOTHING
         self.landmarks = 0
         self._tried_at = 0
+        self._agreed: tuple[Fold, Agreement] | None = None
         self.warnings: list[str] = []
         self.reasons: tuple[str, ...] = ()
         self.refused = 0
@@ -158,7 +159,7 @@ class JoinRule:
         limit, count = self._config.withdraw_above, len(fold.contributions)
         if limit is None or count < 1.25 * self._tried_at:
             return []
-        agreement = marginals.joint_cost(fold)
+        agreement = self._agreement(fold)
         if not suspects(agreement, limit):
             return []
         self._tried_at = count
@@ -170,6 +171,12 @@ class JoinRule:
         self.take_withdrawal(withdrawal)
         self._tried_at = 0
         return [Outgoing(ch.WITHDRAWAL, robot, withdrawal)]
+
+    def _agreement(self, fold: Fold) -> Agreement:
+        """The agreement of a fold; the last one's is kept, since a broadcast asks twice."""
+        if self._agreed is None or self._agreed[0] is not fold:
+            self._agreed = fold, marginals.joint_cost(fold)
+        return self._agreed[1]
 
     def _agreement_without(self, robots: Collection[str]) -> Agreement | None:
         fold = self._ticks.without(robots).fold
@@ -194,7 +201,7 @@ class JoinRule:
     def _fused(self, fold: Fold, tail: Tail, digest: bytes) -> m.FusedMap:
         chi2 = dof = 0.0
         if fold.contributions:
-            agreement = marginals.joint_cost(fold)
+            agreement = self._agreement(fold)
             chi2, dof = agreement.chi2, agreement.dof
             self.finding = finding(agreement)
         joint = False
