@@ -157,7 +157,7 @@ class JoinRule:
     def _withdrawals(self, fold: Fold, now_ns: int) -> list[Outgoing]:
         """Who is wrong beyond doubt goes; looked at again when the set has grown by a quarter."""
         limit, count = self._config.withdraw_above, len(fold.contributions)
-        if limit is None or count < 1.25 * self._tried_at:
+        if limit is None or not count or count < 1.25 * self._tried_at:
             return []
         agreement = self._agreement(fold)
         if not suspects(agreement, limit):
