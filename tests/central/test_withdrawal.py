@@ -235,3 +235,19 @@ def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
     assert disagreement(Agreement(0.0, 1.0, {}, tuple(costs)))["a"] < 2.0
     assert np.isclose(disagreement(agreement(a=3.0))["a"], 3.0 * 0.98)
     assert disagreement(Agreement(0.0, 1.0, {}, agreement(a=9.0).submaps[:7])) == {}
+
+
+def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
+    rule = JoinRule(CentralConfig(), bytes(8))
+    samples = team_run()
+    for message in (*messages(samples, m.Start), *messages(samples, m.Submap)):
+        if message.robot == "r1":
+            take = rule.take_start if isinstance(message, m.Start) else rule.take_submap
+            take(
+                msgspec.structs.replace(message, sightings=0)
+                if isinstance(message, m.Submap)
+                else message
+            )
+    rule.take_withdrawal(m.Withdrawal(0, "r1", "operator", "it fell into the pool"))
+    fused = rule.conclude(0)[-1].message
+    assert (fused.ids, fused.members, fused.withdrawn) == (b"", (), ("r1",))
