@@ -69,13 +69,12 @@ class _Stream:
             case m.Observations() if self.segmenter is not None:
                 self.segmenter.observe(reading.stamp_ns, *translate.scan_of(reading))
             case m.Odometry() if self.segmenter is not None and reading.duration_ns > 0:
+                motion = translate.motion_of(reading, config.clock_offset_s)
+                end_ns, duration_ns, _, _ = motion
                 if self.segmenter.now_ns is None:
-                    self.segmenter.begin(reading.stamp_ns - reading.duration_ns)
-                epochs = self.segmenter.drive(
-                    reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
-                )
-                self._file(epochs, reading.reading)
-                self.covered_ns = reading.stamp_ns
+                    self.segmenter.begin(end_ns - duration_ns)
+                self._file(self.segmenter.drive(*motion), reading.reading)
+                self.covered_ns = end_ns
             case _:
                 pass
 

@@ -194,7 +194,7 @@ def nested(
     """Fields of a model with figures laid over them: `forward.per_m` is a field of `forward`.
 
     A density that was learnt replaces all three of its noise. What is no field of the model (a
-    correlation time) is left out.
+    share of outliers) is left out.
     """
     names = {field.name for field in msgspec.structs.fields(declared)}
     fields = dict(below)

@@ -10,6 +10,9 @@ from team.config import Sensor
 SHORTEST_READING_M = 0.05
 """A reading that the noise would make shorter is given as this: a sensor has no negative range."""
 
+SHORTEST_TIME_S = 1e-9
+"""A correlation time that is shorter is this: none from one reading to the next."""
+
 
 @dataclass(frozen=True)
 class Visible:
@@ -56,7 +59,7 @@ def persistent(
     order = np.lexsort((seen.steps, seen.points))
     again = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
     gaps = np.diff(seen.steps[order])[again - 1] * step_s
-    kept = np.exp(-gaps[:, np.newaxis] / times)
+    kept = np.exp(-gaps[:, np.newaxis] / np.maximum(times, SHORTEST_TIME_S))
     for row, rho in zip(again.tolist(), kept, strict=True):
         before = constant[order[row - 1]]
         constant[order[row]] = rho * before + np.sqrt(1.0 - rho**2) * constant[order[row]]

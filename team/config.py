@@ -144,8 +144,8 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bearing_offset: float = 0.0
     range_white: Share = 1.0
     bearing_white: Share = 1.0
-    range_correlation_s: Positive = 10.0
-    bearing_correlation_s: Positive = 10.0
+    range_correlation_s: NonNegative = 10.0
+    bearing_correlation_s: NonNegative = 10.0
     marker_range_offset: float = 0.0
     marker_sigma: NonNegative = 0.0
 

@@ -222,13 +222,16 @@ def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path:
     of_sensor = (
         Figure("range_scale", 0.9, 0.001, ""),
         Figure("range_correlation_s", 7.0, 1.0, "s"),
+        Figure("bearing_correlation_s", 0.0, 0.0, "s"),
+        Figure("bearing_outliers", 0.017, 0.002, ""),
     )
     found = Calibration(figures, of_sensor, True, ("a note",))
     place = tmp_path / "mine.toml"
     text = scenario_toml(found, load("utias"), ["set.zip"])
     place.write_text(text, "utf-8")
     assert "± 0.002 rad/√m" in text
-    assert "# range_correlation_s: 7 ± 1 s" in text
+    assert "range_correlation_s = 7  # ± 1 s" in text
+    assert "# bearing_outliers: 0.017 ± 0.002" in text
     written, expected = load(place), with_figures(load("utias"), figures, of_sensor)
     turn = written.robots[3].motion.turn
     assert (turn.per_m, turn.per_rad) == (0.07, 0.2)

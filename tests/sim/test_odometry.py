@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from central.team_epochs import TeamEpochs
 from sim.in_memory import final_map, run_team
 from sim.odometry import told
 from sim.scenario import Scenario, load
@@ -152,3 +153,29 @@ def submaps_of(robot: RobotConfig, world: WorldStreams) -> list[m.Submap]:
 
 def cost_per_dof(of: m.FusedMap) -> float:
     return of.chi2 / of.dof
+
+
+def test_a_centre_that_takes_raw_readings_puts_the_clock_right_too() -> None:
+    exact, off = (
+        team_epochs(each.robots[0], streams_of(each))
+        for each in (mixed_team(), mixed_team(clock_offset_s=-0.75))
+    )
+    assert len(exact) == 120
+    assert exact == off
+    ignorant = team_epochs(mixed_team().robots[0], streams_of(mixed_team(clock_offset_s=-0.75)))
+    assert ignorant != exact
+
+
+def team_epochs(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
+    """Stamp, motion and ranges of each epoch of the first robot, as the centre cuts them."""
+    epochs = TeamEpochs([robot.id])
+    epochs.configure(robot.id, robot)
+    readings = published(world.streams[0])
+    for reading in readings:
+        epochs.put(reading)
+    epochs.end(m.End(0, (m.StreamEnd(robot.id, 1, len(readings)),)))
+    return [
+        (each.stamp_ns, each.epoch.increment.mean.tobytes(), each.epoch.ranges.tobytes())
+        for step in epochs.steps()
+        for each in step
+    ]

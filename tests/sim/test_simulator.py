@@ -401,6 +401,8 @@ def test_errors_that_persist_have_the_declared_variance_share_and_time() -> None
 
 def test_errors_are_white_where_nothing_else_is_declared() -> None:
     assert correlation(errors_by_landmark(Sensor()), 1) == pytest.approx(0.0, abs=0.03)
+    no_time = Sensor(range_white=0.2, range_correlation_s=0.0)
+    assert correlation(errors_by_landmark(no_time), 1) == pytest.approx(0.0, abs=0.03)
 
 
 @pytest.mark.parametrize("name", ["downs-10", "downs-100"])
