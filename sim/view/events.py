@@ -26,6 +26,7 @@ class Chronicle:
     _alive: dict[str, bool] = field(default_factory=dict)
     _done: set[str] = field(default_factory=set)
     _members: set[str] = field(default_factory=set)
+    _withdrawn: set[str] = field(default_factory=set)
     _reasons: set[str] = field(default_factory=set)
     _warnings: dict[str, set[str]] = field(default_factory=dict)
     _refused: int = 0
@@ -46,6 +47,10 @@ class Chronicle:
                 self._ended = True
                 notes = "".join(f"; {note}" for note in message.notes)
                 return [Event(now_ns, "done", "world", f"the world has ended{notes}")]
+            case m.Withdrawal():
+                self._withdrawn.add(message.robot)
+                text = f"{message.robot} is withdrawn by the {message.by}: {message.reason}"
+                return [Event(now_ns, "withdrawn", f"robot/{message.robot}", text)]
             case m.FusedMap():
                 return self._map(message, now_ns)
             case m.Status():
@@ -77,7 +82,7 @@ class Chronicle:
         ]
         events += [
             Event(now_ns, "withdrawn", f"robot/{robot}", f"{robot} was withdrawn from the map")
-            for robot in sorted(self._members - members)
+            for robot in sorted(self._members - members - self._withdrawn)
         ]
         self._members = members
         events += [

@@ -107,7 +107,8 @@ class ViewerNode:
 
     listens = (
         ch.START, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.OWN_POSE, ch.TEAM_POSE, ch.PARTICLES,
-        ch.ROBOT_DONE, ch.FUSED_MAP, ch.FINAL_MAP, ch.TRAJECTORY, ch.END, ch.STATUS,
+        ch.ROBOT_DONE, ch.FUSED_MAP, ch.FINAL_MAP, ch.TRAJECTORY, ch.WITHDRAWAL, ch.END,
+        ch.STATUS,
     )  # fmt: skip
 
     def __init__(self, period_ns: int = PERIOD_NS) -> None:

@@ -399,7 +399,9 @@ def test_numbers_read_back_from_csv_are_the_same(
 def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: Path) -> None:
     by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
     kept = [message for message in examples() if type(message) in by_class]
-    samples = [sampled(by_class[type(x)], "alpha", x, i) for i, x in enumerate(kept)]
+    samples = [
+        sampled(by_class[type(x)], getattr(x, "robot", "alpha"), x, i) for i, x in enumerate(kept)
+    ]
     samples += [replace(samples[0], payload=b"\x90"), Sample("view/scene", b"?", 0, 0, 0)]
     exported = export_csv(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
     assert exported.unsound == 1

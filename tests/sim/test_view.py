@@ -351,6 +351,13 @@ def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once():
     ]  # fmt: skip
 
 
+def test_a_withdrawal_is_told_once_with_its_reason():
+    said = m.Withdrawal(3, "r2", "operator", "its wheels slip")
+    assert told(fused(["r1", "r2"]), said, fused(["r1"]))[2:] == [
+        ("withdrawn", "r2 is withdrawn by the operator: its wheels slip"),
+    ]  # fmt: skip
+
+
 def test_a_warning_whose_figures_move_is_told_once_and_a_refusal_is_one():
     def status(refused: int, *warnings: str) -> m.Status:
         return m.Status(0, "central", "joining", {"refused": float(refused)}, warnings)

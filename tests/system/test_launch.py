@@ -143,7 +143,7 @@ async def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
 
 
 def test_a_terminal_shows_a_live_table_of_the_robots(watched: Watched) -> None:
-    for text in ("short, seed 1", "pose σ [m]", "mapping", "team map by join", "world ended"):
+    for text in ("short, seed 1", "σ [m]", "mapping", "team map by join", "world ended"):
         assert text in watched.shown, watched.shown
     assert "Traceback" not in watched.shown
 
