@@ -13,6 +13,7 @@ from sim.evaluation import evaluate, to_json
 from sim.history import history
 from sim.in_memory import run_team
 from sim.ledger import Entry, Ledger
+from sim.pictures_time import latency_picture
 from sim.report_page import write_report
 from sim.report_run import Run, run_figures
 from team.recording.recorder import Recorder
@@ -59,6 +60,13 @@ def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Pat
     assert set(figures["nis_per_dof"]) == {"r1", "r2"}
     assert figures["trajectories"]["r1"]["online"]["poses"] > 10
     assert figures["bytes_per_s"][ch.SUBMAP.key("r1")] > 0.0
+
+
+def test_clocks_that_disagree_still_give_a_picture(log: list[Sample], tmp_path: Path) -> None:
+    behind = [replace(s, wall_ns=1) if s.key.startswith("central") else s for s in log]
+    found = history(behind)
+    assert max(of.last_s.max() for of in found.latencies.values()) < 0.0
+    assert latency_picture(found, tmp_path / "latency.png")  # a warning would be an error here
 
 
 def test_what_a_log_says_can_not_become_markup(log: list[Sample], tmp_path: Path) -> None:
