@@ -49,7 +49,8 @@ class Chronicle:
                 return [Event(now_ns, "done", "world", f"the world has ended{notes}")]
             case m.Withdrawal():
                 self._withdrawn.add(message.robot)
-                text = f"{message.robot} is withdrawn by the {message.by}: {message.reason}"
+                by = "centre" if message.by == "central" else message.by
+                text = f"{message.robot} is withdrawn by the {by}: {message.reason}"
                 return [Event(now_ns, "withdrawn", f"robot/{message.robot}", text)]
             case m.FusedMap():
                 return self._map(message, now_ns)

@@ -352,9 +352,9 @@ def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once():
 
 
 def test_a_withdrawal_is_told_once_with_its_reason():
-    said = m.Withdrawal(3, "r2", "operator", "its wheels slip")
+    said = m.Withdrawal(3, "r2", "central", "its wheels slip")
     assert told(fused(["r1", "r2"]), said, fused(["r1"]))[2:] == [
-        ("withdrawn", "r2 is withdrawn by the operator: its wheels slip"),
+        ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
     ]  # fmt: skip
 
 
