@@ -103,7 +103,7 @@ class ErrorFigure(NamedTuple):
         )
         pictures = [
             Picture(
-                panel.name.replace(" ", "-").replace(",", "") or "errors",
+                panel.name.partition(",")[0].replace(" ", "-") or "errors",
                 f"{self.title}{': ' if panel.name else ''}{panel.name}. Above: medians over "
                 f"{len(options.seeds)} seeds and the band of four fifths of them. Below: the run "
                 f"of seed {options.seeds[0]} within its own 3σ bound; dashed: the printed maximum.",
