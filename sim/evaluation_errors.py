@@ -24,17 +24,23 @@ class Path:
     poses: Float[np.ndarray, "K 3"]
 
 
+SMALL_TURN = 1e-6
+"""Below this [rad] (δ/2) cot(δ/2) is 1 to the last bit."""
+
+
 @dataclass(frozen=True)
 class PoseErrors:
     """Estimate − truth of the K poses that have truth, in (x [m], y [m], theta [rad]).
 
     sigmas: what the estimator says of each. nees: eᵀ P⁻¹ e, 3 degrees of freedom each.
+    motion_nees: the same of the rigid motion of the frame that carries the estimate to the truth.
     """
 
     stamps_ns: Int64[np.ndarray, " K"]
     errors: Float[np.ndarray, "K 3"]
     sigmas: Float[np.ndarray, "K 3"]
     nees: Float[np.ndarray, " K"]
+    motion_nees: Float[np.ndarray, " K"]
 
     @property
     def position_rmse_m(self) -> float:
@@ -238,4 +244,27 @@ def pose_errors(
         errors,
         np.sqrt(np.diagonal(P, axis1=1, axis2=2)),
         np.einsum("ki,ki->k", whitened, whitened),
+        _motion_nees(path.poses[known], true_poses[known], P),
     )
+
+
+def _motion_nees(
+    poses: Float[np.ndarray, "K 3"], truth: Float[np.ndarray, "K 3"], P: Float[np.ndarray, "K 3 3"]
+) -> Float[np.ndarray, " K"]:
+    """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, so that a turn about a far point is no excess.
+
+    Where a map may be turned about its origin by δ, a pose d away errs by d δ²/2 along its radius,
+    which an ellipse in (x, y, θ) does not allow for. ξ = (V⁻¹ (p' − R p), δ) with the V of the
+    exponential on SE(2); to first order (dx, dy, dθ) → ξ is A = [1 0 y; 0 1 −x; 0 0 1].
+    """
+    turn = on_circle(truth[:, 2] - poses[:, 2])
+    p = poses[:, 0] + 1j * poses[:, 1]
+    shift = truth[:, 0] + 1j * truth[:, 1] - np.exp(1j * turn) * p
+    half = 0.5 * np.where(np.abs(turn) < SMALL_TURN, SMALL_TURN, turn)
+    shift = shift * (half / np.tan(half) - 0.5j * turn)
+    xi = np.column_stack([shift.real, shift.imag, turn])
+    A = np.tile(np.eye(3), (len(poses), 1, 1))
+    A[:, 0, 2], A[:, 1, 2] = poses[:, 1], -poses[:, 0]
+    solved = np.linalg.solve(A @ P @ A.transpose(0, 2, 1), xi[:, :, np.newaxis])[:, :, 0]
+    squared: Float[np.ndarray, " K"] = np.einsum("ki,ki->k", xi, solved)
+    return squared

@@ -171,13 +171,15 @@ def team_figures(evaluation: Evaluation) -> Figures:
 
 
 def _robot_figures(robot: RobotResult) -> Figures:
-    """One robot's errors [m]; first_pose_chi2: of its first smoothed pose, 3 degrees of freedom."""
+    """One robot's errors [m]; first_pose_chi2: of the motion of
+    the frame that its first smoothed pose is off by, 3 degrees of freedom.
+    """
     smoothed, online = robot.smoothed, robot.online
     return {
         "position_rmse": None if smoothed is None else smoothed.position_rmse_m,
         "position_rmse_aligned": robot.aligned_rmse_m,
         "pose_nees": None if smoothed is None else smoothed.nees_per_dof,
-        "first_pose_chi2": None if smoothed is None else float(smoothed.nees[0]),
+        "first_pose_chi2": None if smoothed is None else float(smoothed.motion_nees[0]),
         "online_position_rmse": None if online is None else online.position_rmse_m,
         "online_pose_nees": None if online is None else online.nees_per_dof,
     }

@@ -372,3 +372,18 @@ def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds() -> 
     assert set(of_a_robot) <= set(figures["robots"]["r1"])
     assert figures["processes"]["world"]["exit"] == 0
     assert set(figures["channels"][ch.ODOMETRY.key("r1")]) == {"messages", "bytes"}
+
+
+def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone() -> None:
+    """A pose 100 m away errs by 5 m along the circle and by 0.13 m across it; sigma there: 1 mm."""
+    turn, sigma = 0.05, 0.05
+    truth = np.array([[100.0, 0.0, 0.3]])
+    pose = np.array([[100.0 * np.cos(turn), 100.0 * np.sin(turn), 0.3 + turn]])
+    A = np.array([[1.0, 0.0, pose[0, 1]], [0.0, 1.0, -pose[0, 0]], [0.0, 0.0, 1.0]])
+    back = np.linalg.inv(A)
+    covariance = back @ np.diag([1e-6, 1e-6, sigma**2]) @ back.T
+    stamps = np.array([0])
+    found = pose_errors(Path(stamps, pose), covariance[None], Path(stamps, truth))
+    assert found is not None
+    assert found.motion_nees[0] == pytest.approx((turn / sigma) ** 2)
+    assert found.nees[0] > 1000.0
