@@ -154,6 +154,8 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The particle front end of one window and the rule that closes the window.
 
     window_s: a window closes with the first odometry interval that ends this long after its start.
+    window_m: a window in which the odometry drove less than this goes on, up to standing_s: what a
+    robot sees from one place it sees with one error, which is counted once for each window.
     keyframe_s: sightings within this time are reduced to one per landmark (median, moved with the
     odometry to the keyframe's end); 0 takes every observation message as an epoch of its own.
     node_s: each submap carries the robot's poses at the multiples of this team time that lie in its
@@ -170,6 +172,8 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     proposal: Literal["fastslam2", "fastslam1"] = "fastslam2"
     resample_below: Fraction = 0.5
     window_s: Positive = 12.0
+    window_m: NonNegative = 0.0
+    standing_s: NonNegative = 60.0
     keyframe_s: NonNegative = 0.0
     node_s: NonNegative = 0.0
     sighting_s: NonNegative = 0.5

@@ -82,6 +82,8 @@ class HybridMember:
     def __init__(self, config: RobotConfig, epoch: int) -> None:
         self._config = config
         self._window_ns = round(config.front_end.window_s * 1e9)
+        self._standing_ns = round(config.front_end.standing_s * 1e9)
+        self._way_m = 0.0
         self._epoch = epoch
         with_nodes = config.front_end.node_s > 0.0 and config.fusion == "join"
         self._grid = PoseGrid(config.sensor, config.front_end) if with_nodes else None
@@ -132,12 +134,20 @@ class HybridMember:
             self._start_ns = stamp_ns - duration_ns
             self._segmenter.begin(self._start_ns)
         before_ns = self.last_epoch_ns
+        self._way_m += abs(forward) * duration_ns * 1e-9
         for epoch in self._segmenter.drive(stamp_ns, duration_ns, forward, yaw_rate):
             self._advance(epoch)
-        if stamp_ns - self._start_ns >= self._window_ns:
+        if self._is_full(stamp_ns - self._start_ns):
             return Driven.with_submap(self._close(stamp_ns))
+        if self._grid is not None:
+            self._grid.go_on(stamp_ns)
         moved = self.last_epoch_ns != before_ns
         return Driven(None, self.last_epoch_ns if moved else None)
+
+    def _is_full(self, lasting_ns: int) -> bool:
+        """Whether the window is long enough to close; one of a standing robot goes on."""
+        standing = self._way_m < self._config.front_end.window_m
+        return lasting_ns >= self._window_ns and not (standing and lasting_ns < self._standing_ns)
 
     def finish(self) -> tuple[Driven, int]:
         """The stream has ended: the last submap, and how many scans no odometry covered."""
@@ -252,6 +262,7 @@ class HybridMember:
         self._first_reading = first_reading
         self._last_reading = first_reading - 1
         self._start_ns = stamp_ns
+        self._way_m = 0.0
         self._segmenter.begin(stamp_ns)
         if self._gate is not None:
             self._gate.begin()

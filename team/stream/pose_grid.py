@@ -69,6 +69,11 @@ class PoseGrid:
         self._last_ns = stamp_ns + self._window_ns
         self._uncovered, self._ahead, self._at_node = [], [], {}
 
+    def go_on(self, stamp_ns: int) -> None:
+        """The window is open still: it may reach the next grid time after its planned end."""
+        if stamp_ns >= self._begin_ns + self._window_ns:
+            self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
+
     def observe(self, stamp_ns: int, counter: int, looks: Looks) -> str | None:
         """Keep sightings until the odometry covers their time; the reason if all are rejected."""
         teammates, ranges, bearings = looks

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from sim.scenario import load, with_options
 from sim.source import streams_of
 from team import translate
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig
 from team.estimation.consistency import chi2_interval, nees
 from team.robot.member import HybridMember
 from team.robot.members import member_of
@@ -159,3 +160,36 @@ def test_over_a_whole_run_the_own_map_is_over_confident_in_some_runs_by_nature()
         ratios.append(nees(error, own.covariance) / len(error))
     assert np.mean(ratios) > 2.0 > chi2_interval(36, 0.999, len(ratios))[1]
     assert np.median(ratios) < 1.5
+
+
+def standing(window_m):
+    """A member that stands for 45 s, then drives for 15 s, in odometry intervals of a second."""
+    front_end = FrontEnd(particles=8, window_s=10.0, window_m=window_m, standing_s=30.0, node_s=5.0)
+    member = HybridMember(RobotConfig("r1", motion=NOISY, front_end=front_end), 1)
+    member.start(np.zeros(3), None)
+    closed = []
+    for second in range(1, 61):
+        looks = ("r2",), np.array([2.0]), np.array([0.1])
+        if second % 5 == 0:
+            assert member.sight(second * 10**9 - 1, second, looks) is None
+        driven = member.drive(second * 10**9, 10**9, 0.1 if second > 45 else 0.0, 0.0)
+        closed += [] if driven.closed is None else [driven.closed]
+    return closed
+
+
+NOISY = MotionModel(forward=MotionNoise(per_s=0.01), turn=MotionNoise(per_s=0.01))
+
+
+def test_the_window_of_a_standing_robot_goes_on_until_it_moves_or_has_lasted_long_enough():
+    assert [w.end_ns // 10**9 for w in standing(0.0)] == [10, 20, 30, 40, 50, 60]
+    # 30 s is as long as one may stand; then at 46 s it moves, and by 56 s the next ten are over.
+    assert [w.end_ns // 10**9 for w in standing(0.05)] == [30, 46, 56]
+
+
+def test_a_long_window_has_all_its_nodes_and_loses_no_sighting():
+    for window_m in (0.0, 0.05):
+        closed = standing(window_m)
+        nodes = [t // 10**9 for w in closed for t in w.local.node_stamps.tolist()]
+        assert nodes == list(range(5, 5 + 5 * len(nodes), 5))
+        assert [s.stamp_ns // 10**9 for w in closed for s in w.sightings] == nodes
+        assert nodes[-1] >= 55
