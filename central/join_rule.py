@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from central.config import CentralConfig
-from central.monitor import NOTHING, finding
+from central.monitor import NOTHING, finding, miscalibrations
 from central.submap_set import Stream, SubmapSet
 from central.tick_fold import TickFold
 from central.withdrawal import convicted, suspects
@@ -217,7 +217,11 @@ class JoinRule:
         self.landmarks = len(ids)
         biases = marginals.bias_estimates(fold)
         self.finding = self.finding.with_biases(biases)
-        self.reasons = (*(fold.reasons[k] for k in sorted(fold.reasons)), *fold.doubts)
+        self.reasons = (
+            *(fold.reasons[k] for k in sorted(fold.reasons)),
+            *fold.doubts,
+            *miscalibrations(biases),
+        )
         frame = fold.frame
         last_ns = fold.contributions[-1].end_ns if fold.contributions else 0
         return m.FusedMap(

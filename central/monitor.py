@@ -9,13 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import numpy as np
 from scipy.stats import chi2 as chi_squared
 
+from team.config import Bias
 from team.estimation.marginals import Agreement, BiasEstimate
 
 WARN = 1.1
 FAIL = 1.3
 QUANTILE = 0.999
+MISCALIBRATED = 0.015
+"""A mean of the robots' scales beyond this is an error of the models, not of single robots."""
+SIGMAS = 3.0
 NAMED = 3
 """Submaps that are named at the most, the worst first."""
 
@@ -37,6 +42,41 @@ class Finding:
 
 
 NOTHING = Finding({}, ())
+
+
+def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
+    """What the team's own data say against the models of all robots together, in words.
+
+    The size of a map comes from the odometry and from the ranges. Where they contradict each other
+    the robots' range scales, each of which is held near its model's, move in the same direction:
+    the joint cost hardly shows it, their mean does. At speeds that the models were not learnt at
+    the odometry's scale is free instead; then nothing is wrong, but it is told.
+    """
+    found = []
+    ranges = _mean_of(biases, "range_scale")
+    if ranges is not None:
+        found.append(
+            "odometry or range scale not calibrated, covariance not valid: by the odometry, the "
+            f"robots' ranges read {100.0 * ranges:+.1f} % long (see `teamslam calibrate`)"
+        )
+    ways = _mean_of(biases, "forward_scale")
+    if ways is not None:
+        found.append(
+            "odometry not calibrated at these speeds: by the ranges, the robots drive "
+            f"{100.0 * ways:+.1f} % farther than it says; taken into account"
+        )
+    return tuple(found)
+
+
+def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
+    """The mean of one bias over the robots, where it is too large to be that of single robots."""
+    known = np.array([(value, sigma) for _, bias, value, sigma in biases if bias == name])
+    if not len(known):
+        return None
+    mean = float(known[:, 0].mean())
+    # They may share their errors (the map's scale), so the mean is no better known than each.
+    sigma = float(known[:, 1].mean())
+    return mean if abs(mean) > max(MISCALIBRATED, SIGMAS * sigma) else None
 
 
 def finding(agreement: Agreement) -> Finding:

@@ -336,10 +336,11 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     (robot, epoch, sequence). digest: 8-byte name of the set (and of the rule and its settings).
     frame: "robot/epoch" whose start fixes it. provisional: some members lie ahead of the watermark.
     covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 where the rule has none.
-    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined, and what
-    speaks for another minimum of the final map. biases: by robot, epoch and name, where submaps
-    have sensitivities. joined: how robots with an unknown start were joined, and how sure that is.
-    withdrawn: the robots that the team goes on without, ascending.
+    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined, what
+    speaks for another minimum of the final map, and that models do not fit the data. biases: by
+    robot, epoch and name, where submaps have sensitivities. joined: how robots with an unknown
+    start were joined, and how sure that is. withdrawn: the robots that the team goes on without,
+    ascending.
     """
 
     rule: Text
