@@ -117,8 +117,8 @@ class LiveErrors:
         if channel not in (ch.OWN_POSE, ch.TEAM_POSE):
             return True
         known = self._robot(robot)
-        if channel is ch.OWN_POSE and known.given_map:
-            return False
+        if known.given_map != (channel is ch.TEAM_POSE):
+            return channel is ch.TEAM_POSE  # the first one given the map replaces the others
         return known.newest_ns is None or sample.stamp_ns - known.newest_ns >= EVERY_NS
 
     def take(self, channel: ch.Channel, message: m.Message) -> None:

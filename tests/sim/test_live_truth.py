@@ -67,6 +67,8 @@ def test_poses_given_the_map_replace_those_of_the_robot_alone() -> None:
     errors.take(ch.TRUTH, truth(seconds, line(seconds)))
     errors.take(ch.OWN_POSE, pose(1.0, line([1.0])[0] + far))
     assert errors.of("r1").mean > 100.0
+    (given,) = samples([Outgoing(ch.TEAM_POSE, "r1", pose(1.0, far))])
+    assert errors.wants(ch.TEAM_POSE, "r1", given)  # though it is of the same moment
     errors.take(ch.TEAM_POSE, pose(2.0, line([2.0])[0]))
     assert errors.of("r1").mean == pytest.approx(0.0, abs=1e-12)
     (sample,) = samples([Outgoing(ch.OWN_POSE, "r1", pose(5.0, far))])
