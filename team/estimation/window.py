@@ -28,9 +28,9 @@ POSE_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
 
 POSE_DEGREES = 5.0
-"""p + 2 of a pose's p = 3 numbers; see `moments`."""
+"""q + 2 of a pose's q = 3 numbers; see `sample_factor`."""
 MOST_SQUARE = 0.1
-"""Particles that are thinner than ten of equal weight are taken for ten: see `moments`."""
+"""Σ wᵢ² of ten particles of equal weight; see `sample_factor`."""
 
 SOLVED = 1e-6
 """A Gauss-Newton step of squared Mahalanobis length below this changes nothing that matters."""
@@ -179,7 +179,8 @@ def gaussian(window: Window) -> LocalMap:
         noise,
     )
     poses = np.concatenate((particles.poses, *window.paths[window.node_epochs]), axis=1)
-    mean, covariance = moments(poses, np.exp(particles.log_weights), means, covariances)
+    weights = np.exp(particles.log_weights)
+    mean, covariance = moments(poses, weights, means, covariances, sample_factor(weights))
     numbers = np.arange(poses.shape[1])
     covariance[numbers, numbers] += np.tile(POSE_JITTER, len(numbers) // 3)
     cholesky_factor(covariance, "the submap of a window")
@@ -308,25 +309,32 @@ def _mean_direction(angles: Float[np.ndarray, " M"], weights: Float[np.ndarray, 
     return math.atan2(sine, cosine)
 
 
+def sample_factor(weights: Float[np.ndarray, " M"]) -> float:
+    """What the scatter of particles is to be taken times for its inverse to be right on average.
+
+    N = 1/Σ wᵢ² particles estimate their own mean, and the inverse of the covariance of such a
+    sample of q-dimensional normals is too large by ν/(ν − q − 1), ν = N − 1 (Anderson 2003, section
+    7.7): the factor is N/(N − q − 2), with the q = 3 numbers of a pose, the directions in which no
+    particle has a covariance of its own. Fewer than ten particles are taken for ten.
+    """
+    return 1.0 / (1.0 - POSE_DEGREES * min(float(np.sum(weights * weights)), MOST_SQUARE))
+
+
 @compiled
 def moments(
     poses: Float[np.ndarray, "M p"],
     weights: Float[np.ndarray, " M"],
     means: Float[np.ndarray, "M L 2"],
     covariances: Float[np.ndarray, "M L 3"],
+    between: float = 1.0,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
     """Mean and covariance of the mixture Σ wᵢ N(μᵢ, blkdiag(0, Σ₁, …, Σ_L)), n = p + 2L.
 
     Each particle has p/3 poses (x, y, theta), one behind the other. The scatter between the
-    particles is that of a sample: N = 1/Σ wᵢ² of them estimate their own mean, and what joining
-    takes is the inverse, which a sample of q-dimensional normals makes too large by
-    ν/(ν − q − 1), ν = N − 1 (Anderson 2003, section 7.7). So the scatter is taken times
-    N/(N − q − 2), with the q = 3 numbers of a pose: the directions in which no particle has a
-    covariance of its own.
+    particles is taken times `between`: 1 for the mixture itself, see `sample_factor`.
     """
     count, p = poses.shape
     n = p + 2 * means.shape[1]
-    between = 1.0 / (1.0 - POSE_DEGREES * min(float(np.sum(weights * weights)), MOST_SQUARE))
     deviations = np.empty((count, n))
     deviations[:, :p] = poses
     deviations[:, p::2] = means[:, :, 0]

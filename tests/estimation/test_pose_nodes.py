@@ -48,6 +48,8 @@ def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
     both = np.concatenate([window.particles.poses, window.paths[1], window.paths[2]], axis=1)
     deviations = both - local.mean[:9]
     expected = (weights[:, None] * deviations).T @ deviations
+    effective = 1.0 / np.sum(weights**2)
+    expected *= effective / (effective - 5.0)  # what a sample's inverse is too large by
     expected += np.diag(np.tile(windows.POSE_JITTER, 3))
     np.testing.assert_allclose(local.covariance[:9, :9], expected, atol=1e-12)
 

@@ -58,7 +58,8 @@ async def test_a_robot_that_is_killed_is_named_and_the_others_finish_the_map(
     assert f"start it again by: teamslam robot {folder}/scenario.json r1 --connect tcp/" in failure
     result = json.loads((team.folder / "result.json").read_text())
     assert {name: process["exit"] for name, process in result["processes"].items()} == {
-        "router": 0, "recorder": 0, "central": 0, "robot-r1": -9, "robot-r2": 0, "world": 0
+        "router": 0, "recorder": 0, "central": 0, "robot-r1": -9, "robot-r2": 0, "viewer": 0,
+        "world": 0,
     }  # fmt: skip
     log = open_log(folder / "log.mcap")
     assert log.complete
@@ -137,7 +138,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
 
 async def test_no_process_outlives_a_launch_that_is_killed(team: Processes) -> None:
     launch, folder = await launched(team)
-    assert len(team.alive()) == 7
+    assert len(team.alive()) == 8
     launch.signal(signal.SIGKILL)
     assert await launch.ended() == -signal.SIGKILL
     await team.none_left(5.0)
