@@ -1,4 +1,4 @@
-"""The solution of a submap graph: Gauss-Newton, damped only where the cost would rise.
+"""The solution of a submap graph: Gauss-Newton, shortened or damped where the cost would rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start or bias − prior‖², where ρ is the identity, or
 Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters with a wide
@@ -27,6 +27,8 @@ from team.estimation.geometry import wrapped
 from team.estimation.submap_graph import Graph
 
 Values = Float[np.ndarray, " _"]
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Of an undamped step, tried before damping: a long curved valley is gone along, not shunned."""
 LEAST_DAMPING = 1e-4
 MOST_DAMPING = 1e8
 LEAST_WEIGHT = 1e-6
@@ -290,7 +292,10 @@ def _moved(island: Island, step: Values) -> Island:
 
 
 def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
-    """One iteration: the island, the damping for the next one, the largest change [m, rad]."""
+    """One iteration: the island, the damping for the next one, the whole step's largest change.
+
+    A step is taken if it lowers the cost; else, undamped, a share of it; else one more damped.
+    """
     values, gradient = island.normal_equations
     diagonal = island.graph.diagonal
     before = island.quadratic(island.state)
@@ -299,11 +304,12 @@ def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
         damped[diagonal] *= 1.0 + damping
         cholesky = island.posterior if damping == 0.0 else _factorised(island.graph, damped)
         step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
-        moved = _moved(island, step)
-        if island.quadratic(moved.state) <= before * (1.0 + ROUNDING) + ROUNDING:
-            eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
-            largest = float(np.abs(step).max(initial=0.0))
-            return aged(moved, 1), eased, largest
+        for share in SHARES if damping == 0.0 else (1.0,):
+            moved = _moved(island, share * step)
+            if island.quadratic(moved.state) <= before * (1.0 + ROUNDING) + ROUNDING:
+                eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
+                largest = float(np.abs(step).max(initial=0.0))
+                return aged(moved, 1), eased, largest
         damping = max(10.0 * damping, LEAST_DAMPING)
     return aged(island, 1), 0.0, 0.0
 

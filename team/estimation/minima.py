@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
+from team.estimation.contribution import Stream, named
 from team.estimation.gauss_newton import Island, NotDeterminedError, aged, settled
 from team.estimation.geometry import wrapped
 from team.estimation.relaxation import relaxed
@@ -176,6 +177,19 @@ def doubts(search: Search) -> list[str]:
             f"the map does not fit its submaps: chi² {search.best.cost:.1f} with {dof} degrees of "
             "freedom; it may be a wrong minimum, or the covariances are too small"
         )
+    if search.best.change > SETTLED_M:
+        found.append(
+            f"the map is not settled: after {search.best.iterations} iterations "
+            f"a step is still {search.best.change:.2g} m or rad"
+        )
+    limit = island.settings.alignment_heading_sigma
+    found += [
+        f"{named(stream)} is placed weakly: its heading is known to {np.degrees(sigma):.0f}° at "
+        f"best, {np.degrees(limit):.0f}° needed; the map may be bent by more than its covariance "
+        "says"
+        for stream, sigma in sorted(_heading_sigmas(island).items())
+        if sigma > limit
+    ]
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)
         points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]
@@ -185,3 +199,16 @@ def doubts(search: Search) -> list[str]:
             f"more, up to {farthest:.1f} m away"
         )
     return found
+
+
+def _heading_sigmas(island: Island) -> dict[Stream, float]:
+    """Of each stream the standard deviation [rad] of the heading that is known best."""
+    graph, covariance = island.graph, island.selected_covariance
+    return {
+        stream: 0.0
+        if graph.fixed[list(nodes)].any()
+        else min(
+            float(graph.pattern.diagonal_block(covariance, node)[2, 2]) ** 0.5 for node in nodes
+        )
+        for stream, nodes in graph.streams.items()
+    }

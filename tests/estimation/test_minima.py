@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from team.estimation import gauss_newton
 from team.estimation.contribution import Contribution, Start
 from team.estimation.gauss_newton import JoinSettings
 from team.estimation.joining import EMPTY_FOLD, converged, folded, started
@@ -70,7 +71,7 @@ def test_a_search_leaves_the_wrong_minimum_that_gauss_newton_stays_in():
         assert search.best.cost < right + 0.1
         assert search.gained == pytest.approx(alone - search.best.cost)
         assert doubts(search) == []
-    assert wrong >= 3, "the mutant without a search is often lost"
+    assert wrong >= 2, "the mutant without a search is often lost"
 
 
 def test_a_cost_that_the_degrees_of_freedom_do_not_allow_is_said():
@@ -92,6 +93,36 @@ def test_a_cost_that_the_degrees_of_freedom_do_not_allow_is_said():
     (text,) = told.doubts
     assert "the map does not fit its submaps: chi²" in text
     assert suspicious(told.main, told.main.cost)
+
+
+@pytest.mark.parametrize("seed", [1, 12])
+def test_a_long_curved_valley_is_gone_along_to_its_end(seed, monkeypatch):
+    far = {"size": 100.0, "reach": 20.0, "sigmas": (0.02, 0.3, 3.0)}
+    island = island_of(team(seed, robots=1, submaps=30, landmarks=3, **far))
+    island = replace(island, state=relaxed(island.graph, island.state))
+    found = minimum(island)
+    assert found.iterations < 25
+    assert found.change < OPTIONS.step_tolerance
+    monkeypatch.setattr(gauss_newton, "SHARES", (1.0,))
+    creeping = minimum(island)
+    assert creeping.iterations == OPTIONS.max_iterations, "the mutant damps at once"
+    assert creeping.cost > found.cost + 10.0
+
+
+def test_a_map_that_is_not_settled_is_said():
+    island = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
+    hasty = replace(island, settings=replace(OPTIONS, max_iterations=1))
+    assert any("is not settled: after 1 iterations" in text for text in doubts(searched([hasty])))
+
+
+@pytest.mark.parametrize(("landmark_sigma", "said"), [(6.0, True), (0.2, False)])
+def test_a_robot_whose_heading_no_landmark_gives_is_said(landmark_sigma, said):
+    world = team(4, robots=2, submaps=3, landmarks=4, sigmas=(0.1, 0.02, landmark_sigma))
+    wide = np.diag([100.0, 100.0, 9.0])
+    starts = [world.starts[0], replace(world.starts[1], covariance=wide)]
+    island = joined_with(world.submaps, starts, (), OPTIONS).main
+    found = [text for text in doubts(searched([island])) if "is placed weakly" in text]
+    assert [text.split(" is ")[0] for text in found] == ["r1 (epoch 0)"] * said
 
 
 # --- two places for one robot ---
