@@ -12,7 +12,8 @@ class Changes:
 
     without: robots that were not there. seed: of the estimators and of the losses. loss, delay_s:
     of submaps on their way to the centre. no_centre: when there is none. partitions: robots that
-    the centre can not reach, and when. unsafe_feedback: see `UnsafeRobot`.
+    the centre can not reach, and when. unsafe_feedback: see `UnsafeRobot`. noise: factors on the
+    standard deviations that the robots assume, by kind (`sim.rerun_noise`).
     """
 
     without: tuple[str, ...] = ()
@@ -26,3 +27,4 @@ class Changes:
     no_centre: Span | None = None
     partitions: tuple[tuple[tuple[str, ...], Span], ...] = ()
     unsafe_feedback: bool = False
+    noise: tuple[tuple[str, float], ...] = ()

@@ -57,6 +57,13 @@ def rerun(
     unsafe_feedback: Annotated[
         bool, typer.Option("--unsafe-feedback", help="Robots send what they took from the team.")
     ] = False,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Robots assume another noise: odometry=2, range=0.5, bearing=3; repeatable.",
+            metavar="KIND=FACTOR",
+        ),
+    ] = None,
     json_file: JsonFile = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder for a picture of both maps.")
@@ -80,6 +87,7 @@ def rerun(
         None if no_centre is None else _span(no_centre, "--no-centre"),
         tuple(_partition(each) for each in partition or ()),
         unsafe_feedback,
+        _noise(noise or []),
     )
     if not verify:
         _compare(log, changes, json_file, output)
@@ -116,6 +124,27 @@ def _partition(text: str) -> tuple[tuple[str, ...], tuple[float, float]]:
     if not (robots and colon):
         fail(f"--partition {text}: give robots and seconds, as r1,r2:100-200", WRONG_USE)
     return tuple(robots.split(",")), _span(span, "--partition")
+
+
+def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
+    from sim.rerun_noise import KINDS
+
+    factors: dict[str, float] = {}
+    for text in asked:
+        kind, _, number = text.partition("=")
+        try:
+            factor = float(number)
+        except ValueError:
+            factor = math.nan
+        if kind not in KINDS or not 0.0 < factor < math.inf:
+            fail(
+                f"--noise {text}: give one of {', '.join(KINDS)} and a factor above 0, as range=2",
+                WRONG_USE,
+            )
+        if kind in factors:
+            fail(f"--noise {text}: {kind} is given twice", WRONG_USE)
+        factors[kind] = factor
+    return tuple(factors.items())
 
 
 def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path | None) -> None:

@@ -5,6 +5,7 @@ import msgspec
 from sim.changes import Changes, Span
 from sim.in_memory import run_nodes
 from sim.links import Conditions, Partition
+from sim.rerun_noise import with_noise
 from sim.rerun_unsafe import UnsafeRobot
 from sim.rerun_world import RecordedWorld
 from sim.scenario import Scenario, with_options
@@ -39,8 +40,12 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
         raise ScenarioError("a team without robots has nothing to compute")
     front = {"particles": changes.particles, "window_s": changes.window_s}
     front = {name: value for name, value in front.items() if value is not None}
+    noise = dict(changes.noise)
     kept = tuple(
-        msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, **front))
+        with_noise(
+            msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, **front)),
+            noise,
+        )
         for r in kept
     )
     changed = with_options(

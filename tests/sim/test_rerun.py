@@ -15,7 +15,10 @@ from sim.evaluation import evaluate
 from sim.rerun import Verification, verify
 from sim.rerun_change import changed_run
 from sim.rerun_log import RerunError
+from sim.rerun_noise import with_noise
 from sim.scenario_checks import ScenarioError
+from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from team.estimation.models import increment_of
 from team.pairs import LOCALISERS, PAIRS
 from team.recording.reader import Log
 from team.wire import channels as ch
@@ -240,7 +243,14 @@ def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(
     result = runner.invoke(app, ["rerun", str(bad.path), "--verify"])
     assert result.exit_code == 1
     assert "robot/r2/submap" in result.output
-    for wrong in (["--verify", "--delay", "3"], ["--loss", "1"], ["--no-centre", "9-3"]):
+    for wrong in (
+        ["--verify", "--delay", "3"],
+        ["--loss", "1"],
+        ["--no-centre", "9-3"],
+        ["--noise", "luck=2"],
+        ["--noise", "range=0"],
+        ["--noise", "range=2", "--noise", "range=3"],
+    ):
         assert runner.invoke(app, ["rerun", str(log.path), *wrong]).exit_code == 2
 
 
@@ -292,7 +302,15 @@ def test_another_rule_is_the_run_that_would_have_used_it(log: Log) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [Changes(seed=7), Changes(particles=20), Changes(window_s=20.0)], ids=str
+    "changes",
+    [
+        Changes(seed=7),
+        Changes(particles=20),
+        Changes(window_s=20.0),
+        Changes(noise=(("odometry", 2.0),)),
+        Changes(noise=(("range", 0.5), ("bearing", 0.5))),
+    ],
+    ids=str,
 )
 def test_another_estimator_sees_the_same_readings_and_gives_another_map(
     changes: Changes, log: Log, samples: list[Sample]
@@ -301,6 +319,22 @@ def test_another_estimator_sees_the_same_readings_and_gives_another_map(
     assert messages(run, ch.ODOMETRY, "r1") == messages(samples, ch.ODOMETRY, "r1")
     assert final(run) != final(samples)
     assert final(run) == final(changed_run(log, changes))
+
+
+def test_a_noise_is_a_factor_on_every_standard_deviation_of_its_kind() -> None:
+    motion = MotionModel(
+        kind="differential-drive",
+        wheel_base=0.3,
+        left_wheel=0.1,
+        right_wheel=0.2,
+        turn=MotionNoise(per_rad=0.2),
+        alphas=(0.01,) * 6,
+    )
+    robot = RobotConfig("r1", motion, Sensor(0.1, 0.02, 0.3))
+    noisy = with_noise(robot, {"odometry": 3.0, "range": 2.0})
+    assert noisy.sensor == Sensor(0.2, 0.04, 0.3)
+    before, after = (increment_of(each.motion, 0.5, 0.4, 0.3).covariance for each in (robot, noisy))
+    np.testing.assert_allclose(after, 9.0 * before, rtol=1e-12)
 
 
 def test_unsafe_feedback_ruins_the_covariance_before_the_error(tmp_path: Path) -> None:
