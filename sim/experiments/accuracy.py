@@ -1,12 +1,19 @@
 """How accurate and how honest the team is, in every kind of world: all parts of it, one command."""
 
-from sim.experiments import accuracy_garbage, accuracy_starts, accuracy_utias, accuracy_worlds
+from sim.experiments import (
+    accuracy_few,
+    accuracy_garbage,
+    accuracy_starts,
+    accuracy_utias,
+    accuracy_worlds,
+)
 from sim.experiments.experiment import Experiment, Options, Outcome, Results, combined
 from sim.experiments.task import Task
 
 PARTS: tuple[Experiment, ...] = (
     accuracy_worlds,
     accuracy_starts,
+    accuracy_few,
     accuracy_garbage,
     accuracy_utias,
 )

@@ -11,7 +11,6 @@ from sim.experiments.experiment import Goal, Options, Outcome, Results, Table
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
 from sim.scenario import Scenario, load, with_options
-from sim.worlds import SimulatedWorld
 from team.estimation.consistency import chi2_interval
 
 WORLDS = ("thesis", "thesis-b")
@@ -67,14 +66,16 @@ def _pairs(world: str, options: Options) -> list[tuple[Task, Task]]:
     for seed in options.seeds:
         scenario = with_options(load(world), seed=seed)
         found.append(
-            (team_task(scenario, batch=True), team_task(_unknown(scenario), note="unknown starts"))
+            (
+                team_task(scenario, batch=True),
+                team_task(unknown_starts(scenario), note="unknown starts"),
+            )
         )
     return found
 
 
-def _unknown(scenario: Scenario) -> Scenario:
+def unknown_starts(scenario: Scenario) -> Scenario:
     """Only the first robot's start pose is told."""
-    assert isinstance(scenario.world, SimulatedWorld)
     names = tuple(robot.id for robot in scenario.robots[1:])
     world = msgspec.structs.replace(scenario.world, unknown_starts=names)
     return msgspec.structs.replace(scenario, world=world)

@@ -6,6 +6,7 @@ is per landmark: 2 where the covariance is right.
 
 from collections.abc import Mapping
 
+from sim.experiments.accuracy_starts import unknown_starts
 from sim.experiments.experiment import (
     Dataset,
     Goal,
@@ -44,8 +45,10 @@ ROBOT: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """One run of each set; its world and its robots have no randomness but the estimator's."""
-    return [_task(dataset) for dataset in options.datasets]
+    """Each set with known starts and without; there is no randomness but the estimator's."""
+    return [
+        task for dataset in options.datasets for task in (_task(dataset), _unknown_task(dataset))
+    ]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
@@ -59,16 +62,29 @@ def outcome(options: Options, results: Results) -> Outcome:
         for dataset in options.datasets
         if (run := results.of(_task(dataset))) is not None
     }
+    unknown = {
+        dataset.name: set_figures(run)
+        for dataset in options.datasets
+        if (run := results.of(_unknown_task(dataset))) is not None
+    }
     rows = tuple((name, *cells_of(of_set, SHOWN)) for name, of_set in figures.items())
+    rows += tuple(
+        (f"{name}, one start known", *cells_of(of_set, SHOWN)) for name, of_set in unknown.items()
+    )
     robots = tuple(
         (f"{name}, {robot}", *cells_of(of_robot, ROBOT))
         for name, of_set in figures.items()
         for robot, of_robot in of_set["robots"].items()
     )
     goals = [goal for dataset in options.datasets for goal in _goals(dataset, figures)]
+    goals += [
+        Goal(f"{name}, one start known: aligned [m]", of_set["aligned"], 0.0, 1.1 * known)
+        for name, of_set in unknown.items()
+        if (known := figures.get(name, {}).get("aligned")) is not None
+    ]
     return Outcome(
         "real data",
-        {"utias": figures},
+        {"utias": figures, "utias_unknown_starts": unknown},
         (
             Table("UTIAS, five robots, one profile", _heads("set", SHOWN), rows),
             Table("each robot", _heads("robot", ROBOT), robots),
@@ -92,6 +108,10 @@ def set_figures(run: Figures) -> Figures:
 
 def _task(dataset: Dataset) -> Task:
     return team_task(load("utias"), dataset=dataset)
+
+
+def _unknown_task(dataset: Dataset) -> Task:
+    return team_task(unknown_starts(load("utias")), dataset=dataset, note="unknown starts")
 
 
 def _goals(dataset: Dataset, figures: Mapping[str, Figures]) -> list[Goal]:

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sim.cli import app
-from sim.experiments import accuracy_worlds
+from sim.experiments import accuracy_few, accuracy_worlds
 from sim.experiments.catalogue import ENTRIES, Entry
 from sim.experiments.experiment import Goal, Options, Outcome, Picture, Results, Table
 from sim.experiments.output import to_json, write
@@ -136,3 +136,24 @@ def test_wrong_use_ends_with_2_and_says_what_is_wrong(arguments: list[str], said
     refused = CliRunner().invoke(app, ["experiment", *arguments])
     assert refused.exit_code == 2
     assert said in refused.output
+
+
+def few_run(first_chi2, shape_nees, said):
+    robots = {"r1": {"first_pose_chi2": 1.0}, "r2": {"first_pose_chi2": first_chi2}}
+    figures = {"rmse_aligned": 0.5, "shape_nees": shape_nees, "landmarks": 4.0}
+    return figures | {"robots": robots, "not_joined": [], "said": said}
+
+
+@pytest.mark.parametrize(
+    ("run", "wrong", "silent"),
+    [
+        (few_run(2.0, 2.0, []), 0, 0),
+        (few_run(20.0, 2.0, []), 1, 1),
+        (few_run(2.0, 12.0, []), 1, 1),
+        (few_run(20.0, 2.0, ["another map fits about as well"]), 1, 0),
+        (few_run(None, 2.0, []), 0, 0),
+    ],
+)
+def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(run, wrong, silent):
+    figures = accuracy_few.few_figures([run])
+    assert (figures["wrong"], figures["silent"]) == (wrong, silent)

@@ -1,0 +1,107 @@
+"""Few landmarks and unknown starts: where wrong minima live. None of them may be silent.
+
+A map is wrong where its shape (without the rigid part), or the first pose of a robot that joined,
+lies beyond the 99.9 % ellipsoid of its own covariance. It is silent where the final map says
+neither that nor why a robot waits. Two wrong ones in a thousand maps are chance.
+"""
+
+import msgspec
+
+from sim.experiments.accuracy_starts import WRONG_CHI2, unknown_starts
+from sim.experiments.experiment import Goal, Options, Outcome, Results, Table
+from sim.experiments.task import Task
+from sim.experiments.team_runs import Figures, Shown, cells_of, middle, over_seeds, team_task
+from sim.scenario import Scenario, load, with_options
+from sim.worlds import SimulatedWorld
+from team.estimation.consistency import chi2_interval
+
+WORLDS = ("thesis", "thesis-b")
+COUNTS = (3, 4, 5)
+SEEN_EVERY_S = 5.0
+"""With sightings: the robots' poses are nodes so often."""
+SHOWN: Shown = (
+    ("rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("aligned_median", "median [m]", "{:.3f}"),
+    ("shape_nees", "shape NEES", "{:.3g}"),
+    ("joined", "joined", "{:.0%}"),
+    ("said", "said", "{:.0f}"),
+    ("wrong", "wrong", "{:.0f}"),
+    ("silent", "silent", "{:.0f}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """Each world and number of landmarks, with and without sightings of teammates."""
+    return [task for case in _cases(options).values() for task in case]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """How often a map is wrong, and whether it says so."""
+    figures: dict[str, Figures] = {}
+    for name, case in _cases(options).items():
+        figures[name] = few_figures(results.of_all(case))
+    silent = [of_case["silent"] for of_case in figures.values() if "silent" in of_case]
+    runs = sum(of_case["seeds"] for of_case in figures.values())
+    table = Table(
+        f"few landmarks, one start known, {len(options.seeds)} seeds",
+        ("world, landmarks", *(heading for _, heading, _ in SHOWN)),
+        tuple((name, *cells_of(of_case, SHOWN)) for name, of_case in figures.items()),
+        "said: maps with a doubt or a reason; silent: wrong ones without",
+    )
+    most = float(max(1, round(0.01 * runs)))
+    goal = Goal("few landmarks: silent", float(sum(silent)) if silent else None, 0.0, most)
+    return Outcome("few landmarks", {"few": figures}, (table,), goals=(goal,))
+
+
+def few_figures(runs: list[Figures]) -> Figures:
+    """The figures over the seeds of one case, with how many maps are wrong, and silently so."""
+    figures = over_seeds(runs)
+    if not runs:
+        return figures
+    wrong = [is_wrong(run) for run in runs]
+    return figures | {
+        "aligned_median": middle(run["rmse_aligned"] for run in runs),
+        "joined": sum(not run["not_joined"] for run in runs) / len(runs),
+        "said": sum(bool(run["said"]) for run in runs),
+        "wrong": sum(wrong),
+        "silent": sum(bad and not run["said"] for bad, run in zip(wrong, runs, strict=True)),
+    }
+
+
+def is_wrong(run: Figures) -> bool:
+    """Whether the map's shape or a robot's first pose lies beyond 99.9 % of its covariance."""
+    dof = 2 * round(run["landmarks"] or 0.0) - 3
+    shape = run["shape_nees"]
+    if shape is not None and dof > 0 and 0.5 * shape > chi2_interval(dof, 0.998, 1)[1]:
+        return True
+    first = [robot["first_pose_chi2"] for robot in run["robots"].values()]
+    return any(chi2 is not None and chi2 > WRONG_CHI2 for chi2 in first)
+
+
+def _cases(options: Options) -> dict[str, list[Task]]:
+    return {
+        f"{world}, {count}, {'sightings' if seen else 'none seen'}": [
+            team_task(
+                _few(with_options(load(world), seed=seed), count, seen),
+                note=f"{count} landmarks, one start known{', sightings' if seen else ''}",
+            )
+            for seed in options.seeds
+        ]
+        for world in WORLDS
+        for count in COUNTS
+        for seen in (False, True)
+    }
+
+
+def _few(scenario: Scenario, count: int, seen: bool) -> Scenario:
+    """So many landmarks at random, the first robot's start known, teammates seen or not."""
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = msgspec.structs.replace(scenario.world, landmarks=(), landmark_count=count)
+    node_s = SEEN_EVERY_S if seen else 0.0
+    robots = tuple(
+        msgspec.structs.replace(
+            robot, front_end=msgspec.structs.replace(robot.front_end, node_s=node_s)
+        )
+        for robot in scenario.robots
+    )
+    return unknown_starts(msgspec.structs.replace(scenario, world=world, robots=robots))
