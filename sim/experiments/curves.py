@@ -70,14 +70,20 @@ def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
 
 def online(samples: Iterable[Sample], robot: str) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
     """What a robot said of its pose when it was there: with the team's map once it had one."""
-    keys = (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
+    return said_poses(samples, (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot)))
+
+
+def said_poses(
+    samples: Iterable[Sample], keys: Sequence[str]
+) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
+    """The poses and covariances of these keys; of one time that of the last key."""
     said: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
         if sample.key in said:
             message = opened(sample)[2]
             if isinstance(message, m.PoseEstimate):
                 said[sample.key][message.stamp_ns] = message
-    newest = said[keys[0]] | said[keys[1]]
+    newest = {stamp_ns: pose for key in keys for stamp_ns, pose in said[key].items()}
     estimates = [newest[stamp_ns] for stamp_ns in sorted(newest)]
     return Path(
         np.array(sorted(newest), dtype=np.int64),
@@ -89,12 +95,12 @@ def _pose_curve(found: PoseErrors) -> Figures:
     """Distance and heading error with their sigmas; √(σx² + σy²) is that of the distance."""
     errors, sigmas = found.errors, found.sigmas
     return {
-        "time_s": _short(found.stamps_ns * 1e-9),
-        "error_m": _short(np.hypot(errors[:, 0], errors[:, 1])),
-        "sigma_m": _short(np.hypot(sigmas[:, 0], sigmas[:, 1])),
-        "heading_error_deg": _short(np.degrees(np.abs(errors[:, 2]))),
-        "heading_sigma_deg": _short(np.degrees(sigmas[:, 2])),
-        "nees": _short(found.nees / 3.0),
+        "time_s": short(found.stamps_ns * 1e-9),
+        "error_m": short(np.hypot(errors[:, 0], errors[:, 1])),
+        "sigma_m": short(np.hypot(sigmas[:, 0], sigmas[:, 1])),
+        "heading_error_deg": short(np.degrees(np.abs(errors[:, 2]))),
+        "heading_sigma_deg": short(np.degrees(sigmas[:, 2])),
+        "nees": short(found.nees / 3.0),
     }
 
 
@@ -130,11 +136,12 @@ def _landmark_curve(
         sigmas.append(float(np.sqrt(np.trace(covariance))))
     return {
         "id": landmark,
-        "time_s": _short(np.array(times)),
-        "error_m": _short(np.array(errors)),
-        "sigma_m": _short(np.array(sigmas)),
+        "time_s": short(np.array(times)),
+        "error_m": short(np.array(errors)),
+        "sigma_m": short(np.array(sigmas)),
     }
 
 
-def _short(values: Float[np.ndarray, " K"]) -> list[float]:
+def short(values: Float[np.ndarray, " K"]) -> list[float]:
+    """The values in so many digits, to be kept as JSON."""
     return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]

@@ -87,7 +87,7 @@ class ErrorFigure(NamedTuple):
         """Medians and bands over the seeds beside the printed figures."""
         found = {panel.name: self._curves(panel, options, results) for panel in self.panels}
         rows = [
-            (f"{panel.name}: {method.name}" if panel.name else method.name, *_row(panel, method, c))
+            (f"{panel.name}: {method.name}" if panel.name else method.name, *row(panel, method, c))
             for panel in self.panels
             for method in panel.methods
             if (c := found[panel.name].get(method.name)) is not None
@@ -107,14 +107,14 @@ class ErrorFigure(NamedTuple):
                 f"{self.title}{': ' if panel.name else ''}{panel.name}. Above: medians over "
                 f"{len(options.seeds)} seeds and the band of four fifths of them. Below: the run "
                 f"of seed {options.seeds[0]} within its own 3σ bound; dashed: the printed maximum.",
-                _drawing(f"{self.title}{': ' if panel.name else ''}{panel.name}", panel, curves),
+                drawing(f"{self.title}{': ' if panel.name else ''}{panel.name}", panel, curves),
             )
             for panel in self.panels
             if (curves := found[panel.name])
         ]
         figures = {
             panel.name or "figure": {
-                name: _numbers(panel, name, curves) for name, curves in found[panel.name].items()
+                name: numbers(panel, name, curves) for name, curves in found[panel.name].items()
             }
             for panel in self.panels
         }
@@ -182,7 +182,8 @@ def _of(run: Figures, what: str) -> Figures | None:
     return curve
 
 
-def _row(panel: Panel, method: Method, curves: Curves) -> tuple[str, ...]:
+def row(panel: Panel, method: Method, curves: Curves) -> tuple[str, ...]:
+    """The figures of one method as cells of a table."""
     printed = panel.printed.get(method.name)
     largest = np.nanmax(curves.errors, axis=1)
     low, middle, high = np.quantile(largest, (BAND[0], 0.5, BAND[1]))
@@ -197,7 +198,8 @@ def _row(panel: Panel, method: Method, curves: Curves) -> tuple[str, ...]:
     )
 
 
-def _numbers(panel: Panel, name: str, curves: Curves) -> Figures:
+def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
+    """The figures of one method for machines."""
     largest = np.nanmax(curves.errors, axis=1)
     return {
         "printed_max_m": panel.printed.get(name),
@@ -211,14 +213,18 @@ def _numbers(panel: Panel, name: str, curves: Curves) -> Figures:
     }
 
 
-def _drawing(title: str, panel: Panel, found: Mapping[str, Curves]) -> Callable[[Path], None]:
+def drawing(
+    title: str, panel: Panel, found: Mapping[str, Curves], unit: str = "step"
+) -> Callable[[Path], None]:
+    """What draws the medians with their bands, and one run within its bound; unit: of the times."""
+
     def draw(path: Path) -> None:
-        _draw(path, title, panel, found)
+        _draw(path, title, panel, found, unit)
 
     return draw
 
 
-def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves]) -> None:
+def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], unit: str) -> None:
     methods = [method for method in panel.methods if method.name in found]
     picture = figure(11.0, 8.0)
     grid = picture.add_gridspec(2, len(methods), height_ratios=(1.3, 1.0))
@@ -234,15 +240,16 @@ def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves]) -> 
             label=method.name,
         )  # fmt: skip
     above.set_title(title, fontsize=12)
-    above.set_xlabel("step")
+    above.set_xlabel(unit)
     above.set_ylabel("distance to the truth [m]")
-    above.set_xlim(0, 500)
+    above.set_xlim(0, max(curves.times_s[-1] for curves in found.values()))
     above.set_ylim(bottom=0)
     above.legend(frameon=False, fontsize=10)
     ruled(above)
     for column, method in enumerate(methods):
         below = picture.add_subplot(grid[1, column])
         _draw_run(below, method, found[method.name], panel.printed.get(method.name))
+        below.set_xlabel(unit)
         if column == 0:
             below.set_ylabel("one run [m]")
     picture.savefig(path, dpi=120)
@@ -257,7 +264,6 @@ def _draw_run(axis: "Axes", method: Method, curves: Curves, printed: float | Non
         axis.axhline(printed, color=method.colour, linestyle="--", linewidth=1.0)
         most = max(most, printed)
     axis.set_ylim(0, 1.15 * max(most, min(float(np.nanquantile(bound, 0.9)), 3.0 * most)))
-    axis.set_xlim(0, 500)
+    axis.set_xlim(0, curves.times_s[-1])
     axis.set_title(method.name, fontsize=10)
-    axis.set_xlabel("step")
     ruled(axis)

@@ -12,7 +12,7 @@ from team.config import Estimator, RobotConfig, Sensor
 from team.estimation import dead_reckoning, ekf_slam, hybrid_thesis, localisation, plain_fastslam
 from team.estimation.dead_reckoning import DeadReckoning
 from team.estimation.ekf_slam import EkfSlam
-from team.estimation.fastslam import Proposal
+from team.estimation.fastslam import Particles, Proposal
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.localisation import Localisation
 from team.estimation.models import Increment
@@ -44,7 +44,8 @@ class Filter(NamedTuple):
 
     begun: the state at a start pose (None: unknown) with its covariance (None: exact). looks: it
     takes landmarks; maps: it has a map of its own. joint: with the covariance between landmarks.
-    absorbed: the state with these landmarks in place of its own.
+    absorbed: the state with these landmarks in place of its own. particles: those of a state, for
+    viewers.
     """
 
     begun: Begun
@@ -56,6 +57,7 @@ class Filter(NamedTuple):
     looks: bool = True
     maps: bool = True
     joint: bool = True
+    particles: Callable[[Any], Particles] | None = None
 
 
 def _thesis_begun(
@@ -186,7 +188,13 @@ def _plain(proposal: Proposal) -> Filter:
             state, increment, config.sensor, ids, ranges, bearings, generator
         )
 
-    return Filter(begun, stepped, plain_fastslam.pose_gaussian, plain_fastslam.landmark_gaussian)
+    return Filter(
+        begun,
+        stepped,
+        plain_fastslam.pose_gaussian,
+        plain_fastslam.landmark_gaussian,
+        particles=lambda state: state.particles,
+    )
 
 
 def _localisation_begun(

@@ -10,6 +10,7 @@ from team.config import RobotConfig
 from team.estimation import geometry
 from team.estimation import window as windows
 from team.estimation.conditioning import RobotPrior, team_pose
+from team.estimation.fastslam import Particles
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.innovation import NOTHING, Innovation
 from team.estimation.randomness import generator
@@ -31,6 +32,15 @@ class Cloud(NamedTuple):
 
     poses: Float[np.ndarray, "P 3"]
     weights: Float[np.ndarray, " P"]
+
+
+def thinned(particles: Particles, begun_at: Float[np.ndarray, "3"]) -> Cloud:
+    """Every so many particles, in their order; begun_at: their frame's pose in the own map's."""
+    every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
+    logs = particles.log_weights[::every]
+    weights = np.exp(logs - logs.max())
+    poses = [geometry.compose(begun_at, pose) for pose in particles.poses[::every]]
+    return Cloud(np.array(poses), weights / weights.sum())
 
 
 @dataclass(frozen=True)
@@ -55,11 +65,15 @@ class ClosedWindow:
 
 @dataclass(frozen=True)
 class Driven:
-    """What an odometry interval gave: a submap; the stamps of a new running pose and map."""
+    """What an odometry interval gave: a submap; the stamps of a new running pose and map.
+
+    cloud: the particles at map_ns of an estimator that keeps them over the whole stream.
+    """
 
     closed: ClosedWindow | None = None
     pose_ns: int | None = None
     map_ns: int | None = None
+    cloud: Cloud | None = None
 
     @classmethod
     def with_submap(cls, closed: ClosedWindow) -> Self:
@@ -225,7 +239,7 @@ class HybridMember:
             stamp_ns,
             local,
             () if self._grid is None else self._grid.sightings(),
-            self._cloud(),
+            thinned(self._window.particles, self.whole.mean[:3]),
             self._window.innovation,
             gated,
         )
@@ -246,16 +260,6 @@ class HybridMember:
         config = self._config
         self._window = windows.opened(config.front_end, config.sensor)
         self._generator = generator(config.seed, config.id, self._epoch, self.sequence)
-
-    def _cloud(self) -> Cloud:
-        """Every so many particles, in their order, placed where the window began."""
-        particles = self._window.particles
-        every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
-        logs = particles.log_weights[::every]
-        weights = np.exp(logs - logs.max())
-        begun_at = self.whole.mean[:3]
-        poses = [geometry.compose(begun_at, pose) for pose in particles.poses[::every]]
-        return Cloud(np.array(poses), weights / weights.sum())
 
     def _begin_window(self, sequence: int, first_reading: int, stamp_ns: int) -> None:
         self.sequence = sequence

@@ -294,12 +294,15 @@ class RobotNode:
         if driven.closed is not None:
             return self._send(driven.closed)
         out = self._poses(driven.pose_ns)
-        return out if driven.map_ns is None else out + self._mapped(driven.map_ns)
+        if driven.map_ns is None:
+            return out
+        out += self._speaker.cloud(driven.map_ns, driven.cloud)
+        return out + self._mapped(driven.map_ns)
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
         self._locals.append(closed.local)
         out = self._held.put([*self._sightings(closed), self._speaker.submap(closed)])
-        out += self._speaker.cloud(closed)
+        out += self._speaker.cloud(closed.end_ns, closed.cloud)
         out.append(self._speaker.innovation(closed))
         self._gated += closed.gated
         out += self._poses(closed.end_ns)

@@ -12,7 +12,7 @@ from team.estimation.models import Increment
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
 from team.robot.filters import FILTERS, KnownMap
-from team.robot.member import NOT_USED, ClosedWindow, Driven
+from team.robot.member import NOT_USED, ClosedWindow, Cloud, Driven, thinned
 from team.stream.pose_grid import Looks
 from team.stream.segmenter import Segmenter
 
@@ -104,7 +104,13 @@ class RunningMember:
         fresh = self.sequence > before or (last and now_ns != self._map_ns)
         map_ns = now_ns if self._filter.maps and fresh and due else None
         self._map_ns = self._map_ns if map_ns is None else map_ns
-        return Driven(None, now_ns if self.sequence > before else None, map_ns)
+        return Driven(None, now_ns if self.sequence > before else None, map_ns, self._cloud(map_ns))
+
+    def _cloud(self, map_ns: int | None) -> Cloud | None:
+        """The particles, where there are any and a map is said."""
+        if map_ns is None or self._filter.particles is None:
+            return None
+        return thinned(self._filter.particles(self._state), np.zeros(3))
 
     def _advance(
         self,

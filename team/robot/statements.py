@@ -9,7 +9,7 @@ from jaxtyping import Float
 from team import translate
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.sighting import Sighting
-from team.robot.member import ClosedWindow
+from team.robot.member import ClosedWindow, Cloud
 from team.stream.pose_grid import NodeSighting
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -54,12 +54,12 @@ class Speaker:
         message = translate.sighting_message(sighting, self.config, each.readings)
         return Outgoing(ch.SIGHTING_FACTOR, self.robot, message)
 
-    def cloud(self, closed: ClosedWindow) -> list[Outgoing]:
-        """The thinned particles of the window's end, if it has any."""
-        if closed.cloud is None:
+    def cloud(self, stamp_ns: int, cloud: Cloud | None) -> list[Outgoing]:
+        """The thinned particles at this time, if there are any."""
+        if cloud is None:
             return []
-        poses, weights = (from_floats(x) for x in closed.cloud)
-        message = m.ParticleCloud(closed.end_ns, self.robot, poses, weights)
+        poses, weights = (from_floats(x) for x in cloud)
+        message = m.ParticleCloud(stamp_ns, self.robot, poses, weights)
         return [Outgoing(ch.PARTICLES, self.robot, message)]
 
     def innovation(self, closed: ClosedWindow) -> Outgoing:
