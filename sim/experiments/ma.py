@@ -106,18 +106,19 @@ def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
         for name, robot in evaluation.robots.items()
     }
     start_ns = min(int(said.stamps_ns[0]) for said, _, _ in paths.values() if len(said.stamps_ns))
-    truth = next(
-        dict(zip(*translate.landmarks_of(message), strict=True))
+    ids, positions = next(
+        translate.landmarks_of(message)
         for message in messages(samples, ch.TRUTH_LANDMARKS.key())
         if isinstance(message, m.TruthLandmarks)
     )
+    truth = dict(zip(ids.tolist(), positions, strict=True))
     robots = {name: _robot(*said, start_ns) for name, said in paths.items()}
     first = resolved.robots[0].id
     return {
         "robots": robots,
         "map": _map(samples, first, truth, start_ns),
         "clouds": _clouds(samples, first),
-        "truth": np.array(list(truth.values())).tolist(),
+        "truth": positions.tolist(),
     }
 
 
