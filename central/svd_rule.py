@@ -77,7 +77,7 @@ class SvdJoinRule(JoinRule):
         first = placed[0] if placed else min(chains)
         joined = {stream: self._extended(stream, chains[stream]) for stream in chains}
         maps = {s: svd_joining.landmark_gaussian(x.state) for s, x in joined.items()}
-        fused, reasons = _tied(first, maps, full=self._weighting == "full")
+        fused, reasons = tied(first, maps, full=self._weighting == "full")
         self.landmarks = len(fused.ids)
         return fused_message(
             self._config,
@@ -108,7 +108,7 @@ class SvdJoinRule(JoinRule):
         return _Joined(len(chain), svd_joining.solved(state), digest)
 
 
-def _tied(
+def tied(
     first: Stream, maps: Mapping[Stream, LandmarkGaussian], *, full: bool
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
     """The maps in the frame of the first, one by one: next who shares most with those that are in.

@@ -41,4 +41,9 @@ ENTRIES = (
     Entry("xu-5.1", "xu_maps:FIGURE_5_1", "Thesis: the two robots' map at four steps.", 1, 1),
     Entry("xu-5.2", "xu_errors:FIGURE_5_2", "Thesis: pose error, one robot against two."),
     Entry("xu-5.3", "xu_errors:FIGURE_5_3", "Thesis: first landmark, one robot against two."),
+    Entry("downs-5.1", "downs:TABLE_5_1", "Downs: maps of the EKF, each robot and set.", 1, 1),
+    Entry("downs-5.2", "downs:TABLE_5_2", "Downs: paths of the EKF, each robot and set.", 1, 1),
+    Entry("downs-5.3", "downs:TABLE_5_3", "Downs: joined maps of one robot, t-test.", 1, 1),
+    Entry("downs-5.4", "downs:TABLE_5_4", "Downs: smoothed paths of one robot.", 1, 1),
+    Entry("downs-5.5", "downs:TABLE_5_5", "Downs: joined maps of five robots, t-test.", 1, 1),
 )
