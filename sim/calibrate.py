@@ -21,8 +21,8 @@ from sim import calibration_motion as motion
 from sim import calibration_sensor as sensor
 from sim.calibration_data import Reference, references, true_paths
 from sim.calibration_figures import CalibrationError, Figure, jackknifed
-from sim.calibration_join import JoinedTeam, joined_team
-from sim.evaluation_errors import TRUTH_GAP_NS
+from sim.calibration_join import JoinedTeam, config_of, joined_team
+from sim.evaluation_errors import TRUTH_GAP_NS, Path
 from sim.scenario import Scenario
 from sim.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
@@ -65,13 +65,14 @@ def calibrated(
 def _by_truth(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
-    data = [
-        each
-        for label, world in worlds
-        for each in references(
-            world, true_paths(world.streams), _positions(world), TRUTH_GAP_NS, label
-        )
-    ]
+    data, notes = [], []
+    for label, world in worlds:
+        paths = true_paths(world.streams)
+        turning = _turning_first(world, scenario)
+        data += references(world, paths, _positions(world), TRUTH_GAP_NS, label, turning)
+        notes += _left_out(label, world, paths, "no ground truth")
+    for note in notes:
+        progress(note)
     progress(f"odometry and sensor against the truth of {len(data)} robots")
     of_motion = _motion_figures(data, scenario)
     of_sensor = jackknifed(sensor.fit_sensor, data, sensor.UNITS)
@@ -88,7 +89,7 @@ def _by_truth(
             else f
             for f in of_sensor
         )
-    return Calibration(of_motion, of_sensor, True, _alarms(of_motion, scenario))
+    return Calibration(of_motion, of_sensor, True, (*notes, *_alarms(of_motion, scenario)))
 
 
 def _by_the_map(
@@ -97,16 +98,35 @@ def _by_the_map(
     learnt = scenario
     figures: tuple[Figure, ...] = ()
     for turn in range(ROUNDS):
-        data = []
+        data, notes = [], []
         for label, world in worlds:
             progress(f"joined map of {label}, {turn + 1} of {ROUNDS}")
             team = joined_team(world, _mistrusting(learnt))
-            data += references(world, team.paths, team.landmarks, JOINED_GAP_NS, label)
+            turning = _turning_first(world, scenario)
+            data += references(world, team.paths, team.landmarks, JOINED_GAP_NS, label, turning)
+            notes += _left_out(label, world, team.paths, "not in the team's joined map")
         found = (f for f in _motion_figures(data, learnt) if f.name in SCALES)
         figures = tuple(_with_systematic(f) for f in found)
         learnt = with_figures(scenario, figures, ())
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
-    return Calibration(figures, (), False, (note, *_alarms(figures, scenario)))
+    return Calibration(figures, (), False, (note, *notes, *_alarms(figures, scenario)))
+
+
+def _turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:
+    names = (stream.robot for stream in world.streams)
+    return frozenset(n for n in names if config_of(n, scenario).motion.kind == "turn-then-drive")
+
+
+def _left_out(
+    label: str, world: WorldStreams, paths: Mapping[str, Path], pathless: str
+) -> list[str]:
+    """The robots of which nothing can be learnt, each with its reason."""
+    return [
+        f"{label} {stream.robot}: {reason}: nothing is learnt from it"
+        for stream in world.streams
+        for reason in (pathless if len(stream.intervals.end_ns) else "no odometry",)
+        if stream.robot not in paths or not len(stream.intervals.end_ns)
+    ]
 
 
 def _with_systematic(figure: Figure) -> Figure:

@@ -10,7 +10,8 @@ from sim.evaluation_errors import Path, on_circle
 from sim.streams import Detections, Intervals, RobotStream, WorldStreams
 
 LARGEST_TURN_RAD = 0.35
-"""Between two poses of a path; more is a fault of resampled headings beside ±π."""
+FASTEST_TURN_RAD_S = 3.0
+"""Between two poses of a path; more than both is a fault of resampled headings beside ±π."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,7 @@ class Reference:
 
     gap_ns: between poses of `path` that are at most this far apart it is interpolated.
     landmarks: position of each id in the path's frame; `teammates`: the paths of the others.
+    turns_first: between two poses the robot turns, then drives straight on (else: an arc).
     """
 
     name: str
@@ -30,6 +32,7 @@ class Reference:
     sighted: Detections
     names: tuple[str, ...]
     teammates: Mapping[str, Path]
+    turns_first: bool = False
 
     def between(self, begin_ns: int, end_ns: int) -> "Reference":
         """The same with the odometry and the readings of [begin_ns, end_ns) only."""
@@ -52,11 +55,14 @@ def _between(seen: Detections, begin_ns: int, end_ns: int) -> Detections:
 
 
 def poses_at(
-    path: Path, stamps_ns: Int64[np.ndarray, " n"], gap_ns: int
+    path: Path, stamps_ns: Int64[np.ndarray, " n"], gap_ns: int, *, turns_first: bool = False
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """The path at these times by linear interpolation, and which of them are known.
+    """The path at these times, and which of them are known.
 
-    Not known: outside the path, in a gap longer than gap_ns, beside a jump of the heading.
+    Between two poses it is the arc that joins them: s of the way from (p, θ), that is
+    (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ). With turns_first it is the chord,
+    with the heading of its end. Not known: outside the path, in a gap longer than gap_ns, beside a
+    jump of the heading.
     """
     if len(path.stamps_ns) < 2:
         return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=np.bool_)
@@ -65,9 +71,24 @@ def poses_at(
     step = path.poses[after] - path.poses[after - 1]
     step[:, 2] = on_circle(step[:, 2])
     share = (stamps_ns - begin) / np.maximum(end - begin, 1)
-    known = (end - begin <= gap_ns) & (np.abs(step[:, 2]) <= LARGEST_TURN_RAD)
+    largest = np.maximum(LARGEST_TURN_RAD, FASTEST_TURN_RAD_S * 1e-9 * (end - begin))
+    known = (end - begin <= gap_ns) & (np.abs(step[:, 2]) <= largest)
     known &= (stamps_ns >= path.stamps_ns[0]) & (stamps_ns <= path.stamps_ns[-1])
-    return path.poses[after - 1] + share[:, np.newaxis] * step, known
+    if turns_first:
+        heading = np.where(share > 0.0, step[:, 2], 0.0)
+        gone = share[:, np.newaxis] * step[:, :2]
+    else:
+        heading = share * step[:, 2]
+        length = share * sinc(0.5 * heading) / sinc(0.5 * step[:, 2])
+        c, s = (f(0.5 * (heading - step[:, 2])) for f in (np.cos, np.sin))
+        x, y = length * step[:, :2].T
+        gone = np.stack([c * x - s * y, s * x + c * y], axis=1)
+    return path.poses[after - 1] + np.column_stack([gone, heading]), known
+
+
+def sinc(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """sin(angle)/angle, 1 at 0: the chord of an arc over its length, by half the turn."""
+    return np.asarray(np.sinc(angle / np.pi))
 
 
 def references(
@@ -76,8 +97,9 @@ def references(
     landmarks: Mapping[int, Float[np.ndarray, "2"]],
     gap_ns: int,
     label: str,
+    turning_first: frozenset[str] = frozenset(),
 ) -> list[Reference]:
-    """The references of the robots that have a path."""
+    """The references of the robots that have a path and odometry."""
     return [
         Reference(
             f"{label} {stream.robot}",
@@ -89,6 +111,7 @@ def references(
             stream.teammate_detections,
             stream.teammates,
             paths,
+            stream.robot in turning_first,
         )
         for stream in world.streams
         if stream.robot in paths and len(stream.intervals.end_ns)

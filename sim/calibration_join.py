@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
@@ -47,8 +48,7 @@ def joined_team(world: WorldStreams, scenario: Scenario) -> JoinedTeam:
 
     Between two ends of windows a path is the particles' mean, bent to end where the join ends it.
     """
-    configs = {robot.id: robot for robot in scenario.robots}
-    tracks = {s.robot: _tracks(configs[s.robot], s) for s in world.streams if s.robot in configs}
+    tracks = {s.robot: _tracks(config_of(s.robot, scenario), s) for s in world.streams}
     fold: Fold = EMPTY_FOLD
     for stream in world.streams:
         if stream.start is not None and tracks.get(stream.robot):
@@ -78,6 +78,12 @@ def joined_team(world: WorldStreams, scenario: Scenario) -> JoinedTeam:
         ends = state[at[:, np.newaxis] + np.arange(3)]
         paths[robot] = _bent(tracks[robot], ends)
     return JoinedTeam(landmarks, paths)
+
+
+def config_of(robot: str, scenario: Scenario) -> RobotConfig:
+    """The robot's configuration; one that the scenario does not know has the first one's models."""
+    configs = {each.id: each for each in scenario.robots}
+    return configs.get(robot) or msgspec.structs.replace(scenario.robots[0], id=robot)
 
 
 def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:

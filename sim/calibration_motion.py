@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from sim.calibration_data import Reference, poses_at
+from sim.calibration_data import Reference, poses_at, sinc
 from sim.calibration_figures import CalibrationError, huber
 from sim.evaluation_errors import on_circle
 
 SPAN_S = 10.0
 """Errors are taken over so long: those of one command are correlated for seconds."""
 STEPS = 40
-"""Steps of a span, each a chord of the true path."""
+"""Steps of a span, each an arc (or turn and chord) of the true path."""
 STEP_S = SPAN_S / STEPS
 LEAST_SPANS = 30
 LEAST_WAY_M = 0.05
@@ -92,7 +92,7 @@ def _steps_of(data: Reference) -> Float[np.ndarray, "spans steps 5"]:
     edges = np.append(intervals.end_ns[0] - intervals.duration_ns[0], intervals.end_ns)
     spans = int((edges[-1] - edges[0]) * 1e-9 / SPAN_S)
     grid = edges[0] + np.rint(np.arange(spans * STEPS + 1) * STEP_S * 1e9).astype(np.int64)
-    poses, known = poses_at(data.path, grid, data.gap_ns)
+    poses, known = poses_at(data.path, grid, data.gap_ns, turns_first=data.turns_first)
     logged = [
         np.diff(
             np.interp(
@@ -105,9 +105,10 @@ def _steps_of(data: Reference) -> Float[np.ndarray, "spans steps 5"]:
         for rate in (intervals.forward, intervals.yaw_rate)
     ]
     turn = on_circle(np.diff(poses[:, 2]))
-    middle = poses[:-1, 2] + 0.5 * turn
-    c, s = np.cos(middle), np.sin(middle)
-    x, y = np.diff(poses[:, :2], axis=0).T
+    toward = poses[1:, 2] if data.turns_first else poses[1:, 2] - 0.5 * turn
+    c, s = np.cos(toward), np.sin(toward)
+    chords = np.ones_like(turn) if data.turns_first else sinc(0.5 * turn)
+    x, y = np.diff(poses[:, :2], axis=0).T / chords
     rows = np.stack([*logged, c * x + s * y, c * y - s * x, turn], axis=1)
     whole = (known[1:] & known[:-1]).reshape(spans, STEPS).all(axis=1)
     return np.asarray(rows.reshape(spans, STEPS, 5)[whole])

@@ -57,7 +57,7 @@ def _rows(data: Sequence[Reference]) -> _Rows:
         seen = each.seen
         ids = np.array(sorted(each.landmarks), dtype=np.int64)
         stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
-        poses, known = poses_at(each.path, stamps, each.gap_ns)
+        poses, known = poses_at(each.path, stamps, each.gap_ns, turns_first=each.turns_first)
         known &= np.isin(seen.ids, ids)
         if not known.any():
             continue
@@ -175,7 +175,7 @@ def _marker_offset(data: Sequence[Reference], affine: Float[np.ndarray, "2"]) ->
     for each in data:
         seen = each.sighted
         stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
-        here, known = poses_at(each.path, stamps, each.gap_ns)
+        here, known = poses_at(each.path, stamps, each.gap_ns, turns_first=each.turns_first)
         for index, name in enumerate(each.names):
             if name in each.teammates:
                 there, there_known = poses_at(each.teammates[name], stamps, each.gap_ns)

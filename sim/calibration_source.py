@@ -3,8 +3,11 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
+from sim.datasets.tables import opened as opened_set
+from sim.datasets.utias_log import present_robots
 from sim.scenario import Scenario, ScenarioError, load, loads, with_options
 from sim.source import streams_of
 from sim.streams import (
@@ -29,11 +32,11 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
 def readings_of(path: Path) -> tuple[WorldStreams, Scenario]:
     """The readings of a log (`.mcap`) with its scenario, or of a UTIAS set with `utias`.
 
-    Of a log the first epoch of each robot is taken.
+    Of a log the first epoch of each robot is taken; of a set, all robots that it has files of.
     Raises DatasetError, LogError or ScenarioError.
     """
     if path.suffix != ".mcap":
-        scenario = with_options(load("utias"), dataset=path)
+        scenario = _with_its_robots(path)
         return streams_of(scenario), scenario
     messages = [opened(sample)[2] for sample in _samples(path)]
     configured = [each for each in messages if isinstance(each, m.Configured)]
@@ -42,6 +45,15 @@ def readings_of(path: Path) -> tuple[WorldStreams, Scenario]:
     scenario = loads(configured[-1].configuration)
     clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
     return world_of(messages, path.name, clocks), scenario
+
+
+def _with_its_robots(path: Path) -> Scenario:
+    """The scenario `utias` with the robots that the set has files of, however many."""
+    with opened_set(str(path), "Barcodes.dat") as files:
+        present = present_robots(files)
+    scenario = with_options(load("utias"), robots=max(present, default=None), dataset=path)
+    robots = tuple(robot for robot in scenario.robots if int(robot.id[1:]) in present)
+    return msgspec.structs.replace(scenario, robots=robots or scenario.robots)
 
 
 def _samples(path: Path) -> list[Sample]:

@@ -20,6 +20,7 @@ from sim.calibration_sensor import UNITS as SENSOR_UNITS
 from sim.calibration_sensor import fit_sensor
 from sim.calibration_source import world_of
 from sim.cli import app
+from sim.datasets.utias_writer import write_utias
 from sim.evaluation_errors import Path, on_circle
 from sim.scenario import Scenario, load, with_options
 from sim.streams import Detections, Intervals, WorldStreams, grouped
@@ -167,7 +168,38 @@ def test_a_path_is_known_neither_in_a_gap_nor_beside_a_jump_of_its_heading() -> 
     poses, known = poses_at(path, (at * SECOND).astype(np.int64), 2 * SECOND)
     np.testing.assert_array_equal(known, [False, True, False, False, True, False])
     assert abs(on_circle(poses[1, 2:])[0]) == pytest.approx(np.pi)
-    np.testing.assert_allclose(poses[4], [3.5, 0.0, 0.05])
+    np.testing.assert_allclose(poses[4], [3.5, -0.5 * np.tan(0.025), 0.05])
+
+
+def spinning(seed: int, *, turns_first: bool) -> Reference:
+    """A base that turns up to 2 rad in a step of 1 s and drives 1.05 times what it logs."""
+    rng = np.random.default_rng(seed)
+    v, w = rng.uniform(0.2, 0.5, 300), rng.uniform(-2.0, 2.0, 300)
+    ahead = 1.05 * v + 0.01 * rng.standard_normal(300)
+    turn = 0.95 * w + 0.01 * rng.standard_normal(300)
+    heading = np.append(0.0, np.cumsum(turn))
+    toward = heading[1:] if turns_first else heading[1:] - 0.5 * turn
+    chord = ahead if turns_first else ahead * 2.0 * np.sin(0.5 * turn) / turn
+    x, y = (np.append(0.0, np.cumsum(chord * f(toward))) for f in (np.cos, np.sin))
+    stamps = np.arange(301, dtype=np.int64) * SECOND
+    path = Path(stamps, np.stack([x, y, on_circle(heading)], axis=1))
+    intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
+    name = f"r{seed}"
+    return Reference(
+        name, intervals, NOTHING, path, SECOND, SEEN, NOTHING, (), {}, turns_first=turns_first
+    )
+
+
+@pytest.mark.parametrize("turns_first", [True, False])
+def test_two_robots_that_turn_as_far_as_they_like_are_calibrated(turns_first: bool) -> None:
+    data = [spinning(seed, turns_first=turns_first) for seed in (1, 2)]
+    found = by_name(jackknifed(lambda part: fit_motion(part, None), data, MOTION_UNITS))
+    assert found["forward_scale"].value == pytest.approx(1.05, abs=0.01)
+    assert found["yaw_scale"].value == pytest.approx(0.95, abs=0.005)
+    assert found["turn_drag"].value < 0.005
+    confused = [replace(each, turns_first=not turns_first) for each in data]
+    wrong = fit_motion(confused, None)
+    assert abs(wrong["forward_scale"] - 1.05) + wrong["turn_drag"] > 0.05
 
 
 def test_too_little_motion_or_too_few_readings_are_said(bases: list[Reference]) -> None:
@@ -256,7 +288,7 @@ def slipping() -> tuple[Scenario, WorldStreams]:
     motion = MotionModel(forward=MotionNoise(per_m=0.05), turn=MotionNoise(per_rad=0.05))
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01)
     front_end = FrontEnd(window_s=5.0, particles=30, keyframe_s=0.5)
-    robots = tuple(RobotConfig(f"r{i}", motion, sensor, front_end) for i in (1, 2, 3))
+    robots = tuple(RobotConfig(f"r{i}", motion, sensor, front_end) for i in (1, 2))
     team = with_options(Scenario("slipping", "slipping", world, robots), seed=3)
     told = streams(team)
     less = tuple(
@@ -288,6 +320,18 @@ def test_odometry_that_does_not_fit_is_learnt_and_told_with_and_without_truth(
         assert motion["forward.per_m"].value == pytest.approx(0.05, rel=0.25)
     else:
         assert found.sensor == ()
+
+
+def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(
+    slipping: tuple[Scenario, WorldStreams], tmp_path: File
+) -> None:
+    """A set of two robots: of one the ground truth is missing, the other's is too short."""
+    write_utias(slipping[1], tmp_path / "set")
+    (tmp_path / "set" / "Robot2_Groundtruth.dat").unlink()
+    said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "set")])
+    assert said.exit_code == 1
+    assert "set r2: no ground truth: nothing is learnt from it" in said.output
+    assert "24 stretches of 10 s of motion with a known path, 30 needed" in said.output
 
 
 def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path: File) -> None:
