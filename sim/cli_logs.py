@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -150,6 +150,13 @@ def repair(
 @app.command()
 def limit(
     log: LogArgument,
+    noise: Annotated[
+        Literal["white", "profile"],
+        typer.Option(
+            help="white: each reading's error is its own, no sightings of teammates; profile: the "
+            "scenario's errors that persist, biases, and sightings."
+        ),
+    ] = "white",
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
 ) -> None:
     """The batch MAP over all raw readings of a log: the limit that a team can reach."""
@@ -157,7 +164,7 @@ def limit(
     from team.recording.reader import open_log
 
     try:
-        result = batch_map(open_log(log).samples())
+        result = batch_map(open_log(log).samples(), noise)
     except LimitError as error:
         fail(str(error), FAILED)
     figures = result.to_json()

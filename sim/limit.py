@@ -5,12 +5,15 @@ the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of `increment
 `BetweenFactorPose2` with its logarithm; each accepted range and bearing, independent, with the
 sensor's noise (under a Cauchy loss where the centre's `robust_c` asks for a robust join).
 Levenberg-Marquardt starts from the joined solution, so what it finds is never worse than that.
-What it does not model: sightings of teammates, and errors of a sensor that persist.
+Under the noise `white` every reading's error is its own and sightings of teammates are not used;
+under `profile` the sensor's errors persist as the scenario says, biases are estimated and sightings
+are factors (`sim.limit_errors`). Not modelled: an error of the odometry's scale at speeds that the
+profile has not seen.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -24,6 +27,7 @@ from sim.evaluation_errors import (
     map_errors,
     pose_errors,
 )
+from sim.limit_errors import add_errors, bias_key, has_biases, profile_graph
 from sim.limit_graph import factor_graph, landmark_starts, pose_key, tangent, values_of
 from sim.limit_readings import Chain, anchored, chains_of
 from team.estimation.gaussian import Matrix
@@ -32,6 +36,7 @@ from team.wire.bus import Sample
 LARGEST_DECREMENT = 1e-3
 """√(gᵀH⁻¹g) allowed at the optimum: how far the next Newton step goes, in standard deviations."""
 ITERATIONS = 1000
+NoiseKind = Literal["white", "profile"]
 
 
 class LimitError(RuntimeError):
@@ -45,6 +50,7 @@ class Limit:
     gradient_norm: of the optimum's cost, in the units of the state; newton_decrement: √(gᵀH⁻¹g).
     paths: all poses; final_pose_nees_per_dof and position_rmse_m where there is truth.
     left_out: robots whose place in the team's frame is not known, and why.
+    biases: (bearing [rad], range scale) of each robot, estimated. team: the run's own final map.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -60,16 +66,17 @@ class Limit:
     final_pose_nees_per_dof: Mapping[str, float]
     robust: bool
     left_out: tuple[str, ...]
+    noise: NoiseKind
+    biases: Mapping[str, tuple[float, float]]
+    team: MapErrors | None
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that machines read."""
-        errors = self.errors
         return {
+            "noise": self.noise,
             "landmarks": len(self.ids),
-            "landmark_rmse_m": None if errors is None else errors.rmse_m,
-            "landmark_rmse_aligned_m": None if errors is None else errors.aligned_rmse_m,
-            "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
-            "map_nees_in_band": None if errors is None else errors.in_band,
+            **_map_figures(self.errors),
+            "team": _map_figures(self.team),
             "cost": self.cost,
             "initial_cost": self.initial_cost,
             "gradient_norm": self.gradient_norm,
@@ -79,6 +86,8 @@ class Limit:
                     "poses": len(path.stamps_ns),
                     "position_rmse_m": self.position_rmse_m.get(robot),
                     "final_pose_nees_per_dof": self.final_pose_nees_per_dof.get(robot),
+                    "bearing_bias_rad": self.biases.get(robot, (None, None))[0],
+                    "range_scale_bias": self.biases.get(robot, (None, None))[1],
                 }
                 for robot, path in self.paths.items()
             },
@@ -87,7 +96,19 @@ class Limit:
         }
 
 
-def batch_map(samples: Iterable[Sample]) -> Limit:
+def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
+    shape = None if errors is None else errors.shape
+    return {
+        "landmark_rmse_m": None if errors is None else errors.rmse_m,
+        "landmark_rmse_aligned_m": None if errors is None else errors.aligned_rmse_m,
+        "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
+        "map_nees_in_band": None if errors is None else errors.in_band,
+        "shape_nees_per_landmark": None if shape is None else shape.nees_per_landmark,
+        "coverage": None if errors is None else errors.coverage,
+    }
+
+
+def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
     """The batch MAP of a log of a run under the rule `join`, from start to end.
 
     Raises LimitError without GTSAM, without a scenario, without a joined map, or when the optimiser
@@ -98,7 +119,9 @@ def batch_map(samples: Iterable[Sample]) -> Limit:
     run = evaluate(kept)
     if run.scenario is None or run.map is None:
         raise LimitError("the log has no scenario or no final map: record a run to its end")
-    chains, anchors, left_out = _placed(chains_of(kept, run.scenario), run)
+    chains, anchors, left_out = _placed(
+        chains_of(kept, run.scenario, sightings=noise == "profile"), run
+    )
     if not chains:
         raise LimitError(
             "no robot's trajectory is in the log: the batch starts from the joined solution, "
@@ -109,13 +132,21 @@ def batch_map(samples: Iterable[Sample]) -> Limit:
         zip(*(anchored(c, a) for c, a in zip(chains, anchors, strict=True)), strict=True)
     )
     starts = [landmark_starts(chains, poses, run.map) for poses in fillings]
-    graph = factor_graph(gtsam, chains, fillings[0], starts[0], robust_c)
+    if noise == "profile":
+        descend = _stepped
+        sigmas = run.scenario.central.bias_sigma
+        graph = profile_graph(gtsam, chains, fillings[0], starts[0], robust_c, sigmas)
+    else:
+        descend = _optimised
+        graph = factor_graph(gtsam, chains, fillings[0], starts[0], robust_c)
     initials = [
         values_of(gtsam, poses, landmarks)
         for poses, landmarks in zip(fillings, starts, strict=True)
     ]
+    if noise == "profile":
+        initials = [add_errors(values, chains) for values in initials]
     try:
-        optimum, figures = _solved(gtsam, graph, initials)
+        optimum, figures = _solved(gtsam, graph, initials, descend)
     except RuntimeError as error:
         if isinstance(error, LimitError):
             raise
@@ -129,22 +160,23 @@ def batch_map(samples: Iterable[Sample]) -> Limit:
         run,
         robust=robust_c is not None,
         left_out=left_out,
+        noise=noise,
         **figures,
     )
 
 
-def _solved(gtsam: Any, graph: Any, initials: Sequence[Any]) -> tuple[Any, dict[str, float]]:
+def _solved(
+    gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, dict[str, float]]:
     """The best optimum from all starts, and its figures; raises LimitError if it is none."""
-    optima = [_optimised(gtsam, graph, initial) for initial in initials]
+    optima = [descend(gtsam, graph, initial) for initial in initials]
     costs = [2.0 * graph.error(optimum) for optimum in optima]
     initial_cost = min(2.0 * graph.error(initial) for initial in initials)
     best = int(np.argmin(costs))
     if costs[best] > initial_cost:
         raise LimitError(f"the batch cost {costs[best]} lies above its start's, {initial_cost}")
     linear = graph.linearize(optima[best])
-    step = linear.optimize()
-    gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
-    decrement = float(np.sqrt(max(2.0 * gain, 0.0)))
+    _, decrement = _newton_step(gtsam, linear)
     if decrement > LARGEST_DECREMENT:
         raise LimitError(
             f"the batch has not converged: the next Newton step goes {decrement:.2g} sigma, "
@@ -197,6 +229,34 @@ def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
     return gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters).optimize()
 
 
+def _newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
+    """The step to the optimum of a linear graph, and how many standard deviations it goes."""
+    step = linear.optimize()
+    gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
+    return step, float(np.sqrt(max(2.0 * gain, 0.0)))
+
+
+def _stepped(gtsam: Any, graph: Any, initial: Any) -> Any:
+    """Gauss-Newton; a step that does not lower the cost is halved.
+
+    For factors in Python: GTSAM's Levenberg-Marquardt takes five times as long for one iteration.
+    """
+    values, cost = initial, graph.error(initial)
+    for _ in range(ITERATIONS):
+        step, decrement = _newton_step(gtsam, graph.linearize(values))
+        if decrement < 0.1 * LARGEST_DECREMENT:
+            break
+        for halvings in range(30):
+            trial = values.retract(step.scale(0.5**halvings))
+            lower = graph.error(trial)
+            if lower < cost:
+                break
+        else:
+            break
+        values, cost = trial, lower
+    return values
+
+
 def _limit(
     gtsam: Any,
     graph: Any,
@@ -219,7 +279,7 @@ def _limit(
     )
     known = [k for k, i in enumerate(landmarks) if i in truth]
     rows = np.array([2 * k + axis for k in known for axis in range(2)], dtype=np.int64)
-    paths, errors, nees = {}, {}, {}
+    paths, errors, nees, biases = {}, {}, {}, {}
     for c, chain in enumerate(chains):
         robot, last = chain.config.id, pose_key(c, len(chain.increments))
         keys = range(pose_key(c, 0), last + 1)
@@ -228,6 +288,9 @@ def _limit(
         true_path = run.robots[robot].truth
         true_poses, seen = interpolated(true_path, path.stamps_ns)
         paths[robot] = path
+        if figures["noise"] == "profile" and has_biases(chain):
+            turned, scaled = optimum.atPoint2(bias_key(c)).tolist()
+            biases[robot] = (turned, scaled)
         if seen.any():
             errors[robot] = distance_rmse(path.poses[seen, :2], true_poses[seen, :2])
         turn = tangent(path.poses[-1, 2])
@@ -249,5 +312,7 @@ def _limit(
         paths=paths,
         position_rmse_m=errors,
         final_pose_nees_per_dof=nees,
+        biases=biases,
+        team=run.map.errors,
         **figures,
     )

@@ -55,6 +55,23 @@ def factor_graph(
 
     Where no start pose is known, the first chain's is held where the joined solution has it.
     """
+    graph = path_graph(gtsam, chains, poses)
+    for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
+        first = pose_key(c, 0)
+        for i, scan in enumerate(chain.scans, 1):
+            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+                distance, _ = predicted(path[i], landmarks[landmark])
+                range_var, bearing_var = noise(chain.config.sensor, distance)
+                model = gtsam.noiseModel.Diagonal.Variances(np.array([bearing_var, range_var]))
+                model = under_loss(gtsam, model, robust_c)
+                graph.push_back(
+                    gtsam.BearingRangeFactor2D(first + i, landmark, gtsam.Rot2(b), r, model)
+                )
+    return graph
+
+
+def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> Any:
+    """The factors of the start poses and of the odometry."""
     graph = gtsam.NonlinearFactorGraph()
     floor = np.diag(FLOOR_SIGMAS) ** 2
     anyone = any(chain.start is not None for chain in chains)
@@ -67,18 +84,14 @@ def factor_graph(
             model = gtsam.noiseModel.Gaussian.Covariance(increment.covariance + floor)
             motion = gtsam.Pose2(*increment.mean)
             graph.push_back(gtsam.BetweenFactorPose2(first + i, first + i + 1, motion, model))
-        for i, scan in enumerate(chain.scans, 1):
-            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
-                distance, _ = predicted(path[i], landmarks[landmark])
-                range_var, bearing_var = noise(chain.config.sensor, distance)
-                model = gtsam.noiseModel.Diagonal.Variances(np.array([bearing_var, range_var]))
-                if robust_c is not None:
-                    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(robust_c)
-                    model = gtsam.noiseModel.Robust.Create(loss, model)
-                graph.push_back(
-                    gtsam.BearingRangeFactor2D(first + i, landmark, gtsam.Rot2(b), r, model)
-                )
     return graph
+
+
+def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
+    """The noise model under a Cauchy loss of this scale, or as it is."""
+    if c is None:
+        return model
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)
 
 
 def _start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
+from msgspec import structs
 
 from sim.evaluation_errors import Path, on_circle
 from sim.scenario import Scenario
@@ -14,13 +15,18 @@ from team.config import RobotConfig
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Pose, between, compose
 from team.estimation.models import Increment
+from team.stream.pose_grid import NodeSighting, PoseGrid
 from team.stream.segmenter import Epoch, Segmenter
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.channels import channel_of
 
-_TAKEN = frozenset(channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS))
+_TAKEN = frozenset(
+    channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS, ch.SIGHTINGS)
+)
+_ENDLESS_S = 1e9
+"""The batch has one window."""
 
 
 class Scan(NamedTuple):
@@ -37,6 +43,7 @@ class Chain:
 
     increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1.
     start: the pose that reading 0 gives (None: unknown), with its covariance (None: exact).
+    sightings: of teammates, from the poses at the team's grid times, if they were asked for.
     """
 
     config: RobotConfig
@@ -46,6 +53,7 @@ class Chain:
     stamps_ns: Int64[np.ndarray, " K"]
     increments: tuple[Increment, ...]
     scans: tuple[Scan, ...]
+    sightings: tuple[NodeSighting, ...] = ()
 
     @property
     def dead_reckoned(self) -> Float[np.ndarray, "K 3"]:
@@ -56,9 +64,12 @@ class Chain:
         return np.array(poses)
 
 
-def chains_of(samples: Iterable[Sample], scenario: Scenario) -> list[Chain]:
+def chains_of(
+    samples: Iterable[Sample], scenario: Scenario, *, sightings: bool = False
+) -> list[Chain]:
     """The chains of all robots by (robot, epoch); readings in the order of their counter, once.
 
+    With sightings there is a pose at each time of the team's grid (`front_end.node_s`) too.
     Raises WireError for a reading that is not sound.
     """
     streams: dict[tuple[str, int], dict[int, m.Reading]] = {}
@@ -71,14 +82,16 @@ def chains_of(samples: Iterable[Sample], scenario: Scenario) -> list[Chain]:
                 stream[message.reading] = message
     configs = {robot.id: robot for robot in scenario.robots}
     chains = [
-        _chain(configs[robot], epoch, [readings[i] for i in sorted(readings)])
+        _chain(configs[robot], epoch, [readings[i] for i in sorted(readings)], sightings)
         for (robot, epoch), readings in sorted(streams.items())
         if robot in configs
     ]
     return [chain for chain in chains if chain is not None]
 
 
-def _chain(config: RobotConfig, epoch: int, readings: Sequence[m.Reading]) -> Chain | None:
+def _chain(
+    config: RobotConfig, epoch: int, readings: Sequence[m.Reading], sightings: bool
+) -> Chain | None:
     """None for a stream without odometry: it has no motion that links its poses."""
     odometry = [
         translate.motion_of(reading, config.clock_offset_s)
@@ -88,7 +101,8 @@ def _chain(config: RobotConfig, epoch: int, readings: Sequence[m.Reading]) -> Ch
     if not odometry:
         return None
     first_ns, last_ns = odometry[0][0] - odometry[0][1], odometry[-1][0]
-    segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
+    grid = _grid(config) if sightings else None
+    segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s, grid)
     segmenter.begin(first_ns)
     start: tuple[Pose | None, Matrix | None] = (None, None)
     epochs: list[Epoch] = []
@@ -98,6 +112,8 @@ def _chain(config: RobotConfig, epoch: int, readings: Sequence[m.Reading]) -> Ch
                 start = translate.pose_of(reading)
             case m.Observations():
                 segmenter.observe(reading.stamp_ns, *translate.scan_of(reading))
+            case m.Sightings() if grid is not None:
+                grid.observe(reading.stamp_ns, reading.reading, translate.looks_of(reading))
             case m.Odometry():
                 epochs += segmenter.drive(*translate.motion_of(reading, config.clock_offset_s))
     last, rest = segmenter.cut(last_ns)
@@ -114,7 +130,15 @@ def _chain(config: RobotConfig, epoch: int, readings: Sequence[m.Reading]) -> Ch
         np.array([first_ns, *(e.stamp_ns for e in epochs)]),
         tuple(e.increment for e in epochs),
         tuple(Scan(e.ids, e.ranges, e.bearings) for e in epochs),
+        () if grid is None else grid.sightings(),
     )
+
+
+def _grid(config: RobotConfig) -> PoseGrid | None:
+    """The grid of a robot whose submaps have pose nodes."""
+    if not config.front_end.node_s:
+        return None
+    return PoseGrid(config.sensor, structs.replace(config.front_end, window_s=_ENDLESS_S))
 
 
 def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
