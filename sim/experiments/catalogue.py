@@ -46,4 +46,5 @@ ENTRIES = (
     Entry("downs-5.3", "downs:TABLE_5_3", "Downs: joined maps of one robot, t-test.", 1, 1),
     Entry("downs-5.4", "downs:TABLE_5_4", "Downs: smoothed paths of one robot.", 1, 1),
     Entry("downs-5.5", "downs:TABLE_5_5", "Downs: joined maps of five robots, t-test.", 1, 1),
+    Entry("downs-minima", "downs_minima", "Downs: has the shared map one minimum?", 3, 1),
 )

@@ -3,14 +3,17 @@
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
+from sim.experiments import downs_minima
 from sim.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
 from sim.experiments.downs_joined import spherical_task
 from sim.experiments.downs_printed import EKF_MAPS, JOINED_MAPS
 from sim.experiments.experiment import Dataset, Options, Results
 from sim.experiments.team_runs import Figures
 from sim.scenario import load, with_options
+from team.estimation.alignment import procrustes
 
 SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 
@@ -69,3 +72,32 @@ def test_what_is_printed_stands_beside_what_is_computed() -> None:
     assert len(EKF_MAPS) == len(JOINED_MAPS) == 9
     (picture,) = outcome.pictures
     assert "logarithmic" in picture.caption
+
+
+def _map(points: np.ndarray, sigma: float) -> Figures:
+    return {
+        "ids": list(range(len(points))),
+        "means": points.tolist(),
+        "covariance": (sigma**2 * np.eye(2 * len(points))).tolist(),
+    }
+
+
+def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_form() -> None:
+    points = np.array([[0.0, 0.0], [5.0, 1.0], [2.0, 7.0], [-4.0, 3.0]])
+    turned = points @ np.array([[0.0, -1.0], [1.0, 0.0]]) + [3.0, -2.0]
+    turned[2] += 0.3
+    pair = downs_minima.common(_map(points, 0.1), _map(turned, 0.2))
+    turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    assert downs_minima.minima(downs_minima.profile(pair, turns)) == 1
+    closed = procrustes(points, turned, np.ones(4))
+    np.testing.assert_allclose(downs_minima.evolved(pair, 1), closed, atol=1e-4)
+    alike, weighted = (
+        kind(pair, turns) for kind in (downs_minima.profile, downs_minima.profile_with_covariances)
+    )
+    np.testing.assert_allclose(weighted, 2.0 * alike / (0.1**2 + 0.2**2), rtol=1e-9)
+
+
+def test_a_curve_with_two_minima_is_said_to_have_two() -> None:
+    turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    assert downs_minima.minima(np.cos(2.0 * turns)) == 2
+    assert downs_minima.minima(np.cos(turns)) == 1
