@@ -350,8 +350,8 @@ TABLE_5_2 = PrintedTable(
     (
         _DIFFERS,
         "The printed paths are some eight times better than the printed maps that they were made "
-        "with, in one frame; a path in a map that lies wrong by 0.3 m can not be right within "
-        "0.04 m of the truth. Rows 3 and 8 of the printed table are the same.",
+        "with, in one frame; how a path can be right within 0.04 m in a map that lies wrong by "
+        "0.3 m the source does not say. Rows 3 and 8 of the printed table are the same.",
     ),
 )
 _JOINED = (
