@@ -18,8 +18,8 @@ from tests.system.scenarios import STEPS, short
 SUBMAPS = STEPS // 12  # windows of 12 s, steps of 1 s
 
 
-async def launched(team: Processes, speed: str = "20") -> tuple[Process, Path]:
-    """A launch that has got as far as r1's second submap; and its run's folder."""
+async def launched(team: Processes, speed: str = "8") -> tuple[Process, Path]:
+    """A launch that has got as far as r1's second submap, seconds before its end; its run's folder."""
     folder = team.folder / "run"
     launch = await team.start(
         *("launch", short(team.folder), "--speed", speed, "--no-report"),
