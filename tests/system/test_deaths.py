@@ -19,7 +19,7 @@ SUBMAPS = STEPS // 12  # windows of 12 s, steps of 1 s
 
 
 async def launched(team: Processes, speed: str = "8") -> tuple[Process, Path]:
-    """A launch that has got as far as r1's second submap, seconds before its end; its run's folder."""
+    """A launch that has r1's second submap, seconds before its end; and its run's folder."""
     folder = team.folder / "run"
     launch = await team.start(
         *("launch", short(team.folder), "--speed", speed, "--no-report"),
