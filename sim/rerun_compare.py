@@ -15,7 +15,11 @@ from team.wire import messages as m
 RELATIVE = 1e-6
 ABSOLUTE = 1e-9
 """Elsewhere: |a − b| ≤ ABSOLUTE·s + RELATIVE·|b|, s the largest of the array (1 at the least)."""
-_IDS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {"ids": arrays.ids, "stamps": arrays.stamps}
+_IDS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
+    "ids": arrays.ids,
+    "stamps": arrays.stamps,
+    "nodes": arrays.stamps,
+}
 _FLOATS = (
     "pose",
     "poses",
@@ -23,8 +27,11 @@ _FLOATS = (
     "means",
     "covariance",
     "covariances",
+    "sensitivity",
     "weights",
 )
+ARRAYS = frozenset({*_IDS, *_FLOATS})
+"""The fields that are compared number by number."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import random
 import struct
 from pathlib import Path
+from typing import get_type_hints
 
 import msgspec
 import numpy as np
@@ -14,6 +15,7 @@ from sim.cli_rerun import app
 from sim.evaluation import evaluate
 from sim.rerun import Verification, verify
 from sim.rerun_change import changed_run
+from sim.rerun_compare import ARRAYS
 from sim.rerun_log import RerunError
 from sim.rerun_noise import with_noise
 from sim.scenario_checks import ScenarioError
@@ -252,6 +254,14 @@ def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(
         ["--noise", "range=2", "--noise", "range=3"],
     ):
         assert runner.invoke(app, ["rerun", str(log.path), *wrong]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "channel", [c for c in ch.CHANNELS if c.recomputable], ids=lambda c: c.name
+)
+def test_every_array_that_is_recomputed_is_compared_number_by_number(channel: ch.Channel) -> None:
+    hints = get_type_hints(channel.message, include_extras=True)
+    assert ARRAYS.issuperset(name for name, hint in hints.items() if hint is bytes)
 
 
 # Under other conditions.
