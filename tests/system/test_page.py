@@ -111,6 +111,7 @@ def test_it_plays_and_pauses_and_ends_at_the_end(page):
 
 def test_an_event_leads_to_its_time(page):
     page.wait("document.querySelectorAll('#events li').length > 3")
+    seek(page, 30)
     page.ask("document.querySelector('#events li').click()")
     page.wait("document.querySelector('#now').textContent === '0.0'")
 
