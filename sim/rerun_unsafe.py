@@ -46,8 +46,7 @@ def with_prior(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> L
 
     `pending` leads from the prior's pose to the start of the window.
     """
-    mean = np.concatenate([prior.pose, prior.means.ravel()])
-    whole = WholeMap(prior.ids, mean, prior.covariance)
+    whole = prior.whole
     for each in pending:
         whole = joined(whole, each)
     fed = joined(_seen_from_its_pose(whole, local.ids), local)

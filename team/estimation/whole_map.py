@@ -6,14 +6,16 @@ independent Gaussians, and "these two landmarks are the same" is an observation 
 Earlier submaps are not linearised again, so the map is over-confident after many joins.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team.estimation.gaussian import carried_along, information
-from team.estimation.geometry import compose, transformed, wrapped
+from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
+from team.estimation.geometry import wrapped
 from team.estimation.submap import LocalMap
+from team.estimation.tie_kernel import Tie, tied, tied_pose
 
 ITERATIONS = 3
 
@@ -33,32 +35,109 @@ def begun(pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"] | N
     return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)
 
 
-def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
+def joined(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> WholeMap:
     """The local map composed onto the current pose: known landmarks fused, new ones added.
 
     With s = (whole, local) and the constraint h(s) = pose ∘ local landmark − whole landmark = 0 for
-    each known landmark: the iterated EKF update of s in Joseph's form, then
-    (pose ∘ end pose, landmarks, pose ∘ new landmarks) with its Jacobian.
+    each known landmark: the iterated EKF update of s, then (pose ∘ end pose, landmarks,
+    pose ∘ new landmarks) with its Jacobian. The update has rank 2k for k known landmarks and the
+    Jacobian is the identity for the landmarks of the whole map: O(n²k) for its n numbers.
+
+    gate: known landmarks whose constraint the rest contradicts by more, worst first, are left out
+    of the local map. By Baarda's test of one of them, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with the multiplier
+    z = S⁻¹ y, is by how much the cost falls without that constraint; χ² with two degrees of
+    freedom.
     """
-    local = local.without_nodes
+    local, in_whole, in_local, tie = _agreeing(whole, local.without_nodes, gate)
     n, m = len(whole.mean), len(local.mean)
-    prior = np.concatenate([whole.mean, local.mean])
-    covariance = np.zeros((n + m, n + m))
-    covariance[:n, :n], covariance[n:, n:] = whole.covariance, local.covariance
-    _, in_whole, in_local = np.intersect1d(whole.ids, local.ids, return_indices=True)
-    state = prior
-    if len(in_whole):
-        for _ in range(ITERATIONS):
-            gap, H = _constraints(state, n, in_whole, in_local)
-            spread = information(H @ covariance @ H.T, "the known landmarks' innovation")
-            gain = covariance @ H.T @ spread
-            state = prior - gain @ (gap + H @ (prior - state))
-        rest = np.eye(n + m) - gain @ H
-        covariance = rest @ covariance @ rest.T
+    sights, known = 3 + _points(in_local), 3 + _points(in_whole)
+    k = len(in_whole)
+    of_pose = np.tile(np.eye(2, 3), (k, 1))
+    of_pose[:, 2] = tie.lever.ravel()
+    turn = np.array([[tie.cos, -tie.sin], [tie.sin, tie.cos]])
+    U = whole.covariance[:, :3] @ of_pose.T - whole.covariance[:, known]
+    V = (local.covariance[:, sights].reshape(m, k, 2) @ turn.T).reshape(m, 2 * k)
+    state = whole.mean - U @ tie.multiplier
+    ended = local.mean - V @ tie.multiplier
+    of_whole, of_local = U @ tie.inverse, V @ tie.inverse
+    # (pose, local): what the new pose and the new landmarks are made of.
+    own = np.empty((3 + m, 3 + m))
+    own[:3, :3] = whole.covariance[:3, :3] - of_whole[:3] @ U[:3].T
+    own[3:, 3:] = local.covariance - of_local @ V.T
+    own[:3, 3:] = -of_whole[:3] @ V.T
+    own[3:, :3] = own[:3, 3:].T
+    old = np.concatenate(
+        [whole.covariance[3:, :3] - of_whole[3:] @ U[:3].T, -of_whole[3:] @ V.T], axis=1
+    )
     fresh = np.setdiff1d(np.arange(len(local.ids)), in_local)
-    mean, G = _advanced(state, n, fresh)
-    ids = np.concatenate([whole.ids, local.ids[fresh]])
-    return _by_id(ids, mean, G @ covariance @ G.T)
+    made, G = _composed(state[:3], ended, fresh)
+    covariance = np.empty((n + 2 * len(fresh), n + 2 * len(fresh)))
+    made_at = np.concatenate([np.arange(3), np.arange(n, len(covariance))])
+    covariance[3:n, 3:n] = whole.covariance[3:, 3:] - of_whole[3:] @ U[3:].T
+    covariance[np.ix_(made_at, made_at)] = G @ own @ G.T
+    covariance[3:n, made_at] = old @ G.T
+    covariance[made_at, 3:n] = covariance[3:n, made_at].T
+    mean = np.concatenate([made[:3], state[3:], made[3:]])
+    return _by_id(np.concatenate([whole.ids, local.ids[fresh]]), mean, covariance)
+
+
+def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> PoseGaussian:
+    """The pose of `joined`, without the landmarks."""
+    local, in_whole, in_local, tie = _agreeing(whole, local, gate)
+    place, sights = _entries(in_whole), _sights(local, in_local)
+    pose, covariance = tied_pose(
+        tie,
+        whole.mean[place],
+        whole.covariance[place[:, None], place],
+        local.end_pose,
+        local.covariance[:3, :3],
+        local.covariance[:3, sights],
+    )
+    return PoseGaussian(pose, covariance)
+
+
+def _agreeing(
+    whole: WholeMap, local: LocalMap, gate: float
+) -> tuple[LocalMap, Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Tie]:
+    """The local map without what the gate leaves out, its known landmarks here and there."""
+    while True:
+        _, in_whole, in_local = np.intersect1d(
+            whole.ids, local.ids, assume_unique=True, return_indices=True
+        )
+        place, sights = _entries(in_whole), _sights(local, in_local)
+        tie, sound = tied(
+            whole.mean[place],
+            whole.covariance[place[:, None], place],
+            local.mean[sights],
+            local.covariance[sights[:, None], sights],
+            ITERATIONS,
+        )
+        if not sound:
+            raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
+        worst = _worst(tie, gate)
+        if worst is None:
+            return local, in_whole, in_local, tie
+        local = without(local, int(in_local[worst]))
+
+
+def _worst(tie: Tie, gate: float) -> int | None:
+    """The place of the constraint that the rest contradicts most; None within the gate."""
+    if not len(tie.multiplier) or gate == math.inf:
+        return None
+    z = tie.multiplier.reshape(-1, 2)
+    at = np.arange(len(z))
+    own = tie.inverse.reshape(len(z), 2, len(z), 2)[at, :, at]
+    gain = np.einsum("ki,ki->k", z, np.linalg.solve(own, z[:, :, None])[:, :, 0])
+    worst = int(gain.argmax())
+    return worst if gain[worst] > gate else None
+
+
+def without(local: LocalMap, place: int) -> LocalMap:
+    """The map as if it had not seen its landmark at this place."""
+    rows = np.delete(np.arange(len(local.mean)), _sights(local, np.array([place])))
+    ids = np.delete(local.ids, place)
+    covariance = local.covariance[np.ix_(rows, rows)]
+    return LocalMap(ids, local.mean[rows], covariance, local.node_stamps)
 
 
 def absorbed(
@@ -86,6 +165,16 @@ def absorbed(
     return _by_id(np.concatenate([own, ids]), mean, joint)
 
 
+def _sights(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    """Places of the coordinates of a submap's landmarks, behind its poses."""
+    return len(local.mean) - 2 * len(local.ids) + _points(index)
+
+
+def _entries(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    """Places of the pose and of the landmarks with these indices."""
+    return np.concatenate([np.arange(3), 3 + _points(index)])
+
+
 def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
     """Places of the coordinates of the points with these indices."""
     return (2 * index[:, None] + np.arange(2)).ravel()
@@ -97,54 +186,27 @@ def _by_id(
     covariance: Float[np.ndarray, "n n"],
 ) -> WholeMap:
     order = np.argsort(ids)
-    place = np.concatenate([np.arange(3), 3 + _points(order)])
+    place = _entries(order)
     sorted_covariance = covariance[np.ix_(place, place)]
     return WholeMap(ids[order], mean[place], 0.5 * (sorted_covariance + sorted_covariance.T))
 
 
-def _turn(heading: float) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, "2 2"]]:
-    """R and dR/dθ."""
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
-
-
-def _constraints(
-    state: Float[np.ndarray, " n"],
-    split: int,
-    in_whole: Int64[np.ndarray, " k"],
-    in_local: Int64[np.ndarray, " k"],
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
-    """h(s) and its Jacobian; the local map begins at `split`."""
-    R, slope = _turn(state[2])
-    gap = np.zeros(2 * len(in_whole))
-    H = np.zeros((len(gap), len(state)))
-    for k, (a, b) in enumerate(zip(in_whole, in_local, strict=True)):
-        rows = slice(2 * k, 2 * k + 2)
-        own = slice(3 + 2 * a, 5 + 2 * a)
-        seen = slice(split + 3 + 2 * b, split + 5 + 2 * b)
-        gap[rows] = transformed(state[:3], state[seen]) - state[own]
-        H[rows, :2], H[rows, 2] = np.eye(2), slope @ state[seen]
-        H[rows, own], H[rows, seen] = -np.eye(2), R
-    return gap, H
-
-
-def _advanced(
-    state: Float[np.ndarray, " n"], split: int, fresh: Int64[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
-    """(pose ∘ end pose, landmarks, pose ∘ fresh local landmarks) and its Jacobian."""
-    R, slope = _turn(state[2])
-    size = split + 2 * len(fresh)
-    mean = np.zeros(size)
-    G = np.zeros((size, len(state)))
-    mean[:3] = compose(state[:3], state[split : split + 3])
-    G[:3, :3] = np.eye(3)
-    G[:2, 2] = slope @ state[split : split + 2]
-    G[:2, split : split + 2], G[2, split + 2] = R, 1.0
-    mean[3:split] = state[3:split]
-    G[3:split, 3:split] = np.eye(split - 3)
-    for k, b in enumerate(fresh):
-        rows = slice(split + 2 * k, split + 2 * k + 2)
-        seen = slice(split + 3 + 2 * b, split + 5 + 2 * b)
-        mean[rows] = transformed(state[:3], state[seen])
-        G[rows, :2], G[rows, 2], G[rows, seen] = np.eye(2), slope @ state[seen], R
+def _composed(
+    pose: Float[np.ndarray, "3"], local: Float[np.ndarray, " m"], fresh: Int64[np.ndarray, " f"]
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q p"]]:
+    """(pose ∘ end pose, pose ∘ fresh local landmarks) and its Jacobian by (pose, local)."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    at = np.concatenate([np.arange(2), 3 + _points(fresh)]).reshape(-1, 2)
+    rows = np.concatenate([np.arange(2), 3 + np.arange(2 * len(fresh))]).reshape(-1, 2)
+    points = local[at]
+    mean = np.empty(3 + 2 * len(fresh))
+    G = np.zeros((len(mean), 3 + len(local)))
+    mean[rows] = pose[:2] + points @ np.array([[c, s], [-s, c]])
+    mean[2] = wrapped(pose[2] + local[2])
+    G[rows[:, 0], 0] = G[rows[:, 1], 1] = 1.0
+    G[rows[:, 0], 2] = -s * points[:, 0] - c * points[:, 1]
+    G[rows[:, 1], 2] = c * points[:, 0] - s * points[:, 1]
+    G[rows[:, 0], 3 + at[:, 0]] = G[rows[:, 1], 3 + at[:, 1]] = c
+    G[rows[:, 0], 3 + at[:, 1]], G[rows[:, 1], 3 + at[:, 0]] = -s, s
+    G[2, 2] = G[2, 5] = 1.0
     return mean, G

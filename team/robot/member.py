@@ -9,7 +9,7 @@ from jaxtyping import Float
 from team.config import RobotConfig
 from team.estimation import geometry
 from team.estimation import window as windows
-from team.estimation.conditioning import RobotPrior, team_pose
+from team.estimation.conditioning import pose_now
 from team.estimation.fastslam import Particles
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.innovation import NOTHING, Innovation
@@ -181,9 +181,7 @@ class HybridMember:
 
     def own_pose(self, window: LocalMap | None) -> PoseGaussian:
         """The pose of the own whole map, times the open window."""
-        ids, means = self.whole.ids, self.whole.mean[3:].reshape(-1, 2)
-        own = RobotPrior(self.whole.mean[:3], ids, means, self.whole.covariance)
-        return PoseGaussian(*team_pose(own, (), window))
+        return pose_now(self.whole, window)
 
     def own_map(self) -> LandmarkGaussian:
         """The landmarks of the own whole map."""

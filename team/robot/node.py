@@ -13,7 +13,7 @@ import numpy as np
 
 from team import translate
 from team.config import Exchange, RobotConfig
-from team.estimation.conditioning import team_pose
+from team.estimation.conditioning import pose_now
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
@@ -23,6 +23,7 @@ from team.robot.members import Member, member_of
 from team.robot.pace import Pace
 from team.robot.rendezvous import Held
 from team.robot.statements import Speaker
+from team.robot.team_map import TeamMap
 from team.stream.inbox import Inbox
 from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
@@ -58,6 +59,7 @@ class RobotNode:
         self._member: Member = member_of(config, 0)
         self._locals: list[LocalMap] = []
         self._prior: m.Prior | None = None
+        self._team_map = TeamMap()
         self._epoch = 0
         self._consumed = 0
         self._steps = 0
@@ -377,9 +379,8 @@ class RobotNode:
         prior = self._prior
         if prior is None or prior.epoch != self._epoch:
             return out
-        pending = self._locals[max(prior.sequence + 1, 0) :]
         try:
-            posed = team_pose(translate.prior_of(prior), pending, window)
+            posed = pose_now(self._team_map.given(prior, self._locals), window)
         except (NotACovarianceError, np.linalg.LinAlgError) as error:
             self.warnings.append(f"no team pose from the fused map: {error}")
             return out

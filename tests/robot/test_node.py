@@ -93,7 +93,7 @@ def test_the_prior_does_change_the_team_pose():
 
 def test_a_prior_that_can_not_be_solved_is_a_warning_and_the_robot_goes_on():
     node = RobotNode(config())
-    flat = msgspec.structs.replace(prior(), covariance=packed(np.ones((7, 7))))
+    flat = msgspec.structs.replace(prior(), covariance=packed(-100.0 * np.eye(7)))
     out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
     out += node.handle(flat, 0)
     out += driven(node, READINGS[10:])

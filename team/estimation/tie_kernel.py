@@ -1,0 +1,202 @@
+"""Landmarks that two Gaussian maps share, as constraints without noise: their multipliers."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.compiled import compiled
+from team.estimation.geometry import wrapped
+
+
+class Tie(NamedTuple):
+    """The constraints R(θ) bₗ + t − aₗ = 0 of k landmarks at the result of the iterations.
+
+    (cos, sin) of θ; lever: ∂(R bₗ)/∂θ; multiplier z = S⁻¹ y of the innovation y with covariance
+    S = H P Hᵀ, and S⁻¹. The state moves by −P Hᵀ z, its covariance by −P Hᵀ S⁻¹ H P.
+    """
+
+    cos: float
+    sin: float
+    lever: Float[np.ndarray, "k 2"]
+    multiplier: Float[np.ndarray, " m"]
+    inverse: Float[np.ndarray, "m m"]
+
+
+@compiled
+def tied(
+    mean: Float[np.ndarray, " p"],
+    covariance: Float[np.ndarray, "p p"],
+    seen: Float[np.ndarray, " m"],
+    seen_covariance: Float[np.ndarray, "m m"],
+    iterations: int,
+) -> tuple[Tie, bool]:
+    """The iterated EKF update by the constraints; whether S is positive definite.
+
+    mean: (t, θ, a₁, a₂, …), a map's pose and the landmarks; seen: (b₁, b₂, …), the same landmarks
+    in the frame of that pose, independent of the map. m = 2k, p = 3 + m.
+    """
+    m = len(seen)
+    state, local = mean.copy(), seen.copy()
+    lever = np.empty((m // 2, 2))
+    y, z = np.empty(m), np.zeros(m)
+    S = np.empty((m, m))
+    c, s = 1.0, 0.0
+    for _ in range(iterations):
+        c, s = math.cos(state[2]), math.sin(state[2])
+        turn = mean[2] - state[2]
+        for point in range(m // 2):
+            i, j = 2 * point, 2 * point + 1
+            x, u = -s * local[i] - c * local[j], c * local[i] - s * local[j]
+            lever[point, 0], lever[point, 1] = x, u
+            y[i] = c * seen[i] - s * seen[j] + mean[0] - mean[3 + i] + x * turn
+            y[j] = s * seen[i] + c * seen[j] + mean[1] - mean[3 + j] + u * turn
+        U = _of_map(covariance, lever)
+        V = _of_seen(seen_covariance, c, s)
+        for point in range(m // 2):
+            i, j = 2 * point, 2 * point + 1
+            for k in range(m):
+                S[i, k] = U[0, k] + lever[point, 0] * U[2, k] - U[3 + i, k]
+                S[j, k] = U[1, k] + lever[point, 1] * U[2, k] - U[3 + j, k]
+                S[i, k] += c * V[i, k] - s * V[j, k]
+                S[j, k] += s * V[i, k] + c * V[j, k]
+        if not _invert(S):
+            return Tie(c, s, lever, z, S), False
+        _multiply(S, y, z)
+        _step(mean, U, z, state)
+        _step(seen, V, z, local)
+    return Tie(c, s, lever, z, S), True
+
+
+@compiled
+def _of_map(
+    covariance: Float[np.ndarray, "q p"], lever: Float[np.ndarray, "k 2"]
+) -> Float[np.ndarray, "q m"]:
+    """Rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ."""
+    U = np.empty((len(covariance), 2 * len(lever)))
+    for row in range(len(covariance)):
+        x, y, turn = covariance[row, 0], covariance[row, 1], covariance[row, 2]
+        for point in range(len(lever)):
+            i, j = 2 * point, 2 * point + 1
+            U[row, i] = x + lever[point, 0] * turn - covariance[row, 3 + i]
+            U[row, j] = y + lever[point, 1] * turn - covariance[row, 3 + j]
+    return U
+
+
+@compiled
+def _of_seen(covariance: Float[np.ndarray, "q m"], c: float, s: float) -> Float[np.ndarray, "q m"]:
+    """Rows of the local map's covariance (columns: the landmarks) times Hᵀ."""
+    V = np.empty_like(covariance)
+    for row in range(len(covariance)):
+        for i in range(0, covariance.shape[1], 2):
+            x, y = covariance[row, i], covariance[row, i + 1]
+            V[row, i], V[row, i + 1] = c * x - s * y, s * x + c * y
+    return V
+
+
+@compiled
+def _multiply(
+    A: Float[np.ndarray, "q m"], x: Float[np.ndarray, " m"], out: Float[np.ndarray, " q"]
+) -> None:
+    """Into `out`: A x."""
+    for row in range(len(A)):
+        total = 0.0
+        for column in range(len(x)):
+            total += A[row, column] * x[column]
+        out[row] = total
+
+
+@compiled
+def _step(
+    mean: Float[np.ndarray, " q"],
+    gain: Float[np.ndarray, "q m"],
+    z: Float[np.ndarray, " m"],
+    out: Float[np.ndarray, " q"],
+) -> None:
+    """Into `out`: mean − gain z."""
+    _multiply(gain, z, out)
+    for row in range(len(mean)):
+        out[row] = mean[row] - out[row]
+
+
+@compiled
+def tied_pose(
+    tie: Tie,
+    mean: Float[np.ndarray, " p"],
+    covariance: Float[np.ndarray, "p p"],
+    end: Float[np.ndarray, "3"],
+    end_covariance: Float[np.ndarray, "3 3"],
+    end_of_seen: Float[np.ndarray, "3 m"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """(pose ∘ end pose) of the tied maps and its covariance; mean and covariance as in `tied`.
+
+    end: N(end pose, covariance) in the frame of the map's pose; end_of_seen: its covariance with
+    the landmarks that were seen.
+    """
+    gain = np.concatenate(
+        (_of_map(covariance[:3], tie.lever), _of_seen(end_of_seen, tie.cos, tie.sin))
+    )
+    before, state = np.concatenate((mean[:3], end)), np.empty(6)
+    _step(before, gain, tie.multiplier, state)
+    joint, row = np.zeros((6, 6)), np.empty(len(tie.multiplier))
+    joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], end_covariance
+    for a in range(6):
+        _multiply(tie.inverse, gain[a], row)
+        for b in range(6):
+            for k in range(len(row)):
+                joint[a, b] -= row[k] * gain[b, k]
+    c, s = math.cos(state[2]), math.sin(state[2])
+    x, y = c * state[3] - s * state[4], s * state[3] + c * state[4]
+    G = np.zeros((3, 6))
+    G[0, 0], G[1, 1], G[2, 2], G[2, 5] = 1.0, 1.0, 1.0, 1.0
+    G[0, 2], G[1, 2] = -y, x
+    G[0, 3], G[0, 4], G[1, 3], G[1, 4] = c, -s, s, c
+    spread = np.zeros((3, 3))
+    for a in range(3):
+        for b in range(a + 1):
+            for i in range(6):
+                for j in range(6):
+                    spread[a, b] += G[a, i] * joint[i, j] * G[b, j]
+            spread[b, a] = spread[a, b]
+    return np.array([state[0] + x, state[1] + y, wrapped(state[2] + state[5])]), spread
+
+
+@compiled
+def _invert(S: Float[np.ndarray, "m m"]) -> bool:
+    """S ← S⁻¹ by Cholesky, exactly symmetric; whether it is positive definite."""
+    m = len(S)
+    for k in range(m):
+        for j in range(k):
+            factor = S[k, j]
+            for i in range(k, m):
+                S[i, k] -= S[i, j] * factor
+        if not S[k, k] > 0.0:
+            return False
+        S[k, k] = math.sqrt(S[k, k])
+        for i in range(k + 1, m):
+            S[i, k] /= S[k, k]
+    _inverted(S)
+    return True
+
+
+@compiled
+def _inverted(S: Float[np.ndarray, "m m"]) -> None:
+    """S ← L⁻ᵀ L⁻¹ of the lower triangle L of S."""
+    m = len(S)
+    for k in range(m):  # L ← L⁻¹, column by column
+        S[k, k] = 1.0 / S[k, k]
+        for i in range(k + 1, m):
+            total = 0.0
+            for j in range(k, i):
+                total -= S[i, j] * S[j, k]
+            S[i, k] = total / S[i, i]
+    for i in range(m):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, m):
+                total += S[k, i] * S[k, j]
+            S[j, i] = total  # of the diagonal last, when its row needs it no more
+    for i in range(m):
+        for j in range(i):
+            S[i, j] = S[j, i]
