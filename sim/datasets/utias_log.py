@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int64
 
 from sim.datasets.tables import DatasetError, File, optional_table
 from sim.datasets.utias_rows import Readings, counted, intervals_of, readings_of, truth_of
-from sim.streams import Intervals
+from sim.world.streams import Intervals
 
 TRUTH = ("time [s]", "x [m]", "y [m]", "orientation [rad]")
 ODOMETRY = ("time [s]", "forward velocity [m/s]", "angular velocity [rad/s]")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.streams import Intervals
+from sim.world.streams import Intervals
 
 LONG_GAP_NS = 2_000_000_000
 """A gap in the odometry or the truth that is worth a note."""

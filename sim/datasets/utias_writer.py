@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.datasets.utias import ROBOTS
-from sim.streams import RobotStream, WorldStreams
+from sim.world.streams import RobotStream, WorldStreams
 
 Row = tuple[str | float, ...]
 

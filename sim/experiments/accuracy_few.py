@@ -11,8 +11,8 @@ from sim.experiments.accuracy_starts import WRONG_CHI2, unknown_starts
 from sim.experiments.experiment import Goal, Options, Outcome, Results, Table
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, Shown, cells_of, middle, over_seeds, team_task
-from sim.scenario import Scenario, load, with_options
-from sim.worlds import SimulatedWorld
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.world.worlds import SimulatedWorld
 from team.estimation.consistency import chi2_interval
 
 WORLDS = ("thesis", "thesis-b")

@@ -10,8 +10,8 @@ import msgspec
 from sim.experiments.experiment import Goal, Options, Outcome, Results, Table
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
-from sim.scenario import Scenario, load, with_options
-from sim.worlds import GarbageKind, SimulatedWorld
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.world.worlds import GarbageKind, SimulatedWorld
 
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3

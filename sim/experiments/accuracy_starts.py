@@ -10,7 +10,7 @@ import msgspec
 from sim.experiments.experiment import Goal, Options, Outcome, Results, Table
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
-from sim.scenario import Scenario, load, with_options
+from sim.scenario.scenario import Scenario, load, with_options
 from team.estimation.consistency import chi2_interval
 
 WORLDS = ("thesis", "thesis-b")

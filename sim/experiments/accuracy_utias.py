@@ -18,7 +18,7 @@ from sim.experiments.experiment import (
 )
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, Shown, cells_of, team_task
-from sim.scenario import load
+from sim.scenario.scenario import load
 
 MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
 """By the data set's number; other sets have no goal of their own."""

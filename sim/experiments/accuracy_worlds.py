@@ -15,7 +15,7 @@ from sim.experiments.experiment import (
 )
 from sim.experiments.task import Task
 from sim.experiments.team_runs import OURS, Figures, Shown, cells_of, named, over_seeds, team_task
-from sim.scenario import load, with_options
+from sim.scenario.scenario import load, with_options
 from team.pairs import PAIRS
 
 

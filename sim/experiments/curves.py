@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from sim.evaluation import evaluate
-from sim.evaluation_errors import Path, PoseErrors, pose_errors
+from sim.evaluation.errors import Path, PoseErrors, pose_errors
+from sim.evaluation.evaluation import evaluate
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, TimedRun, named
-from sim.scenario import Scenario, loads
-from sim.source import streams_of
+from sim.scenario.scenario import Scenario, loads
+from sim.scenario.source import streams_of
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m

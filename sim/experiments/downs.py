@@ -28,8 +28,8 @@ from sim.experiments.experiment import (
 )
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, team_task
-from sim.scenario import Scenario, load, with_options
-from sim.worlds import UtiasWorld
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.world.worlds import UtiasWorld
 
 Row = tuple[float | None, ...]
 """Errors [m] of robots 1 … 5, or the team's alone; None where there is none."""

@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Float
 
 from central.svd_rule import tied
-from sim.evaluation import Evaluation, evaluate
-from sim.evaluation_errors import MapErrors, Path, map_errors, pose_errors
+from sim.evaluation.errors import MapErrors, Path, map_errors, pose_errors
+from sim.evaluation.evaluation import Evaluation, evaluate
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
-from sim.in_memory import run_team
-from sim.scenario import Scenario, loads, with_options
-from sim.source import streams_of
-from sim.worlds import SimulatedWorld, UtiasWorld
+from sim.in_memory.team import run_team
+from sim.scenario.scenario import Scenario, loads, with_options
+from sim.scenario.source import streams_of
+from sim.world.worlds import SimulatedWorld, UtiasWorld
 from team import translate
 from team.estimation import joining, svd_joining
 from team.estimation.contribution import Contribution

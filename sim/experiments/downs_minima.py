@@ -29,8 +29,8 @@ from sim.experiments.experiment import (
 )
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
-from sim.scenario import load, with_options
-from sim.worlds import SimulatedWorld, UtiasWorld
+from sim.scenario.scenario import load, with_options
+from sim.world.worlds import SimulatedWorld, UtiasWorld
 from team.estimation.alignment import procrustes
 from team.estimation.geometry import wrapped
 

@@ -13,15 +13,15 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from sim.evaluation import evaluate
-from sim.evaluation_errors import Path, pose_errors
+from sim.evaluation.errors import Path, pose_errors
+from sim.evaluation.evaluation import evaluate
 from sim.experiments.curves import messages, said_poses, short
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, TimedRun, named
 from sim.experiments.xu import Method, with_particles
-from sim.scenario import Scenario, load, loads, with_options
-from sim.worlds import UtiasWorld
+from sim.scenario.scenario import Scenario, load, loads, with_options
+from sim.world.worlds import UtiasWorld
 from team import translate
 from team.config import MotionModel, RobotConfig, Sensor
 from team.wire import channels as ch

@@ -20,7 +20,7 @@ from sim.experiments.ma import DEAD_RECKONING, MULTI_3, MULTI_5, SINGLE, ma_task
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
 from sim.experiments.xu import Method
-from sim.pictures import MAP_COLOUR, ROBOT_COLOURS, TRUTH_COLOUR, ellipse_of
+from sim.pictures.run import MAP_COLOUR, ROBOT_COLOURS, TRUTH_COLOUR, ellipse_of
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes

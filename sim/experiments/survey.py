@@ -11,7 +11,7 @@ from sim.experiments.experiment import Options, Outcome, Results, Table
 from sim.experiments.task import Task
 from sim.experiments.team_runs import OURS, Figures, Shown, cells_of, named, over_seeds, team_task
 from sim.experiments.xu import with_particles
-from sim.scenario import load, with_options
+from sim.scenario.scenario import load, with_options
 from team.config import Estimator, FusionRule
 from team.pairs import PAIRS
 

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import msgspec
 
 from central.node import CentralNode
-from sim.evaluation import Evaluation, RobotResult, evaluate
+from sim.evaluation.evaluation import Evaluation, RobotResult, evaluate
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
-from sim.in_memory import run_team
-from sim.limit import Limit, LimitError, batch_map
-from sim.scenario import Scenario, loads, with_options
-from sim.source import streams_of
-from sim.streams import WorldStreams
-from sim.worlds import SimulatedWorld
+from sim.in_memory.team import run_team
+from sim.limit.limit import Limit, LimitError, batch_map
+from sim.scenario.scenario import Scenario, loads, with_options
+from sim.scenario.source import streams_of
+from sim.world.streams import WorldStreams
+from sim.world.worlds import SimulatedWorld
 from team.config import Estimator, FusionRule
 from team.robot.node import RobotNode
 from team.wire import channels as ch

@@ -17,7 +17,7 @@ from sim.experiments.drawing import BAND, Curves, figure, ruled, spread
 from sim.experiments.experiment import Options, Outcome, Picture, Results, Table
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
-from sim.scenario import Scenario, load, with_options
+from sim.scenario.scenario import Scenario, load, with_options
 from team.config import MotionNoise
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import numpy as np
 
-from sim.evaluation import evaluate
+from sim.evaluation.evaluation import evaluate
 from sim.experiments.curves import messages, online
 from sim.experiments.drawing import figure, ruled
 from sim.experiments.experiment import Options, Outcome, Picture, Results, Table
@@ -16,8 +16,8 @@ from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, TimedRun, rms
 from sim.experiments.xu import EKF, FASTSLAM, HYBRID, MULTI_HYBRID, OUR_TEAM, OURS, Method, Panel
 from sim.experiments.xu import task as curves_of
-from sim.pictures import MAP_COLOUR, ROBOT_COLOURS, TRUTH_COLOUR, ellipse_of
-from sim.scenario import loads
+from sim.pictures.run import MAP_COLOUR, ROBOT_COLOURS, TRUTH_COLOUR, ellipse_of
+from sim.scenario.scenario import loads
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sim.evaluation_errors import Path, PoseErrors, distance_rmse, interpolated, pose_errors
+from sim.evaluation.errors import Path, PoseErrors, distance_rmse, interpolated, pose_errors
 from sim.view.drawn import Landmarks
 from team.wire import messages as m
 from team.wire.arrays import floats, stamps

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from sim.evaluation_errors import PoseErrors
+from sim.evaluation.errors import PoseErrors
 from sim.view import foxglove_scene as fox
 from sim.view.drawn import Landmarks, Track, colour_of, in_order, landmarks_of
 from sim.view.errors import RunningErrors, map_fit

@@ -13,13 +13,13 @@ from central.config import CentralConfig
 from central.join_rule import JoinRule
 from central.tick_fold import TickFold
 from central.withdrawal import convicted, disagreement
-from sim.in_memory import final_map, run_team
-from sim.ledger import ledger
-from sim.rerun import verify
-from sim.rerun_log import recorded
-from sim.scenario import Scenario, with_options
-from sim.simulator import simulated
-from sim.worlds import SimulatedWorld
+from sim.in_memory.team import final_map, run_team
+from sim.rerun.ledger import ledger
+from sim.rerun.log import recorded
+from sim.rerun.verification import verify
+from sim.scenario.scenario import Scenario, with_options
+from sim.world.simulator import simulated
+from sim.world.worlds import SimulatedWorld
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.joining import converged

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim import scenario
-from sim.simulator import simulated
+from sim.scenario import scenario
+from sim.world.simulator import simulated
 from team.estimation.models import Increment, corrected, increment_of
 
 

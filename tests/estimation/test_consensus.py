@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.scenario import load
-from sim.source import streams_of
-from sim.streams import WorldStreams
+from sim.scenario.scenario import load
+from sim.scenario.source import streams_of
+from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation import consensus
 from team.estimation import consensus_kernel as kernel

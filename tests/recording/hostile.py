@@ -12,7 +12,7 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from sim.cli import app
+from sim.cli.main import app
 from team.recording.reader import LogError
 from team.recording.recorder import RecorderError
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sim import cli_log
-from sim.cli import app
+from sim.cli import log as cli_log
+from sim.cli.main import app
 from team.recording import parquet_tables
 from team.recording.parquet_tables import export_parquet
 from team.recording.reader import Log, open_log

@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.evaluation import evaluate
-from sim.in_memory import run_team
-from sim.scenario import Scenario, load
-from sim.source import streams_of
-from sim.streams import RobotStream
+from sim.evaluation.evaluation import evaluate
+from sim.in_memory.team import run_team
+from sim.scenario.scenario import Scenario, load
+from sim.scenario.source import streams_of
+from sim.world.streams import RobotStream
 from team.config import RobotConfig
 from team.robot.node import RobotNode
 from team.wire import messages as m

@@ -1,0 +1,1 @@
+"""Models' figures learnt from readings."""

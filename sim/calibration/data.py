@@ -1,0 +1,127 @@
+"""What a calibration is learnt from: a robot's readings beside poses that they are held against."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from sim.evaluation.errors import Path, on_circle
+from sim.world.streams import Detections, Intervals, RobotStream, WorldStreams
+
+LARGEST_TURN_RAD = 0.35
+FASTEST_TURN_RAD_S = 3.0
+"""Between two poses of a path; more than both is a fault of resampled headings beside ±π."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """One robot's odometry and landmark readings, and the poses and landmarks of reference.
+
+    gap_ns: between poses of `path` that are at most this far apart it is interpolated.
+    landmarks: position of each id in the path's frame; `teammates`: the paths of the others.
+    turns_first: between two poses the robot turns, then drives straight on (else: an arc).
+    """
+
+    name: str
+    intervals: Intervals
+    seen: Detections
+    path: Path
+    gap_ns: int
+    landmarks: Mapping[int, Float[np.ndarray, "2"]]
+    sighted: Detections
+    names: tuple[str, ...]
+    teammates: Mapping[str, Path]
+    turns_first: bool = False
+
+    def between(self, begin_ns: int, end_ns: int) -> "Reference":
+        """The same with the odometry and the readings of [begin_ns, end_ns) only."""
+        chosen = (self.intervals.end_ns >= begin_ns) & (self.intervals.end_ns < end_ns)
+        intervals = Intervals(*(part[chosen] for part in vars(self.intervals).values()))
+        seen, sighted = (_between(each, begin_ns, end_ns) for each in (self.seen, self.sighted))
+        return replace(self, intervals=intervals, seen=seen, sighted=sighted)
+
+
+def _between(seen: Detections, begin_ns: int, end_ns: int) -> Detections:
+    first, last = (int(at) for at in np.searchsorted(seen.stamps_ns, [begin_ns, end_ns]))
+    rows = slice(int(seen.offsets[first]), int(seen.offsets[last]))
+    return Detections(
+        seen.stamps_ns[first:last],
+        seen.offsets[first : last + 1] - seen.offsets[first],
+        seen.ids[rows],
+        seen.ranges[rows],
+        seen.bearings[rows],
+    )
+
+
+def poses_at(
+    path: Path, stamps_ns: Int64[np.ndarray, " n"], gap_ns: int, *, turns_first: bool = False
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """The path at these times, and which of them are known.
+
+    Between two poses it is the arc that joins them: s of the way from (p, θ), that is
+    (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ). With turns_first it is the chord,
+    with the heading of its end. Not known: outside the path, in a gap longer than gap_ns, beside a
+    jump of the heading.
+    """
+    if len(path.stamps_ns) < 2:
+        return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=np.bool_)
+    after = np.clip(np.searchsorted(path.stamps_ns, stamps_ns), 1, len(path.stamps_ns) - 1)
+    begin, end = path.stamps_ns[after - 1], path.stamps_ns[after]
+    step = path.poses[after] - path.poses[after - 1]
+    step[:, 2] = on_circle(step[:, 2])
+    share = (stamps_ns - begin) / np.maximum(end - begin, 1)
+    largest = np.maximum(LARGEST_TURN_RAD, FASTEST_TURN_RAD_S * 1e-9 * (end - begin))
+    known = (end - begin <= gap_ns) & (np.abs(step[:, 2]) <= largest)
+    known &= (stamps_ns >= path.stamps_ns[0]) & (stamps_ns <= path.stamps_ns[-1])
+    if turns_first:
+        heading = np.where(share > 0.0, step[:, 2], 0.0)
+        gone = share[:, np.newaxis] * step[:, :2]
+    else:
+        heading = share * step[:, 2]
+        length = share * sinc(0.5 * heading) / sinc(0.5 * step[:, 2])
+        c, s = (f(0.5 * (heading - step[:, 2])) for f in (np.cos, np.sin))
+        x, y = length * step[:, :2].T
+        gone = np.stack([c * x - s * y, s * x + c * y], axis=1)
+    return path.poses[after - 1] + np.column_stack([gone, heading]), known
+
+
+def sinc(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """sin(angle)/angle, 1 at 0: the chord of an arc over its length, by half the turn."""
+    return np.asarray(np.sinc(angle / np.pi))
+
+
+def references(
+    world: WorldStreams,
+    paths: Mapping[str, Path],
+    landmarks: Mapping[int, Float[np.ndarray, "2"]],
+    gap_ns: int,
+    label: str,
+    turning_first: frozenset[str] = frozenset(),
+) -> list[Reference]:
+    """The references of the robots that have a path and odometry."""
+    return [
+        Reference(
+            f"{label} {stream.robot}",
+            stream.intervals,
+            stream.landmark_detections,
+            paths[stream.robot],
+            gap_ns,
+            landmarks,
+            stream.teammate_detections,
+            stream.teammates,
+            paths,
+            stream.robot in turning_first,
+        )
+        for stream in world.streams
+        if stream.robot in paths and len(stream.intervals.end_ns)
+    ]
+
+
+def true_paths(streams: Sequence[RobotStream]) -> dict[str, Path]:
+    """The true paths of the robots that have one."""
+    return {
+        stream.robot: Path(stream.truth_ns, stream.truth)
+        for stream in streams
+        if stream.truth is not None and stream.truth_ns is not None and len(stream.truth) > 1
+    }

@@ -1,0 +1,135 @@
+"""The team's map and paths from its own readings: the reference where there is no truth."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int64
+
+from central.tick_fold import join_settings
+from sim.evaluation.errors import Path, on_circle
+from sim.scenario.scenario import Scenario
+from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream, WorldStreams
+from team.config import RobotConfig
+from team.estimation.geometry import compose
+from team.estimation.joining import (
+    EMPTY_FOLD,
+    Contribution,
+    Fold,
+    Start,
+    converged,
+    folded,
+    started,
+)
+from team.estimation.window import Window
+from team.robot.member import ClosedWindow, HybridMember
+
+
+@dataclass(frozen=True)
+class _Track:
+    """One closed window: its submap, and the mean path of its particles in its own frame."""
+
+    closed: ClosedWindow
+    stamps_ns: Int64[np.ndarray, " K"]
+    path: Float[np.ndarray, "K 3"]
+
+
+@dataclass(frozen=True)
+class JoinedTeam:
+    """Landmarks by id and each robot's path, in the frame of the joined map."""
+
+    landmarks: Mapping[int, Float[np.ndarray, "2"]]
+    paths: Mapping[str, Path]
+
+
+def joined_team(world: WorldStreams, scenario: Scenario) -> JoinedTeam:
+    """Every robot's windows with the scenario's models, joined; the main island's robots only.
+
+    Between two ends of windows a path is the particles' mean, bent to end where the join ends it.
+    """
+    tracks = {s.robot: _tracks(config_of(s.robot, scenario), s) for s in world.streams}
+    fold: Fold = EMPTY_FOLD
+    for stream in world.streams:
+        if stream.start is not None and tracks.get(stream.robot):
+            start = stream.start
+            fold = started(fold, Start(stream.robot, 1, start.pose, start.covariance))
+    contributions = [
+        Contribution(robot, 1, t.closed.sequence, t.closed.end_ns, t.closed.local)
+        for robot, windows in tracks.items()
+        for t in windows
+    ]
+    tick_ns = round(scenario.central.tick_s * 1e9)
+    ticks: dict[int, list[Contribution]] = {}
+    for contribution in sorted(contributions, key=lambda c: c.key):
+        ticks.setdefault(-(-contribution.end_ns // tick_ns), []).append(contribution)
+    settings = join_settings(scenario.central)
+    for tick in sorted(ticks):
+        fold = folded(fold, ticks[tick], settings)
+    fold = converged(fold, settings)
+    graph, state = fold.main.graph, fold.main.state
+    landmarks = {
+        id_: state[graph.offset[node] : graph.offset[node] + 2].copy()
+        for id_, node in sorted(graph.landmarks.items())
+    }
+    paths = {}
+    for (robot, _), nodes in sorted(graph.streams.items()):
+        at = graph.offset[list(nodes)]
+        ends = state[at[:, np.newaxis] + np.arange(3)]
+        paths[robot] = _bent(tracks[robot], ends)
+    return JoinedTeam(landmarks, paths)
+
+
+def config_of(robot: str, scenario: Scenario) -> RobotConfig:
+    """The robot's configuration; one that the scenario does not know has the first one's models."""
+    configs = {each.id: each for each in scenario.robots}
+    return configs.get(robot) or msgspec.structs.replace(scenario.robots[0], id=robot)
+
+
+def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
+    member = HybridMember(config, 1)
+    tracks: list[_Track] = []
+    stamps: list[int] = []
+    window = member.window
+    for counter in range(1, len(stream)):
+        kind = stream.kinds[counter]
+        member.consumed(counter)
+        if kind == OBSERVATIONS:
+            seen = stream.observations(counter)
+            member.observe(seen.stamp_ns, (seen.ids, seen.ranges, seen.bearings))
+        elif kind == ODOMETRY:
+            closed = member.drive(*stream.odometry(counter)).closed
+            if closed is not None:
+                tracks.append(_track(closed, stamps, window))
+                stamps = []
+            window = member.window
+            if member.last_epoch_ns is not None:
+                stamps += [member.last_epoch_ns] * (len(window.paths) - len(stamps))
+    last = member.finish()[0].closed
+    return tracks if last is None else [*tracks, _track(last, stamps, window)]
+
+
+def _track(closed: ClosedWindow, stamps: Sequence[int], window: Window) -> _Track:
+    weights = np.exp(window.particles.log_weights)
+    x, y, heading = (window.paths[: len(stamps), :, i] for i in range(3))
+    turned = np.arctan2(np.sin(heading) @ weights, np.cos(heading) @ weights)
+    path = np.stack([x @ weights, y @ weights, turned], axis=1)
+    ends = np.vstack([path, closed.local.mean[:3]])
+    return _Track(closed, np.append(np.array(stamps, dtype=np.int64), closed.end_ns), ends)
+
+
+def _bent(tracks: Sequence[_Track], ends: Float[np.ndarray, "K 3"]) -> Path:
+    stamps = [np.array([tracks[0].closed.start_ns])]
+    poses = [ends[:1]]
+    for track, start, end in zip(tracks, ends[:-1], ends[1:], strict=True):
+        carried = np.array([compose(start, pose) for pose in track.path])
+        missing = end - carried[-1]
+        missing[2] = float(on_circle(missing[2:])[0])
+        begin_ns = track.closed.start_ns
+        share = (track.stamps_ns - begin_ns) / max(track.closed.end_ns - begin_ns, 1)
+        stamps.append(track.stamps_ns)
+        poses.append(carried + share[:, np.newaxis] * missing)
+    times, first = np.unique(np.concatenate(stamps), return_index=True)
+    path = np.concatenate(poses)[first]
+    path[:, 2] = on_circle(path[:, 2])
+    return Path(times, path)

@@ -1,0 +1,54 @@
+"""A calibration as a scenario in TOML that a user can read, with each figure's uncertainty."""
+
+from collections.abc import Sequence
+
+import msgspec
+
+from sim.calibration.calibrate import Calibration, nested
+from sim.calibration.figures import Figure
+from sim.scenario.scenario import Scenario, builtin_names
+from team.config import MotionModel, Sensor
+
+
+def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
+    """A document with `base`, the scenario's name if it is built in, else "utias"."""
+    base = scenario.name if scenario.name in builtin_names() else "utias"
+    how = "ground truth" if calibration.by_truth else "the team's own joined map"
+    lines = [
+        f"# Learnt from {', '.join(sources)} by `teamslam calibrate`, against {how}.",
+        "# ± is one standard deviation, leaving out one robot (or stretch of time) after another.",
+        *(f"# {note}" for note in calibration.notes),
+        f'base = "{base}"',
+    ]
+    parts = (
+        ("motion", calibration.motion, MotionModel),
+        ("sensor", calibration.sensor, Sensor),
+    )
+    for name, figures, declared in parts:
+        if figures:
+            lines += ["", f"[defaults.{name}]", *_table(figures, declared)]
+    return "\n".join(lines) + "\n"
+
+
+def _table(figures: Sequence[Figure], declared: type[msgspec.Struct]) -> list[str]:
+    fields = nested({}, figures, declared)
+    lines = []
+    for figure in figures:
+        if figure.name in fields:
+            lines.append(f"{figure.name} = {figure.value:.5g}  # {_uncertainty(figure)}")
+        elif "." not in figure.name:
+            lines.append(f"# {figure.name}: {figure.value:.5g} {_uncertainty(figure)}")
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            inner = ", ".join(f"{key} = {number:.5g}" for key, number in value.items())
+            marks = [
+                f"{f.name.partition('.')[2]} {_uncertainty(f)}"
+                for f in figures
+                if f.name.startswith(f"{name}.")
+            ]
+            lines.append(f"{name} = {{ {inner} }}  # {', '.join(marks)}")
+    return lines
+
+
+def _uncertainty(figure: Figure) -> str:
+    return f"± {figure.sigma:.2g} {figure.unit}".rstrip()

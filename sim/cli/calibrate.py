@@ -1,0 +1,69 @@
+"""The command that learns the models' figures from readings: calibrate."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim.cli.options import FAILED, WRONG_USE, fail
+
+app = typer.Typer()
+
+
+@app.command()
+def calibrate(
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            help="UTIAS data sets (folder or zip) or logs (.mcap), learnt from together."
+        ),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write a scenario with what was learnt.")
+    ] = None,
+    truth: Annotated[bool, typer.Option(help="Use the ground truth where it is there.")] = True,
+    scenario: Annotated[
+        str | None, typer.Option(help="The scenario to begin with; default: the source's own.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures as JSON, too.")
+    ] = None,
+) -> None:
+    """Learn odometry and sensor models from readings; every figure with its uncertainty."""
+    import json
+    from dataclasses import asdict, replace
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from sim.calibration.calibrate import calibrated
+    from sim.calibration.figures import CalibrationError
+    from sim.calibration.scenario import scenario_toml
+    from sim.calibration.source import readings_of
+    from sim.cli.options import scenario_of
+
+    if output is not None and output.suffix != ".toml":
+        fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)
+    read = []
+    for path in source:
+        typer.echo(f"reading {path}", err=True)
+        read.append((path.name, *readings_of(path)))
+    start = read[0][2] if scenario is None else scenario_of(scenario)
+    worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
+    try:
+        found = calibrated(worlds, start, lambda text: typer.echo(text, err=True))
+    except CalibrationError as error:
+        fail(str(error), FAILED)
+    table = Table("part", "figure", "value", "± (1 σ)", "unit")
+    for part, figures in (("motion", found.motion), ("sensor", found.sensor)):
+        for figure in figures:
+            numbers = (f"{figure.value:.5g}", f"{figure.sigma:.2g}")
+            table.add_row(part, figure.name, *numbers, figure.unit)
+    Console().print(table)
+    for note in found.notes:
+        typer.echo(note)
+    if json_file is not None:
+        json_file.write_text(json.dumps(asdict(found), indent=2) + "\n")
+    if output is not None:
+        output.write_text(scenario_toml(found, start, [name for name, _, _ in read]), "utf-8")
+        typer.echo(f"wrote {output}: `teamslam launch {output} --dataset …` uses it")

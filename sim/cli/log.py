@@ -1,0 +1,255 @@
+"""`teamslam log`: look into a log, check it, repair it, part it, put logs together, export them."""
+
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sim.cli.logs import repair
+from sim.cli.options import FAILED, WRONG_USE, fail
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from team.recording.reader import Log
+    from team.recording.summary import KeySummary
+    from team.recording.tables import Exported
+    from team.wire.channels import Channel
+
+LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
+NewLog = Annotated[Path, typer.Option("--output", "-o", help="The new log.")]
+ChannelNames = Annotated[
+    str | None, typer.Option(help="Channels, as odometry,submap; all without.", metavar="NAMES")
+]
+
+app = typer.Typer(name="log", help="Logs: info, check, repair, cut, merge, export.")
+app.command()(repair)
+
+
+class Format(StrEnum):
+    """What a log is exported as."""
+
+    CSV = "csv"
+    PARQUET = "parquet"
+    TUM = "tum"
+    UTIAS = "utias"
+
+
+@app.command()
+def info(
+    log: LogArgument,
+    keys: Annotated[bool, typer.Option("--keys", help="A row per key, not per channel.")] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures of every key, too.")
+    ] = None,
+) -> None:
+    """What is in a log: channels, messages, bytes, rates, span in team time, metadata."""
+    import json
+    from dataclasses import asdict
+
+    from rich.console import Console
+    from rich.text import Text
+
+    from team.recording.reader import open_log
+    from team.recording.summary import summarised
+
+    opened = open_log(log)
+    summary = summarised(opened)
+    span = summary.span_ns()
+    console = Console()
+    messages, size = (sum(getattr(k, name) for k in summary.keys) for name in ("messages", "bytes"))
+    state = "complete" if opened.complete else "not finished by its recorder"
+    typer.echo(
+        f"{log}\nteam {_line(opened.team)}, {state}: {messages} messages, {size} payload bytes"
+    )
+    if span is not None:
+        first, last = (ns * 1e-9 for ns in span)
+        typer.echo(f"readings over {last - first:.3f} s of team time, {first:.3f} to {last:.3f} s")
+        console.print(_key_table(summary.keys, span[0], by_key=keys))
+    for name, value in opened.metadata.items():
+        console.print(Text(_line(f"{name}: {value}")), no_wrap=True, overflow="ellipsis")
+    for damage in summary.damaged:
+        typer.echo(f"damaged: {_line(damage)}", err=True)
+    if json_file is not None:
+        figures = {
+            "log": str(log),
+            "team": opened.team,
+            "complete": opened.complete,
+            "span_ns": span,
+            "keys": [{**asdict(each), "rate_hz": each.rate_hz} for each in summary.keys],
+            "metadata": opened.metadata,
+            "damaged": summary.damaged,
+        }
+        json_file.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
+
+
+@app.command()
+def check(log: LogArgument) -> None:
+    """Whether a log is whole and sound: checksums, schemas, counters, order, every message.
+
+    Exit status 1 when anything is wrong; each finding is one line.
+    """
+    from team.recording.check import checked
+    from team.recording.reader import open_log
+
+    findings = checked(open_log(log))
+    for finding in findings:
+        typer.echo(_line(str(finding)))
+    if findings:
+        raise typer.Exit(FAILED)
+    typer.echo(f"{log}: nothing wrong")
+
+
+@app.command()
+def cut(
+    log: LogArgument,
+    output: NewLog,
+    from_s: Annotated[
+        float | None, typer.Option("--from", help="Seconds after the first reading.")
+    ] = None,
+    to_s: Annotated[
+        float | None, typer.Option("--to", help="Seconds after the first reading, excluded.")
+    ] = None,
+    channels: ChannelNames = None,
+) -> None:
+    """Write a stretch of team time, or some channels, as a log of its own.
+
+    Configurations and true landmarks that were said before the stretch hold in it and are kept.
+    """
+    import math
+
+    from team.recording.cut import cut as cut_log
+    from team.recording.reader import open_log
+
+    bounds = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
+    given = [s for s in (from_s, to_s) if s is not None]
+    if not (all(abs(s) < 4e9 for s in given) and bounds[0] < bounds[1]):
+        fail(f"--from {from_s} --to {to_s}: give seconds, the first before the second", WRONG_USE)
+    chosen = _channels(channels)
+    _refuse_existing(output)
+    typer.echo(f"{output}: {cut_log(open_log(log), output, from_s, to_s, chosen)} messages")
+
+
+@app.command()
+def merge(
+    logs: Annotated[list[Path], typer.Argument(help="Logs of one team: of robots, or parts.")],
+    output: NewLog,
+) -> None:
+    """Put logs together: by team time, what several of them have once."""
+    from team.recording.merge import merge as merge_logs
+    from team.recording.reader import open_log
+
+    _refuse_existing(output)
+    merged = merge_logs([open_log(log) for log in logs], output)
+    typer.echo(f"{output}: {merged.messages} messages; {merged.duplicates} duplicates left out")
+
+
+@app.command()
+def export(
+    log: LogArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="A new folder.")],
+    form: Annotated[
+        Format,
+        typer.Option(
+            "--format",
+            help="A table per channel (csv, parquet), the robots' paths (tum), a data set (utias).",
+        ),
+    ] = Format.CSV,
+    channels: ChannelNames = None,
+) -> None:
+    """Write a log as tables, its paths for evo, or its readings and truth as a UTIAS data set."""
+    from sim.export.log import export_tum, export_utias
+    from team.recording.reader import open_log
+
+    opened = open_log(log)
+    chosen = _channels(channels)
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        fail(f"{output} is there and not an empty folder: give a new one", WRONG_USE)
+    if form in (Format.UTIAS, Format.TUM):
+        if channels is not None:
+            fail(f"--channels is for tables: {form} is of all that the format has", WRONG_USE)
+        if form is Format.TUM:
+            for path in export_tum(opened, output):
+                typer.echo(path)
+            return
+        for number, robot in enumerate(export_utias(opened, output), 1):
+            typer.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
+        return
+    exported = _exporter(form)(opened, output, chosen)
+    for path, rows in exported.rows.items():
+        typer.echo(f"{path}: {rows} rows")
+    if exported.unsound:
+        typer.echo(f"left out: {exported.unsound} unsound messages", err=True)
+
+
+def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Exported]":
+    """What writes the tables; ends the command where it is not installed."""
+    from team.recording.csv_tables import export_csv
+    from team.recording.parquet_tables import export_parquet
+
+    if form is Format.CSV:
+        return export_csv
+    if find_spec("pyarrow") is None:
+        fail("--format parquet needs pyarrow: pip install 'teamslam[parquet]'", WRONG_USE)
+    return export_parquet
+
+
+def _channels(names: str | None) -> "list[Channel] | None":
+    """The channels by name; ends the command at a name that is none."""
+    if names is None:
+        return None
+    from team.wire.channels import CHANNELS
+
+    known = {channel.name: channel for channel in CHANNELS if channel.recorded}
+    given = [name.strip() for name in names.split(",")]
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        fail(f"--channels: no channel {unknown[0]!r}; there are {', '.join(known)}", WRONG_USE)
+    return [known[name] for name in dict.fromkeys(given)]
+
+
+def _refuse_existing(path: Path) -> None:
+    if path.exists():
+        fail(f"{path} exists: choose another name or remove it", WRONG_USE)
+
+
+def _line(text: str) -> str:
+    """A text of a file that is not trusted, as one line that can not steer a terminal."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+
+
+def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> "Table":
+    """Messages, bytes, rate of one key, first and last time [s after start_ns], by key or channel.
+
+    The rate of a channel is the mean of those of its keys; a key that begins before start_ns, as
+    what is said at team time zero of a data set, has none.
+    """
+    from rich.table import Table
+    from rich.text import Text
+
+    groups: dict[str, list[KeySummary]] = {}
+    for each in keys:
+        groups.setdefault(each.key if by_key else each.channel, []).append(each)
+    table = Table("key" if by_key else "channel")
+    for title in ("keys", "messages", "bytes", "Hz", "from s", "to s"):
+        table.add_column(title, justify="right")
+    for name, of in groups.items():
+        running = [each.rate_hz for each in of if each.first_ns >= start_ns]
+        rates = [rate for rate in running if rate is not None]
+        table.add_row(
+            Text(_line(name)),
+            str(len(of)),
+            str(sum(each.messages for each in of)),
+            str(sum(each.bytes for each in of)),
+            f"{sum(rates) / len(rates):.3g}" if rates else "",
+            _after(min(each.first_ns for each in of), start_ns),
+            _after(max(each.last_ns for each in of), start_ns),
+        )
+    return table
+
+
+def _after(stamp_ns: int, start_ns: int) -> str:
+    return "before" if stamp_ns < start_ns else f"{(stamp_ns - start_ns) * 1e-9:.1f}"

@@ -1,0 +1,62 @@
+"""`teamslam`: the command line. Every command imports what it needs when it runs."""
+
+import os
+import sys
+
+# Before NumPy: one BLAS thread per process, for the same bits everywhere and no fight for cores.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
+
+from sim.cli.calibrate import app as calibrate_commands  # noqa: E402
+from sim.cli.experiment import app as experiment_commands  # noqa: E402
+from sim.cli.launch import app as launch_commands  # noqa: E402
+from sim.cli.log import app as log_tools  # noqa: E402
+from sim.cli.logs import app as log_commands  # noqa: E402
+from sim.cli.nodes import app as node_commands  # noqa: E402
+from sim.cli.options import FAILED, WRONG_USE  # noqa: E402
+from sim.cli.rerun import app as rerun_commands  # noqa: E402
+from sim.cli.view import app as view_commands  # noqa: E402
+
+app = typer.Typer(
+    help="Multi-robot SLAM as real processes over Zenoh.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+for _part in (
+    launch_commands, node_commands, log_commands, rerun_commands, view_commands, calibrate_commands,
+):  # fmt: skip
+    app.add_typer(_part)
+app.add_typer(log_tools)
+app.add_typer(experiment_commands)
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: bool = typer.Option(False, "--version", help="Print the version.")) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"teamslam {installed('teamslam')}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """Run a command; what a user did wrong ends with 2, what failed with 1, without a traceback."""
+    from sim.datasets.tables import DatasetError
+    from sim.launch.launch import LaunchError
+    from sim.scenario.checks import ScenarioError
+    from team.recording.reader import LogError
+    from team.recording.recorder import RecorderError
+    from team.wire.bus import BusError
+
+    try:
+        app()
+    except (ScenarioError, DatasetError, LogError, BusError) as error:
+        typer.secho(f"error: {error}", fg="red", err=True)
+        sys.exit(WRONG_USE)
+    except (LaunchError, RecorderError, OSError) as error:
+        typer.secho(f"error: {error}", fg="red", err=True)
+        sys.exit(FAILED)

@@ -1,0 +1,213 @@
+"""One process each: router, world, robot, central, record. `launch` starts these very commands."""
+
+import logging
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim.cli.options import (
+    FAILED,
+    WRONG_USE,
+    Connect,
+    Dataset,
+    EstimatorOption,
+    FusionOption,
+    Robots,
+    ScenarioArgument,
+    Seed,
+    SpeedText,
+    fail,
+    parsed_speed,
+    scenario_of,
+)
+from sim.scenario.scenario import Scenario, doubts, with_options
+from team.wire.arrays import ids
+
+LOOPBACK = "tcp/127.0.0.1:7447"
+_LOG = logging.getLogger("teamslam")
+
+app = typer.Typer()
+
+
+def _scenario(
+    name: str,
+    robots: int | None,
+    seed: int | None,
+    estimator: str | None,
+    fusion: str | None,
+    dataset: Path | None = None,
+) -> Scenario:
+    return with_options(
+        scenario_of(name),
+        robots=robots,
+        seed=seed,
+        estimator=estimator,
+        fusion=fusion,
+        dataset=dataset,
+    )
+
+
+def _connected(scenario: Scenario, connect: str) -> None:
+    _LOG.info("connected to team %s at %s", scenario.team, connect)
+
+
+@app.command()
+def router(
+    listen: Annotated[str, typer.Option(help="Where to listen; port 0: any free one.")] = LOOPBACK,
+) -> None:
+    """The team's Zenoh router: every other process is its client. Runs until it is stopped."""
+    from team.shell import process
+    from team.wire.zenoh_bus import router as zenoh_router
+
+    with process("router", endless=True) as stop, zenoh_router(listen) as endpoint:
+        typer.echo(f"listening at {endpoint}")
+        stop.wait()
+
+
+@app.command()
+def world(
+    scenario: ScenarioArgument,
+    connect: Connect = LOOPBACK,
+    speed: SpeedText = "1",
+    recorder: Annotated[
+        bool, typer.Option(help="Wait for a recorder before the first reading.")
+    ] = True,
+    cache: Annotated[
+        int | None,
+        typer.Option(help="Readings per robot that can be asked for again; default: all.", min=0),
+    ] = None,
+    robots: Robots = None,
+    seed: Seed = None,
+    dataset: Dataset = None,
+) -> None:
+    """The world: a simulator or a data set that publishes every robot's readings."""
+    from sim.scenario.source import streams_of
+    from sim.world_node.main import run_world
+    from team.shell import process
+    from team.wire.zenoh_bus import ZenohBus
+
+    pace = parsed_speed(speed)
+    resolved = _scenario(scenario, robots, seed, None, None, dataset)
+    streams = streams_of(resolved)
+    with process("world") as stop, ZenohBus(resolved.team, connect) as bus:
+        _connected(resolved, connect)
+        for text in doubts(resolved):
+            _LOG.warning("%s", text)
+        run_world(bus, resolved, streams, stop, speed=pace, recorder=recorder, cache=cache)
+
+
+@app.command()
+def robot(
+    scenario: ScenarioArgument,
+    name: Annotated[str, typer.Argument(help="The robot's name in the scenario, as r1.")],
+    connect: Connect = LOOPBACK,
+    robots: Robots = None,
+    seed: Seed = None,
+    estimator: EstimatorOption = None,
+    fusion: FusionOption = None,
+) -> None:
+    """A robot: runs its estimator on its sensor stream and publishes submaps, maps and poses.
+
+    Started again after a crash it resumes after its last submap.
+    """
+    from team.robot.main import RobotShell
+    from team.shell import process
+    from team.wire.zenoh_bus import ZenohBus
+
+    resolved = _scenario(scenario, robots, seed, estimator, fusion)
+    configs = {config.id: config for config in resolved.robots}
+    if name not in configs:
+        fail(
+            f"{scenario} has no robot {name!r}; its robots: {', '.join(configs)}",
+            WRONG_USE,
+        )
+    with process(f"robot-{name}") as stop, ZenohBus(resolved.team, connect) as bus:
+        _connected(resolved, connect)
+        RobotShell(bus, configs[name], stop, exchange=resolved.exchange).run()
+
+
+@app.command()
+def central(
+    scenario: ScenarioArgument,
+    connect: Connect = LOOPBACK,
+    patience: Annotated[
+        float, typer.Option(help="Seconds that a lost robot has to come back.", min=0.0)
+    ] = 3.0,
+    robots: Robots = None,
+    seed: Seed = None,
+    estimator: EstimatorOption = None,
+    fusion: FusionOption = None,
+) -> None:
+    """The central computer: fuses the robots' maps and broadcasts the fused map back."""
+    from central.main import CentralShell
+    from team.shell import process
+    from team.wire.zenoh_bus import ZenohBus
+
+    resolved = _scenario(scenario, robots, seed, estimator, fusion)
+    names = [config.id for config in resolved.robots]
+    with process("central") as stop, ZenohBus(resolved.team, connect) as bus:
+        _connected(resolved, connect)
+        CentralShell(bus, resolved.central, names, stop, patience).run()
+
+
+@app.command()
+def record(
+    scenario: ScenarioArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The MCAP file to write.")],
+    connect: Connect = LOOPBACK,
+) -> None:
+    """The recorder: every message of the team to one MCAP file, until the team has left."""
+    from sim.scenario.scenario import dumps
+    from team.recording.provenance import provenance
+    from team.recording.recorder import Recorder
+    from team.recording.shell import record as record_until_end
+    from team.shell import process
+    from team.wire.channels import robot_node
+    from team.wire.zenoh_bus import ZenohBus
+
+    resolved = scenario_of(scenario)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {
+        **provenance(),
+        "seed": str(resolved.seed),
+        "scenario": dumps(resolved),
+    }
+    expected = ["world", "central", *(robot_node(r.id) for r in resolved.robots)]
+    with process("recorder", endless=True) as stop, ZenohBus(resolved.team, connect) as bus:
+        recorder = Recorder(output, resolved.team, metadata)
+        _connected(resolved, connect)
+        written = record_until_end(bus, recorder, expected, stop=stop)
+        _LOG.info("wrote %s, %d messages", output, written)
+
+
+@app.command()
+def withdraw(
+    robot: Annotated[str, typer.Argument(help="The robot's name, as r3.")],
+    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    connect: Connect = LOOPBACK,
+    reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
+    ] = 60.0,
+) -> None:
+    """Let a running team go on without a robot: its map is that of a team that never had it.
+
+    The order is recorded, and there is no way back.
+    """
+    from sim.launch.withdraw import WithdrawError
+    from sim.launch.withdraw import withdraw as order
+    from team.wire.zenoh_bus import ZenohBus
+
+    if not re.fullmatch("[a-z][a-z0-9_]{0,31}", robot):
+        fail(f"{robot!r} is no robot's name", WRONG_USE)
+    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
+        fail(f"{team!r} is no team's name", WRONG_USE)
+    with ZenohBus(team, connect) as bus:
+        try:
+            fused = order(bus, robot, reason, patience)
+        except WithdrawError as error:
+            fail(str(error), FAILED)
+    landmarks = len(ids(fused.ids, "ids"))
+    typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")

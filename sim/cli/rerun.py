@@ -1,0 +1,288 @@
+"""Commands that compute a log again: rerun and verify-ledger."""
+
+import json
+import math
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sim.cli.options import FAILED, WRONG_USE, EstimatorOption, FusionOption, fail
+from sim.rerun.changes import Changes
+
+if TYPE_CHECKING:
+    from sim.rerun.verification import Verification
+
+app = typer.Typer()
+
+OFFENDERS = 20
+"""Offenders that are printed; the JSON file has all."""
+
+LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
+
+
+@app.command()
+def rerun(
+    log: LogArgument,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
+    ] = False,
+    without: Annotated[
+        list[str] | None, typer.Option(help="A robot that was not there; repeatable.")
+    ] = None,
+    fusion: FusionOption = None,
+    estimator: EstimatorOption = None,
+    particles: Annotated[int | None, typer.Option(help="Particles of each robot.", min=4)] = None,
+    window: Annotated[float | None, typer.Option(help="Seconds of a submap's window.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the estimators and of the losses.", min=0)
+    ] = None,
+    loss: Annotated[
+        float,
+        typer.Option(help="Probability that a submap is lost on its way; it is sent again."),
+    ] = 0.0,
+    delay: Annotated[
+        float, typer.Option(help="Seconds that submaps need to the centre.", min=0.0)
+    ] = 0.0,
+    no_centre: Annotated[
+        str | None, typer.Option(help="Seconds without a centre, as 60-120.", metavar="SPAN")
+    ] = None,
+    partition: Annotated[
+        list[str] | None,
+        typer.Option(help="Robots without the centre, as r1,r2:100-200.", metavar="ROBOTS:SPAN"),
+    ] = None,
+    unsafe_feedback: Annotated[
+        bool, typer.Option("--unsafe-feedback", help="Robots send what they took from the team.")
+    ] = False,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Robots assume another noise: odometry=2, range=0.5, bearing=3; repeatable.",
+            metavar="KIND=FACTOR",
+        ),
+    ] = None,
+    json_file: JsonFile = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for a picture of both maps.")
+    ] = None,
+) -> None:
+    """Compute a log again: to verify it, or under other conditions to compare.
+
+    With --verify every message is computed again from the inputs that it names. Otherwise the
+    recorded readings run once more through the same nodes, with the changes asked for; without any
+    change, as they would have run with every message arriving at once.
+    """
+    changes = Changes(
+        tuple(without or ()),
+        fusion,
+        estimator,
+        particles,
+        _positive(window, "--window"),
+        seed,
+        _probability(loss),
+        delay,
+        None if no_centre is None else _span(no_centre, "--no-centre"),
+        tuple(_partition(each) for each in partition or ()),
+        unsafe_feedback,
+        _noise(noise or []),
+    )
+    if not verify:
+        _compare(log, changes, json_file, output)
+    elif changes == Changes():
+        _verify(log, json_file)
+    else:
+        fail("--verify compares with the log as it is: leave the changes away", WRONG_USE)
+
+
+def _positive(value: float | None, option: str) -> float | None:
+    if value is not None and not (value > 0.0 and math.isfinite(value)):
+        fail(f"{option} {value}: give a positive number", WRONG_USE)
+    return value
+
+
+def _probability(loss: float) -> float:
+    if not 0.0 <= loss < 1.0:
+        fail(f"--loss {loss}: give a probability from 0 to below 1", WRONG_USE)
+    return loss
+
+
+def _span(text: str, option: str) -> tuple[float, float]:
+    try:
+        begin, end = (float(part) for part in text.split("-"))
+    except ValueError:
+        begin, end = math.nan, math.nan
+    if not 0.0 <= begin < end < math.inf:
+        fail(f"{option} {text}: give seconds since the log's first reading, as 60-120", WRONG_USE)
+    return begin, end
+
+
+def _partition(text: str) -> tuple[tuple[str, ...], tuple[float, float]]:
+    robots, colon, span = text.partition(":")
+    if not (robots and colon):
+        fail(f"--partition {text}: give robots and seconds, as r1,r2:100-200", WRONG_USE)
+    return tuple(robots.split(",")), _span(span, "--partition")
+
+
+def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
+    from sim.rerun.noise import KINDS
+
+    factors: dict[str, float] = {}
+    for text in asked:
+        kind, _, number = text.partition("=")
+        try:
+            factor = float(number)
+        except ValueError:
+            factor = math.nan
+        if kind not in KINDS or not 0.0 < factor < math.inf:
+            fail(
+                f"--noise {text}: give one of {', '.join(KINDS)} and a factor above 0, as range=2",
+                WRONG_USE,
+            )
+        if kind in factors:
+            fail(f"--noise {text}: {kind} is given twice", WRONG_USE)
+        factors[kind] = factor
+    return tuple(factors.items())
+
+
+def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from sim.evaluation.evaluation import evaluate, to_json
+    from sim.rerun.changed_run import changed_run
+    from sim.rerun.comparison import (
+        comparison_picture,
+        comparison_rows,
+        largest_move_m,
+        same_final_map,
+    )
+    from sim.rerun.log import RerunError
+    from team.recording.reader import open_log
+
+    log = open_log(path)
+    recorded = evaluate(log.samples())
+    try:
+        changed = evaluate(changed_run(log, changes))
+    except RerunError as error:
+        fail(f"{path}: {error}", FAILED)
+    table = Table("", "recorded", "recomputed")
+    for row in comparison_rows(recorded, changed):
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console()
+    console.print(table)
+    same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
+    moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
+    verdict = "the same bytes" if same else f"another one{moved}"
+    console.print(f"final map: {verdict}", highlight=False)
+    if json_file is not None:
+        figures = {
+            "changes": asdict(changes),
+            "same_final_map": same,
+            "largest_move_m": move_m,
+            "recorded": to_json(recorded),
+            "recomputed": to_json(changed),
+        }
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        picture = output / "maps.png"
+        if comparison_picture(recorded, changed, picture):
+            console.print(f"wrote {picture}", highlight=False, soft_wrap=True)
+    if changed.map is None:
+        fail("the changed run ended without a final map", FAILED)
+
+
+def _verify(path: Path, json_file: Path | None) -> None:
+    from sim.rerun.log import RerunError
+    from sim.rerun.verification import verify
+    from team.recording.reader import open_log
+
+    log = open_log(path)
+    began = time.monotonic()
+    try:
+        result = verify(log)
+    except RerunError as error:
+        fail(f"{path}: {error}", FAILED)
+    elapsed_s = time.monotonic() - began
+    _print_verification(result, elapsed_s)
+    if json_file is not None:
+        figures = asdict(result) | {"elapsed_s": elapsed_s, "equal": result.first is None}
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    if not log.complete:
+        typer.echo(f"{path} is cut: its last messages may lack their inputs", err=True)
+    if result.first is not None:
+        fail(f"the first difference: {result.first}", FAILED)
+
+
+def _print_verification(result: "Verification", elapsed_s: float) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table()
+    for heading in ("channel", "messages", "equal", "within tolerance", "different"):
+        table.add_column(heading, justify="left" if heading == "channel" else "right")
+    for row in result.channels:
+        cells = (row.messages, row.equal, row.close, row.different)
+        table.add_row(row.channel, *(f"{n:,}" for n in cells))
+    console = Console()
+    console.print(table)
+    for row in result.channels:
+        if row.first is not None:
+            console.print(f"{row.channel}: {row.first}", highlight=False, markup=False)
+    if result.other_platform:
+        from sim.rerun.compare import RELATIVE
+
+        differing = ", ".join(result.other_platform)
+        note = f"another platform ({differing}): numbers compared within {RELATIVE:g}, not bits"
+        console.print(note, highlight=False, markup=False)
+    if result.unsound:
+        console.print(f"{result.unsound} samples are no sound messages: left out", highlight=False)
+    different = sum(row.different for row in result.channels)
+    verdict = "all equal" if not different else f"{different} different"
+    if not different and any(row.close for row in result.channels):
+        verdict = "all equal within the tolerance"
+    console.print(
+        f"{result.messages:,} messages from {result.readings:,} readings: {verdict}; "
+        f"{elapsed_s:.1f} s for {result.span_s:.0f} s of team time, "
+        f"{result.span_s / elapsed_s:.0f} × real time",
+        highlight=False,
+    )
+
+
+@app.command(name="verify-ledger")
+def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
+    """Prove that each reading of a log was used once: its disposition, its submap, its maps."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from sim.rerun.ledger import ledger
+    from sim.rerun.log import RerunError, recorded
+    from team.recording.reader import open_log
+
+    try:
+        found = ledger(recorded(open_log(log)))
+    except RerunError as error:
+        fail(f"{log}: {error}", FAILED)
+    robots = sorted({robot for robot, _ in found.entries})
+    table = Table("disposition")
+    for robot in [*robots, "all"]:
+        table.add_column(robot, justify="right")
+    of_robots = [found.totals(robot) for robot in robots]
+    for disposition, count in found.totals().items():
+        counts = [*(totals.get(disposition, 0) for totals in of_robots), count]
+        table.add_row(disposition, *(f"{n:,}" for n in counts))
+    console = Console()
+    console.print(table)
+    used = sum(1 for maps in found.maps.values() if maps)
+    console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
+    if json_file is not None:
+        json_file.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+    for offender in found.offenders[:OFFENDERS]:
+        typer.secho(offender, fg="red", err=True)
+    if found.offenders:
+        fail(f"{len(found.offenders)} offenders against the ledger", FAILED)
+    console.print(found.statement(), highlight=False, soft_wrap=True)

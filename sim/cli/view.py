@@ -1,0 +1,129 @@
+"""`teamslam viewer`, a node that publishes views, and `teamslam view`, a log or a run on a page."""
+
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sim.cli.nodes import LOOPBACK
+from sim.cli.options import WRONG_USE, Connect, ScenarioArgument, fail, scenario_of
+
+if TYPE_CHECKING:
+    from sim.view.session import Shown
+    from team.recording.reader import Log
+
+_LOG = logging.getLogger("teamslam")
+Port = Annotated[int, typer.Option(help="Where the page is served; 0: any free port.", min=0)]
+FoxglovePort = Annotated[
+    int, typer.Option(help="Where Foxglove can connect; 0: any free port.", min=0)
+]
+Open = Annotated[
+    bool | None,
+    typer.Option("--open/--no-browser", help="Open the page; default: where there is a display."),
+]
+app = typer.Typer()
+
+
+@app.command()
+def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK) -> None:
+    """Publish what Foxglove, Lichtblick and Rerun draw, once a second of team time.
+
+    The recorder stores it beside the team's own messages. Ends after the final map.
+    """
+    from sim.view.viewer import run_viewer
+    from team.shell import process
+    from team.wire.zenoh_bus import ZenohBus
+
+    resolved = scenario_of(scenario)
+    with process("viewer", endless=True) as stop, ZenohBus(resolved.team, connect) as bus:
+        _LOG.info("connected to team %s at %s", resolved.team, connect)
+        _LOG.info("published %d views", run_viewer(bus, stop))
+
+
+@app.command()
+def view(
+    log: Annotated[Path, typer.Argument(help="An MCAP log of a team.")],
+    port: Port = 0,
+    foxglove_port: FoxglovePort = 8765,
+    host: Annotated[
+        str, typer.Option(help="The address to serve at; others than 127.0.0.1 show it to others.")
+    ] = "127.0.0.1",
+    browser: Open = None,
+    follow: Annotated[
+        bool, typer.Option(help="The log is being recorded, or will be: show it as it grows.")
+    ] = False,
+    export: Annotated[
+        Path | None,
+        typer.Option(help="Write the log with what other tools draw to this new file, and end."),
+    ] = None,
+    layout: Annotated[
+        Path | None, typer.Option(help="Write a Foxglove layout for this team's log, and end.")
+    ] = None,
+) -> None:
+    """Look at a log, or at a run by the log that is recorded of it, on a page in a browser.
+
+    The map with its uncertainty, robots, paths, errors within their bounds, consistency, traffic
+    and events; nothing is fetched from elsewhere. Foxglove and Lichtblick can connect, too. Ends
+    with Ctrl-C.
+    """
+    from team.recording.reader import open_log
+    from team.shell import process
+
+    if not follow or log.exists():
+        opened = open_log(log)
+        if export is not None or layout is not None:
+            _write(opened, export, layout)
+            return
+    elif export is not None or layout is not None:
+        fail(f"{log}: not found; --export and --layout need a log", WRONG_USE)
+    with (
+        process("view", endless=True) as stop,
+        shown_on_page(log, host, port, foxglove_port, browser, growing=follow) as shown,
+    ):
+        stop.wait()
+        if shown.feed.error is not None:
+            fail(shown.feed.error, WRONG_USE)
+
+
+@contextmanager
+def shown_on_page(
+    log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
+) -> Iterator["Shown"]:
+    """Serve a log, say where, and open the page if that is wished or natural."""
+    from sim.view.session import session
+
+    with session(log, host, port, foxglove_port, growing=growing) as shown:
+        typer.echo(f"page      {shown.url}")
+        typer.echo(f"foxglove  {shown.foxglove}")
+        if _has_display() if browser is None else browser:
+            import webbrowser
+
+            webbrowser.open(shown.url)
+        yield shown
+
+
+def _has_display() -> bool:
+    """Whether a browser would be seen; without one, text browsers would take the terminal."""
+    windows = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+    return bool(windows) and sys.stdout.isatty()
+
+
+def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
+    from sim.view.export import export_views
+    from sim.view.layout import layout as layout_of
+    from team.wire.channels import ROBOT_CONFIG
+
+    for path in (export, layout):
+        if path is not None and path.exists():
+            fail(f"{path} exists: choose another name or remove it", WRONG_USE)
+    if export is not None:
+        typer.echo(f"{export}: {export_views(log, export)} messages")
+    if layout is not None:
+        owners = {ROBOT_CONFIG.owner(sample.key) for sample in log.samples((ROBOT_CONFIG,))}
+        layout.write_text(layout_of(log.team, [name for name in owners if name]), "utf-8")
+        typer.echo(f"wrote {layout}: import it in Foxglove or Lichtblick")

@@ -1,0 +1,1 @@
+"""What other programs read: logs as data sets, paths as files."""

@@ -1,0 +1,170 @@
+"""A whole team in one process, on the bus in memory: the same nodes, synchronous, deterministic."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from sim.in_memory.links import Conditions, Link
+from sim.scenario.scenario import Scenario
+from sim.scenario.source import tells_map
+from sim.world.streams import WorldStreams
+from sim.world_node.node import WorldNode, expected_nodes
+from team import translate
+from team.config import Exchange, RobotConfig
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+
+
+@runtime_checkable
+class World(Protocol):
+    """Whatever publishes the readings: a scenario's world, or a log's."""
+
+    @property
+    def listens(self) -> tuple[ch.Channel, ...]:
+        """The channels that it subscribes to."""
+
+    @property
+    def now_ns(self) -> int:
+        """Team time: the stamp that it has published up to."""
+
+    def begin(self) -> list[Outgoing]:
+        """What it says first."""
+
+    def publish(self, clock_s: float) -> list[Outgoing]:
+        """The next readings; nothing when it waits or has ended."""
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Take one message."""
+
+
+@dataclass
+class _Seat:
+    """A node, its bus, the link over which the others' messages reach it."""
+
+    node: World | RobotNode | CentralNode
+    bus: MemoryBus
+    link: Link
+
+    def send(self, out: list[Outgoing]) -> None:
+        for outgoing in out:
+            self.bus.publish(outgoing)
+
+    def take(self, now_ns: int) -> bool:
+        samples = self.link.arrived(self.bus.receive(0.0), now_ns)
+        for sample in samples:
+            _, _, message = opened(sample)
+            self.send(self.node.handle(message, sample.stamp_ns))
+        return bool(samples)
+
+
+def run_team(
+    scenario: Scenario,
+    streams: WorldStreams,
+    robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
+    central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
+) -> Iterator[Sample]:
+    """Run the team to its final map; everything that a recorder would take, in its order."""
+    expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
+    announced = translate.configured("world", 0, 0, scenario)
+    world = WorldNode(streams, expected, announced, tells_map=tells_map(scenario, streams))
+    yield from run_nodes(scenario, world, None, robot, central)
+
+
+def run_nodes(
+    scenario: Scenario,
+    world: World,
+    conditions: Conditions | None = None,
+    robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
+    central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
+) -> Iterator[Sample]:
+    """Run the scenario's robots and centre in a world, until nothing is on its way any more.
+
+    conditions: what becomes of messages and of the centre; none: everything arrives at once.
+    """
+    conditions = Conditions() if conditions is None else conditions
+    network = MemoryNetwork()
+    recorder = MemoryBus(network)
+    for channel in ch.CHANNELS:
+        if channel.recorded:
+            recorder.subscribe(channel, "**")
+    recorder.watch_alive()
+    names = [config.id for config in scenario.robots]
+    source = _Seat(world, MemoryBus(network), Link())
+    for channel in world.listens:
+        source.bus.subscribe(channel)
+    source.bus.watch_alive()
+    centre = _centre(network, scenario, conditions, central)
+    robots = [
+        _robot(network, robot(config, scenario.exchange), conditions) for config in scenario.robots
+    ]
+    _enter(source, "world")
+    _enter(centre, "central")
+    for name, seat in zip(names, robots, strict=True):
+        _enter(seat, ch.robot_node(name))
+    now_ns = world.now_ns
+    up = True
+    while True:
+        published = world.publish(0.0)
+        source.send(published)
+        now_ns = max(now_ns, world.now_ns)
+        if up and conditions.centre_is_down(now_ns):
+            centre.bus.close()
+            up = False
+        elif not up and not conditions.centre_is_down(now_ns):
+            centre = _centre(network, scenario, conditions, central)
+            _enter(centre, "central")
+            up = True
+        seats = [source, *([centre] if up else []), *robots]
+        busy = sum(seat.take(now_ns) for seat in seats)
+        yield from recorder.receive()
+        if busy or published:
+            continue
+        coming = [seat.link.next_ns for seat in seats if seat.link.next_ns is not None]
+        coming += [] if up else [conditions.centre_back_ns]
+        if not coming:
+            return
+        now_ns = min(coming)  # the world has nothing more to say: time goes on to what comes next
+
+
+def _enter(seat: _Seat, token: str) -> None:
+    seat.send(seat.node.begin())
+    seat.bus.declare_alive(token)
+
+
+def _centre(
+    network: MemoryNetwork,
+    scenario: Scenario,
+    conditions: Conditions,
+    central: Callable[[CentralConfig, list[str]], CentralNode],
+) -> _Seat:
+    names = [config.id for config in scenario.robots]
+    node = central(scenario.central, names)
+    bus = MemoryBus(network)
+    for channel in node.listens:
+        bus.subscribe(channel)
+    bus.watch_alive()
+    return _Seat(node, bus, conditions.to_centre(names))
+
+
+def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _Seat:
+    bus = MemoryBus(network)
+    for channel in RobotNode.listens:
+        bus.subscribe(channel, node.robot)
+    for channel in node.overhears:
+        bus.subscribe(channel)
+    bus.watch_alive("central")
+    return _Seat(node, bus, conditions.to_robot(node.robot))
+
+
+def final_map(samples: list[Sample]) -> m.FusedMap:
+    """The team's final map among what a run sent."""
+    for sample in reversed(samples):
+        if sample.key == ch.FINAL_MAP.key():
+            _, _, message = opened(sample)
+            assert isinstance(message, m.FusedMap)
+            return message
+    raise LookupError("the run ended without a final map")

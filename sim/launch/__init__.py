@@ -1,0 +1,1 @@
+"""A whole team as processes: started, watched, ordered about, ended."""

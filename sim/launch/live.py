@@ -1,0 +1,192 @@
+"""What a user sees while a team runs: a live table in a terminal, plain lines elsewhere."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from sim.evaluation.events import without_figures
+from sim.launch.launch import Watch
+from sim.launch.truth import LiveErrors
+from team.wire import messages as m
+
+LINE_S = 5.0
+"""Wall time between two plain lines."""
+PATIENCE_S = 8.0
+"""Processes start slowly on a busy machine: nobody is missed before."""
+
+
+@contextmanager
+def shown(title: str) -> Iterator[Callable[[Watch], None]]:
+    """A function that shows the state of a run again and again, fit for where it is printed."""
+    console = Console(stderr=True)
+    if console.is_terminal and sys.stderr.isatty():
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            yield lambda watch: live.update(_view(title, watch))
+    else:
+        yield _Lines(console).show
+
+
+class _Lines:
+    """Plain lines: one every LINE_S, and every warning once."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._due = 0.0
+        self._said: set[str] = set()
+
+    def show(self, watch: Watch) -> None:
+        for warning in _warnings(watch):
+            if without_figures(warning) not in self._said:
+                self._said.add(without_figures(warning))
+                self._print(watch, f"warning: {warning}")
+        for words in () if watch.fused is None else watch.fused.joined:
+            if words not in self._said:
+                self._said.add(words)
+                self._print(watch, words)
+        now = time.monotonic()
+        if now < self._due or "world" not in watch.statuses:
+            return
+        self._due = now + LINE_S
+        world = watch.statuses["world"].figures
+        robots = [s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")]
+        if watch.statuses["world"].state == "waiting":
+            self._print(watch, f"waiting: {len(robots)} of {watch.robots} robots")
+            return
+        submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
+        fused = watch.fused
+        landmarks = 0 if fused is None else len(fused.ids) // 4
+        honesty = _honesty(watch)
+        self._print(
+            watch,
+            f"{_done(world):4.0%}  team time {world.get('team_time_s', 0.0):.0f} s, "
+            f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
+            f"{'; ' if honesty else ''}{honesty}",
+        )
+
+    def _print(self, watch: Watch, text: str) -> None:
+        elapsed = time.monotonic() - watch.began
+        self._console.print(
+            f"[{elapsed:6.1f} s] {text}", markup=False, highlight=False, soft_wrap=True
+        )
+
+
+def _done(world: Mapping[str, float]) -> float:
+    total = world.get("of", 0.0)
+    return world.get("readings", 0.0) / total if total else 0.0
+
+
+def _warnings(watch: Watch) -> list[str]:
+    """Failures and what the nodes warn of; that some are not there yet is none for a while.
+
+    While the team starts everyone misses everyone: the world says it for all of them.
+    """
+    if time.monotonic() - watch.began <= PATIENCE_S:
+        return list(watch.failures)
+    world = watch.statuses.get("world")
+    said = sorted(watch.statuses.items())
+    if world is None:
+        said = [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
+        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in said if s.warnings]
+    elif world.state == "waiting":
+        texts = [f"world: {w}" for w in world.warnings]
+    else:
+        texts = [f"{node}: {w}" for node, status in said for w in status.warnings]
+    return [*watch.failures, *texts]
+
+
+def _view(title: str, watch: Watch) -> Group:
+    elapsed = time.monotonic() - watch.began
+    world = watch.statuses.get("world")
+    parts: list[Text | Table] = [Text(f"{title}   {elapsed:.1f} s", style="bold")]
+    robots = {n: s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")}
+    if world is None or world.state == "waiting":
+        parts.append(Text(f"starting: {len(robots)} of {watch.robots} robots are there"))
+    else:
+        bar = Table.grid(padding=(0, 2))
+        bar.add_row(
+            ProgressBar(total=1.0, completed=_done(world.figures), width=36),
+            f"{_done(world.figures):.0%}",
+            f"team time {world.figures.get('team_time_s', 0.0):,.0f} s, world {world.state}",
+        )
+        parts.append(bar)
+    if robots:
+        parts.append(_robots(robots, watch.errors))
+    parts += [Text(line) for line in _map_lines(watch)]
+    parts += [Text(words) for words in (() if watch.fused is None else watch.fused.joined)]
+    parts += [Text(w, style="yellow") for w in _warnings(watch)[-4:]]
+    return Group(*parts)
+
+
+_COLUMNS = (
+    ("steps", "\nsteps", "{:,.0f}"),
+    ("submaps", "sub-\nmaps", "{:,.0f}"),
+    ("landmarks", "land-\nmarks", "{:,.0f}"),
+    ("pose_sigma_m", "pose\nσ [m]", "{:.2f}"),
+    ("nis_per_dof", "NIS\n/dof", "{:.2f}"),
+    ("messages_per_s", "\nmsg/s", "{:,.0f}"),
+    ("bytes_per_s", "\nB/s", "{:,.0f}"),
+)
+_SHOWN_AT_MOST = 12
+"""Robots with a row of their own: a table that is higher than the terminal would be cut."""
+
+
+def _robots(statuses: Mapping[str, m.Status], errors: LiveErrors) -> Table:
+    """A row for each robot; NEES and coverage of its poses where there is a truth."""
+    table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
+    judged = any(errors.of(n.removeprefix("robot/")).count for n in statuses)
+    table.add_column(Text("\nrobot"), no_wrap=True)
+    headings = [heading for _, heading, _ in _COLUMNS] + ["NEES\n/dof", "in\n95 %"] * judged
+    for heading in headings:
+        table.add_column(Text(heading), justify="right", no_wrap=True)
+    table.add_column(Text("\nstate"), no_wrap=True)
+    for node, status in list(statuses.items())[:_SHOWN_AT_MOST]:
+        robot = node.removeprefix("robot/")
+        cells = [
+            form.format(status.figures[key]) if key in status.figures else "–"
+            for key, _, form in _COLUMNS
+        ]
+        if judged:
+            tally = errors.of(robot)
+            cells += [_number(tally.mean, ".2f"), _number(tally.coverage, ".0%")]
+        table.add_row(robot, *cells, status.state)
+    if len(statuses) > _SHOWN_AT_MOST:
+        table.add_row(f"… {len(statuses) - _SHOWN_AT_MOST} more")
+    return table
+
+
+def _map_lines(watch: Watch) -> list[str]:
+    """What the team's map is made of, and whether it can be believed."""
+    fused, central, world = watch.fused, watch.statuses.get("central"), watch.statuses.get("world")
+    if fused is None:
+        return ["no fused map yet"]
+    figures = {} if central is None else central.figures
+    lag_s = 0.0 if world is None else max(0.0, 1e-9 * (world.stamp_ns - fused.stamp_ns))
+    lines = [
+        f"team map by {fused.rule}, {lag_s:.0f} s behind: {len(fused.ids) // 4} landmarks from "
+        f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} maps sent"
+    ]
+    honesty = _honesty(watch)
+    return [*lines, honesty] if honesty else lines
+
+
+def _honesty(watch: Watch) -> str:
+    """The consistency monitor; against the truth NEES and coverage of the map's landmarks."""
+    central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
+    cost = None if central is None else central.figures.get("joint_cost_per_dof")
+    parts = [] if cost is None else [f"joint cost per dof {cost:.2f}"]
+    if landmarks.count:
+        parts.append(f"map NEES per dof {landmarks.mean:.2f}")
+        parts.append(f"{landmarks.coverage:.0%} of landmarks within 95 %")
+    return ", ".join(parts)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else f"{value:{form}}"

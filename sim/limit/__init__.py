@@ -1,0 +1,1 @@
+"""The batch MAP over all raw readings, which no team can beat."""

@@ -1,0 +1,1 @@
+"""A log computed again: as it was, or under other conditions."""

@@ -1,0 +1,278 @@
+"""A simulated world: true paths, odometry with noise in it, readings of landmarks and teammates.
+
+Nothing here comes from the estimator: the motion and the sensor are written again in `paths`,
+`odometry` and `sensing` beside this, so that an error in either half shows. Every stream of random
+numbers is named by (seed, robot, purpose): a further robot changes nobody else's noise.
+"""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from math import atan2, hypot
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from sim.world.garbage import spoilt
+from sim.world.odometry import slip, told
+from sim.world.paths import Drive, Limits, Pose, Step, driven, followed
+from sim.world.sensing import Visible, persistent, readings, visible
+from sim.world.streams import (
+    Detections,
+    Intervals,
+    RobotStream,
+    StartPose,
+    WorldStreams,
+    grouped,
+    robot_stream,
+)
+from sim.world.worlds import SimulatedWorld, starts_unknown
+from team.config import RobotConfig, Sensor
+
+
+def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
+    """The streams of a team in a simulated world, from stamp 0; landmarks are numbered from 1.
+
+    Robot i follows path i; without one, or if its motion slips or goes in arcs, it steers: to its
+    path's way-points or to random ones. Each step ends with one message of the landmarks seen,
+    perhaps empty, and one of the teammates seen, if any. Where an odometry's clock is late, team
+    time begins so much later than 0 that no stamp of it is negative.
+    """
+    landmarks = _landmarks(world, seed)
+    ids = np.arange(1, len(landmarks) + 1, dtype=np.uint32)
+    drives = _until_all_stand(
+        world, [_drive(world, robot, i, seed) for i, robot in enumerate(robots)]
+    )
+    steps = len(drives[0].steps)
+    begin_ns = max(0, *(_clock_ns(robot) for robot in robots))
+    stamps = begin_ns + np.rint(np.arange(steps + 1) * (world.step_s * 1e9)).astype(np.int64)
+    streams = tuple(
+        _stream(world, robots, drives, i, landmarks, stamps, seed) for i in range(len(robots))
+    )
+    return WorldStreams(streams, ids, landmarks, source=f"simulated world, seed {seed}")
+
+
+def _clock_ns(robot: RobotConfig) -> int:
+    return round(robot.clock_offset_s * 1e9)
+
+
+def generator(seed: int, *names: str) -> np.random.Generator:
+    """The stream of random numbers of one purpose, e.g. (seed, robot, "odometry")."""
+    digest = hashlib.sha256("/".join(names).encode()).digest()
+    words = np.random.SeedSequence([seed, int.from_bytes(digest[:16], "little")])
+    return np.random.Generator(np.random.Philox(words))
+
+
+def _landmarks(world: SimulatedWorld, seed: int) -> Float[np.ndarray, "L 2"]:
+    if world.landmark_count:
+        uniform = generator(seed, "world", "landmarks").random((world.landmark_count, 2))
+        return _places(world, uniform)
+    return np.array(world.landmarks, dtype=np.float64).reshape(-1, 2)
+
+
+def _places(world: SimulatedWorld, uniform: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+    """Uniform numbers → points of the square, or of the disc by radius and direction."""
+    if world.radius_m is None:
+        return uniform * world.size_m
+    radius, direction = world.radius_m * uniform[:, 0], 2.0 * np.pi * uniform[:, 1]
+    return np.column_stack((radius * np.cos(direction), radius * np.sin(direction)))
+
+
+def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> Drive:
+    """The true motion of one robot."""
+    motion = robot.motion
+    turn_rate = min(world.turn_rate_rad_s, motion.yaw_rate_limit or np.inf)
+    path = np.array(world.paths[index]) if index < len(world.paths) else None
+    if path is not None and motion.kind == "turn-then-drive" and not motion.slips:
+        return followed(path, world.steps)
+    start, way_points = _route(world, robot.id, path, seed)
+    limits = Limits(
+        world.speed_m_s * world.step_s,
+        turn_rate * world.step_s,
+        world.way_point_tolerance_m,
+        world.steering == "turn-first",
+    )
+    normals = generator(seed, robot.id, "slip").standard_normal((world.steps, 2))
+
+    def slipped(k: int, step: Step) -> tuple[float, float]:
+        return slip(motion, step, world.step_s, normals[k])
+
+    return driven(start, way_points, limits, motion.kind, world.steps, slipped)
+
+
+def _route(
+    world: SimulatedWorld, robot: str, path: Float[np.ndarray, "W 2"] | None, seed: int
+) -> tuple[Pose, Iterator[tuple[float, float]]]:
+    """Where a robot starts, looking to where it goes first, and the way-points that follow."""
+    way_points = _random_way_points(world, robot, seed) if path is None else _each(path)
+    if path is None and world.radius_m is not None:
+        return (0.0, 0.0, 0.0), way_points
+    first, second = next(way_points), next(way_points)
+    start: Pose = (*first, atan2(second[1] - first[1], second[0] - first[0]))
+    return start, _behind(second, way_points)
+
+
+def _behind(
+    first: tuple[float, float], others: Iterator[tuple[float, float]]
+) -> Iterator[tuple[float, float]]:
+    yield first
+    yield from others
+
+
+def _each(path: Float[np.ndarray, "W 2"]) -> Iterator[tuple[float, float]]:
+    yield from map(tuple, path.tolist())
+
+
+def _random_way_points(
+    world: SimulatedWorld, robot: str, seed: int
+) -> Iterator[tuple[float, float]]:
+    def endless() -> Iterator[tuple[float, float]]:
+        uniform = generator(seed, robot, "way-points")
+        while True:
+            x, y = _places(world, uniform.random((1, 2)))[0].tolist()
+            yield x, y
+
+    starts = 0 if world.radius_m is not None else 1
+    count = world.way_point_count
+    return islice(endless(), starts + count) if count else endless()
+
+
+def _until_all_stand(world: SimulatedWorld, drives: Sequence[Drive]) -> list[Drive]:
+    """With a number of way-points the world ends when the last robot has reached its last one."""
+    if not world.way_point_count:
+        return list(drives)
+    moving = [np.flatnonzero(drive.steps.any(axis=1)) for drive in drives]
+    last = max((int(steps[-1]) + 1 for steps in moving if len(steps)), default=1)
+    return [Drive(drive.poses[: last + 1], drive.steps[:last]) for drive in drives]
+
+
+def _stream(
+    world: SimulatedWorld,
+    robots: Sequence[RobotConfig],
+    drives: Sequence[Drive],
+    index: int,
+    landmarks: Float[np.ndarray, "L 2"],
+    stamps_ns: Int64[np.ndarray, " K_plus_1"],
+    seed: int,
+) -> RobotStream:
+    robot, drive = robots[index], drives[index]
+    unknown = starts_unknown(world, robot.id)
+    start = None if unknown else StartPose(drive.poses[0].copy(), None)
+    return robot_stream(
+        robot.id,
+        int(stamps_ns[0]),
+        start,
+        _odometry(robot, drive, stamps_ns, seed),
+        _observations(world, robot, drive, landmarks, stamps_ns, seed),
+        _sightings(world, robots, drives, index, stamps_ns[1:], seed),
+        [other.id for other in robots],
+        stamps_ns,
+        drive.poses,
+        clock_offset_ns=_clock_ns(robot),
+    )
+
+
+def _odometry(
+    robot: RobotConfig, drive: Drive, stamps_ns: Int64[np.ndarray, " K_plus_1"], seed: int
+) -> Intervals:
+    count = len(drive.steps)
+    normals = generator(seed, robot.id, "odometry").standard_normal((count, 2))
+    of_wheels = generator(seed, robot.id, "wheels").standard_normal((count, 2))
+    duration_ns = np.diff(stamps_ns)
+    forward, yaw_rate = told(robot.motion, drive.steps, duration_ns * 1e-9, normals, of_wheels)
+    return Intervals(stamps_ns[1:], duration_ns, forward, yaw_rate)
+
+
+def _observations(
+    world: SimulatedWorld,
+    robot: RobotConfig,
+    drive: Drive,
+    landmarks: Float[np.ndarray, "L 2"],
+    stamps_ns: Int64[np.ndarray, " K_plus_1"],
+    seed: int,
+) -> Detections:
+    """One message a step, perhaps empty."""
+    first = 0 if world.look_at_start else 1
+    at_ns = stamps_ns[first:]
+    seen = _visible(world, robot, drive.poses[first:], landmarks[np.newaxis])
+    ranges, bearings = _read(world, robot.sensor, seen, seed, robot.id, "observations")
+    offsets = np.searchsorted(seen.steps, np.arange(len(at_ns) + 1))
+    ids = (seen.points + 1).astype(np.uint32)
+    clean = Detections(at_ns, offsets, ids, ranges, bearings)
+    if not world.garbage:
+        return clean
+    return spoilt(
+        clean,
+        world.garbage,
+        world.garbage_kind,
+        _span(world, robot.sensor),
+        robot.sensor.field_of_view,
+        len(landmarks),
+        generator(seed, robot.id, "garbage").random((len(ids), 3)),
+    )
+
+
+def _read(
+    world: SimulatedWorld, sensor: Sensor, seen: Visible, seed: int, *names: str
+) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
+    """What the sensor reads of what is seen, with the random numbers of this purpose."""
+    errors = generator(seed, *names).standard_normal((len(seen.steps), 2))
+    if sensor.range_white < 1.0 or sensor.bearing_white < 1.0:
+        lasting = generator(seed, *names, "persistent").standard_normal((len(seen.steps), 2))
+        errors = persistent(seen, sensor, world.step_s, np.column_stack((errors, lasting)))
+    return readings(seen, sensor, errors)
+
+
+def _sightings(
+    world: SimulatedWorld,
+    robots: Sequence[RobotConfig],
+    drives: Sequence[Drive],
+    index: int,
+    ends_ns: Int64[np.ndarray, " K"],
+    seed: int,
+) -> Detections:
+    """One message for each step at whose end a teammate is seen; ids index the robots."""
+    robot = robots[index]
+    none = np.zeros(0)
+    columns = [(none.astype(np.int64), none.astype(np.uint32), none, none)]
+    for i, other in enumerate(robots):
+        if i != index:
+            at = drives[i].poses[1:, np.newaxis, :2]
+            seen = _visible(world, robot, drives[index].poses[1:], at)
+            ranges, bearings = _read(
+                world, robot.sensor, seen, seed, robot.id, "sightings", other.id
+            )
+            columns.append((seen.steps, np.full(len(ranges), i), ranges, bearings))
+    steps, others, ranges, bearings = (
+        np.concatenate(parts) for parts in zip(*columns, strict=True)
+    )
+    order = np.lexsort((others, steps))
+    return grouped(
+        ends_ns[steps[order]], others[order].astype(np.uint32), ranges[order], bearings[order]
+    )
+
+
+def _visible(
+    world: SimulatedWorld,
+    robot: RobotConfig,
+    poses: Float[np.ndarray, "K 3"],
+    points: Float[np.ndarray, "#K P 2"],
+) -> Visible:
+    """What the robot truly sees from these poses."""
+    sensor = robot.sensor
+    nearest, farthest = _limits(world, sensor)
+    return visible(poses, points, nearest, farthest, sensor.field_of_view)
+
+
+def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
+    """The world's true ranges of sight; where it has none, those of the sensor's readings."""
+    nearest = sensor.min_range if world.visible_from_m is None else world.visible_from_m
+    farthest = sensor.max_range if world.visible_to_m is None else world.visible_to_m
+    return nearest, farthest
+
+
+def _span(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
+    """The ranges at which anything can be seen; no farther than the place is wide."""
+    nearest, farthest = _limits(world, sensor)
+    across = hypot(world.size_m, world.size_m) if world.radius_m is None else 2.0 * world.radius_m
+    return nearest, max(nearest, min(farthest, across))

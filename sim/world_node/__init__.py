@@ -1,0 +1,1 @@
+"""The world's process: publishes readings as far as credit allows."""

@@ -1,0 +1,312 @@
+"""The world's node: publishes every robot's readings in team time, as far as credit allows.
+
+It waits until everyone is there, never drops a reading, and ends with the last counters. It is the
+source of the streams, so it also answers for what a receiver missed.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from sim.world import streams as s
+from sim.world.streams import RobotStream, WorldStreams
+from sim.world_node.configurations import Configurations
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
+
+CREDIT_READINGS = 4096
+"""The world is at most this many readings ahead of the slowest living robot."""
+CREDIT_RECORDER = 16384
+"""… and this many, of all robots together, ahead of a living recorder."""
+BATCH = 256
+"""Readings between two looks at what has come in."""
+ANSWER = 8192
+"""Readings in one answer to a query; who wants more asks again."""
+TRUTH_BATCH_NS = 1_000_000_000
+FIRST_EPOCH = 1
+
+
+@dataclass
+class _Source:
+    """One robot's stream; its present epoch began at reading `base` of the whole."""
+
+    stream: RobotStream
+    epoch: int = FIRST_EPOCH
+    base: int = 0
+    published: int = 0
+    consumed: int = 0
+    truth_sent: int = 0
+    alive: bool = False
+
+    @property
+    def counter(self) -> int:
+        """Readings published in this epoch."""
+        return self.published - self.base
+
+    def message(self, index: int) -> m.Reading:
+        """The reading at `index` of the whole stream, as this epoch counts it."""
+        robot, epoch, reading = self.stream.robot, self.epoch, index - self.base
+        stamp_ns = int(self.stream.stamps_ns[index])
+        if reading == 0 and epoch > FIRST_EPOCH:
+            return m.Start(stamp_ns, robot, epoch, 0, b"", b"")
+        kind = self.stream.kinds[index]
+        if kind == s.ODOMETRY:
+            o = self.stream.odometry(index)
+            stamp_ns -= self.stream.clock_offset_ns
+            return m.Odometry(stamp_ns, robot, epoch, reading, o.duration_ns, o.forward, o.yaw_rate)
+        if kind == s.OBSERVATIONS:
+            z = self.stream.observations(index)
+            return m.Observations(
+                stamp_ns,
+                robot,
+                epoch,
+                reading,
+                from_ids(z.ids),
+                from_floats(z.ranges),
+                from_floats(z.bearings),
+            )
+        if kind == s.SIGHTINGS:
+            t = self.stream.sightings(index)
+            return m.Sightings(
+                stamp_ns,
+                robot,
+                epoch,
+                reading,
+                t.teammates,
+                from_floats(t.ranges),
+                from_floats(t.bearings),
+            )
+        start = self.stream.start
+        pose = b"" if start is None else from_floats(start.pose)
+        known = start is not None and start.covariance is not None
+        covariance = from_floats(start.covariance) if start is not None and known else b""
+        return m.Start(stamp_ns, robot, epoch, reading, pose, covariance)
+
+
+_CHANNEL_OF_KIND = {
+    s.START: ch.START,
+    s.ODOMETRY: ch.ODOMETRY,
+    s.OBSERVATIONS: ch.OBSERVATIONS,
+    s.SIGHTINGS: ch.SIGHTINGS,
+}
+
+
+@dataclass
+class WorldNode:
+    """`begin`, then `publish` again and again until `ended`; `handle` for what comes in.
+
+    expected: the nodes that must be alive before the first reading. speed: team seconds per second
+    of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's last
+    readings can be asked for again; None: all. Who asks for older ones gets a new epoch instead: a
+    start at an unknown pose, and readings that count from there. configurations: what the others
+    are to announce; the world does not begin while anyone has announced something else.
+    tells_map: the robots are told the landmarks, since they only localise themselves.
+    """
+
+    streams: WorldStreams
+    expected: frozenset[str]
+    scenario: m.Configured
+    speed: float = float("inf")
+    cache: int | None = None
+    configurations: Configurations = field(default_factory=lambda: Configurations({}))
+    tells_map: bool = False
+    ended: bool = field(default=False, init=False)
+    finished: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self._sources = {x.robot: _Source(x) for x in self.streams.streams}
+        self._names = [x.robot for x in self.streams.streams]
+        robots, indices = self.streams.order()
+        self._order = deque(zip(robots.tolist(), indices.tolist(), strict=True))
+        self._alive: set[str] = set()
+        self._recorded: dict[tuple[str, int], int] = {}
+        self._recorder = False
+        self._unrecorded = 0
+        self._published = 0
+        self._began_at: float | None = None
+        self._starts: list[Outgoing] = []
+        first = [int(x.stamps_ns[0]) for x in self.streams.streams if len(x)]
+        self._first_ns = min(first, default=0)
+        self.now_ns = self._first_ns
+
+    listens: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.ROBOT_PROGRESS,
+        ch.RECORDER_PROGRESS,
+        ch.FINAL_MAP,
+    )
+    announcements: ClassVar[tuple[ch.Channel, ...]] = (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
+    """Listened to as well where configurations are compared."""
+
+    @property
+    def waiting_for(self) -> list[str]:
+        """Who is not there yet, or has not said yet with which configuration."""
+        if self._began_at is not None:
+            return []
+        silent = self.configurations.unheard(self.expected & self._alive)
+        return sorted([*(self.expected - self._alive), *silent])
+
+    def begin(self) -> list[Outgoing]:
+        """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
+        out = [Outgoing(ch.WORLD_CONFIG, "", self.scenario)]
+        if self.streams.landmarks is not None:
+            order = np.argsort(self.streams.landmark_ids)
+            truth = m.TruthLandmarks(
+                self._first_ns,
+                from_ids(self.streams.landmark_ids[order]),
+                from_floats(self.streams.landmarks[order]),
+            )
+            out.append(Outgoing(ch.TRUTH_LANDMARKS, "", truth))
+            if self.tells_map:
+                told = m.KnownMap(self._first_ns, truth.ids, truth.positions)
+                out.append(Outgoing(ch.KNOWN_MAP, "", told))
+        return out
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Take progress, liveliness, configurations, the final map; the answer is always empty."""
+        match message:
+            case m.Liveliness():
+                self._take_liveliness(message)
+            case m.Progress() if message.node == "recorder":
+                stream = (message.robot, message.epoch)
+                self._recorded[stream] = max(self._recorded.get(stream, 0), message.readings)
+            case m.Progress():
+                source = self._sources.get(message.robot)
+                if source is not None and message.epoch == source.epoch:
+                    source.consumed = max(source.consumed, source.base + message.readings)
+            case m.Configured():
+                self.configurations.take(message)
+            case m.FusedMap() if message.final:
+                self.finished = True
+            case _:
+                pass
+        return []
+
+    def _take_liveliness(self, message: m.Liveliness) -> None:
+        (self._alive.add if message.alive else self._alive.discard)(message.node)
+        if not self._recorder and "recorder" in self._alive:  # it counts from zero, from here on
+            self._recorded, self._unrecorded = {}, self._published
+        self._recorder = "recorder" in self._alive
+        for name, source in self._sources.items():
+            source.alive = ch.robot_node(name) in self._alive
+
+    def publish(self, clock_s: float) -> list[Outgoing]:
+        """The next readings, at most BATCH: as many as pace and credit allow at `clock_s`."""
+        if self.ended:  # a new epoch may begin after the end; it has its own last counters
+            out, self._starts = self._starts, []
+            return [*out, Outgoing(ch.END, "", self._end())] if out else []
+        if self._began_at is None and (self.waiting_for or self.configurations.mismatches):
+            return []
+        if self._began_at is None:
+            self._began_at = clock_s
+        horizon = self._horizon_ns(clock_s)
+        out, self._starts = self._starts, []
+        while self._order and len(out) < BATCH:
+            robot, index = self._order[0]
+            source = self._sources[self._names[robot]]
+            stamp_ns = int(source.stream.stamps_ns[index])
+            if stamp_ns > horizon or not self._credit(source):
+                break
+            self._order.popleft()
+            self.now_ns = max(self.now_ns, stamp_ns)
+            kind = int(source.stream.kinds[index])
+            name = source.stream.robot
+            out.append(Outgoing(_CHANNEL_OF_KIND[kind], name, source.message(index)))
+            source.published = index + 1
+            self._published += 1
+            out += self._truth(source, stamp_ns, TRUTH_BATCH_NS)
+        if not self._order:
+            self.ended = True
+            for source in self._sources.values():
+                out += self._truth(source, 2**62, 0)
+            out.append(Outgoing(ch.END, "", self._end()))
+        return out
+
+    def _horizon_ns(self, clock_s: float) -> float:
+        assert self._began_at is not None
+        if self.speed == float("inf"):
+            return self.speed  # at the first look no time has passed: 0 · ∞ is not a number
+        return self._first_ns + (clock_s - self._began_at) * self.speed * 1e9
+
+    def _credit(self, source: _Source) -> bool:
+        if source.alive and source.published - source.consumed >= CREDIT_READINGS:
+            return False
+        ahead = self._published - self._unrecorded - sum(self._recorded.values())
+        return not self._recorder or ahead < CREDIT_RECORDER
+
+    def _truth(self, source: _Source, stamp_ns: int, batch_ns: int) -> list[Outgoing]:
+        stream = source.stream
+        if stream.truth is None or stream.truth_ns is None:
+            return []
+        begin = source.truth_sent
+        if begin >= len(stream.truth_ns) or stamp_ns - stream.truth_ns[begin] < batch_ns:
+            return []
+        end = int(np.searchsorted(stream.truth_ns, stamp_ns, side="right"))
+        if end <= begin:
+            return []
+        source.truth_sent = end
+        truth = m.Truth(
+            int(stream.truth_ns[end - 1]),
+            stream.robot,
+            from_stamps(stream.truth_ns[begin:end]),
+            from_floats(stream.truth[begin:end]),
+        )
+        return [Outgoing(ch.TRUTH, stream.robot, truth)]
+
+    def _end(self) -> m.End:
+        ends = tuple(m.StreamEnd(n, x.epoch, x.counter) for n, x in self._sources.items())
+        notes = [*self.streams.notes]
+        for name, source in self._sources.items():
+            notes += [f"{name}: {note}" for note in source.stream.notes]
+        return m.End(self.now_ns, ends, tuple(notes))
+
+    def readings(self, request: bytes) -> Iterable[bytes]:
+        """The answer to `ReadingsWanted`: the published readings asked for, ANSWER at most."""
+        wanted = decoded(request, m.ReadingsWanted)
+        source = self._sources.get(wanted.robot)
+        if source is None or wanted.epoch not in (0, source.epoch):
+            return []
+        if self.cache is not None and wanted.first < source.counter - self.cache:
+            self._begin_epoch(source)
+            return []
+        last = source.counter - 1 if wanted.last < 0 else min(wanted.last, source.counter - 1)
+        last = min(last, wanted.first + ANSWER - 1)
+        return [encoded(source.message(source.base + i)) for i in range(wanted.first, last + 1)]
+
+    def _begin_epoch(self, source: _Source) -> None:
+        """The stream can not be continued where the robot is: it begins anew at a free pose."""
+        source.epoch += 1
+        source.base = source.published - 1
+        source.consumed = source.base
+        start = source.message(source.base)
+        self._starts.append(Outgoing(ch.START, source.stream.robot, start))
+
+    def status(self) -> m.Status:
+        """How far the world is, for people."""
+        total = self._published + len(self._order)
+        figures = {
+            "readings": float(self._published),
+            "of": float(total),
+            "team_time_s": (self.now_ns - self._first_ns) * 1e-9,
+        }
+        waiting = self.waiting_for
+        state = "publishing" if self._began_at is not None else "waiting"
+        warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
+        return m.Status(
+            self.now_ns,
+            "world",
+            "ended" if self.ended else state,
+            figures,
+            (*self.configurations.mismatches, *warnings),
+        )
+
+
+def expected_nodes(robots: Sequence[str], *, recorder: bool) -> frozenset[str]:
+    """Who must be alive before the world begins."""
+    nodes = {ch.robot_node(robot) for robot in robots} | {"central"}
+    return frozenset(nodes | {"recorder"} if recorder else nodes)

@@ -1,0 +1,343 @@
+"""Calibration: what was put into readings comes out of them, within its own uncertainty."""
+
+import re
+from dataclasses import replace
+from pathlib import Path as File
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sim.calibration.calibrate import Calibration, calibrated, with_figures
+from sim.calibration.data import Reference, poses_at
+from sim.calibration.figures import CalibrationError, Figure, groups_of, jackknifed
+from sim.calibration.join import joined_team
+from sim.calibration.motion import UNITS as MOTION_UNITS
+from sim.calibration.motion import fit_motion
+from sim.calibration.scenario import scenario_toml
+from sim.calibration.sensor import UNITS as SENSOR_UNITS
+from sim.calibration.sensor import fit_sensor
+from sim.calibration.source import world_of
+from sim.cli.main import app
+from sim.datasets.utias_writer import write_utias
+from sim.evaluation.errors import Path, on_circle
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.world.streams import Detections, Intervals, WorldStreams, grouped
+from sim.world.worlds import SimulatedWorld
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.wire.bus import opened
+from tests.sim.logs import scenario, streams, world_log
+
+SECOND = 1_000_000_000
+SEEN = {i: np.array([3.0 * np.cos(i), 3.0 * np.sin(i)]) for i in range(1, 7)}
+NOTHING = grouped(np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0), np.empty(0))
+
+
+def driven(seed: int, seconds: int = 1500) -> Reference:
+    """A base that drives 1.05 v less 0.1 m of each radian, turns 0.9 ω − 0.03 rad/m; 10 Hz."""
+    rng = np.random.default_rng(seed)
+    legs = seconds // 3
+    v = np.repeat(rng.choice([0.0, 0.05, 0.08, -0.06], legs), 30)
+    w = np.repeat(rng.choice([0.0, 0.0, 0.15, -0.15, 0.4, -0.4], legs), 30)
+    dt, n = 0.1, len(v)
+    speed = np.sign(v) * np.maximum(1.05 * np.abs(v) - 0.1 * np.abs(0.9 * w), 0.0)
+    ahead = speed * dt + 0.03 * np.sqrt(np.abs(speed) * dt) * rng.standard_normal(n)
+    turn = 0.9 * w * dt - 0.03 * ahead + 0.08 * np.sqrt(np.abs(w) * dt) * rng.standard_normal(n)
+    heading = np.append(0.0, np.cumsum(turn))
+    middle = heading[:-1] + 0.5 * turn
+    x, y = (np.append(0.0, np.cumsum(ahead * f(middle))) for f in (np.cos, np.sin))
+    stamps = np.arange(n + 1, dtype=np.int64) * (SECOND // 10)
+    path = Path(stamps, np.stack([x, y, on_circle(heading)], axis=1))
+    intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
+    return Reference(f"r{seed}", intervals, NOTHING, path, SECOND, SEEN, NOTHING, (), {})
+
+
+def seeing(seed: int) -> Reference:
+    """Standing at the middle, 4 Hz: ranges 0.95 d + 0.1, of σ 0.05 d; a fifth white, 5 s the rest.
+
+    Bearings are 0.02 rad too large, of σ 0.01, all white, and 3 % of them anywhere.
+    """
+    rng = np.random.default_rng(seed)
+    n, dt = 2000, 0.25
+    keep = np.exp(-dt / 5.0)
+    rows = []
+    for i, place in SEEN.items():
+        slow = np.empty(n)
+        slow[0] = rng.standard_normal()
+        for k in range(1, n):
+            slow[k] = keep * slow[k - 1] + np.sqrt(1.0 - keep**2) * rng.standard_normal()
+        error = np.sqrt(0.8) * slow + np.sqrt(0.2) * rng.standard_normal(n)
+        distance = np.hypot(*(place * (0.5 + 0.25 * i)))
+        ranges = 0.95 * distance * (1.0 + 0.05 * error) + 0.1
+        bearings = np.arctan2(place[1], place[0]) + 0.02 + 0.01 * rng.standard_normal(n)
+        wild = rng.random(n) < 0.03
+        bearings[wild] = rng.uniform(-3.0, 3.0, np.count_nonzero(wild))
+        rows.append(
+            np.stack([np.arange(n) * dt, np.full(n, i), ranges, on_circle(bearings)], axis=1)
+        )
+    all_rows = np.concatenate(rows)
+    all_rows = all_rows[np.argsort(all_rows[:, 0], kind="stable")]
+    stamps = np.rint(all_rows[:, 0] * 1e9).astype(np.int64)
+    seen = grouped(stamps, all_rows[:, 1].astype(np.uint32), all_rows[:, 2], all_rows[:, 3])
+    ends = np.array([0, int(stamps[-1])], dtype=np.int64)
+    intervals = Intervals(ends[1:], np.diff(ends), np.zeros(1), np.zeros(1))
+    landmarks = {i: place * (0.5 + 0.25 * i) for i, place in SEEN.items()}
+    return Reference(
+        f"r{seed}", intervals, seen, Path(ends, np.zeros((2, 3))), int(ends[1]), landmarks,
+        NOTHING, (), {},
+    )  # fmt: skip
+
+
+def by_name(figures: tuple[Figure, ...]) -> dict[str, Figure]:
+    return {figure.name: figure for figure in figures}
+
+
+@pytest.fixture(scope="module")
+def bases() -> list[Reference]:
+    return [driven(seed) for seed in range(1, 6)]
+
+
+def test_the_odometrys_figures_come_out_of_readings_within_their_uncertainty(
+    bases: list[Reference],
+) -> None:
+    found = by_name(jackknifed(lambda part: fit_motion(part, None), bases, MOTION_UNITS))
+    true = {"forward_scale": 1.05, "turn_drag": 0.1, "yaw_scale": 0.9, "veer": -0.03}
+    for name, value in true.items():
+        figure = found[name]
+        assert abs(figure.value - value) < 4.0 * figure.sigma + 1e-3, figure
+        assert figure.sigma < 0.02, figure
+    assert found["forward.per_m"].value == pytest.approx(0.03, rel=0.15)
+    assert found["turn.per_rad"].value == pytest.approx(0.08, rel=0.15)
+
+
+def test_a_turn_of_the_odometry_that_is_not_the_robots_own_is_found_out(
+    bases: list[Reference],
+) -> None:
+    """The power of the test above: with yaw rates of the other sign nothing of it holds."""
+    mirrored = [
+        replace(each, intervals=replace(each.intervals, yaw_rate=-each.intervals.yaw_rate))
+        for each in bases
+    ]
+    found = fit_motion(mirrored, None)
+    assert found["yaw_scale"] == pytest.approx(-0.9, abs=0.02)
+
+
+def test_the_sensors_figures_come_out_of_readings_within_their_uncertainty() -> None:
+    data = [seeing(seed) for seed in range(1, 6)]
+    found = by_name(jackknifed(fit_sensor, data, SENSOR_UNITS))
+    true = {"range_scale": 0.95, "range_offset": 0.1, "bearing_offset": 0.02}
+    for name, value in true.items():
+        assert abs(found[name].value - value) < 4.0 * found[name].sigma + 1e-4, found[name]
+    assert found["range_sigma_per_m"].value == pytest.approx(0.05, rel=0.1)
+    assert found["range_white"].value == pytest.approx(0.2, abs=0.06)
+    assert found["range_correlation_s"].value == pytest.approx(5.0, rel=0.25)
+    assert found["bearing_sigma"].value == pytest.approx(0.01, rel=0.05)
+    assert found["bearing_white"].value > 0.9
+    assert found["bearing_outliers"].value == pytest.approx(0.03, abs=0.01)
+
+
+def test_leaving_out_gives_the_standard_error_of_a_mean(bases: list[Reference]) -> None:
+    marks = {each.name: float(i**2) for i, each in enumerate(bases)}
+    (figure,) = jackknifed(
+        lambda part: {"mean": float(np.mean([marks[each.name] for each in part]))},
+        bases,
+        {"mean": "m"},
+    )
+    values = np.array(list(marks.values()))
+    assert figure.value == pytest.approx(values.mean())
+    assert figure.sigma == pytest.approx(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def test_one_robots_log_is_cut_into_stretches_that_lose_no_reading(bases: list[Reference]) -> None:
+    groups = groups_of(bases[:1])
+    ends = np.concatenate([part.intervals.end_ns for group in groups for part in group])
+    np.testing.assert_array_equal(ends, bases[0].intervals.end_ns)
+    cut = seeing(1).between(SECOND, 3 * SECOND)
+    assert cut.seen.stamps_ns[0] == SECOND
+    assert cut.seen.stamps_ns[-1] < 3 * SECOND
+    assert len(cut.seen.ids) == cut.seen.offsets[-1] == 8 * len(SEEN)
+
+
+def test_a_path_is_known_neither_in_a_gap_nor_beside_a_jump_of_its_heading() -> None:
+    path = Path(
+        np.array([0, 1, 5, 6, 7]) * SECOND,
+        np.array([[0, 0, 3.1], [1, 0, -3.1], [2, 0, -3.1], [3, 0, 0.0], [4, 0, 0.1]]),
+    )
+    at = np.array([-1.0, 0.5, 3.0, 5.5, 6.5, 8.0])
+    poses, known = poses_at(path, (at * SECOND).astype(np.int64), 2 * SECOND)
+    np.testing.assert_array_equal(known, [False, True, False, False, True, False])
+    assert abs(on_circle(poses[1, 2:])[0]) == pytest.approx(np.pi)
+    np.testing.assert_allclose(poses[4], [3.5, -0.5 * np.tan(0.025), 0.05])
+
+
+def spinning(seed: int, *, turns_first: bool) -> Reference:
+    """A base that turns up to 2 rad in a step of 1 s and drives 1.05 times what it logs."""
+    rng = np.random.default_rng(seed)
+    v, w = rng.uniform(0.2, 0.5, 300), rng.uniform(-2.0, 2.0, 300)
+    ahead = 1.05 * v + 0.01 * rng.standard_normal(300)
+    turn = 0.95 * w + 0.01 * rng.standard_normal(300)
+    heading = np.append(0.0, np.cumsum(turn))
+    toward = heading[1:] if turns_first else heading[1:] - 0.5 * turn
+    chord = ahead if turns_first else ahead * 2.0 * np.sin(0.5 * turn) / turn
+    x, y = (np.append(0.0, np.cumsum(chord * f(toward))) for f in (np.cos, np.sin))
+    stamps = np.arange(301, dtype=np.int64) * SECOND
+    path = Path(stamps, np.stack([x, y, on_circle(heading)], axis=1))
+    intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
+    name = f"r{seed}"
+    return Reference(
+        name, intervals, NOTHING, path, SECOND, SEEN, NOTHING, (), {}, turns_first=turns_first
+    )
+
+
+@pytest.mark.parametrize("turns_first", [True, False])
+def test_two_robots_that_turn_as_far_as_they_like_are_calibrated(turns_first: bool) -> None:
+    data = [spinning(seed, turns_first=turns_first) for seed in (1, 2)]
+    found = by_name(jackknifed(lambda part: fit_motion(part, None), data, MOTION_UNITS))
+    assert found["forward_scale"].value == pytest.approx(1.05, abs=0.01)
+    assert found["yaw_scale"].value == pytest.approx(0.95, abs=0.005)
+    assert found["turn_drag"].value < 0.005
+    confused = [replace(each, turns_first=not turns_first) for each in data]
+    wrong = fit_motion(confused, None)
+    assert abs(wrong["forward_scale"] - 1.05) + wrong["turn_drag"] > 0.05
+
+
+def test_too_little_motion_or_too_few_readings_are_said(bases: list[Reference]) -> None:
+    with pytest.raises(CalibrationError, match="stretches of 10 s of motion"):
+        fit_motion([bases[0].between(0, 60 * SECOND)], None)
+    with pytest.raises(CalibrationError, match="readings of landmarks"):
+        fit_sensor(bases)
+
+
+def test_the_readings_of_a_log_are_the_worlds() -> None:
+    team = scenario(robots=2)
+    told = streams(team)
+    read = world_of([opened(sample)[2] for sample in world_log(team)], "a log")
+    assert [each.robot for each in read.streams] == [each.robot for each in told.streams]
+    np.testing.assert_array_equal(read.landmarks, told.landmarks)
+    for found, expected in zip(read.streams, told.streams, strict=True):
+        np.testing.assert_array_equal(found.kinds, expected.kinds)
+        np.testing.assert_array_equal(found.truth, expected.truth)
+        for name in ("intervals", "landmark_detections"):
+            for part, other in zip(
+                vars(getattr(found, name)).values(),
+                vars(getattr(expected, name)).values(),
+                strict=True,
+            ):
+                np.testing.assert_array_equal(part, other)
+        assert isinstance(found.teammate_detections, Detections)
+
+
+def test_the_joined_teams_paths_and_landmarks_lie_where_the_robots_were() -> None:
+    team = scenario(robots=2)
+    world = streams(team)
+    joined = joined_team(world, team)
+    for stream in world.streams:
+        path = joined.paths[stream.robot]
+        assert np.all(np.diff(path.stamps_ns) > 0)
+        assert stream.truth is not None
+        assert stream.truth_ns is not None
+        true, known = poses_at(Path(stream.truth_ns, stream.truth), path.stamps_ns, 10 * SECOND)
+        errors = np.hypot(*(path.poses - true)[known, :2].T)
+        assert np.sqrt(np.mean(errors**2)) < 0.3
+    assert world.landmarks is not None
+    truth = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
+    assert max(np.hypot(*(place - truth[i])) for i, place in joined.landmarks.items()) < 1.0
+
+
+def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path: File) -> None:
+    figures = (
+        Figure("forward_scale", 1.1, 0.01, ""),
+        Figure("turn.per_m", 0.07, 0.002, "rad/√m"),
+        Figure("turn.per_rad", 0.2, 0.003, "rad/√rad"),
+    )
+    of_sensor = (
+        Figure("range_scale", 0.9, 0.001, ""),
+        Figure("range_correlation_s", 7.0, 1.0, "s"),
+        Figure("bearing_correlation_s", 0.0, 0.0, "s"),
+        Figure("bearing_outliers", 0.017, 0.002, ""),
+    )
+    found = Calibration(figures, of_sensor, True, ("a note",))
+    place = tmp_path / "mine.toml"
+    text = scenario_toml(found, load("utias"), ["set.zip"])
+    place.write_text(text, "utf-8")
+    assert "± 0.002 rad/√m" in text
+    assert "range_correlation_s = 7  # ± 1 s" in text
+    assert "# bearing_outliers: 0.017 ± 0.002" in text
+    written, expected = load(place), with_figures(load("utias"), figures, of_sensor)
+    turn = written.robots[3].motion.turn
+    assert (turn.per_m, turn.per_rad) == (0.07, 0.2)
+    for mine, theirs in zip(written.robots, expected.robots, strict=True):
+        assert msgspec.to_builtins(mine.sensor) == msgspec.to_builtins(theirs.sensor)
+        assert mine.motion.forward_scale == theirs.motion.forward_scale
+
+
+@pytest.fixture(scope="module")
+def slipping() -> tuple[Scenario, WorldStreams]:
+    """A simulated team whose bases drive 10 % farther than their odometry says."""
+    world = SimulatedWorld(
+        steps=1000,
+        step_s=0.25,
+        size_m=20.0,
+        landmark_count=12,
+        speed_m_s=0.4,
+        turn_rate_rad_s=0.5,
+        visible_from_m=1.0,
+        visible_to_m=12.0,
+    )
+    motion = MotionModel(forward=MotionNoise(per_m=0.05), turn=MotionNoise(per_rad=0.05))
+    sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01)
+    front_end = FrontEnd(window_s=5.0, particles=30, keyframe_s=0.5)
+    robots = tuple(RobotConfig(f"r{i}", motion, sensor, front_end) for i in (1, 2))
+    team = with_options(Scenario("slipping", "slipping", world, robots), seed=3)
+    told = streams(team)
+    less = tuple(
+        replace(each, intervals=replace(each.intervals, forward=each.intervals.forward / 1.1))
+        for each in told.streams
+    )
+    return team, replace(told, streams=less)
+
+
+@pytest.mark.parametrize("by_truth", [True, False])
+def test_odometry_that_does_not_fit_is_learnt_and_told_with_and_without_truth(
+    slipping: tuple[Scenario, WorldStreams], by_truth: bool
+) -> None:
+    team, world = slipping
+    told: list[str] = []
+    world = world if by_truth else replace(world, landmarks=None)
+    found = calibrated([("a log", world)], team, told.append)
+    assert found.by_truth is by_truth
+    assert told
+    motion = by_name(found.motion)
+    assert motion["forward_scale"].value == pytest.approx(1.1, abs=0.015)
+    assert motion["yaw_scale"].value == pytest.approx(1.0, abs=0.02)
+    (alarm,) = (note for note in found.notes if "not calibrated for these data" in note)
+    assert re.match(r"forward_scale is \+(9|10)\.\d %", alarm)
+    if by_truth:
+        sensor = by_name(found.sensor)
+        assert sensor["range_scale"].value == pytest.approx(1.0, abs=0.003)
+        assert sensor["bearing_sigma"].value == pytest.approx(0.01, rel=0.05)
+        assert motion["forward.per_m"].value == pytest.approx(0.05, rel=0.25)
+    else:
+        assert found.sensor == ()
+
+
+def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(
+    slipping: tuple[Scenario, WorldStreams], tmp_path: File
+) -> None:
+    """A set of two robots: of one the ground truth is missing, the other's is too short."""
+    write_utias(slipping[1], tmp_path / "set")
+    (tmp_path / "set" / "Robot2_Groundtruth.dat").unlink()
+    said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "set")])
+    assert said.exit_code == 1
+    assert "set r2: no ground truth: nothing is learnt from it" in said.output
+    assert "24 stretches of 10 s of motion with a known path, 30 needed" in said.output
+
+
+def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path: File) -> None:
+    team = scenario()
+    with pytest.raises(CalibrationError, match="30 needed"):
+        calibrated([("a log", streams(team))], team, lambda text: None)
+    result = CliRunner().invoke(app, ["calibrate", "a.zip", "-o", str(tmp_path / "a.json")])
+    assert result.exit_code == 2
+    assert "ends in .toml" in result.output

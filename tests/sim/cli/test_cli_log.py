@@ -1,0 +1,195 @@
+"""`teamslam log`: what it prints, writes and refuses, and with which exit status."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from sim.cli.main import app
+from sim.cli.options import WRONG_USE
+from sim.datasets.utias_writer import write_utias
+from team.recording.reader import LogError, open_log
+from team.recording.recorder import Recorder
+from team.wire.bus import Sample
+from tests.sim.logs import scenario, streams, world_log
+from tests.support import ROOT
+
+
+def run(*arguments: object) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error; a `LogError` is what `main` makes of it."""
+    result = CliRunner().invoke(app, ["log", *map(str, arguments)], env={"COLUMNS": "80"})
+    if isinstance(result.exception, LogError):
+        return WRONG_USE, result.stdout, f"error: {result.exception}"
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def published() -> list[Sample]:
+    """A world of two robots; each key counts from 0, as a bus does."""
+    counts: dict[str, int] = {}
+    samples = []
+    for sample in world_log(scenario(robots=2)):
+        count = counts[sample.key] = counts.get(sample.key, -1) + 1
+        samples.append(replace(sample, counter=count, wall_ns=count))
+    return samples
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "log.mcap"
+    with Recorder(path, "small", {"seed": "1", "note": "x" * 200 + "\n\x1b[2J[bold]"}) as recorder:
+        recorder.write(published())
+    return path
+
+
+@pytest.mark.parametrize("options", [(), ("--keys",)])
+def test_info_fits_eighty_columns_and_steers_no_terminal(
+    log: Path, options: tuple[str, ...]
+) -> None:
+    status, out, _ = run("info", log, *options)
+    lines = [line for line in out.splitlines() if str(log) not in line]
+    assert status == 0
+    assert max(map(len, lines)) <= 80
+    assert "\x1b" not in out
+    assert "team small, complete: " in out
+    assert [line for line in lines if line.startswith("note: xxx")]
+    assert ("robot/r1/odometry" if options else "odometry") in out
+
+
+def test_what_is_said_before_the_readings_has_neither_time_nor_rate(tmp_path: Path) -> None:
+    late = [s for s in published() if "odometry" in s.key and s.counter > 5]
+    config = next(s for s in published() if s.key == "world/config")
+    with Recorder(tmp_path / "late.mcap", "small", {}) as recorder:
+        recorder.write([config, *late])
+    rows = [line.split("│")[1:-1] for line in run("info", tmp_path / "late.mcap")[1].splitlines()]
+    cells = {row[0].strip(): [cell.strip() for cell in row[3:]] for row in rows if row}
+    assert cells["world_config"][1:] == ["", "before", "before"]
+    assert cells["odometry"][1:] == ["1", "0.0", "13.0"]
+
+
+def test_the_figures_of_info_are_written_for_machines(log: Path, tmp_path: Path) -> None:
+    assert run("info", log, "--json", tmp_path / "info.json")[0] == 0
+    figures = json.loads((tmp_path / "info.json").read_text())
+    odometry = next(each for each in figures["keys"] if each["key"] == "robot/r1/odometry")
+    assert (odometry["messages"], odometry["rate_hz"]) == (20, pytest.approx(1.0))
+    assert (figures["team"], figures["complete"], figures["metadata"]["seed"]) == (
+        "small", True, "1",
+    )  # fmt: skip
+    assert figures["span_ns"] == [0, 20 * 10**9]
+
+
+def test_check_ends_with_1_and_a_line_for_each_finding(log: Path, tmp_path: Path) -> None:
+    assert run("check", log)[:2] == (0, f"{log}: nothing wrong\n")
+    lost = tmp_path / "lost.mcap"
+    with Recorder(lost, "small", {}) as recorder:
+        recorder.write([s for s in published() if s.counter != 3])
+    status, out, _ = run("check", lost)
+    assert status == 1
+    assert "robot/r1/odometry: 1 message missing: 3" in out.splitlines()
+    assert all(": 1 message missing: 3" in line for line in out.splitlines())
+
+
+def test_parts_by_the_command_merge_to_a_sound_log(log: Path, tmp_path: Path) -> None:
+    a, b, m = (tmp_path / f"{name}.mcap" for name in "abm")
+    assert run("cut", log, "-o", a, "--to", 7.5)[0] == 0
+    assert run("cut", log, "-o", b, "--from", 7.5)[0] == 0
+    status, out, _ = run("merge", a, b, "-o", m)
+    assert (status, out.split(": ")[1].split()[0]) == (0, str(len(published())))
+    assert list(open_log(m).samples()) == open_log(log).in_time_order()
+    assert run("check", m)[0] == 0
+
+
+def test_a_log_that_is_cut_off_is_repaired(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-100])
+    assert run("check", tmp_path / "cut.mcap")[0] == 1
+    assert run("repair", tmp_path / "cut.mcap", "-o", tmp_path / "whole.mcap")[0] == 0
+    assert run("check", tmp_path / "whole.mcap")[0] == 0
+    assert list(open_log(tmp_path / "whole.mcap").samples()) == published()
+
+
+def test_the_exported_data_set_is_the_one_that_the_world_would_write(
+    log: Path, tmp_path: Path
+) -> None:
+    write_utias(streams(scenario(robots=2)), tmp_path / "world")
+    status, out, _ = run("export", log, "--format", "utias", "-o", tmp_path / "log")
+    assert status == 0
+    assert "Robot2_*.dat: r2" in out
+    names = sorted(path.name for path in (tmp_path / "world").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "log").iterdir())
+    for name in names:
+        assert (tmp_path / "log" / name).read_bytes() == (tmp_path / "world" / name).read_bytes()
+
+
+def test_chosen_channels_are_exported_as_csv(log: Path, tmp_path: Path) -> None:
+    status, out, _ = run("export", log, "-o", tmp_path / "out", "--channels", "odometry, truth")
+    assert status == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "odometry.csv", "truth.csv",
+    ]  # fmt: skip
+    assert "odometry.csv: 40 rows" in out
+
+
+def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
+    log: Path, tmp_path: Path
+) -> None:
+    alone = tmp_path / "r1.mcap"
+    own = [s for s in published() if s.key.startswith("robot/r1")]
+    with Recorder(alone, "small", {}) as recorder:
+        recorder.write(own)
+    status, _, err = run("export", alone, "--format", "utias", "-o", tmp_path / "out")
+    assert status == 2
+    assert "r1.mcap: it sights r2, of whom it has no readings; `teamslam log merge`" in err
+    with Recorder(tmp_path / "gap.mcap", "small", {}) as recorder:
+        recorder.write([s for s in own if s.counter != 3 and "sight" not in s.key])
+    status, _, err = run("export", tmp_path / "gap.mcap", "--format", "utias", "-o", tmp_path / "o")
+    assert status == 2
+    assert "gap.mcap: r1: odometry intervals are not contiguous in time; the format needs" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["info", "nowhere.mcap"], "nowhere.mcap: not found; give the path of a log"),
+        (["check", "LOG/.."], "Is a directory; give the path of a readable file"),
+        (["cut", "LOG", "-o", "LOG"], "exists: choose another name or remove it"),
+        (["cut", "LOG", "-o", "new", "--from", "5", "--to", "5"], "the first before the second"),
+        (["cut", "LOG", "-o", "new", "--from", "nan"], "give seconds"),
+        (["cut", "LOG", "-o", "new", "--from", "50"], "its readings are from 0 to 20.000 s"),
+        (["cut", "LOG", "-o", "new", "--channels", "odo"], "no channel 'odo'; there are start, "),
+        (["merge", "LOG", "nowhere.mcap", "-o", "new"], "nowhere.mcap: not found"),
+        (["merge", "LOG", "-o", "LOG"], "exists: choose another name"),
+        (["export", "LOG", "-o", "LOG/.."], "not an empty folder: give a new one"),
+        (["export", "LOG", "-o", "new", "--format", "excel"], "'excel' is not one of"),
+        (
+            ["export", "LOG", "-o", "new", "--format", "utias", "--channels", "start"],
+            "--channels is for tables",
+        ),
+    ],
+)
+def test_what_a_user_gets_wrong_ends_with_2_and_leaves_nothing(
+    log: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str],
+    told: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    given = [
+        log.parent if each == "LOG/.." else log if each == "LOG" else each for each in arguments
+    ]
+    status, _, err = run(*given)
+    assert status == 2
+    assert told in " ".join(err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_program_itself_ends_with_2_and_one_line(tmp_path: Path) -> None:
+    (tmp_path / "hello.mcap").write_bytes(b"hello")
+    done = subprocess.run(
+        [sys.executable, "-m", "sim", "log", "check", str(tmp_path / "hello.mcap")],
+        cwd=ROOT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"error: {tmp_path / 'hello.mcap'}: not an MCAP file; give a log")
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,148 @@
+"""Data sets with a fault each: the team still ends with a sound map, and it is said what was wrong.
+
+The faults are those of sets that people have: files that are missing, foreign barcodes, rows out
+of order, gaps. Readings and repairs themselves are tested in test_utias.
+"""
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from sim.datasets.utias_writer import write_utias
+from sim.evaluation.evaluation import Evaluation, evaluate
+from sim.in_memory.team import run_team
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.scenario.source import streams_of
+from sim.world.streams import WorldStreams
+from sim.world.worlds import SimulatedWorld, UtiasWorld
+
+STEPS = 25
+
+
+@pytest.fixture(scope="module")
+def simulated() -> WorldStreams:
+    scenario = with_options(load("waypoints"), robots=2)
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = msgspec.structs.replace(scenario.world, steps=STEPS, size_m=30.0, landmark_count=12)
+    return streams_of(msgspec.structs.replace(scenario, world=world))
+
+
+def utias(path: Path) -> Scenario:
+    """The profile with few particles, for two robots whose odometry has the camera's clock."""
+    scenario = with_options(load("utias"), robots=2, dataset=path)
+    assert isinstance(scenario.world, UtiasWorld)
+    robots = tuple(
+        msgspec.structs.replace(
+            robot, front_end=msgspec.structs.replace(robot.front_end, particles=20)
+        )
+        for robot in scenario.robots
+    )
+    world = msgspec.structs.replace(scenario.world, odometry_delay_s=0.0)
+    return msgspec.structs.replace(scenario, robots=robots, world=world)
+
+
+def edited(path: Path, change: Callable[[list[str]], list[str]]) -> None:
+    """Change the rows of a file, its two comment lines apart."""
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:2] + change(lines[2:])) + "\n")
+
+
+def removed(*names: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        for name in names:
+            (folder / f"{name}.dat").unlink()
+
+    return change
+
+
+def changed(kind: str, change: Callable[[list[str]], list[str]]) -> Callable[[Path], None]:
+    return lambda folder: edited(folder / f"Robot2_{kind}.dat", change)
+
+
+def zipped(folder: Path) -> None:
+    """The folder becomes a zip of the same name that holds it as MRSLAM_Dataset4."""
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for path in folder.iterdir():
+        path.unlink()
+    folder.rmdir()
+    with zipfile.ZipFile(folder, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(f"MRSLAM_Dataset4/{name}", content)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is done to a set, what must be said; framed: the map lies in the truth's frame."""
+
+    damage: Callable[[Path], None]
+    said: tuple[str, ...]
+    framed: bool = True
+    surveyed: bool = True
+
+
+NO_START = "no ground truth at its first reading: its start pose is not known"
+FAULTS = {
+    "none, in a zip of another name": Fault(zipped, ()),
+    "no truth of one robot": Fault(
+        removed("Robot2_Groundtruth"),
+        ("r2: no ground truth: its trajectory's error can not be computed", f"r2: {NO_START}"),
+    ),
+    "no truth at all": Fault(
+        removed("Robot1_Groundtruth", "Robot2_Groundtruth", "Landmark_Groundtruth"),
+        (
+            "no landmark ground truth: the map's error can not be computed",
+            f"r1: {NO_START}",
+            f"r2: {NO_START}",
+        ),
+        framed=False,
+        surveyed=False,
+    ),
+    "no odometry of one robot": Fault(
+        removed("Robot2_Odometry"), ("r2: no odometry: only what it saw is given",)
+    ),
+    "no readings of one robot": Fault(
+        removed("Robot2_Measurement"), ("r2: no measurements: only its odometry is given",)
+    ),
+    "unknown barcodes": Fault(
+        changed("Measurement", lambda rows: [*rows, *(f"{i}.5 999 2.0 0.1" for i in range(20))]),
+        ("r2: 20 measurements dropped: unknown barcode",),
+    ),
+    "backward steps": Fault(
+        changed("Odometry", lambda rows: [*rows[:7], rows[8], rows[7], *rows[9:]]),
+        ("r2: 1 odometry row earlier than the row before: sorted by time",),
+    ),
+    "gaps": Fault(
+        changed("Odometry", lambda rows: rows[:10] + rows[15:]),
+        ("r2: odometry has a gap of 6.0 s: its last velocities hold over it",),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_set_with_a_fault_gives_a_sound_map_and_says_what_is_wrong(
+    name: str, simulated: WorldStreams, tmp_path: Path
+) -> None:
+    fault = FAULTS[name]
+    write_utias(simulated, tmp_path / "set")
+    fault.damage(tmp_path / "set")
+    scenario = utias(tmp_path / "set")
+    found = evaluate(run_team(scenario, streams_of(scenario)))
+    assert set(fault.said) <= set(found.notes)
+    assert bool(found.notes) == bool(fault.said)
+    assert_sound(found, fault)
+
+
+def assert_sound(found: Evaluation, fault: Fault) -> None:
+    assert found.map is not None
+    assert found.unsound == 0
+    assert len(found.map.ids) >= 4
+    assert np.isfinite(found.map.means).all()
+    assert np.all(np.linalg.eigvalsh(found.map.covariance) > 0.0)
+    assert (found.map.errors is not None) == fault.surveyed
+    if fault.framed and found.map.errors is not None:
+        assert found.map.errors.rmse_m < 1.5

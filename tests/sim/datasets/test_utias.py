@@ -1,0 +1,543 @@
+"""UTIAS data sets: what is written is read again, repairs are counted, damage is named exactly."""
+
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sim.cli.main import app
+from sim.datasets import errata
+from sim.datasets.tables import DatasetError
+from sim.datasets.utias import utias
+from sim.datasets.utias_rows import start_pose
+from sim.datasets.utias_writer import landmark_shift, write_utias
+from sim.scenario.scenario import load, with_options
+from sim.scenario.source import streams_of
+from sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
+from sim.world.worlds import UtiasWorld
+from sim.world_node.node import WorldNode
+from team.config import RobotConfig
+from team.wire import messages as m
+
+REAL = Path(__file__).parents[4] / "shared" / "utias"
+
+
+def team(count: int) -> list[RobotConfig]:
+    return [RobotConfig(id=f"r{i}") for i in range(1, count + 1)]
+
+
+def read(path: Path, count: int = 3, **options: float | bool) -> WorldStreams:
+    return utias(UtiasWorld(path=str(path), **options), team(count))  # type: ignore[arg-type]  # one dict for floats and flags
+
+
+@pytest.fixture(scope="module")
+def simulated() -> WorldStreams:
+    return streams_of(load("waypoints"))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, simulated: WorldStreams) -> Path:
+    """A fresh data set of three robots."""
+    write_utias(simulated, tmp_path / "MRCLAM_Dataset0")
+    return tmp_path / "MRCLAM_Dataset0"
+
+
+def edited(path: Path, change: Callable[[list[str]], list[str]]) -> None:
+    """Change the rows of a file, its two comment lines apart."""
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:2] + change(lines[2:])) + "\n")
+
+
+def without_empty_messages(stream: RobotStream) -> np.ndarray:
+    lengths = np.diff(stream.landmark_detections.offsets)
+    keep = np.ones(len(stream), dtype=bool)
+    observations = stream.kinds == OBSERVATIONS
+    keep[observations] = lengths[stream.rows[observations]] > 0
+    return keep
+
+
+def assert_same_readings(given: RobotStream, found: RobotStream, shift: int) -> None:
+    keep = without_empty_messages(given)
+    assert np.array_equal(found.kinds, given.kinds[keep])
+    assert np.array_equal(found.stamps_ns, given.stamps_ns[keep])
+    assert found.teammates == given.teammates
+    for name in ("duration_ns", "forward", "yaw_rate"):
+        assert np.allclose(
+            getattr(found.intervals, name), getattr(given.intervals, name), atol=1e-9
+        )
+    for name, added in (("landmark_detections", shift), ("teammate_detections", 0)):
+        a, b = getattr(found, name), getattr(given, name)
+        assert np.array_equal(a.ids, b.ids + added)
+        assert np.allclose(a.ranges, b.ranges, rtol=0, atol=1e-9)
+        assert np.allclose(a.bearings, b.bearings, rtol=0, atol=1e-9)
+    assert np.allclose(found.truth, given.truth, rtol=0, atol=1e-9)
+
+
+def test_what_is_written_is_read_again(folder: Path, simulated: WorldStreams) -> None:
+    found = read(folder)
+    assert landmark_shift(simulated) == 5, "subjects 1 to 5 are robots"
+    assert np.array_equal(found.landmark_ids, simulated.landmark_ids + 5)
+    assert np.allclose(found.landmarks, simulated.landmarks, rtol=0, atol=1e-9)
+    assert found.source == "UTIAS data set MRCLAM_Dataset0"
+    for given, read_again in zip(simulated.streams, found.streams, strict=True):
+        assert_same_readings(given, read_again, 5)
+        assert read_again.start.covariance is None
+        assert np.allclose(read_again.start.pose, given.start.pose, rtol=0, atol=1e-9)
+
+
+def test_a_written_set_has_the_files_of_the_format(folder: Path) -> None:
+    names = {path.name for path in folder.iterdir()}
+    kinds = ("Odometry", "Measurement", "Groundtruth")
+    robots = {f"Robot{i}_{kind}.dat" for i in (1, 2, 3) for kind in kinds}
+    assert names == {"Barcodes.dat", "Landmark_Groundtruth.dat"} | robots
+
+
+def test_more_robots_than_the_rig_had_can_be_written_and_read(tmp_path: Path) -> None:
+    given = streams_of(with_options(load("thesis-b"), robots=7))
+    write_utias(given, tmp_path)
+    found = read(tmp_path, 7)
+    assert landmark_shift(given) == 7
+    for a, b in zip(given.streams, found.streams, strict=True):
+        assert_same_readings(a, b, 7)
+
+
+def test_what_was_read_and_written_is_read_the_same(folder: Path, tmp_path: Path) -> None:
+    first = read(folder)
+    write_utias(first, tmp_path / "again")
+    second = read(tmp_path / "again")
+    assert landmark_shift(first) == 0
+    for a, b in zip(first.streams, second.streams, strict=True):
+        assert a.landmark_detections.ranges.tobytes() == b.landmark_detections.ranges.tobytes()
+        assert np.array_equal(a.stamps_ns, b.stamps_ns)
+
+
+@pytest.mark.parametrize("inside", ["", "MRSLAM_Dataset4/", "a/b/"])
+def test_a_zip_is_read_as_its_folder_whatever_the_folder_is_called(
+    folder: Path, tmp_path: Path, inside: str
+) -> None:
+    archive = tmp_path / "set.zip"
+    with zipfile.ZipFile(archive, "w") as target:
+        for path in folder.iterdir():
+            target.write(path, inside + path.name)
+    expected, found = read(folder), read(archive)
+    for a, b in zip(expected.streams, found.streams, strict=True):
+        assert np.array_equal(a.stamps_ns, b.stamps_ns)
+        assert np.array_equal(a.landmark_detections.ranges, b.landmark_detections.ranges)
+
+
+def test_the_folder_above_the_set_will_do(folder: Path) -> None:
+    assert len(read(folder.parent).streams) == 3
+
+
+def test_odometry_acts_later_by_its_delay(folder: Path) -> None:
+    prompt = read(folder).streams[0]
+    late = read(folder, odometry_delay_s=0.25).streams[0]
+    assert np.array_equal(late.intervals.end_ns, prompt.intervals.end_ns + 250_000_000)
+    assert np.array_equal(late.intervals.forward, prompt.intervals.forward)
+    seen, before = late.landmark_detections, prompt.landmark_detections
+    assert np.array_equal(seen.ranges, before.ranges), "the camera's clock stays"
+
+
+def test_a_robots_clock_offset_orders_its_readings_and_leaves_its_stamps(folder: Path) -> None:
+    world = UtiasWorld(path=str(folder), odometry_delay_s=0.1)
+    robots = [msgspec.structs.replace(team(1)[0], clock_offset_s=0.4)]
+    (stream,) = utias(world, robots).streams
+    (late,) = read(folder, 1, odometry_delay_s=0.5).streams
+    assert np.array_equal(stream.stamps_ns, late.stamps_ns)
+    node = WorldNode(utias(world, robots), frozenset(), m.Configured(0, "world", 0, bytes(8), "{}"))
+    sent = [o.message for o in node.publish(0.0) if isinstance(o.message, m.Odometry)]
+    assert sent[0].stamp_ns == late.intervals.end_ns[0] - 400_000_000
+
+
+def test_a_simulated_clock_offset_is_written_as_the_odometry_stamps_it(
+    folder: Path, tmp_path: Path
+) -> None:
+    scenario = load("waypoints")
+    off = msgspec.structs.replace(scenario.robots[0], clock_offset_s=0.25)
+    late = msgspec.structs.replace(scenario, robots=(off, *scenario.robots[1:]))
+    write_utias(streams_of(late), tmp_path / "late")
+    first = [
+        float((each / "Robot1_Odometry.dat").read_text().splitlines()[2].split()[0])
+        for each in (folder, tmp_path / "late")
+    ]
+    assert first == [0.0, 0.0], "the world began 0.25 s later, the odometry's clock reads 0 there"
+    found = utias(UtiasWorld(path=str(tmp_path / "late")), [off, *team(3)[1:]])
+    given = streams_of(late)
+    assert_same_readings(given.streams[0], found.streams[0], 5)
+
+
+@pytest.mark.parametrize("name", ["waypoints", "downs-100"])
+def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(
+    name: str, tmp_path: Path
+) -> None:
+    done = CliRunner().invoke(app, ["simulate", name, "-o", str(tmp_path / "set")])
+    assert done.exit_code == 0
+    scenario = load(tmp_path / "set" / "scenario.toml")
+    source = load(name)
+    assert f"teamslam launch {tmp_path / 'set' / 'scenario.toml'}" in done.stdout
+    assert scenario.robots == source.robots
+    assert (scenario.central, scenario.seed) == (source.central, source.seed)
+    found, given = streams_of(scenario), streams_of(source)
+    for before, after in zip(given.streams, found.streams, strict=True):
+        assert np.allclose(before.start.pose, after.start.pose, atol=1e-8)
+        assert np.allclose(before.intervals.forward, after.intervals.forward, atol=1e-8)
+        assert len(before.landmark_detections.ids) == len(after.landmark_detections.ids)
+
+
+def test_the_start_pose_is_the_truth_with_the_given_sigmas(folder: Path) -> None:
+    start = read(folder, start_sigma_m=0.05, start_sigma_rad=0.03).streams[0].start
+    assert np.allclose(start.covariance, np.diag([0.0025, 0.0025, 0.0009]))
+
+
+def test_the_start_poses_of_a_data_set_can_be_kept_from_the_team(folder: Path) -> None:
+    told = read(folder, unknown_starts=("*", "!r1")).streams
+    assert [each.start is None for each in told] == [False, True, True]
+    assert all(each.truth is not None for each in told)
+
+
+def test_a_start_heading_survives_the_fault_of_resampled_truth_at_the_wrap() -> None:
+    stamps = 20_000_000 * np.arange(21)
+    heading = np.full(21, 3.1415)
+    heading[10:] = -3.1414
+    heading[8:12] = [2.0, 0.7, -0.6, -1.9]  # what linear resampling makes of the step at ±π
+    truth = np.column_stack([0.1 * np.arange(21), np.zeros(21), heading])
+    pose = start_pose(stamps, truth, 205_000_000)
+    assert pose[0] == pytest.approx(1.025)
+    assert abs(np.angle(np.exp(1j * (pose[2] - np.pi)))) < 1e-3
+    assert -np.pi < pose[2] <= np.pi
+    assert start_pose(stamps, truth, 10**9) is None
+
+
+def test_a_cut_ends_the_whole_team_at_one_time(folder: Path, simulated: WorldStreams) -> None:
+    for given, cut in zip(simulated.streams, read(folder, duration_s=60.0).streams, strict=True):
+        assert cut.stamps_ns[-1] == 60 * 10**9
+        assert np.count_nonzero(cut.kinds == ODOMETRY) == 60
+        assert np.array_equal(cut.intervals.forward, read_forward(given)[:60])
+        assert cut.truth_ns[-1] == 60 * 10**9
+
+
+def read_forward(stream: RobotStream) -> np.ndarray:
+    return np.array([float(f"{value:.9f}") for value in stream.intervals.forward])
+
+
+def test_rows_out_of_order_are_sorted_and_counted(folder: Path) -> None:
+    expected = read(folder).streams[0]
+    for kind in ("Odometry", "Groundtruth"):
+        edited(folder / f"Robot1_{kind}.dat", lambda rows: [*rows[:7], rows[8], rows[7], *rows[9:]])
+    found = read(folder).streams[0]
+    assert np.array_equal(found.intervals.forward, expected.intervals.forward)
+    assert np.array_equal(found.truth, expected.truth)
+    assert "1 odometry row earlier than the row before: sorted by time" in found.notes
+    assert "1 ground truth row earlier than the row before: sorted by time" in found.notes
+
+
+def test_an_odometry_row_that_lasts_no_time_is_dropped_and_counted(folder: Path) -> None:
+    expected = read(folder).streams[0]
+    twice = "2.000000 9.0 9.0"
+    edited(folder / "Robot1_Odometry.dat", lambda rows: [*rows[:2], twice, *rows[2:]])
+    found = read(folder).streams[0]
+    assert np.array_equal(found.intervals.end_ns, expected.intervals.end_ns)
+    assert np.array_equal(found.intervals.forward, expected.intervals.forward), "the later acts"
+    assert any(note.startswith("1 odometry row dropped: another row has") for note in found.notes)
+
+
+def test_measurements_that_mean_nothing_are_dropped_and_counted(folder: Path) -> None:
+    expected = read(folder).streams[0]
+    extra = [
+        "50.0 999 1.0 0.0",  # no such barcode
+        "50.1 1101 1.0 0.0",
+        "50.2 101 1.0 0.0",  # the robot itself
+        "50.3 106 0.0 0.0",  # no range
+        "50.4 106 2.0 0.1",
+        "50.4 106 2.5 0.2",  # again, at the same time
+        "5000.0 106 2.0 0.1",  # long after the last odometry
+        "5000.0 102 2.0 0.1",
+    ]
+    edited(folder / "Robot1_Measurement.dat", lambda rows: sorted([*rows, *extra], key=time_of))
+    found = read(folder).streams[0]
+    assert set(found.notes) == {
+        "2 measurements dropped: unknown barcode",
+        "1 measurement dropped: range not above 0",
+        "1 measurement dropped: a second one of the same subject at the same time",
+        "2 measurements dropped: after its last odometry, where its motion is not known",
+        "1 measurement dropped: of itself",
+    }
+    assert len(found) == len(expected) + 1 - np.count_nonzero(~without_empty_messages(expected))
+    seen = found.landmark_detections
+    assert seen.ranges[seen.rows(int(np.searchsorted(seen.stamps_ns, 50_400_000_000)))] == [2.0]
+
+
+def time_of(row: str) -> float:
+    return float(row.split()[0])
+
+
+def test_a_bearing_is_brought_onto_the_circle(folder: Path) -> None:
+    edited(folder / "Robot1_Measurement.dat", lambda rows: ["0.5 106 2.0 -3.5", *rows])
+    found = read(folder).streams[0].landmark_detections
+    assert found.bearings[0] == pytest.approx(2 * np.pi - 3.5)
+
+
+def test_sightings_of_robots_outside_the_team_are_dropped_and_counted(folder: Path) -> None:
+    whole, part = read(folder, 3).streams[1], read(folder, 2).streams[1]
+    met = whole.teammate_detections.ids
+    assert part.teammates == ("r1", "r2")
+    assert np.count_nonzero(met == 0) == len(part.teammate_detections.ids) > 0
+    lost = np.count_nonzero(met == 2)
+    assert f"{lost} measurements dropped: of a robot that is not in the team" in part.notes
+
+
+def test_a_robot_without_odometry_still_gives_what_it_saw(folder: Path) -> None:
+    expected = read(folder).streams
+    (folder / "Robot2_Odometry.dat").unlink()
+    found = read(folder).streams
+    assert set(found[1].kinds) == set(expected[1].kinds) - {ODOMETRY}
+    assert found[1].kinds[0] == START
+    assert "no odometry: only what it saw is given" in found[1].notes
+    assert len(found[0]) == len(expected[0])
+
+
+def test_a_robot_without_measurements_still_drives(folder: Path) -> None:
+    (folder / "Robot2_Measurement.dat").unlink()
+    found = read(folder).streams[1]
+    assert set(found.kinds) == {START, ODOMETRY}
+    assert "no measurements: only its odometry is given" in found.notes
+
+
+def test_without_its_truth_a_robots_start_is_unknown_and_it_is_said(folder: Path) -> None:
+    (folder / "Robot2_Groundtruth.dat").unlink()
+    found = read(folder).streams
+    assert (found[1].start, found[1].truth, found[1].truth_ns) == (None, None, None)
+    assert "no ground truth at its first reading: its start pose is not known" in found[1].notes
+    assert found[0].start is not None
+
+
+def test_truth_that_ends_early_is_said(folder: Path) -> None:
+    edited(folder / "Robot2_Groundtruth.dat", lambda rows: rows[:100])
+    found = read(folder).streams[1]
+    assert len(found.truth) == 100
+    assert "ground truth ends 201 s before the odometry" in found.notes
+
+
+def test_long_gaps_are_said(folder: Path) -> None:
+    for kind in ("Odometry", "Groundtruth"):
+        edited(folder / f"Robot1_{kind}.dat", lambda rows: rows[:20] + rows[25:])
+    notes = read(folder).streams[0].notes
+    assert "odometry has a gap of 6.0 s: its last velocities hold over it" in notes
+    assert "ground truth has gaps, the longest of 6.0 s" in notes
+
+
+def test_a_set_without_a_survey_has_no_true_landmarks_but_the_same_readings(folder: Path) -> None:
+    expected = read(folder)
+    (folder / "Landmark_Groundtruth.dat").unlink()
+    found = read(folder)
+    assert found.landmarks is None
+    assert len(found.landmark_ids) == 0
+    assert found.notes == ("no landmark ground truth: the map's error can not be computed",)
+    assert len(found.streams[2]) == len(expected.streams[2])
+
+
+def landmarks_seen(streams: WorldStreams) -> np.ndarray:
+    return np.concatenate([stream.landmark_detections.ids for stream in streams.streams])
+
+
+def test_an_erratum_is_applied_by_content_named_and_can_be_switched_off(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = landmarks_seen(read(folder))
+    assert read(folder).notes == ()
+    rows = [np.loadtxt(folder / f"{name}.dat") for name in ("Barcodes", "Landmark_Groundtruth")]
+    (known,) = errata.ERRATA.values()
+    monkeypatch.setattr(errata, "ERRATA", {errata.content_digest(*rows): known})
+    mended = read(folder)
+    swapped = np.where(plain == 11, 17, np.where(plain == 17, 11, plain))
+    assert not np.array_equal(plain, swapped)
+    assert np.array_equal(landmarks_seen(mended), swapped)
+    assert mended.notes == (known.note,)
+    off = read(folder, errata=False)
+    assert off.notes == ()
+    assert np.array_equal(landmarks_seen(off), plain)
+
+
+def replaced(kind: str, row: int, text: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        edited(folder / f"Robot1_{kind}.dat", lambda rows: [*rows[:row], text, *rows[row + 1 :]])
+
+    return change
+
+
+def barcodes(*rows: str) -> Callable[[Path], None]:
+    return lambda folder: edited(folder / "Barcodes.dat", lambda _: list(rows))
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            replaced("Odometry", 4, "4.0  0.1"),
+            "Robot1_Odometry.dat, line 7: 2 columns, 3 expected (time [s], forward velocity [m/s], "
+            "angular velocity [rad/s]): `4.0  0.1`",
+        ),
+        (
+            replaced("Measurement", 0, "0.5 106 1,5 0.1"),
+            "Robot1_Measurement.dat, line 3: range [m]: '1,5' is not a number: `0.5 106 1,5 0.1`",
+        ),
+        (
+            replaced("Measurement", 2, "0.5 106 nan 0.1"),
+            "Robot1_Measurement.dat, line 5: range [m]: 'nan' is not finite",
+        ),
+        (
+            replaced("Groundtruth", 1, "1.0 0.0 -inf 0.1"),
+            "Robot1_Groundtruth.dat, line 4: y [m]: '-inf' is not finite",
+        ),
+        (
+            replaced("Odometry", 1, "1e300 0.0 0.1"),
+            "Robot1_Odometry.dat, line 4: time [s]: 1e300 is out of bounds",
+        ),
+        (
+            lambda folder: edited(
+                folder / "Robot1_Odometry.dat", lambda rows: [f"{row} 0" for row in rows]
+            ),
+            "Robot1_Odometry.dat, line 3: 4 columns, 3 expected",
+        ),
+        (
+            lambda folder: (folder / "Robot1_Odometry.dat").write_bytes(b"\x00\xff\xfe\n"),
+            "Robot1_Odometry.dat, line 1: 1 columns, 3 expected",
+        ),
+        (barcodes("1 5", "2 5"), "Barcodes.dat: one barcode has two subjects"),
+        (barcodes("1 5.5"), "Barcodes.dat: expected rows of two whole numbers"),
+        (barcodes(), "Barcodes.dat: expected rows of two whole numbers"),
+        (
+            lambda folder: edited(
+                folder / "Landmark_Groundtruth.dat", lambda rows: [rows[0], *rows]
+            ),
+            "Landmark_Groundtruth.dat: one landmark has two positions",
+        ),
+        (lambda folder: (folder / "Barcodes.dat").unlink(), "no Barcodes.dat in it; expected the"),
+        (
+            lambda folder: shutil.copytree(folder, folder / "second"),
+            "more than one data set in it (MRCLAM_Dataset0, second); give one of them",
+        ),
+        (
+            lambda folder: [path.unlink() for path in folder.glob("Robot1_*")],
+            "the data set has no readings of a robot r1; it has r2, r3",
+        ),
+        (
+            lambda folder: [path.unlink() for path in folder.glob("Robot*")],
+            "no RobotN_Odometry.dat in it; expected the folder or zip of one UTIAS MRCLAM set",
+        ),
+        (
+            lambda folder: [path.write_text("# nothing\n") for path in folder.glob("Robot1_*")],
+            "robot r1: neither odometry nor measurements in its files",
+        ),
+    ],
+)
+def test_damage_is_named_with_file_line_and_text(
+    folder: Path, damage: Callable[[Path], object], said: str
+) -> None:
+    damage(folder)
+    with pytest.raises(DatasetError) as refused:
+        read(folder)
+    assert said in str(refused.value)
+
+
+def test_a_robot_of_another_name_is_refused(folder: Path) -> None:
+    with pytest.raises(DatasetError, match="no readings of a robot alice; it has r1, r2, r3"):
+        utias(UtiasWorld(path=str(folder)), [RobotConfig(id="alice")])
+
+
+def test_a_missing_set_is_named_and_it_is_said_what_is_expected(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError) as refused:
+        read(tmp_path / "MRCLAM1.zip")
+    assert str(refused.value).startswith(f"{tmp_path / 'MRCLAM1.zip'}: no such file or folder; ")
+    assert "It is not shipped with this program" in str(refused.value)
+    with pytest.raises(DatasetError, match="no data set given: name it with --dataset or world"):
+        streams_of(load("utias"))
+
+
+def test_a_file_that_is_no_zip_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "set.zip"
+    path.write_text("not a zip")
+    with pytest.raises(DatasetError, match=r"set\.zip: not a zip, or a damaged one"):
+        read(path)
+
+
+def test_a_zip_with_a_damaged_member_is_refused(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "set.zip"
+    with zipfile.ZipFile(path, "w") as target:
+        for each in folder.iterdir():
+            target.write(each, each.name)
+    content = path.read_bytes()
+    at = content.index(b"written by teamslam")
+    path.write_bytes(content[:at] + b"W" + content[at + 1 :])
+    with pytest.raises(DatasetError, match="not a zip, or a damaged one"):
+        read(path)
+
+
+def test_a_zip_without_the_files_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "set.zip"
+    with zipfile.ZipFile(path, "w") as target:
+        target.writestr("readme.txt", "hello")
+    with pytest.raises(DatasetError, match=r"set\.zip: no Barcodes.dat in it; expected the folder"):
+        read(path)
+
+
+def real(number: int, **options: bool) -> WorldStreams:
+    path = REAL / f"MRCLAM_Dataset{number}.zip"
+    if not path.exists():
+        pytest.skip(f"the data set {path.name} is not here: it is not shipped")
+    scenario = with_options(load("utias"), dataset=path)
+    assert isinstance(scenario.world, UtiasWorld)
+    world = UtiasWorld(
+        **{name: getattr(scenario.world, name) for name in scenario.world.__struct_fields__}
+        | options
+    )
+    return utias(world, scenario.robots)
+
+
+def range_errors(world: WorldStreams, landmark: int) -> np.ndarray:
+    """Range less true range of every sighting of one landmark."""
+    errors = []
+    at = world.landmarks[world.landmark_ids == landmark][0]
+    for stream in world.streams:
+        seen = stream.landmark_detections
+        stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
+        x, y = (np.interp(stamps, stream.truth_ns, stream.truth[:, i]) for i in (0, 1))
+        chosen = seen.ids == landmark
+        errors.append((seen.ranges - np.hypot(at[0] - x, at[1] - y))[chosen])
+    return np.concatenate(errors)
+
+
+@pytest.mark.parametrize(
+    ("number", "odometry_rows", "measurements"), [(2, 597_764, 46_499), (6, 301_431, 19_377)]
+)
+def test_of_a_real_set_every_row_is_a_reading_or_in_a_note(
+    number: int, odometry_rows: int, measurements: int
+) -> None:
+    world = real(number)
+    counts = [int(note.split()[0]) for s in world.streams for note in s.notes if "drop" in note]
+    readings = sum(
+        len(stream.landmark_detections.ids) + len(stream.teammate_detections.ids)
+        for stream in world.streams
+    )
+    intervals = sum(len(stream.intervals.end_ns) for stream in world.streams)
+    last_rows = len(world.streams)  # the last row of a robot has no next one that ends it
+    assert intervals + last_rows + readings + sum(counts) == odometry_rows + measurements
+    for landmark in world.landmark_ids.tolist():
+        assert abs(np.median(range_errors(world, landmark))) < 0.25
+    for stream in world.streams:
+        assert stream.start is not None
+        assert np.hypot(*(stream.start.pose[:2] - stream.truth[0, :2])) < 0.05
+
+
+def test_in_the_real_set_1_landmarks_11_and_17_are_put_right() -> None:
+    mended, raw = real(1), real(1, errata=False)
+    assert "landmarks 11 and 17" in mended.notes[0]
+    assert raw.notes == ()
+    for landmark in (11, 17):
+        assert np.percentile(np.abs(range_errors(mended, landmark)), 90) < 0.5
+        assert np.percentile(np.abs(range_errors(raw, landmark)), 50) > 0.5

@@ -1,0 +1,159 @@
+"""What experiments say: figures over seeds, goals, the page, the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from sim.cli.main import app
+from sim.experiments import accuracy_few, accuracy_worlds
+from sim.experiments.catalogue import ENTRIES, Entry
+from sim.experiments.experiment import Goal, Options, Outcome, Picture, Results, Table
+from sim.experiments.output import to_json, write
+from sim.experiments.runner import Concluded, planned
+from sim.experiments.team_runs import Figures, over_seeds
+
+
+def run(rmse: float, nees: float = 1.0, batch: float | None = 0.5, seed: int = 1) -> Figures:
+    figures: Figures = {"rmse": rmse, "nees": nees, "in_band": 1.0, "bytes_per_step": 58.0}
+    figures["seed"] = seed
+    if batch is not None:
+        figures["batch"] = {"rmse": batch, "nees": 1.0, "in_band": True}
+    return figures
+
+
+def test_errors_are_root_mean_squares_and_all_else_means() -> None:
+    figures = over_seeds([run(3.0, 0.8), run(4.0, 1.6)])
+    assert figures["seeds"] == 2
+    assert figures["rmse"] == pytest.approx(12.5**0.5)
+    assert figures["nees"] == pytest.approx(1.2)
+    assert figures["in_band"] == 1.0
+
+
+def test_a_figure_that_no_run_has_is_none_and_one_that_some_have_is_theirs() -> None:
+    assert over_seeds([{"rmse": None}, {"rmse": 2.0}])["rmse"] == 2.0
+    assert over_seeds([{"rmse": None}])["rmse"] is None
+
+
+def test_the_ratio_is_of_the_rms_over_the_same_seeds_to_the_batch_of_the_default_pair() -> None:
+    runs = {
+        "hybrid + join": [run(0.6), run(0.8, batch=1.0, seed=2)],
+        "hybrid + kalman": [run(2.0, 9.0, None)],
+    }
+    figures = accuracy_worlds.world_figures(runs)
+    assert figures["hybrid + join"]["ratio"] == pytest.approx((0.5 / 0.625) ** 0.5)
+    assert figures["hybrid + kalman"]["ratio"] == pytest.approx(4.0)
+    assert figures["batch"]["ratio"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("value", "passed"),
+    [(1.0, True), (1.2, False), (0.7, False), (float("nan"), False), (None, None)],
+)
+def test_a_goal_is_passed_within_its_bounds_only(value: float | None, passed: bool | None) -> None:
+    assert Goal("nees", value, 0.8, 1.15).passed is passed
+
+
+def test_a_team_that_counts_readings_twice_misses_the_goals() -> None:
+    options = Options((1,), quick=True)
+    tasks = accuracy_worlds.tasks(options)
+    honest = Results({task.name: run(0.5) | _POSES for task in tasks})
+    twice = Results({task.name: run(0.5, 2.0) | _POSES for task in tasks})
+    assert all(goal.passed is not False for goal in accuracy_worlds.outcome(options, honest).goals)
+    missed = [
+        goal for goal in accuracy_worlds.outcome(options, twice).goals if goal.passed is False
+    ]
+    assert {goal.figure.rpartition(" ")[2] for goal in missed} == {"nees"}
+
+
+_POSES = {"final_pose_nees": 1.0, "online_pose_nees": 1.0, "each_once": True}
+
+
+def test_every_experiment_plans_runs_and_lives_without_any_result() -> None:
+    for entry in ENTRIES:
+        options = Options((1, 2), quick=True)
+        plan = planned(entry, options)
+        assert len({task.name for task in plan.tasks}) == len(plan.tasks)
+        outcome = plan.experiment.outcome(options, Results({}))
+        assert outcome.title
+        assert all(goal.passed is None for goal in outcome.goals)
+
+
+def concluded() -> Concluded:
+    table = Table("errors", ("rule", "rmse [m]"), (("join", "<0.5>"),), "of the map")
+    outcome = Outcome(
+        "a title",
+        {"rmse": float("nan"), "all": [1.0, float("inf")]},
+        (table,),
+        (Picture("curve", "a curve", lambda path: path.write_bytes(b"\x89PNG")),),
+        (Goal("nees", 1.3, 0.8, 1.2),),
+        ("a remark",),
+        ("a data set",),
+    )
+    return Concluded(Entry("some", "", "Something."), Options((3, 4)), outcome, 2, {"run": "why"})
+
+
+def test_the_json_has_the_figures_the_goals_and_what_is_missing_and_no_nan(tmp_path: Path) -> None:
+    content = to_json(concluded(), {"version.numpy": "2"})
+    assert content["rmse"] is None
+    assert content["all"] == [1.0, None]
+    assert content["goals"][0]["passed"] is False
+    assert content["missing"] == ["a data set"]
+    assert content["failed"] == {"run": "why"}
+    assert content["seeds"] == [3, 4]
+    json.dumps(content, allow_nan=False)
+
+
+def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None:
+    page = write([concluded()], tmp_path, "index", {"version.numpy": "2"}).read_text()
+    assert "&lt;0.5&gt;" in page
+    assert "data:image/png;base64," in page
+    assert 'name="viewport"' in page
+    for said in ("a title", "a remark", "a data set", "MISSED", "version.numpy", "a curve"):
+        assert said in page
+    assert "http" not in page.replace("http://asrl.utias.utoronto.ca", "")
+    assert (tmp_path / "some-curve.png").read_bytes() == b"\x89PNG"
+    assert json.loads((tmp_path / "some.json").read_text())["experiment"] == "some"
+
+
+def test_help_lists_every_experiment() -> None:
+    shown = CliRunner().invoke(app, ["experiment", "--help"], terminal_width=100)
+    assert shown.exit_code == 0
+    for entry in ENTRIES:
+        assert f" {entry.name} " in shown.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["no-such"], "No such command"),
+        (["accuracy", "--seeds", "0"], "--seeds"),
+        (["accuracy", "--json", "nowhere/at/all.json"], "no such folder"),
+    ],
+)
+def test_wrong_use_ends_with_2_and_says_what_is_wrong(arguments: list[str], said: str) -> None:
+    refused = CliRunner().invoke(app, ["experiment", *arguments])
+    assert refused.exit_code == 2
+    assert said in refused.output
+
+
+def few_run(first_chi2, shape_nees, said):
+    robots = {"r1": {"first_pose_chi2": 1.0}, "r2": {"first_pose_chi2": first_chi2}}
+    figures = {"rmse_aligned": 0.5, "shape_nees": shape_nees, "landmarks": 4.0}
+    return figures | {"robots": robots, "not_joined": [], "said": said}
+
+
+@pytest.mark.parametrize(
+    ("run", "wrong", "silent"),
+    [
+        (few_run(2.0, 2.0, []), 0, 0),
+        (few_run(20.0, 2.0, []), 1, 1),
+        (few_run(2.0, 12.0, []), 1, 1),
+        (few_run(20.0, 2.0, ["another map fits about as well"]), 1, 0),
+        (few_run(None, 2.0, []), 0, 0),
+    ],
+)
+def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(run, wrong, silent):
+    figures = accuracy_few.few_figures([run])
+    assert (figures["wrong"], figures["silent"]) == (wrong, silent)

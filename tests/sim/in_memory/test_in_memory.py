@@ -1,0 +1,75 @@
+"""A whole team in one process: every valid pair ends with a map, twice with the same bytes."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from sim.in_memory.team import final_map, run_team
+from sim.scenario.scenario import load, with_options
+from sim.scenario.source import streams_of
+from team import translate
+from team.pairs import PAIRS
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import opened
+
+
+def thesis(estimator, fusion, seed=1, steps=60):
+    scenario = with_options(load("thesis"), seed=seed, estimator=estimator, fusion=fusion)
+    world = msgspec.structs.replace(scenario.world, steps=steps)
+    return msgspec.structs.replace(scenario, world=world)
+
+
+def run(*args, **options):
+    scenario = thesis(*args, **options)
+    return list(run_team(scenario, streams_of(scenario)))
+
+
+@pytest.mark.parametrize(("estimator", "fusion"), sorted(PAIRS))
+def test_the_thesis_team_ends_with_a_map_of_finite_values(estimator, fusion):
+    samples = run(estimator, fusion)
+    fused = final_map(samples)
+    assert fused.final
+    ids, means = translate.landmarks_of(fused)
+    covariance = translate.landmark_covariance_of(fused)
+    assert (len(ids) > 10) == (fusion != "alone")
+    assert bool(fused.reasons) == (fusion in ("kalman", "kalman-per-axis", "alone"))
+    assert np.isfinite(means).all()
+    assert np.isfinite(covariance).all()
+    assert (np.diag(covariance) > 0.0).all()
+    assert sum(s.key == ch.FINAL_MAP.key() for s in samples) == 1
+    consumed = {}
+    for sample in samples:
+        channel, name, message = opened(sample)
+        if channel is ch.ROBOT_DONE:
+            assert sum(e.readings for e in message.ledger) == message.readings
+            consumed[name] = message.readings
+    (end,) = (opened(s)[2] for s in samples if s.key == ch.END.key())
+    assert consumed == {s.robot: s.readings for s in end.streams}
+
+
+@pytest.mark.parametrize(("estimator", "fusion"), sorted(PAIRS))
+def test_run_twice_everything_is_equal(estimator, fusion):
+    one, two = run(estimator, fusion, steps=20), run(estimator, fusion, steps=20)
+    assert one == two
+
+
+def test_another_seed_is_another_map():
+    one, two = (final_map(run("hybrid", "join", seed=s, steps=20)) for s in (1, 2))
+    assert one.means != two.means
+
+
+def test_a_recorder_gets_what_it_would_get_of_processes():
+    samples = run("hybrid", "join", steps=20)
+    keys = {sample.key for sample in samples}
+    assert {"world/config", "central/config", "robot/r1/config", "world/end"} <= keys
+    assert {"robot/r1/alive", "central/alive", "truth/r1", "truth_landmarks"} <= keys
+    for sample in samples:
+        channel, _, message = opened(sample)
+        assert channel.recorded
+        assert isinstance(message, m.Message)
+
+
+def test_a_run_without_a_final_map_says_so():
+    with pytest.raises(LookupError, match="without a final map"):
+        final_map([])

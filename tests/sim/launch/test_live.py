@@ -1,0 +1,114 @@
+"""The plain lines of a run."""
+
+from io import StringIO
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from sim.launch import live
+from sim.launch.launch import Watch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+
+
+def status(node: str, state: str, **figures: float) -> m.Status:
+    return m.Status(0, node, state, figures, ())
+
+
+def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(live, "LINE_S", 0.0)
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=100))
+    watch = Watch(robots=3)
+    watch.statuses["world"] = status("world", "waiting", readings=0.0, of=100.0)
+    watch.statuses["robot/r1"] = status("robot/r1", "waiting")
+    lines.show(watch)
+    watch.statuses["world"] = status("world", "publishing", readings=50.0, of=100.0)
+    lines.show(watch)
+    waiting, running = out.getvalue().splitlines()
+    assert waiting.endswith("] waiting: 1 of 3 robots")
+    assert " 50%  team time 0 s, 1 robots" in running
+
+
+def told(robots: int, *, truth: bool) -> Watch:
+    watch = Watch(robots=robots)
+    watch.statuses["world"] = status("world", "publishing", readings=5.0, of=10.0)
+    watch.statuses["central"] = status("central", "joining", joint_cost_per_dof=1.07, submaps=9.0)
+    for k in range(1, robots + 1):
+        watch.statuses[f"robot/r{k}"] = status(
+            f"robot/r{k}", "mapping", steps=12345.0, submaps=1234.0, landmarks=1000.0,
+            pose_sigma_m=12.34, nis_per_dof=1.05, messages_per_s=1500.0, bytes_per_s=150_000.0,
+        )  # fmt: skip
+        if truth:
+            watch.errors._robot(f"r{k}").tally.take(np.array([3.0, 9.0]), 3)
+    watch.fused = m.FusedMap(
+        0, "join", bytes(8), "r1/1", False, False, 0, (), (), False, from_ids([1, 2]),
+        from_floats([0.0] * 4), from_floats([1.0, 0.0, 1.0] * 2), 1.0, 1,
+    )  # fmt: skip
+    if truth:
+        watch.errors.landmarks.take(np.array([1.0, 2.0]), 2)
+    return watch
+
+
+def printed(watch: Watch, width: int) -> list[str]:
+    out = StringIO()
+    Console(file=out, width=width).print(live._view("thesis, seed 1", watch))
+    return out.getvalue().splitlines()
+
+
+def test_the_table_fits_eighty_columns_with_the_largest_figures() -> None:
+    lines = printed(told(5, truth=True), 80)
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    row = next(line for line in lines if line.strip().startswith("r3")).split()
+    assert row == [
+        "r3", "12,345", "1,234", "1,000", "12.34", "1.05", "1,500", "150,000", "2.00", "50%",
+        "mapping",
+    ]  # fmt: skip
+    expected = "joint cost per dof 1.07, map NEES per dof 0.75, 100% of landmarks within 95 %"
+    assert expected in lines
+
+
+def test_without_truth_there_are_the_monitor_and_nis_alone() -> None:
+    lines = printed(told(2, truth=False), 80)
+    assert any("NIS" in line for line in lines)
+    assert not any("NEES" in line or "95 %" in line for line in lines)
+    assert "joint cost per dof 1.07" in lines
+
+
+def test_a_large_team_is_cut_before_the_terminal_cuts_it() -> None:
+    lines = printed(told(20, truth=False), 100)
+    assert any("8 more" in line for line in lines)
+    assert len(lines) < 24
+
+
+def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "PATIENCE_S", -1.0)
+    watch = Watch(robots=2)
+    missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
+    watch.statuses["recorder"] = m.Status(0, "recorder", "recording", {}, missing)
+    late = m.Status(0, "robot/r1", "waiting", {}, ("no readings of this team yet",))
+    watch.statuses["robot/r1"] = late
+    assert live._warnings(watch) == [f"recorder: {'; '.join(missing)}"]
+    watch.statuses["world"] = m.Status(0, "world", "waiting", {}, ("waiting for robot/r2",))
+    assert live._warnings(watch) == ["world: waiting for robot/r2"]
+    watch.statuses["world"] = m.Status(0, "world", "publishing", {}, ())
+    assert "robot/r1: no readings of this team yet" in live._warnings(watch)
+    watch.failures.append("robot-r2 (pid 7) was killed")
+    assert live._warnings(watch)[0] == "robot-r2 (pid 7) was killed"
+
+
+def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "PATIENCE_S", -1.0)
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=100))
+    watch = Watch(robots=1)
+    watch.statuses["world"] = status("world", "publishing", readings=1.0, of=2.0)
+    for cost in ("8.8", "9.1", "9.4"):
+        warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
+        watch.statuses["central"] = m.Status(0, "central", "joining", {}, (warning,))
+        lines.show(watch)
+    assert out.getvalue().count("submap 20 disagrees") == 1

@@ -1,0 +1,121 @@
+"""What a launch says of its team's honesty while it runs, against figures worked out apart."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from sim.launch.launch import Watch
+from sim.launch.truth import EVERY_NS, LiveErrors
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
+from tests.sim.logs import samples
+
+SECOND = 1_000_000_000
+COVARIANCE = np.array([[0.09, 0.01, 0.0], [0.01, 0.04, 0.005], [0.0, 0.005, 0.01]])
+
+
+def pose(at_s: float, xyt: np.ndarray) -> m.PoseEstimate:
+    return m.PoseEstimate(
+        round(at_s * SECOND), "r1", 1, 0, bytes(8), from_floats(xyt), from_floats(COVARIANCE)
+    )
+
+
+def truth(seconds: list[float], poses: np.ndarray) -> m.Truth:
+    stamps = [round(s * SECOND) for s in seconds]
+    return m.Truth(stamps[-1], "r1", from_stamps(stamps), from_floats(poses))
+
+
+def line(seconds: list[float]) -> np.ndarray:
+    """Drives along x with 1 m/s and turns by 1 rad/s through the cut of the circle."""
+    return np.array([[s, 0.0, (3.0 + s + np.pi) % (2 * np.pi) - np.pi] for s in seconds])
+
+
+def test_the_nees_of_poses_is_against_the_truth_between_its_samples() -> None:
+    errors, rng = LiveErrors(), np.random.default_rng(1)
+    seconds = [float(s) for s in range(6)]
+    expected = []
+    for at in (0.5, 1.75, 3.0, 4.25):
+        deviation = np.linalg.cholesky(COVARIANCE) @ rng.standard_normal(3)
+        errors.take(ch.OWN_POSE, pose(at, line([at])[0] + deviation))
+        expected.append(deviation @ np.linalg.solve(COVARIANCE, deviation))
+    errors.take(ch.TRUTH, truth(seconds[:4], line(seconds[:4])))
+    assert errors.of("r1").count == 3  # the last one's truth is not there yet
+    errors.take(ch.TRUTH, truth(seconds[4:], line(seconds[4:])))
+    tally = errors.of("r1")
+    assert tally.mean == pytest.approx(np.mean(expected) / 3)
+    assert tally.coverage == np.mean(np.array(expected) <= chi2.ppf(0.95, 3))
+
+
+def test_a_pose_that_comes_behind_its_truth_is_judged_too() -> None:
+    errors = LiveErrors()
+    for start in range(0, 40, 4):
+        seconds = [start + 0.5 * k for k in range(9)]
+        errors.take(ch.TRUTH, truth(seconds, line(seconds)))
+        for at in (start + 0.25, start + 1.5):
+            errors.take(ch.TEAM_POSE, pose(at, line([at])[0]))
+    assert errors.of("r1").count == 20
+    assert errors.of("r1").mean == pytest.approx(0.0, abs=1e-12)
+    assert errors.of("r1").coverage == 1.0
+
+
+def test_poses_given_the_map_replace_those_of_the_robot_alone() -> None:
+    errors, far = LiveErrors(), np.array([9.0, 9.0, 0.0])
+    seconds = [float(s) for s in range(6)]
+    errors.take(ch.TRUTH, truth(seconds, line(seconds)))
+    errors.take(ch.OWN_POSE, pose(1.0, line([1.0])[0] + far))
+    assert errors.of("r1").mean > 100.0
+    (given,) = samples([Outgoing(ch.TEAM_POSE, "r1", pose(1.0, far))])
+    assert errors.wants(ch.TEAM_POSE, "r1", given)  # though it is of the same moment
+    errors.take(ch.TEAM_POSE, pose(2.0, line([2.0])[0]))
+    assert errors.of("r1").mean == pytest.approx(0.0, abs=1e-12)
+    (sample,) = samples([Outgoing(ch.OWN_POSE, "r1", pose(5.0, far))])
+    assert not errors.wants(ch.OWN_POSE, "r1", sample)
+
+
+def test_only_one_pose_in_a_second_is_decoded() -> None:
+    errors, taken = LiveErrors(), 0
+    for step in range(300):
+        message = pose(step * 0.01, np.zeros(3))
+        (sample,) = samples([Outgoing(ch.TEAM_POSE, "r1", message)])
+        if errors.wants(ch.TEAM_POSE, "r1", sample):
+            errors.take(ch.TEAM_POSE, message)
+            taken += 1
+    assert taken == 3
+    assert EVERY_NS == SECOND
+
+
+@pytest.mark.parametrize("joint", [True, False])
+def test_the_map_is_judged_by_landmark_and_the_newest_counts(joint: bool) -> None:
+    errors, ids = LiveErrors(), [2, 5, 7]
+    positions = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 6.0]])
+    errors.take(ch.TRUTH_LANDMARKS, m.TruthLandmarks(0, from_ids(ids), from_floats(positions)))
+    root = np.random.default_rng(3).normal(size=(6, 6)) * 0.1
+    P = root @ root.T + 0.01 * np.eye(6)
+    content = translate.joint_bytes(P) if joint else translate.block_bytes(translate.blocks_of(P))
+    for deviation in (np.array([5.0, 5.0]), np.array([0.1, -0.2])):
+        fused = m.FusedMap(
+            9, "join", bytes(8), "r1/1", False, False, 0, (), (), joint,
+            from_ids(ids), from_floats(positions + deviation), content, 3.0, 2,
+        )  # fmt: skip
+        errors.take(ch.FUSED_MAP, fused)
+    blocks = [P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)]
+    expected = [deviation @ np.linalg.solve(block, deviation) for block in blocks]
+    assert errors.landmarks.mean == pytest.approx(np.mean(expected) / 2)
+    assert errors.landmarks.count == 3
+
+
+def test_a_watch_without_truth_has_the_robots_own_figures_only() -> None:
+    bus, others = (MemoryBus(network := MemoryNetwork()), MemoryBus(network))
+    for channel in (ch.STATUS, *LiveErrors.listens):
+        bus.subscribe(channel)
+    status = m.Status(0, "robot/r1", "mapping", {"nis_per_dof": 1.02}, ())
+    others.publish(Outgoing(ch.STATUS, "robot/r1", status))
+    others.publish(Outgoing(ch.TEAM_POSE, "r1", pose(1.0, np.zeros(3))))
+    watch = Watch(robots=1)
+    watch.take(bus)
+    assert watch.statuses["robot/r1"].figures["nis_per_dof"] == 1.02
+    assert watch.errors.of("r1").mean is None
+    assert watch.errors.of("r1").coverage is None

@@ -1,0 +1,95 @@
+"""`teamslam withdraw`: an operator's order reaches the centre, and what comes of it is told."""
+
+import threading
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from sim.cli.main import app
+from sim.launch import withdraw as orders
+from sim.launch.withdraw import WithdrawError, withdraw
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, opened
+from tests.support import examples, wait_until
+
+FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
+CONFIG = next(e for e in examples() if isinstance(e, m.Configured))
+
+
+class Centre(threading.Thread):
+    """A centre that answers an order with a map."""
+
+    def __init__(self, network: MemoryNetwork, answer: m.FusedMap | None) -> None:
+        super().__init__(daemon=True)
+        self.bus, self.answer = MemoryBus(network), answer
+        self.bus.declare_alive("central")
+        self.bus.subscribe(ch.WITHDRAWAL)
+        self.orders: list[m.Withdrawal] = []
+        self.over = threading.Event()
+
+    def run(self) -> None:
+        while not self.over.wait(0.01):
+            self.bus.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
+            for sample in self.bus.receive(0.0):
+                _, _, message = opened(sample)
+                assert isinstance(message, m.Withdrawal)
+                self.orders.append(message)
+                if self.answer is not None:
+                    channel = ch.FINAL_MAP if self.answer.final else ch.FUSED_MAP
+                    self.bus.publish(Outgoing(channel, "", self.answer))
+
+
+def ordered(monkeypatch: pytest.MonkeyPatch, robot: str = "r3", **answer: object) -> Centre:
+    monkeypatch.setattr(orders, "CENTRE_S", 1.0)
+    network = MemoryNetwork()
+    reply = msgspec.structs.replace(FUSED, **answer) if answer else None
+    centre = Centre(network, reply)
+    centre.start()
+    try:
+        withdraw(MemoryBus(network), robot, "a flat wheel", 1.0)
+        wait_until(lambda: bool(centre.orders), what="the order")
+    finally:
+        centre.over.set()
+        centre.join()
+    return centre
+
+
+def test_an_order_is_given_once_and_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    centre = ordered(monkeypatch, final=False, withdrawn=("r3",))
+    (order,) = centre.orders
+    assert (order.robot, order.by, order.reason) == ("r3", "operator", "a flat wheel")
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        ({"final": True, "withdrawn": ()}, "the final map was out before the order"),
+        ({"final": False, "rule": "kalman", "withdrawn": ()}, "the rule kalman can not withdraw"),
+        ({}, "no map without r3 within 1 s"),
+    ],
+)
+def test_an_order_that_is_not_followed_says_why(
+    monkeypatch: pytest.MonkeyPatch, answer: dict[str, object], why: str
+) -> None:
+    with pytest.raises(WithdrawError, match=why):
+        ordered(monkeypatch, **answer)
+
+
+def test_a_robot_that_nobody_knows_can_not_be_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(WithdrawError, match=r"no robot r9; heard of: r3"):
+        ordered(monkeypatch, robot="r9")
+
+
+def test_without_a_centre_there_is_nobody_to_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(orders, "CENTRE_S", 0.2)
+    with pytest.raises(WithdrawError, match="no centre answers"):
+        withdraw(MemoryBus(MemoryNetwork()), "r3", "a flat wheel", 1.0)
+
+
+@pytest.mark.parametrize(("robot", "team"), [("R 3", "thesis"), ("r3", "a/b")])
+def test_names_that_are_none_are_wrong_use(robot: str, team: str) -> None:
+    refused = CliRunner().invoke(app, ["withdraw", robot, "--team", team])
+    assert refused.exit_code == 2
+    assert "is no" in refused.stderr

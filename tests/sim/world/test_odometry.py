@@ -1,0 +1,182 @@
+"""The simulated odometry has the moments that the filter's models claim, whichever the model."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from central.team_epochs import TeamEpochs
+from sim.in_memory.team import final_map, run_team
+from sim.scenario.scenario import Scenario, load
+from sim.scenario.source import streams_of
+from sim.world.odometry import told
+from sim.world.simulator import simulated
+from sim.world.streams import WorldStreams
+from sim.world.worlds import SimulatedWorld
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.estimation.geometry import compose, inverse, logarithm
+from team.estimation.models import increment_of
+from team.robot.node import RobotNode
+from team.wire import messages as m
+from tests.teams import driven, published
+
+SLIP = {"lateral": MotionNoise(per_s=0.004), "final_turn": MotionNoise(per_s=0.003)}
+MODELS = {
+    "alphas": MotionModel(alphas=(4e-4, 1e-4, 2e-4, 3e-3, 1e-4, 1e-3), **SLIP),
+    "turn-then-drive": MotionModel(
+        kind="turn-then-drive", forward=MotionNoise(0.02, 0.02), turn=MotionNoise(0.02, 0.01),
+        **SLIP,
+    ),
+    "wheels": MotionModel(
+        kind="differential-drive", wheel_base=0.5, left_wheel=0.004, right_wheel=0.012, **SLIP
+    ),
+    "calibrated": MotionModel(
+        forward=MotionNoise(0.02, 0.01), turn=MotionNoise(0.02, 0.0, 0.01), forward_scale=1.1,
+        yaw_scale=0.9, turn_drag=0.2, veer=-0.05, **SLIP,
+    ),
+}  # fmt: skip
+
+
+def whitened(truth: MotionModel, filters: MotionModel) -> np.ndarray:
+    """L⁻¹ log(mean⁻¹ ∘ true step), L Lᵀ the filter's covariance, of every step of a team."""
+    world = SimulatedWorld(steps=1500, step_s=0.5, size_m=60.0, turn_rate_rad_s=0.8)
+    errors = []
+    for stream in simulated(world, [RobotConfig(id="r1", motion=truth)], 11).streams:
+        steps = stream.intervals
+        for k in range(len(steps.end_ns)):
+            speed, yaw_rate = float(steps.forward[k]), float(steps.yaw_rate[k])
+            increment = increment_of(filters, 0.5, speed, yaw_rate)
+            moved = compose(inverse(stream.truth[k]), stream.truth[k + 1])
+            error = logarithm(compose(inverse(increment.mean), moved))
+            errors.append(np.linalg.solve(np.linalg.cholesky(increment.covariance), error))
+    return np.array(errors)
+
+
+def moments_agree(errors: np.ndarray) -> bool:
+    """Whether whitened errors have mean 0 and covariance 1: each entry within 99.9 %, all nine."""
+    count = len(errors)
+    mean = np.sqrt(count) * errors.mean(axis=0)
+    second = errors.T @ errors / count - np.eye(3)
+    spread = np.sqrt(count) * second / np.sqrt(np.where(np.eye(3) > 0, 2.0, 1.0))
+    entries = np.concatenate([mean, spread[np.triu_indices(3)]])
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * count)
+    return bool(np.all(np.abs(entries) < 4.0) and low < np.sum(errors**2) < high)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_samples_of_simulated_odometry_have_the_filters_moments(name: str) -> None:
+    assert moments_agree(whitened(MODELS[name], MODELS[name]))
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("alphas", {"alphas": (1e-4, 4e-4, 2e-4, 3e-3, 1e-4, 1e-3)}),
+        ("alphas", {"alpha_interval_s": 0.8}),
+        ("turn-then-drive", {"kind": "velocity"}),
+        ("wheels", {"left_wheel": 0.012, "right_wheel": 0.004}),
+        ("wheels", {"wheel_base": 0.6}),
+        ("calibrated", {"turn_drag": 0.1}),
+        ("calibrated", {"veer": 0.0}),
+    ],
+)
+def test_a_filter_with_another_model_is_found_out(name: str, wrong: dict[str, object]) -> None:
+    other = msgspec.structs.replace(MODELS[name], **wrong)
+    assert not moments_agree(whitened(MODELS[name], other))
+
+
+def test_wheels_that_differ_make_errors_of_way_and_turn_that_go_together() -> None:
+    steps = np.tile([1.0, 0.0], (4000, 1))
+    normals = np.random.default_rng(1).standard_normal((4000, 2))
+    forward, yaw_rate = told(MODELS["wheels"], steps, np.ones(4000), np.zeros((4000, 2)), normals)
+    expected = (0.012**2 - 0.004**2) / (0.012**2 + 0.004**2)
+    assert np.corrcoef(forward, yaw_rate)[0, 1] == pytest.approx(expected, abs=0.03)
+
+
+def mixed_team(**of_first: object) -> Scenario:
+    """Three robots of three kinds, and a short world with enough landmarks."""
+    sensors = (Sensor(), Sensor(range_sigma=0.3), Sensor(range_sigma_per_m=0.02))
+    kinds = ("alphas", "turn-then-drive", "wheels")
+    robots = tuple(
+        RobotConfig(f"r{i}", MODELS[kind], sensor, FrontEnd(particles=60, window_s=8.0))
+        for i, (kind, sensor) in enumerate(zip(kinds, sensors, strict=True), 1)
+    )
+    robots = (msgspec.structs.replace(robots[0], **of_first), *robots[1:])
+    world = SimulatedWorld(
+        steps=120, size_m=40.0, landmark_count=25, visible_from_m=1.0, visible_to_m=12.0
+    )
+    return msgspec.structs.replace(load("waypoints"), name="mixed", world=world, robots=robots)
+
+
+def test_a_team_of_three_different_robots_has_one_consistent_map() -> None:
+    scenario = mixed_team()
+    world = streams_of(scenario)
+    found = final_map(list(run_team(scenario, world)))
+    ids = np.frombuffer(found.ids, "<u4")
+    error = np.frombuffer(found.means).reshape(-1, 2) - world.landmarks[ids.astype(int) - 1]
+    upper = np.frombuffer(found.covariance)
+    P = np.zeros((2 * len(ids), 2 * len(ids)))
+    P[np.triu_indices(len(P))] = upper
+    P = P + P.T - np.diag(P.diagonal())
+    nees = error.ravel() @ np.linalg.solve(P, error.ravel())
+    low, high = chi2.ppf([0.0005, 0.9995], error.size)
+    assert len(ids) >= 20
+    assert low < nees < high
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.5
+
+
+@pytest.mark.parametrize("offset_s", [0.25, -0.75, 3.0])
+def test_a_clock_offset_that_the_robot_knows_changes_nothing_of_its_submaps(
+    offset_s: float,
+) -> None:
+    exact, off = mixed_team(), mixed_team(clock_offset_s=offset_s)
+    one, other = (submaps_of(each.robots[0], streams_of(each)) for each in (exact, off))
+    assert len(one) == 15
+    assert [(s.ids, s.mean, s.covariance) for s in one] == [
+        (s.ids, s.mean, s.covariance) for s in other
+    ]
+
+
+def test_a_clock_offset_that_the_robot_does_not_know_is_found_out() -> None:
+    off, ignorant = mixed_team(clock_offset_s=0.75), mixed_team()
+    world = streams_of(off)
+    good, bad = (final_map(list(run_team(each, world))) for each in (off, ignorant))
+    assert cost_per_dof(good) < 1.2
+    assert not good.withdrawn
+    assert bad.withdrawn, "its submaps contradict the others beyond doubt"
+
+
+def submaps_of(robot: RobotConfig, world: WorldStreams) -> list[m.Submap]:
+    """What the robot makes of its stream, without a centre."""
+    sent = driven(RobotNode(robot), published(world.streams[0]))
+    return [each.message for each in sent if isinstance(each.message, m.Submap)]
+
+
+def cost_per_dof(of: m.FusedMap) -> float:
+    return of.chi2 / of.dof
+
+
+def test_a_centre_that_takes_raw_readings_puts_the_clock_right_too() -> None:
+    exact, off = (
+        team_epochs(each.robots[0], streams_of(each))
+        for each in (mixed_team(), mixed_team(clock_offset_s=-0.75))
+    )
+    assert len(exact) == 120
+    assert exact == off
+    ignorant = team_epochs(mixed_team().robots[0], streams_of(mixed_team(clock_offset_s=-0.75)))
+    assert ignorant != exact
+
+
+def team_epochs(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
+    """Stamp, motion and ranges of each epoch of the first robot, as the centre cuts them."""
+    epochs = TeamEpochs([robot.id])
+    epochs.configure(robot.id, robot)
+    readings = published(world.streams[0])
+    for reading in readings:
+        epochs.put(reading)
+    epochs.end(m.End(0, (m.StreamEnd(robot.id, 1, len(readings)),)))
+    return [
+        (each.stamp_ns, each.epoch.increment.mean.tobytes(), each.epoch.ranges.tobytes())
+        for step in epochs.steps()
+        for each in step
+    ]

@@ -1,0 +1,453 @@
+"""The simulated world: its noise is what the robots are told, its truth is what it says."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2, kstest
+
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.world.paths import Limits, driven, followed, moved, wrapped
+from sim.world.simulator import simulated
+from sim.world.streams import (
+    OBSERVATIONS,
+    ODOMETRY,
+    SIGHTINGS,
+    START,
+    RobotStream,
+    WorldStreams,
+    grouped,
+)
+from sim.world.worlds import SimulatedWorld
+from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+
+angles = st.floats(-np.pi, np.pi)
+
+
+def world_of(scenario: Scenario, seed: int = 1) -> WorldStreams:
+    assert isinstance(scenario.world, SimulatedWorld)
+    return simulated(scenario.world, scenario.robots, seed)
+
+
+def content(stream: RobotStream) -> list[bytes]:
+    """All that the robot itself measures, without its teammates' sightings."""
+    seen, odometry = stream.landmark_detections, stream.intervals
+    arrays = [odometry.forward, odometry.yaw_rate, seen.offsets, seen.ids, seen.ranges]
+    assert stream.truth is not None
+    return [array.tobytes() for array in (*arrays, seen.bearings, stream.truth)]
+
+
+def true_detections(stream: RobotStream, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Range and bearing, from truth, of every observation of a stream with a message per step."""
+    assert stream.truth is not None
+    seen = stream.landmark_detections
+    step = np.repeat(np.arange(1, len(seen.offsets)), np.diff(seen.offsets))
+    across = landmarks[seen.ids.astype(int) - 1] - stream.truth[step, :2]
+    bearing = np.arctan2(across[:, 1], across[:, 0]) - stream.truth[step, 2]
+    return np.hypot(*across.T), np.angle(np.exp(1j * bearing))
+
+
+def inside_two_sided(normalised: np.ndarray) -> bool:
+    """Whether the sum of squares is in the two-sided 99.9 % chi-square interval."""
+    low, high = chi2.ppf([0.0005, 0.9995], normalised.size)
+    return bool(low < np.sum(normalised**2) < high)
+
+
+def test_readings_are_numbered_by_time_with_what_was_seen_before_the_interval_that_ends() -> None:
+    stream = world_of(load("thesis")).streams[0]
+    assert stream.kinds[0] == START
+    assert np.all(np.diff(stream.stamps_ns) >= 0)
+    order = [(int(s), int(k)) for s, k in zip(stream.stamps_ns, stream.kinds, strict=True)]
+    assert order == sorted(order)
+    assert np.count_nonzero(stream.kinds == ODOMETRY) == 500
+    assert np.count_nonzero(stream.kinds == OBSERVATIONS) == 500, "empty messages too"
+
+
+def test_accessors_give_the_reading_of_a_counter() -> None:
+    stream = world_of(load("thesis")).streams[0]
+    odometry = np.flatnonzero(stream.kinds == ODOMETRY).tolist()
+    readings = [stream.odometry(i) for i in odometry]
+    assert [r.stamp_ns for r in readings] == [10**9 * k for k in range(1, 501)]
+    assert {r.duration_ns for r in readings} == {10**9}
+    assert readings[6].forward == stream.intervals.forward[6]
+    seen = [stream.observations(i) for i in np.flatnonzero(stream.kinds == OBSERVATIONS).tolist()]
+    assert np.array_equal(
+        np.concatenate([r.bearings for r in seen]), stream.landmark_detections.bearings
+    )
+    met = stream.sightings(int(np.flatnonzero(stream.kinds == SIGHTINGS)[0]))
+    assert met.teammates == ("r2",)
+    assert 3.0 - 8.0 < met.ranges[0] < 20.0 + 8.0
+    with pytest.raises(LookupError, match="reading 0 of r1: start pose, not odometry"):
+        stream.odometry(0)
+
+
+def test_the_teams_order_is_by_stamp_and_keeps_each_robots_order() -> None:
+    world = world_of(load("waypoints"))
+    stream, counter = world.order()
+    stamps = [world.streams[s].stamps_ns[c] for s, c in zip(stream, counter, strict=True)]
+    assert stamps == sorted(stamps)
+    for i, each in enumerate(world.streams):
+        assert np.array_equal(counter[stream == i], np.arange(len(each)))
+
+
+def test_the_thesis_world_is_the_one_that_the_figures_were_measured_in() -> None:
+    world = world_of(load("thesis"))
+    assert world.landmarks is not None
+    first, second = world.streams
+    assert np.allclose(first.truth[0, :2], [80.238, 39.645])
+    assert np.allclose(first.truth[-1, :2], [70.003, 76.697])
+    assert np.allclose(second.truth[0, :2], [10.238, 39.645])
+    assert np.allclose(second.truth[-1, :2], [76.697, 70.003])
+    steps = np.hypot(*np.diff(first.truth[:, :2], axis=0).T)
+    assert np.allclose(np.median(steps), 496.26 / 500, atol=1e-4)
+    assert len(first.landmark_detections.ids) / 500 == pytest.approx(2.9, abs=0.05)
+    assert np.count_nonzero(first.kinds == SIGHTINGS) == 139
+
+
+@pytest.mark.parametrize("name", ["thesis", "thesis-b", "waypoints"])
+def test_odometry_differs_from_the_true_motion_by_the_noise_that_the_robot_is_told(
+    name: str,
+) -> None:
+    forward, turn = [], []
+    for seed in range(8):
+        scenario = load(name)
+        for robot, stream in zip(scenario.robots, world_of(scenario, seed).streams, strict=True):
+            d, turned = true_steps(stream.truth, robot.motion)
+            if robot.motion.final_turn != MotionNoise() or robot.motion.lateral != MotionNoise():
+                continue  # a slip hides the step in the truth
+            f, w = robot.motion.forward, robot.motion.turn
+            told, told_turn = stream.intervals.forward, stream.intervals.yaw_rate
+            variance = f.per_s**2 + f.per_m**2 * d + f.per_rad**2 * np.abs(turned)
+            forward.append((told - d) / np.sqrt(variance))
+            variance = w.per_s**2 + w.per_m**2 * d + w.per_rad**2 * np.abs(turned)
+            turn.append(np.angle(np.exp(1j * (told_turn - turned))) / np.sqrt(variance))
+    for noise in (np.concatenate(forward), np.concatenate(turn)):
+        assert abs(noise.mean()) < 3.3 / np.sqrt(noise.size)
+        assert inside_two_sided(noise)
+        assert not inside_two_sided(1.1 * noise), "noise that is 10 % too large is found out"
+        assert not inside_two_sided(0.9 * noise)
+
+
+def true_steps(truth: np.ndarray, motion: MotionModel) -> tuple[np.ndarray, np.ndarray]:
+    """(distance, turn) of each step, from poses alone; the chord of an arc is put right."""
+    chord = np.hypot(*np.diff(truth[:, :2], axis=0).T)
+    turned = np.angle(np.exp(1j * np.diff(truth[:, 2])))
+    bend = np.sinc(turned / (2 * np.pi)) if motion.kind == "velocity" else 1.0
+    return chord / bend, turned
+
+
+@pytest.mark.parametrize("name", ["thesis-b", "waypoints"])
+def test_observations_differ_from_the_truth_by_the_noise_that_the_robot_is_told(name: str) -> None:
+    ranges, bearings = [], []
+    for seed in range(8):
+        scenario = load(name)
+        world = world_of(scenario, seed)
+        for robot, stream in zip(scenario.robots, world.streams, strict=True):
+            true_range, true_bearing = true_detections(stream, world.landmarks)
+            sigma = np.hypot(robot.sensor.range_sigma, robot.sensor.range_sigma_per_m * true_range)
+            seen = stream.landmark_detections
+            ranges.append((seen.ranges - true_range) / sigma)
+            apart = np.angle(np.exp(1j * (seen.bearings - true_bearing)))
+            bearings.append(apart / robot.sensor.bearing_sigma)
+    for noise in (np.concatenate(ranges), np.concatenate(bearings)):
+        assert abs(noise.mean()) < 3.3 / np.sqrt(noise.size)
+        assert inside_two_sided(noise)
+        assert not inside_two_sided(1.1 * noise), "noise that is 10 % too large is found out"
+        assert not inside_two_sided(0.9 * noise)
+
+
+def test_sight_is_limited_by_the_true_range_so_that_the_noise_does_not_select() -> None:
+    noise_far, kept_far = [], []
+    for seed in range(8):
+        world = world_of(load("thesis"), seed)
+        for stream in world.streams:
+            true_range, _ = true_detections(stream, world.landmarks)
+            assert true_range.min() >= 3.0
+            assert true_range.max() <= 20.0
+            far = true_range > 18.0
+            noise = (stream.landmark_detections.ranges - true_range)[far] / 2.0
+            noise_far.append(noise)
+            kept_far.append(noise[stream.landmark_detections.ranges[far] <= 20.0])
+    noise, kept = np.concatenate(noise_far), np.concatenate(kept_far)
+    assert abs(noise.mean()) < 3.3 / np.sqrt(noise.size)
+    assert kept.mean() < -20.0 / np.sqrt(kept.size), "a gate on the readings would bias them"
+
+
+def test_a_robot_sees_its_teammates_where_they_are() -> None:
+    scenario = load("thesis-b")
+    world = world_of(scenario)
+    first, second = world.streams
+    met = first.teammate_detections
+    step = (met.stamps_ns // 10**9).astype(int)
+    across = second.truth[step, :2] - first.truth[step, :2]
+    bearing = np.arctan2(across[:, 1], across[:, 0]) - first.truth[step, 2]
+    range_noise = (met.ranges - np.hypot(*across.T)) / 0.2
+    bearing_noise = np.angle(np.exp(1j * (met.bearings - bearing))) / np.deg2rad(2.0)
+    assert inside_two_sided(range_noise)
+    assert inside_two_sided(bearing_noise)
+
+
+def test_a_sensor_is_simulated_with_its_calibration_and_field_of_view() -> None:
+    sensor = Sensor(
+        range_sigma=1e-9,
+        bearing_sigma=1e-9,
+        range_offset=0.3,
+        range_scale=0.9,
+        bearing_offset=0.2,
+        field_of_view=np.pi,
+        min_range=2.0,
+        max_range=30.0,
+    )
+    world = SimulatedWorld(steps=50, landmark_count=200)
+    streams = simulated(world, [RobotConfig(id="r1", sensor=sensor)], 3)
+    true_range, true_bearing = true_detections(streams.streams[0], streams.landmarks)
+    seen = streams.streams[0].landmark_detections
+    assert len(seen.ids) > 100
+    assert np.allclose((seen.ranges - 0.3) / 0.9, true_range, atol=1e-6)
+    assert np.allclose(np.angle(np.exp(1j * (seen.bearings - 0.2 - true_bearing))), 0.0, atol=1e-6)
+    assert np.abs(true_bearing).max() <= np.pi / 2
+    assert true_range.min() >= 2.0
+    assert 28.0 < true_range.max() <= 30.0
+
+
+def test_what_a_sensor_gives_is_a_range_and_a_bearing() -> None:
+    sensor = Sensor(range_sigma=20.0, bearing_sigma=3.0, max_range=40.0)
+    world = SimulatedWorld(steps=100, landmark_count=50)
+    seen = simulated(world, [RobotConfig(id="r1", sensor=sensor)], 3).streams[0].landmark_detections
+    assert seen.ranges.min() == 0.05
+    assert -np.pi < seen.bearings.min() < -3.0
+    assert 3.0 < seen.bearings.max() <= np.pi
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_other_noise() -> None:
+    first, again, other = (world_of(load("waypoints"), seed) for seed in (5, 5, 6))
+    assert [content(s) for s in first.streams] == [content(s) for s in again.streams]
+    assert content(first.streams[0])[0] != content(other.streams[0])[0]
+
+
+@pytest.mark.parametrize("name", ["thesis", "waypoints"])
+def test_a_further_robot_changes_nothing_of_the_others(name: str) -> None:
+    scenario = load(name)
+    count = len(scenario.robots)
+    few = world_of(scenario).streams
+    more = world_of(with_options(scenario, robots=count + 2)).streams
+    for before, after in zip(few, more[:count], strict=True):
+        assert content(before) == content(after)
+        known = np.flatnonzero(after.teammate_detections.ids < count)
+        assert np.array_equal(
+            after.teammate_detections.ranges[known], before.teammate_detections.ranges
+        )
+
+
+def test_two_robots_with_the_same_model_have_different_noise() -> None:
+    first, second = world_of(load("thesis")).streams
+    noise = [s.intervals.forward - true_steps(s.truth, MotionModel())[0] for s in (first, second)]
+    assert abs(np.corrcoef(noise)[0, 1]) < 0.2
+
+
+def test_a_start_pose_is_exact_or_not_told_at_all() -> None:
+    robots = [RobotConfig(id="a"), RobotConfig(id="b")]
+    streams = simulated(SimulatedWorld(steps=5, unknown_starts=("b",)), robots, 1).streams
+    assert streams[0].start is not None
+    assert streams[0].start.covariance is None
+    assert np.array_equal(streams[0].start.pose, streams[0].truth[0])
+    assert streams[1].start is None
+    assert streams[1].kinds[0] == START
+
+
+@pytest.mark.parametrize(
+    ("named", "unknown"),
+    [((), ""), (("*",), "abc"), (("*", "!a"), "bc"), (("c", "a"), "ac"), (("*", "!a", "!b"), "c")],
+)
+def test_unknown_starts_are_named_or_all_or_all_but_some(named: tuple, unknown: str) -> None:
+    robots = [RobotConfig(id=name) for name in "abc"]
+    streams = simulated(SimulatedWorld(steps=5, unknown_starts=named), robots, 1).streams
+    assert "".join(each.robot for each in streams if each.start is None) == unknown
+
+
+def test_a_slip_moves_the_robot_and_is_in_no_odometry() -> None:
+    slipping = MotionModel(lateral=MotionNoise(per_s=0.2), final_turn=MotionNoise(per_s=0.02))
+    world = SimulatedWorld(steps=400)
+    stream = simulated(world, [RobotConfig(id="r1", motion=slipping)], 1).streams[0]
+    aside, turned = [], []
+    for k, (a, b) in enumerate(pairwise(stream.truth.tolist())):
+        step = (float(stream.intervals.forward[k]), float(stream.intervals.yaw_rate[k]))
+        x, y, heading = moved((a[0], a[1], a[2]), step, "velocity")
+        aside.append(-(b[0] - x) * np.sin(heading) + (b[1] - y) * np.cos(heading))
+        turned.append(wrapped(b[2] - heading))
+        assert (b[0] - x) * np.cos(heading) + (b[1] - y) * np.sin(heading) == pytest.approx(0.0)
+    assert inside_two_sided(np.array(aside) / 0.2)
+    assert inside_two_sided(np.array(turned) / 0.02)
+
+
+def test_logged_values_are_such_that_the_scales_put_them_right() -> None:
+    scaled = MotionModel(kind="turn-then-drive", forward_scale=1.25, yaw_scale=0.8)
+    plain = MotionModel(kind="turn-then-drive")
+    world = SimulatedWorld(steps=50)
+    a, b = (
+        simulated(world, [RobotConfig(id="r1", motion=motion)], 1).streams[0].intervals
+        for motion in (scaled, plain)
+    )
+    assert np.allclose(a.forward * 1.25, b.forward)
+    assert np.allclose(a.yaw_rate * 0.8, b.yaw_rate)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    st.lists(
+        st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=2, max_size=8, unique=True
+    ),
+    st.integers(1, 200),
+)
+def test_a_followed_path_is_driven_by_its_own_steps(
+    path: list[tuple[float, float]], steps: int
+) -> None:
+    drive = followed(np.array(path), steps)
+    pose = tuple(drive.poses[0].tolist())
+    for k in range(steps):
+        pose = moved(pose, tuple(drive.steps[k].tolist()), "turn-then-drive")
+        assert np.allclose(pose[:2], drive.poses[k + 1, :2], atol=1e-9)
+    assert np.allclose(drive.poses[-1, :2], path[-1])
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.floats(0.0, 3.0), st.floats(-3.0, 3.0), angles)
+def test_an_arc_is_the_limit_of_many_small_turns_and_drives(
+    distance: float, turn: float, heading: float
+) -> None:
+    parts = 2000
+    direction = heading + turn * (np.arange(parts) + 0.5) / parts
+    x, y, end = moved((1.0, 2.0, heading), (distance, turn), "velocity")
+    assert x == pytest.approx(1.0 + distance * np.cos(direction).mean(), abs=1e-5)
+    assert y == pytest.approx(2.0 + distance * np.sin(direction).mean(), abs=1e-5)
+    assert np.exp(1j * end) == pytest.approx(np.exp(1j * (heading + turn)))
+
+
+@given(st.floats(-1e3, 1e3))
+def test_a_wrapped_angle_is_on_the_half_open_circle_and_the_same_direction(angle: float) -> None:
+    assert -np.pi < wrapped(angle) <= np.pi
+    assert np.exp(1j * wrapped(angle)) == pytest.approx(np.exp(1j * angle), abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
+def test_a_driven_robot_reaches_its_way_points_within_its_limits_and_then_stands(
+    kind: str,
+) -> None:
+    points = [(20.0, 0.0), (20.0, 20.0), (19.0, 20.0), (0.0, 0.0)]
+    limits = Limits(distance=1.0, turn=0.5, tolerance=0.7)
+    drive = driven((0.0, 0.0, np.pi), iter(points), limits, kind, 150, lambda k, step: (0.0, 0.0))
+    for point in points:
+        assert np.hypot(*(drive.poses[:, :2] - point).T).min() <= 0.7
+    assert np.abs(drive.steps[:, 1]).max() <= 0.5
+    assert drive.steps[:, 0].max() <= 1.0
+    assert np.all(drive.steps[-10:] == 0.0)
+
+
+def test_random_way_points_lead_through_the_place_and_not_far_out_of_it() -> None:
+    robots = [RobotConfig(id=f"r{i}") for i in range(1, 6)]
+    for stream in simulated(SimulatedWorld(steps=2000, size_m=40.0), robots, 2).streams:
+        assert stream.truth[:, :2].min() > -3.0
+        assert stream.truth[:, :2].max() < 43.0
+        assert np.all(np.ptp(stream.truth[:, :2], axis=0) > 25.0)
+
+
+def test_readings_of_one_stamp_are_one_message() -> None:
+    stamps = np.array([5, 5, 7, 9, 9, 9])
+    ids = np.arange(6, dtype=np.uint32)
+    seen = grouped(stamps, ids, np.arange(6.0), np.zeros(6))
+    assert seen.stamps_ns.tolist() == [5, 7, 9]
+    assert [seen.ids[seen.rows(i)].tolist() for i in range(3)] == [[0, 1], [2], [3, 4, 5]]
+    nothing = grouped(stamps[:0], ids[:0], np.zeros(0), np.zeros(0))
+    assert (len(nothing.stamps_ns), nothing.offsets.tolist()) == (0, [0])
+
+
+def errors_by_landmark(sensor: Sensor) -> list[np.ndarray]:
+    """Normalised (range, bearing) errors of a standing robot, a row per step, by landmark."""
+    world = SimulatedWorld(steps=4000, step_s=0.5, landmark_count=12, paths=(((0, 0), (1e-9, 0)),))
+    motion = MotionModel(kind="turn-then-drive")
+    streams = simulated(world, [RobotConfig("r1", motion, sensor)], 5)
+    stream = streams.streams[0]
+    true_range, true_bearing = true_detections(stream, streams.landmarks)
+    seen = stream.landmark_detections
+    errors = np.column_stack(
+        [
+            (seen.ranges - true_range) / sensor.range_sigma,
+            np.angle(np.exp(1j * (seen.bearings - true_bearing))) / sensor.bearing_sigma,
+        ]
+    )
+    return [errors[seen.ids == i] for i in range(1, 13)]
+
+
+def correlation(errors: list[np.ndarray], steps: int) -> np.ndarray:
+    """Of each error with the one so many steps later, in units of the declared variance."""
+    return np.mean([np.mean(e[:-steps] * e[steps:], axis=0) for e in errors], axis=0)
+
+
+def test_errors_that_persist_have_the_declared_variance_share_and_time() -> None:
+    sensor = Sensor(
+        range_white=0.2, bearing_white=0.6, range_correlation_s=5.0, bearing_correlation_s=2.0
+    )
+    errors = errors_by_landmark(sensor)
+    assert np.mean([np.var(e, axis=0) for e in errors], axis=0) == pytest.approx(1.0, abs=0.06)
+    for steps in (1, 4, 10):
+        after = 0.5 * steps
+        expected = [0.8 * np.exp(-after / 5.0), 0.4 * np.exp(-after / 2.0)]
+        assert correlation(errors, steps) == pytest.approx(expected, abs=0.05)
+    apart = np.mean([a[:, 0] @ b[:, 0] / len(a) for a, b in pairwise(errors)])
+    assert abs(apart) < 0.06, "each landmark has an error of its own"
+
+
+def test_errors_are_white_where_nothing_else_is_declared() -> None:
+    assert correlation(errors_by_landmark(Sensor()), 1) == pytest.approx(0.0, abs=0.03)
+    no_time = Sensor(range_white=0.2, range_correlation_s=0.0)
+    assert correlation(errors_by_landmark(no_time), 1) == pytest.approx(0.0, abs=0.03)
+
+
+@pytest.mark.parametrize("name", ["downs-10", "downs-100"])
+def test_downs_world_is_a_disc_seen_through_an_arc(name: str) -> None:
+    scenario = load(name)
+    world = world_of(scenario)
+    (stream,) = world.streams
+    assert len(world.landmarks) == int(name.removeprefix("downs-"))
+    assert np.hypot(*world.landmarks.T).max() <= 30.0
+    true_range, true_bearing = true_detections_from_start(stream, world.landmarks)
+    assert 0.2 <= true_range.min() < true_range.max() <= 10.0
+    assert true_range.max() > 9.5
+    assert np.abs(true_bearing).max() <= np.pi / 8
+    assert stream.landmark_detections.stamps_ns[0] == 0, "an observation before any motion"
+    assert np.array_equal(stream.truth[0], np.zeros(3))
+
+
+def test_the_radius_of_a_discs_places_is_uniform_not_their_density() -> None:
+    world = SimulatedWorld(steps=1, radius_m=30.0, landmark_count=4000)
+    landmarks = simulated(world, [RobotConfig("r1")], 2).landmarks
+    radius = np.hypot(*landmarks.T) / 30.0
+    assert kstest(radius, "uniform").pvalue > 1e-3
+    assert kstest(radius**2, "uniform").pvalue < 1e-9
+    assert kstest(np.arctan2(*landmarks.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-3
+
+
+def test_in_downs_world_a_step_turns_or_drives_and_the_hundredth_way_point_ends_it() -> None:
+    scenario = load("downs-10")
+    (stream,) = world_of(scenario).streams
+    chord = np.hypot(*np.diff(stream.truth[:, :2], axis=0).T)
+    turned = np.angle(np.exp(1j * np.diff(stream.truth[:, 2])))
+    assert not np.any((chord > 1e-9) & (np.abs(turned) > 1e-9))
+    assert chord.max() <= 1.0 + 1e-12
+    turning = np.flatnonzero(np.abs(turned) > 1e-9)
+    assert 90 <= len(turning) <= 110, "about one turn for each way-point"
+    assert len(stream.intervals.end_ns) < scenario.world.steps
+    assert chord[-1] > 0.0
+
+
+def true_detections_from_start(
+    stream: RobotStream, landmarks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `true_detections`, of a stream whose first message is before the first step."""
+    seen = stream.landmark_detections
+    step = np.repeat(np.arange(len(seen.offsets) - 1), np.diff(seen.offsets))
+    across = landmarks[seen.ids.astype(int) - 1] - stream.truth[step, :2]
+    bearing = np.arctan2(across[:, 1], across[:, 0]) - stream.truth[step, 2]
+    return np.hypot(*across.T), np.angle(np.exp(1j * bearing))
