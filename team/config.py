@@ -19,6 +19,7 @@ Bias = Literal["bearing", "forward_scale", "range_scale"]
 Estimator = Literal[
     "hybrid",
     "hybrid-thesis",
+    "hybrid-thesis-coded",
     "ekf-slam",
     "fastslam1",
     "fastslam2",

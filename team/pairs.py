@@ -9,14 +9,15 @@ from team.config import Estimator, FusionRule
 Channel = Literal["submap", "own/map", "readings"]
 
 MAPPERS: tuple[Estimator, ...] = ("hybrid", "hybrid-thesis", "ekf-slam", "fastslam1", "fastslam2")
+AS_CODED: Estimator = "hybrid-thesis-coded"
 LOCALISERS: tuple[Estimator, ...] = ("localisation", "dead-reckoning")
 _CONSUMES: Mapping[FusionRule, tuple[Channel, tuple[Estimator, ...]]] = {
     "join": ("submap", ("hybrid",)),
     "kalman": ("own/map", ("hybrid",)),
     "covariance-intersection": ("own/map", ("hybrid",)),
-    "kalman-per-axis": ("own/map", ("hybrid", "hybrid-thesis")),
+    "kalman-per-axis": ("own/map", ("hybrid", "hybrid-thesis", AS_CODED)),
     "latest": ("own/map", MAPPERS),
-    "alone": ("own/map", (*MAPPERS, *LOCALISERS)),
+    "alone": ("own/map", (*MAPPERS, AS_CODED, *LOCALISERS)),
     "svd-join": ("submap", ("hybrid",)),
     "svd-join-spherical": ("submap", ("hybrid",)),
     "joint-fastslam": ("readings", ("hybrid", "dead-reckoning")),

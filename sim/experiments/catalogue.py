@@ -32,6 +32,7 @@ ENTRIES = (
     Entry("ma-6a", "ma_errors:FIGURE_6A", "Ma & Ma: path, one robot against many.", 5, 1),
     Entry("ma-6b", "ma_errors:FIGURE_6B", "Ma & Ma: landmarks, one robot against many.", 5, 1),
     Entry("survey", "survey", "All estimators and rules on the same readings; tables 2.1, 2.2."),
+    Entry("xu-3.5", "xu_localisation", "Thesis: particle-filter localisation on a known map."),
     Entry("xu-4.1", "xu_maps:FIGURE_4_1", "Thesis: the map of EKF-SLAM.", 1, 1),
     Entry("xu-4.2", "xu_maps:FIGURE_4_2", "Thesis: the map of FastSLAM.", 1, 1),
     Entry("xu-4.3", "xu_maps:FIGURE_4_3", "Thesis: the map of Hybrid-SLAM.", 1, 1),

@@ -5,11 +5,12 @@ map at each time: the fused one, or the robot's own where nothing is fused.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt32
 
 from sim.evaluation.errors import Path, PoseErrors, pose_errors
 from sim.evaluation.evaluation import evaluate
@@ -17,6 +18,7 @@ from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, TimedRun, named
 from sim.scenario.scenario import Scenario, loads
 from sim.scenario.source import streams_of
+from sim.world.streams import Detections, RobotStream, WorldStreams, robot_stream
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -28,39 +30,58 @@ DIGITS = 5
 """Significant digits of a kept curve: a picture shows three."""
 
 
-def curves_task(scenario: Scenario, told: Scenario | None = None, label: str = "") -> Task:
-    """The curves of a run. told: the scenario that the team is told, where the world's differs."""
+def curves_task(
+    scenario: Scenario, told: Scenario | None = None, label: str = "", *, late: bool = False
+) -> Task:
+    """The curves of a run. told: the scenario that the team is told, where the world's differs.
+
+    late: each step's readings are those of the step before.
+    """
     steps = getattr(scenario.world, "steps", 500)
     return Task(
         "sim.experiments.curves:curves_run",
         {"world": msgspec.to_builtins(scenario)}
-        | ({} if told is None else {"told": msgspec.to_builtins(told)}),
+        | ({} if told is None else {"told": msgspec.to_builtins(told)})
+        | ({"late": True} if late else {}),
         f"{label or scenario.name}, {named(scenario.estimator, scenario.fusion)}, "
         f"seed {scenario.seed}",
         _COST_S * steps * len(scenario.robots),
     )
 
 
-def curves_run(world: Mapping[str, Any], told: Mapping[str, Any] | None = None) -> Figures:
+def curves_run(
+    world: Mapping[str, Any], told: Mapping[str, Any] | None = None, late: bool = False
+) -> Figures:
     """The curves of every robot's pose, and of the first landmark."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if told is None else loads(msgspec.json.encode(told).decode())
-    samples = list(TimedRun().samples(team, streams_of(scenario)))
+    streams = streams_of(scenario)
+    samples = list(TimedRun().samples(team, a_step_late(streams) if late else streams))
     evaluation = evaluate(samples)
-    true_landmarks = next(
-        translate.landmarks_of(message)
-        for message in messages(samples, ch.TRUTH_LANDMARKS.key())
-        if isinstance(message, m.TruthLandmarks)
-    )
+    ids, positions = true_landmarks(samples)
     first = scenario.robots[0].id
     return {
         "poses": {
             name: _pose_curve(errors)
             for name, robot in evaluation.robots.items()
-            if (errors := pose_errors(*online(samples, name), robot.truth)) is not None
+            if (errors := pose_errors(*said_poses(samples, pose_keys(team, name)), robot.truth))
+            is not None
         },
-        "landmark": _landmark_curve(samples, first, dict(zip(*true_landmarks, strict=True))),
+        "landmark": _landmark_curve(
+            samples, first, dict(zip(ids.tolist(), positions, strict=True))
+        ),
     }
+
+
+def true_landmarks(
+    samples: Iterable[Sample],
+) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """The ids and positions [m] of the world's landmarks; raises StopIteration without them."""
+    return next(
+        translate.landmarks_of(message)
+        for message in messages(samples, ch.TRUTH_LANDMARKS.key())
+        if isinstance(message, m.TruthLandmarks)
+    )
 
 
 def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
@@ -68,9 +89,40 @@ def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
     return (opened(sample)[2] for sample in samples if sample.key == key)
 
 
-def online(samples: Iterable[Sample], robot: str) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """What a robot said of its pose when it was there: with the team's map once it had one."""
-    return said_poses(samples, (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot)))
+def a_step_late(streams: WorldStreams) -> WorldStreams:
+    """Each message of landmarks says what was seen one before; needs a look at the start."""
+    return replace(streams, streams=tuple(_a_step_late(stream) for stream in streams.streams))
+
+
+def _a_step_late(stream: RobotStream) -> RobotStream:
+    seen = stream.landmark_detections
+    rows = int(seen.offsets[-2])
+    late = Detections(
+        seen.stamps_ns[1:], seen.offsets[:-1], seen.ids[:rows], seen.ranges[:rows],
+        seen.bearings[:rows],
+    )  # fmt: skip
+    return robot_stream(
+        stream.robot,
+        int(stream.stamps_ns[0]),
+        stream.start,
+        stream.intervals,
+        late,
+        stream.teammate_detections,
+        stream.teammates,
+        stream.truth_ns,
+        stream.truth,
+        stream.notes,
+        stream.clock_offset_ns,
+    )
+
+
+def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
+    """Where a robot's online pose is said: by the centre if it is the one that estimates it; else
+    by the robot, with the team's map once it has one.
+    """
+    if scenario.fusion == "joint-fastslam":
+        return (ch.CENTRAL_POSE.key(robot),)
+    return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
 
 
 def said_poses(

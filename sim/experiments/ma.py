@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from sim.evaluation.errors import Path, pose_errors
 from sim.evaluation.evaluation import evaluate
-from sim.experiments.curves import messages, said_poses, short
+from sim.experiments.curves import messages, pose_keys, said_poses, short, true_landmarks
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, TimedRun, named
@@ -102,15 +102,11 @@ def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
     samples = list(TimedRun().samples(resolved))
     evaluation = evaluate(samples)
     paths = {
-        name: (*said_poses(samples, _keys(resolved, name)), robot.truth)
+        name: (*said_poses(samples, pose_keys(resolved, name)), robot.truth)
         for name, robot in evaluation.robots.items()
     }
     start_ns = min(int(said.stamps_ns[0]) for said, _, _ in paths.values() if len(said.stamps_ns))
-    ids, positions = next(
-        translate.landmarks_of(message)
-        for message in messages(samples, ch.TRUTH_LANDMARKS.key())
-        if isinstance(message, m.TruthLandmarks)
-    )
+    ids, positions = true_landmarks(samples)
     truth = dict(zip(ids.tolist(), positions, strict=True))
     robots = {name: _robot(*said, start_ns) for name, said in paths.items()}
     first = resolved.robots[0].id
@@ -120,13 +116,6 @@ def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
         "clouds": _clouds(samples, first),
         "truth": positions.tolist(),
     }
-
-
-def _keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
-    """Where a robot's online pose is said, by the centre if it is the one that estimates it."""
-    if scenario.fusion == "joint-fastslam":
-        return (ch.CENTRAL_POSE.key(robot),)
-    return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
 
 
 def _frames(stamps_ns: np.ndarray, start_ns: int) -> list[float]:

@@ -24,7 +24,10 @@ _GRACE_S = 5.0
 
 @dataclass(frozen=True)
 class Done:
-    """A finished task: its result, or else the error in a line and the traceback."""
+    """A finished task: its result, or else the error in a line and the traceback.
+
+    seconds: of the processor, whatever else it computes meanwhile; 0 where the process died.
+    """
 
     task: Task
     result: dict[str, Any] | None
@@ -38,10 +41,9 @@ class _Worker:
     process: BaseProcess
     pipe: Connection
     task: Task | None = None
-    since: float = 0.0
 
     def give(self, task: Task) -> None:
-        self.task, self.since = task, time.monotonic()
+        self.task = task
         self.pipe.send(task)
 
     def end(self) -> None:
@@ -91,13 +93,12 @@ def _received(worker: _Worker) -> tuple[Done, bool]:
     """What became of the worker's task, and whether the worker can take another one."""
     task = worker.task
     assert task is not None
-    seconds = time.monotonic() - worker.since
     try:
-        result, error, details = worker.pipe.recv()
+        result, error, details, seconds = worker.pipe.recv()
     except EOFError:
         worker.process.join(_GRACE_S)
         how = f"its process ended with exit status {worker.process.exitcode}"
-        return Done(task, None, seconds, how), False
+        return Done(task, None, 0.0, how), False
     return Done(task, result, seconds, error, details), True
 
 
@@ -110,12 +111,13 @@ def _work(pipe: Connection) -> None:
             task: Task = pipe.recv()
         except EOFError:
             return
+        begin = time.process_time()
         try:
             answer: tuple[dict[str, Any] | None, str, str] = (task.run(), "", "")
         except Exception as error:  # whatever a run raises is that run's result
             text = " ".join(str(error).split())
             answer = (None, f"{type(error).__name__}: {text}", traceback.format_exc())
-        pipe.send(answer)
+        pipe.send((*answer, time.process_time() - begin))
 
 
 def _end_without(parent: int) -> None:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from sim.evaluation.evaluation import evaluate
-from sim.experiments.curves import messages, online
+from sim.experiments.curves import messages, pose_keys, said_poses, true_landmarks
 from sim.experiments.drawing import figure, ruled
 from sim.experiments.experiment import Options, Outcome, Picture, Results, Table
 from sim.experiments.task import Task
@@ -78,16 +78,12 @@ def maps_run(world: Mapping[str, Any], steps: list[int]) -> Figures:
     scenario = loads(msgspec.json.encode(world).decode())
     samples = list(TimedRun().samples(scenario))
     evaluation = evaluate(samples)
-    truth = next(
-        translate.landmarks_of(message)
-        for message in messages(samples, ch.TRUTH_LANDMARKS.key())
-        if isinstance(message, m.TruthLandmarks)
-    )
+    ids, positions = true_landmarks(samples)
     key = ch.FUSED_MAP.key()
     fused = list(messages(samples, key))
     if not any(isinstance(each, m.FusedMap) and each.ids for each in fused):
         fused = list(messages(samples, ch.OWN_MAP.key(scenario.robots[0].id)))
-    paths = {name: online(samples, name)[0] for name in evaluation.robots}
+    paths = {name: said_poses(samples, pose_keys(scenario, name))[0] for name in evaluation.robots}
     shots = []
     for step in steps:
         now_ns = round(step * 1e9)
@@ -96,14 +92,16 @@ def maps_run(world: Mapping[str, Any], steps: list[int]) -> Figures:
             for each in fused
             if isinstance(each, m.FusedMap | m.MapEstimate) and each.stamp_ns <= now_ns
         ]
-        shots.append(_shot(known[-1] if known else None, dict(zip(*truth, strict=True))))
+        shots.append(
+            _shot(known[-1] if known else None, dict(zip(ids.tolist(), positions, strict=True)))
+        )
         for name, robot in evaluation.robots.items():
             said, true = paths[name], robot.truth
             shots[-1].setdefault("paths", {})[name] = {
                 "online": said.poses[said.stamps_ns <= now_ns, :2].round(2).tolist(),
                 "truth": true.poses[true.stamps_ns <= now_ns, :2].round(2).tolist(),
             }
-    return {"steps": steps, "shots": shots, "landmarks": truth[1].tolist()}
+    return {"steps": steps, "shots": shots, "landmarks": positions.tolist()}
 
 
 def _shot(known: m.FusedMap | m.MapEstimate | None, truth: Mapping[int, np.ndarray]) -> Figures:

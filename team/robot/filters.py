@@ -9,11 +9,19 @@ from jaxtyping import Float, UInt32
 
 from team import translate
 from team.config import Estimator, RobotConfig, Sensor
-from team.estimation import dead_reckoning, ekf_slam, hybrid_thesis, localisation, plain_fastslam
+from team.estimation import (
+    dead_reckoning,
+    ekf_slam,
+    hybrid_thesis,
+    hybrid_thesis_coded,
+    localisation,
+    plain_fastslam,
+)
 from team.estimation.dead_reckoning import DeadReckoning
 from team.estimation.ekf_slam import EkfSlam
 from team.estimation.fastslam import Particles, Proposal
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.hybrid_thesis_coded import CodedState
 from team.estimation.localisation import Localisation
 from team.estimation.models import Increment
 from team.estimation.plain_fastslam import PlainFastSlam
@@ -101,6 +109,33 @@ def _thesis_absorbed(
     state: hybrid_thesis.ThesisState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
 ) -> hybrid_thesis.ThesisState:
     return hybrid_thesis.absorbed(state, ids, means, translate.blocks_of(covariance))
+
+
+def _coded_begun(
+    config: RobotConfig,
+    pose: np.ndarray | None,
+    covariance: Matrix | None,
+    known: KnownMap,
+    generator: np.random.Generator,
+) -> CodedState:
+    """The start is known exactly, as in the thesis."""
+    start = np.zeros(3) if pose is None else pose
+    return hybrid_thesis_coded.started(start, config.front_end.particles)
+
+
+def _coded_stepped(
+    state: CodedState, config: RobotConfig, step: Step, generator: np.random.Generator
+) -> CodedState:
+    increment, ids, ranges, bearings = step
+    return hybrid_thesis_coded.stepped(
+        state, increment, config.sensor, ids, ranges, bearings, generator
+    )
+
+
+def _coded_absorbed(
+    state: CodedState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
+) -> CodedState:
+    return hybrid_thesis_coded.absorbed(state, ids, means, translate.blocks_of(covariance))
 
 
 S = TypeVar("S")
@@ -260,6 +295,14 @@ FILTERS: Mapping[Estimator, Filter] = {
         lambda state: PoseGaussian(state.pose, state.pose_covariance),
         _thesis_landmarks,
         _thesis_absorbed,
+        joint=False,
+    ),
+    "hybrid-thesis-coded": Filter(
+        _coded_begun,
+        _coded_stepped,
+        hybrid_thesis_coded.pose_gaussian,
+        hybrid_thesis_coded.landmark_gaussian,
+        _coded_absorbed,
         joint=False,
     ),
 }
