@@ -67,6 +67,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     the two make one error of (forward, turn), correlated where the wheels differ.
     turn_drag [m]: a base whose outer wheel is no faster than the logged speed loses
     turn_drag·|yaw rate| of it in a turn, at most all. veer [rad/m]: it turns so much on each metre.
+    slow_scale: a base that creeps faster than it is told to has this scale, not forward_scale,
+    where the logged speed is below slow_below [m/s].
     calibrated_speed: the logged speeds [m/s] from which forward_scale was learnt; where the robot
     is slower or faster the scale has an error of its own (the bias "forward_scale").
     """
@@ -81,6 +83,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     yaw_rate_limit: Positive | None = None
     turn_drag: NonNegative = 0.0
     veer: float = 0.0
+    slow_below: NonNegative = 0.0
+    slow_scale: Positive = 1.0
     calibrated_speed: tuple[NonNegative, NonNegative] | None = None
     alphas: Alphas | None = None
     alpha_interval_s: Positive = 1.0

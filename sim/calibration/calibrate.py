@@ -28,7 +28,7 @@ from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
 
 JOINED_GAP_NS = 2_000_000_000
-SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer")
+SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")
 MISTRUST = 4.0
 """Without truth the odometry's densities of noise are taken times this."""
 ROUNDS = 2
@@ -136,10 +136,16 @@ def _with_systematic(figure: Figure) -> Figure:
 
 
 def _motion_figures(data: Sequence[Reference], scenario: Scenario) -> tuple[Figure, ...]:
-    limit = scenario.robots[0].motion.yaw_rate_limit
+    given = scenario.robots[0].motion
     if not data:
         raise CalibrationError("no robot has both odometry and a known path")
-    return jackknifed(lambda part: motion.fit_motion(part, limit), data, motion.UNITS)
+
+    slow_below = given.slow_below if motion.creep(data, given.slow_below) else 0.0
+
+    def fit(part: Sequence[Reference]) -> Mapping[str, float]:
+        return motion.fit_motion(part, given.yaw_rate_limit, slow_below)
+
+    return jackknifed(fit, data, motion.UNITS)
 
 
 def _positions(world: WorldStreams) -> dict[int, np.ndarray]:

@@ -34,13 +34,13 @@ class Figure:
 
 
 def huber(
-    residual: Callable[[Float[np.ndarray, "2"]], Float[np.ndarray, " n"]],
+    residual: Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " n"]],
     sigma: Float[np.ndarray, " n"],
-    start: Float[np.ndarray, "2"],
-) -> Float[np.ndarray, "2"]:
-    """The two parameters that minimise Huber's loss of residual/sigma, linear beyond HUBER."""
+    start: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """The parameters that minimise Huber's loss of residual/sigma, linear beyond HUBER."""
 
-    def weighted(p: Float[np.ndarray, "2"]) -> Float[np.ndarray, " n"]:
+    def weighted(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
         return np.asarray(residual(p) / sigma)
 
     found = least_squares(weighted, start, loss="huber", f_scale=HUBER, x_scale=0.1)

@@ -20,6 +20,8 @@ LEAST_SPANS = 30
 LEAST_WAY_M = 0.05
 """A span in which less is logged is not one of motion."""
 ROUNDS = 4
+STANDING_M_S = 1e-3
+"""A slower speed is none."""
 FLOOR_VARIANCE = 1e-6
 """Of a span without motion: a millimetre, a milliradian of the reference itself."""
 
@@ -28,6 +30,7 @@ UNITS = {
     "turn_drag": "m",
     "yaw_scale": "",
     "veer": "rad/m",
+    "slow_scale": "",
     "forward.per_m": "m/√m",
     "forward.per_rad": "m/√rad",
     "turn.per_m": "rad/√m",
@@ -35,6 +38,10 @@ UNITS = {
     "lateral.per_m": "m/√m",
 }
 
+LEAST_SLOW_S = 20.0
+"""So long must the robots creep for the scale of slow speeds to be learnt."""
+
+Numbers = Float[np.ndarray, " p"]
 Pair = Float[np.ndarray, "2"]
 Grid = Float[np.ndarray, "spans steps"]
 Values = Float[np.ndarray, " spans"]
@@ -69,10 +76,16 @@ class _Spans:
         """clip(yaw_scale · yaw rate, ±limit) [rad/s]."""
         return np.asarray(np.clip(yaw_scale * self.yaw_rate, -limit, limit))
 
-    def forward_of(self, p: Pair, yaw_scale: float, limit: float) -> Values:
-        """The model's way for p = (forward_scale, turn_drag) [m]."""
+    def slow(self, below: float) -> Grid:
+        """1 where the robot creeps, at a logged speed below this [m/s] and not standing; else 0."""
+        speed = np.abs(self.speed)
+        return np.asarray(((speed < below) & (speed > STANDING_M_S)).astype(np.float64))
+
+    def forward_of(self, p: Numbers, yaw_scale: float, limit: float, below: float) -> Values:
+        """The model's way for p = (forward_scale, turn_drag, slow_scale or nothing) [m]."""
         lost = p[1] * np.abs(self.rates(yaw_scale, limit))
-        speed = np.maximum(p[0] * np.abs(self.speed) - lost, 0.0)
+        scale = p[0] + (p[2] - p[0]) * self.slow(below) if len(p) > 2 else p[0]
+        speed = np.maximum(scale * np.abs(self.speed) - lost, 0.0)
         return np.asarray((np.sign(self.speed) * speed).sum(axis=1) * STEP_S)
 
     def turn_of(self, p: Pair, limit: float) -> Values:
@@ -114,9 +127,17 @@ def _steps_of(data: Reference) -> Float[np.ndarray, "spans steps 5"]:
     return np.asarray(rows.reshape(spans, STEPS, 5)[whole])
 
 
-def fit_motion(data: Sequence[Reference], yaw_rate_limit: float | None) -> Mapping[str, float]:
+def creep(data: Sequence[Reference], slow_below: float) -> bool:
+    """Whether the robots crept for long enough to learn the scale of slow speeds."""
+    return bool(_spans(data).slow(slow_below).sum() * STEP_S >= LEAST_SLOW_S)
+
+
+def fit_motion(
+    data: Sequence[Reference], yaw_rate_limit: float | None, slow_below: float = 0.0
+) -> Mapping[str, float]:
     """The model of `increment_of` whose errors over SPAN_S are most likely.
 
+    With slow_below [m/s] the scale below that speed is learnt, too; ask `creep` first.
     Scales by weighted least squares under Huber's loss, densities σ² = per_m² |d| + per_rad² |φ| of
     what is left, in turn (each maximises the likelihood given the other).
     Raises CalibrationError where there is too little motion.
@@ -130,14 +151,14 @@ def fit_motion(data: Sequence[Reference], yaw_rate_limit: float | None) -> Mappi
         )
     limit = np.inf if yaw_rate_limit is None else yaw_rate_limit
     way, rotation = spans.way, np.abs(spans.rates(1.0, limit)).sum(axis=1) * STEP_S
-    scale, drift = np.array([1.0, 0.0]), np.array([1.0, 0.0])
+    scale, drift = np.array([1.0, 0.0, *([1.0] if slow_below else [])]), np.array([1.0, 0.0])
     of_way, of_turn = np.array([0.05, 0.02]), np.array([0.05, 0.1])
 
     def of_the_turn(p: Pair) -> Values:
         return np.asarray(spans.turned - spans.turn_of(p, limit))
 
-    def of_the_way(p: Pair) -> Values:
-        return np.asarray(spans.driven - spans.forward_of(p, float(drift[0]), limit))
+    def of_the_way(p: Numbers) -> Values:
+        return np.asarray(spans.driven - spans.forward_of(p, float(drift[0]), limit, slow_below))
 
     for _ in range(ROUNDS):
         drift = huber(of_the_turn, _sigma(of_turn, way, rotation), drift)
@@ -150,6 +171,7 @@ def fit_motion(data: Sequence[Reference], yaw_rate_limit: float | None) -> Mappi
         "turn_drag": max(float(scale[1]), 0.0),
         "yaw_scale": float(drift[0]),
         "veer": float(drift[1]),
+        **({"slow_scale": float(scale[2])} if slow_below else {}),
         "forward.per_m": float(of_way[0]),
         "forward.per_rad": float(of_way[1]),
         "turn.per_m": float(of_turn[0]),

@@ -71,7 +71,8 @@ def increment_of(
 ) -> Increment:
     """One odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
 
-    With v = forward_scale·forward, ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
+    With v = forward_scale·forward (slow_scale·forward where |forward| < slow_below),
+    ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
     d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the noises
     a (forward, on d), b (turn, on φ), c (final turn), l (lateral):
     "velocity", "differential-drive": Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al.
@@ -84,7 +85,8 @@ def increment_of(
     if motion.yaw_rate_limit is not None:
         rate = min(max(rate, -motion.yaw_rate_limit), motion.yaw_rate_limit)
     lost = motion.turn_drag * abs(rate) * duration_s
-    logged = motion.forward_scale * forward * duration_s
+    slow = abs(forward) < motion.slow_below
+    logged = (motion.slow_scale if slow else motion.forward_scale) * forward * duration_s
     distance = math.copysign(max(abs(logged) - lost, 0.0), logged)
     turn = rate * duration_s + motion.veer * distance
     forward_var = _variance(motion.forward, duration_s, distance, turn)

@@ -209,6 +209,19 @@ def test_a_turn_drags_at_the_speed_and_never_turns_it_round():
         np.testing.assert_allclose(arc, [2.0 * left, 0.0, yaw_rate], atol=1e-12)
 
 
+def test_a_base_that_creeps_has_a_scale_of_its_own_below_a_speed():
+    model = MotionModel(forward_scale=1.1, turn_drag=0.2, slow_below=0.02, slow_scale=2.5)
+    for forward, yaw_rate, left in (
+        (0.01, 0.0, 0.025),
+        (-0.01, 0.0, -0.025),
+        (0.01, 0.1, 0.005),
+        (0.02, 0.0, 0.022),
+        (0.0, 0.1, 0.0),
+    ):
+        arc = logarithm(increment_of(model, 2.0, forward, yaw_rate).mean)
+        np.testing.assert_allclose(arc, [2.0 * left, 0.0, 2.0 * yaw_rate], atol=1e-12)
+
+
 def test_a_base_that_veers_turns_by_the_way_that_it_drove_on_top_of_what_is_logged():
     model = MotionModel(turn_drag=0.5, veer=-0.1, turn=MotionNoise(per_rad=0.2))
     veered = increment_of(model, 2.0, 1.0, 0.4)

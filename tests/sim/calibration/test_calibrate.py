@@ -14,7 +14,7 @@ from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import CalibrationError, Figure, groups_of, jackknifed
 from sim.calibration.join import joined_team
 from sim.calibration.motion import UNITS as MOTION_UNITS
-from sim.calibration.motion import fit_motion
+from sim.calibration.motion import creep, fit_motion
 from sim.calibration.scenario import scenario_toml
 from sim.calibration.sensor import UNITS as SENSOR_UNITS
 from sim.calibration.sensor import fit_sensor
@@ -34,14 +34,20 @@ SEEN = {i: np.array([3.0 * np.cos(i), 3.0 * np.sin(i)]) for i in range(1, 7)}
 NOTHING = grouped(np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0), np.empty(0))
 
 
-def driven(seed: int, seconds: int = 1500) -> Reference:
-    """A base that drives 1.05 v less 0.1 m of each radian, turns 0.9 ω − 0.03 rad/m; 10 Hz."""
+def driven(
+    seed: int, seconds: int = 1500, speeds: tuple[float, ...] = (0.0, 0.05, 0.08, -0.06)
+) -> Reference:
+    """A base that drives 1.05 v less 0.1 m of each radian, turns 0.9 ω − 0.03 rad/m; 10 Hz.
+
+    Below 0.02 m/s it drives 2.4 v.
+    """
     rng = np.random.default_rng(seed)
     legs = seconds // 3
-    v = np.repeat(rng.choice([0.0, 0.05, 0.08, -0.06], legs), 30)
+    v = np.repeat(rng.choice(speeds, legs), 30)
     w = np.repeat(rng.choice([0.0, 0.0, 0.15, -0.15, 0.4, -0.4], legs), 30)
     dt, n = 0.1, len(v)
-    speed = np.sign(v) * np.maximum(1.05 * np.abs(v) - 0.1 * np.abs(0.9 * w), 0.0)
+    scale = np.where(np.abs(v) < 0.02, 2.4, 1.05)
+    speed = np.sign(v) * np.maximum(scale * np.abs(v) - 0.1 * np.abs(0.9 * w), 0.0)
     ahead = speed * dt + 0.03 * np.sqrt(np.abs(speed) * dt) * rng.standard_normal(n)
     turn = 0.9 * w * dt - 0.03 * ahead + 0.08 * np.sqrt(np.abs(w) * dt) * rng.standard_normal(n)
     heading = np.append(0.0, np.cumsum(turn))
@@ -109,6 +115,23 @@ def test_the_odometrys_figures_come_out_of_readings_within_their_uncertainty(
         assert figure.sigma < 0.02, figure
     assert found["forward.per_m"].value == pytest.approx(0.03, rel=0.15)
     assert found["turn.per_rad"].value == pytest.approx(0.08, rel=0.15)
+
+
+def test_the_scale_of_slow_speeds_is_learnt_where_robots_creep() -> None:
+    creeping = [driven(seed, speeds=(0.0, 0.01, 0.08)) for seed in range(1, 6)]
+    assert creep(creeping, 0.015)
+    found = by_name(jackknifed(lambda part: fit_motion(part, None, 0.015), creeping, MOTION_UNITS))
+    for name, value in {"forward_scale": 1.05, "turn_drag": 0.1, "slow_scale": 2.4}.items():
+        assert abs(found[name].value - value) < 4.0 * found[name].sigma + 1e-3, found[name]
+    assert found["slow_scale"].sigma < 0.1
+    unaware = fit_motion(creeping, None)
+    assert unaware["forward.per_m"] > 1.5 * found["forward.per_m"].value
+
+
+def test_the_scale_of_slow_speeds_is_not_learnt_where_nobody_creeps(
+    bases: list[Reference],
+) -> None:
+    assert not creep(bases, 0.015)
 
 
 def test_a_turn_of_the_odometry_that_is_not_the_robots_own_is_found_out(
