@@ -7,15 +7,16 @@ readings are counted again and again, and the covariance that they give is worth
 
 from collections.abc import Callable, Mapping, Sequence
 
+import msgspec
 import numpy as np
 
 from central.config import CentralConfig
+from central.fused import fused_message
 from central.rules import MapEstimate, covariance_intersection, kalman, kalman_per_axis
 from team import translate
 from team.config import FusionRule
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 
 RULES: Mapping[FusionRule, Callable[[Sequence[MapEstimate]], MapEstimate]] = {
@@ -23,13 +24,14 @@ RULES: Mapping[FusionRule, Callable[[Sequence[MapEstimate]], MapEstimate]] = {
     "kalman-per-axis": kalman_per_axis,
     "covariance-intersection": covariance_intersection,
 }
+_NOT_VALID = "this rule counts readings more than once: its covariance is not valid"
 
 
 class FeedbackRule:
     """Waits for every robot's map of a round, fuses them in the order of the robots' names."""
 
     def __init__(self, config: CentralConfig, digest: bytes) -> None:
-        self._rule = config.fusion
+        self._config = config
         self._config_digest = digest
         self._rounds: dict[int, dict[str, m.MapEstimate]] = {}
         self._fused: m.FusedMap | None = None
@@ -76,25 +78,9 @@ class FeedbackRule:
                 MapEstimate(np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 0))),
                 b"",
             )
-        final = m.FusedMap(
-            last.stamp_ns,
-            last.rule,
-            last.digest,
-            last.frame,
-            True,
-            False,
-            last.exchange,
-            last.members,
-            (),
-            last.joint,
-            last.ids,
-            last.means,
-            last.covariance,
-            0.0,
-            0,
-            ("this rule counts readings more than once: its covariance is not valid",)
-            if self._rule != "covariance-intersection"
-            else (),
+        counted_often = self._config.fusion != "covariance-intersection"
+        final = msgspec.structs.replace(
+            last, final=True, reasons=(_NOT_VALID,) if counted_often else ()
         )
         return [Outgoing(ch.FINAL_MAP, "", final)]
 
@@ -108,7 +94,7 @@ class FeedbackRule:
         previous = b"" if self._fused is None else self._fused.digest
         stamp_ns = max(x.stamp_ns for x in maps)
         return self._message(
-            number, stamp_ns, members, RULES[self._rule](values), payload + previous
+            number, stamp_ns, members, RULES[self._config.fusion](values), payload + previous
         )
 
     def _message(
@@ -120,24 +106,12 @@ class FeedbackRule:
         inputs: bytes,
     ) -> m.FusedMap:
         self.landmarks = len(value.ids)
-        joint = self._rule != "kalman-per-axis"
-        digest = translate.digest_of(self._config_digest, number.to_bytes(8, "little"), inputs)
-        return m.FusedMap(
-            stamp_ns,
-            self._rule,
-            digest,
-            "start poses",
-            False,
-            False,
-            number,
+        return fused_message(
+            self._config,
+            translate.digest_of(self._config_digest, number.to_bytes(8, "little"), inputs),
+            value,
             members,
-            (),
-            joint,
-            from_ids(value.ids),
-            from_floats(value.means),
-            translate.joint_bytes(value.covariance)
-            if joint
-            else translate.block_bytes(translate.blocks_of(value.covariance)),
-            0.0,
-            0,
+            stamp_ns=stamp_ns,
+            joint=self._config.fusion != "kalman-per-axis",
+            exchange=number,
         )

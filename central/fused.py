@@ -17,13 +17,14 @@ def fused_message(
     members: tuple[m.Member, ...],
     *,
     stamp_ns: int,
-    final: bool,
+    final: bool = False,
     joint: bool = True,
+    exchange: int = 0,
     frame: str = START_POSES,
     reasons: tuple[str, ...] = (),
 ) -> m.FusedMap:
     """A map with its members and the name of its inputs; with landmarks' own covariances only
-    unless `joint`.
+    unless `joint`. exchange: of the lockstep round, if there are rounds.
     """
     return m.FusedMap(
         stamp_ns,
@@ -32,15 +33,13 @@ def fused_message(
         frame,
         final,
         False,
-        0,
+        exchange,
         members,
         (),
         joint,
         from_ids(value.ids),
         from_floats(value.means),
-        translate.joint_bytes(value.covariance)
-        if joint
-        else translate.block_bytes(translate.blocks_of(value.covariance)),
+        translate.covariance_bytes(value.covariance, joint=joint),
         0.0,
         0,
         reasons,

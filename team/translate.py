@@ -206,6 +206,11 @@ def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
     return grid[np.arange(n), :, np.arange(n), :]
 
 
+def covariance_bytes(covariance: Matrix, *, joint: bool) -> bytes:
+    """A landmark covariance as maps carry it: whole, or each landmark's own block only."""
+    return joint_bytes(covariance) if joint else block_bytes(blocks_of(covariance))
+
+
 def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
     """The joint 2L × 2L covariance; block-diagonal where the message carries blocks only."""
     n = len(ids(message.ids, "ids"))

@@ -31,24 +31,6 @@ _LOG = logging.getLogger("teamslam")
 app = typer.Typer()
 
 
-def _scenario(
-    name: str,
-    robots: int | None,
-    seed: int | None,
-    estimator: str | None,
-    fusion: str | None,
-    dataset: Path | None = None,
-) -> Scenario:
-    return with_options(
-        scenario_of(name),
-        robots=robots,
-        seed=seed,
-        estimator=estimator,
-        fusion=fusion,
-        dataset=dataset,
-    )
-
-
 def _connected(scenario: Scenario, connect: str) -> None:
     _LOG.info("connected to team %s at %s", scenario.team, connect)
 
@@ -89,7 +71,7 @@ def world(
     from team.wire.zenoh_bus import ZenohBus
 
     pace = parsed_speed(speed)
-    resolved = _scenario(scenario, robots, seed, None, None, dataset)
+    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, dataset=dataset)
     streams = streams_of(resolved)
     with process("world") as stop, ZenohBus(resolved.team, connect) as bus:
         _connected(resolved, connect)
@@ -116,7 +98,9 @@ def robot(
     from team.shell import process
     from team.wire.zenoh_bus import ZenohBus
 
-    resolved = _scenario(scenario, robots, seed, estimator, fusion)
+    resolved = with_options(
+        scenario_of(scenario), robots=robots, seed=seed, estimator=estimator, fusion=fusion
+    )
     configs = {config.id: config for config in resolved.robots}
     if name not in configs:
         fail(
@@ -145,7 +129,9 @@ def central(
     from team.shell import process
     from team.wire.zenoh_bus import ZenohBus
 
-    resolved = _scenario(scenario, robots, seed, estimator, fusion)
+    resolved = with_options(
+        scenario_of(scenario), robots=robots, seed=seed, estimator=estimator, fusion=fusion
+    )
     names = [config.id for config in resolved.robots]
     with process("central") as stop, ZenohBus(resolved.team, connect) as bus:
         _connected(resolved, connect)

@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from team.config import Sensor
 from team.estimation import consensus_kernel as kernel
 from team.estimation.geometry import compose
-from team.estimation.models import Increment, located
+from team.estimation.models import Increment, located, variances
 
 EVIDENCE = math.log(100.0)
 """Log odds that a landmark's taken readings must reach: they agree by chance once in a hundred."""
@@ -46,9 +46,7 @@ class _Readings:
         _, self.slots = np.unique(ids, return_inverse=True)
         self.landmarks = int(self.slots.max()) + 1
         self.readings = readings
-        self.sensor = (
-            sensor.range_sigma**2, sensor.range_sigma_per_m**2, sensor.bearing_sigma**2,
-        )  # fmt: skip
+        self.sensor = variances(sensor)
         self.means, self.covariances = _between(motions, seen.tolist())
         reach = min(sensor.max_range, float(readings[:, 0].max()))
         uniform = 1.0 / (reach * sensor.field_of_view)

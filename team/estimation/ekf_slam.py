@@ -15,7 +15,7 @@ from team.estimation import ekf_kernel
 from team.estimation.fastslam_kernel import slots_of
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
-from team.estimation.models import Increment
+from team.estimation.models import Increment, variances
 from team.estimation.submap import LocalMap
 
 
@@ -65,7 +65,7 @@ def stepped(
         slots,
         first,
         np.column_stack((ranges, bearings)),
-        (sensor.range_sigma**2, sensor.range_sigma_per_m**2, sensor.bearing_sigma**2),
+        variances(sensor),
     )
     return EkfSlam(ids_after, mean, P)
 

@@ -15,7 +15,7 @@ from team.config import Sensor
 from team.estimation import fastslam_kernel
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.models import Increment
+from team.estimation.models import Increment, variances
 
 Proposal = Literal["fastslam2", "fastslam1"]
 
@@ -52,10 +52,11 @@ class StepInfo:
     log_evidence: float
 
 
-def at_origin(count: int) -> Particles:
-    """`count` equal particles at pose zero that know no landmark."""
+def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
+    """Equal particles at these poses that know no landmark."""
+    count = len(poses)
     return Particles(
-        poses=np.zeros((count, 3)),
+        poses=poses,
         log_weights=np.full(count, -math.log(count)),
         ids=np.empty(0, np.uint32),
         means=np.empty((count, 0, 2)),
@@ -181,7 +182,7 @@ def stepped(
         slots,
         first,
         np.column_stack((ranges, bearings)),
-        (sensor.range_sigma**2, sensor.range_sigma_per_m**2, sensor.bearing_sigma**2),
+        variances(sensor),
         proposal == "fastslam2",
         poses,
         log_weights,

@@ -41,7 +41,7 @@ class CodedState:
 
 def started(pose: Pose, particles: int) -> CodedState:
     """A robot that knows its pose and no landmark."""
-    at = replace(fastslam.at_origin(particles), poses=np.tile(pose, (particles, 1)))
+    at = fastslam.at_poses(np.tile(pose, (particles, 1)))
     return CodedState(at, at)
 
 

@@ -18,7 +18,7 @@ from team.estimation.fastslam_kernel import semidefinite_factor, slots_of
 from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import compose, wrapped
 from team.estimation.landmark_kernel import Triple, seen
-from team.estimation.models import Increment
+from team.estimation.models import Increment, variances
 
 
 class Innovation(NamedTuple):
@@ -78,7 +78,7 @@ def innovation(
         semidefinite_factor(increment.covariance),
         slots[known],
         np.column_stack((ranges, bearings))[known],
-        (sensor.range_sigma**2, sensor.range_sigma_per_m**2, sensor.bearing_sigma**2),
+        variances(sensor),
     )
     L = cholesky_factor(S, "the prediction of readings")
     whitened = solve_triangular(L, error, lower=True)

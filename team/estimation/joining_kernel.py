@@ -187,16 +187,24 @@ def _sensitivity(factors: Factors, f: int, n: int) -> Float[np.ndarray, "B n"]:
 
 
 @compiled
+def _submap(
+    offset: Indices, factors: Factors, f: int
+) -> tuple[Indices, Indices, Values, Float[np.ndarray, "n n"], Float[np.ndarray, "B n"]]:
+    """A submap's nodes, their places in the state, its mean, its P⁻¹ and its sensitivity."""
+    nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
+    mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
+    n, begin = len(mean), factors.information_start[f]
+    information = factors.information[begin : begin + n * n].reshape(n, n)
+    return nodes, _places(offset, nodes), mean, information, _sensitivity(factors, f, n)
+
+
+@compiled
 def costs(state: Values, offset: Indices, factors: Factors, covariance_factor: float) -> Values:
     """χ² of each submap in the metric (covariance_factor · P)⁻¹."""
     result = np.empty(len(factors.member_start) - 1)
     for f in range(len(result)):
-        at = _places(offset, factors.member[factors.member_start[f] : factors.member_start[f + 1]])
-        mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
+        _, at, mean, information, sensitivity = _submap(offset, factors, f)
         n = len(mean)
-        begin = factors.information_start[f]
-        information = factors.information[begin : begin + n * n].reshape(n, n)
-        sensitivity = _sensitivity(factors, f, n)
         members = at[: len(at) - len(sensitivity)]
         residual, _ = submap_residual(state, members, shifted_mean(state, at, mean, sensitivity))
         c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
@@ -244,16 +252,10 @@ def normal_equations(
                 values[value_start[column_start[node]] + p * size + p] = 1.0
     pair = 0
     for f in range(len(chi2)):
-        nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
-        at = _places(offset, nodes)
-        mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
-        n = len(mean)
-        begin = factors.information_start[f]
-        information = factors.information[begin : begin + n * n].reshape(n, n)
-        sensitivity = _sensitivity(factors, f, n)
+        nodes, at, mean, information, sensitivity = _submap(offset, factors, f)
         hessian, slope, raw = biased_normal(state, at, mean, information, sensitivity)
         chi2[f] = raw / covariance_factor
-        weight = robust_weight(chi2[f], n, scale[f]) / covariance_factor
+        weight = robust_weight(chi2[f], len(mean), scale[f]) / covariance_factor
         row = 0
         for a in range(len(nodes)):
             size = offset[nodes[a] + 1] - offset[nodes[a]]
@@ -292,13 +294,7 @@ def explained(
     result = np.zeros(len(factors.member_start) - 1)
     pair = 0
     for f in range(len(result)):
-        nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
-        at = _places(offset, nodes)
-        mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
-        n = len(mean)
-        begin = factors.information_start[f]
-        information = factors.information[begin : begin + n * n].reshape(n, n)
-        sensitivity = _sensitivity(factors, f, n)
+        nodes, at, mean, information, sensitivity = _submap(offset, factors, f)
         hessian, _, _ = biased_normal(state, at, mean, information, sensitivity)
         row = 0
         for a in range(len(nodes)):

@@ -60,7 +60,7 @@ def begun(
     poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
 ) -> JointFastSlam:
     """The poses exactly known; an uncertain one is a first turn by Increment(0, covariance)."""
-    none = fastslam.at_origin(particles)
+    none = fastslam.at_poses(np.zeros((particles, 3)))
     return JointFastSlam(
         tuple(poses),
         np.stack([np.tile(pose, (particles, 1)) for pose in poses.values()]),

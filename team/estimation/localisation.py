@@ -18,7 +18,7 @@ from team.estimation.fastslam import Particles
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose, wrapped
 from team.estimation.landmark_kernel import Triple, seen
-from team.estimation.models import Increment
+from team.estimation.models import Increment, variances
 from team.estimation.plain_fastslam import pose_moments
 
 
@@ -45,8 +45,7 @@ def begun(
     landmarks: Float[np.ndarray, "L 2"],
 ) -> Localisation:
     """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
-    cloud = fastslam.at_origin(particles)
-    return Localisation(replace(cloud, poses=np.tile(pose, (particles, 1))), ids, landmarks)
+    return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
 
 
 def begun_anywhere(
@@ -63,7 +62,7 @@ def begun_anywhere(
     """
     low, high = np.append(lowest, -np.pi), np.append(highest, np.pi)
     poses = high - (high - low) * generator.random((particles, 3))
-    return Localisation(replace(fastslam.at_origin(particles), poses=poses), ids, landmarks)
+    return Localisation(fastslam.at_poses(poses), ids, landmarks)
 
 
 def stepped(
@@ -92,7 +91,7 @@ def stepped(
         state.landmarks,
         np.searchsorted(state.ids, ids[mapped]),
         np.column_stack((ranges[mapped], bearings[mapped])),
-        (sensor.range_sigma**2, sensor.range_sigma_per_m**2, sensor.bearing_sigma**2),
+        variances(sensor),
     )
     log_weights, _ = fastslam.normalised(log_weights)
     return replace(state, cloud=replace(cloud, log_weights=log_weights))

@@ -249,6 +249,11 @@ def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
     return sensor.range_sigma**2 + slope * slope, sensor.bearing_sigma**2
 
 
+def variances(sensor: Sensor) -> tuple[float, float, float]:
+    """(σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]): what kernels take as a sensor."""
+    return sensor.range_sigma**2, sensor.range_sigma_per_m**2, sensor.bearing_sigma**2
+
+
 def corrected(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:

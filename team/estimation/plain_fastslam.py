@@ -36,9 +36,7 @@ class PlainFastSlam:
 def begun(pose: Pose, particles: int, proposal: Proposal, resample_below: float) -> PlainFastSlam:
     """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
     poses = np.tile(pose, (particles, 1))
-    return PlainFastSlam(
-        replace(fastslam.at_origin(particles), poses=poses), proposal, resample_below
-    )
+    return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
 
 
 def stepped(

@@ -67,7 +67,7 @@ def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
     return Window(
         front_end,
         sensor,
-        fastslam.at_origin(front_end.particles),
+        fastslam.at_poses(np.zeros((front_end.particles, 3))),
         np.empty((0, front_end.particles, 3)),
         np.empty(0, np.int64),
         np.empty(0, np.uint32),

@@ -17,8 +17,6 @@ from team.estimation import (
     localisation,
     plain_fastslam,
 )
-from team.estimation.dead_reckoning import DeadReckoning
-from team.estimation.ekf_slam import EkfSlam
 from team.estimation.fastslam import Particles, Proposal
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.hybrid_thesis_coded import CodedState
@@ -40,24 +38,31 @@ class KnownMap(NamedTuple):
 
 NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
 
+
+class Start(NamedTuple):
+    """Where an estimator begins: a pose (None: unknown), its covariance (None: exact), a map."""
+
+    pose: Float[np.ndarray, "3"] | None
+    covariance: Matrix | None
+    known: KnownMap
+
+
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray]
 """The motion since the last epoch; landmark ids, ranges [m] and bearings [rad] at its end."""
-Begun = Callable[
-    [RobotConfig, np.ndarray | None, Matrix | None, KnownMap, np.random.Generator], Any
-]
+Begun = Callable[[RobotConfig, Start, np.random.Generator], Any]
+Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
 
 
 class Filter(NamedTuple):
     """A recursive estimator over a state of its own.
 
-    begun: the state at a start pose (None: unknown) with its covariance (None: exact). looks: it
-    takes landmarks; maps: it has a map of its own. joint: with the covariance between landmarks.
-    absorbed: the state with these landmarks in place of its own. particles: those of a state, for
-    viewers.
+    looks: it takes landmarks; maps: it has a map of its own. joint: with the covariance between
+    landmarks. absorbed: the state with these landmarks in place of its own. particles: those of a
+    state, for viewers.
     """
 
     begun: Begun
-    stepped: Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
+    stepped: Stepped
     pose: Callable[[Any], PoseGaussian]
     landmarks: Callable[[Any], LandmarkGaussian]
     absorbed: Callable[[Any, np.ndarray, np.ndarray, Matrix], Any] | None = None
@@ -68,15 +73,34 @@ class Filter(NamedTuple):
     particles: Callable[[Any], Particles] | None = None
 
 
+def _random(stepped: Callable[..., Any]) -> Stepped:
+    """The step of an estimator that draws random numbers."""
+
+    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
+        increment, *scan = step
+        return stepped(state, increment, config.sensor, *scan, generator)
+
+    return step
+
+
+def _exact(begun: Callable[..., Any], stepped: Callable[..., Any]) -> tuple[Begun, Stepped]:
+    """Start and step of an estimator that draws none."""
+
+    def start(config: RobotConfig, start: Start, generator: np.random.Generator) -> Any:
+        return _with_start(begun, stepped, start)
+
+    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
+        increment, *scan = step
+        return stepped(state, increment, config.sensor, *scan)
+
+    return start, step
+
+
 def _thesis_begun(
-    config: RobotConfig,
-    pose: np.ndarray | None,
-    covariance: Matrix | None,
-    known: KnownMap,
-    generator: np.random.Generator,
+    config: RobotConfig, start: Start, generator: np.random.Generator
 ) -> hybrid_thesis.ThesisState:
     """The thesis knows the start exactly."""
-    return hybrid_thesis.started(np.zeros(3) if pose is None else pose)
+    return hybrid_thesis.started(np.zeros(3) if start.pose is None else start.pose)
 
 
 def _thesis_stepped(
@@ -86,15 +110,9 @@ def _thesis_stepped(
     generator: np.random.Generator,
 ) -> hybrid_thesis.ThesisState:
     increment, ids, ranges, bearings = step
+    particles = config.front_end.particles
     return hybrid_thesis.stepped(
-        state,
-        increment,
-        config.sensor,
-        ids,
-        ranges,
-        bearings,
-        config.front_end.particles,
-        generator,
+        state, increment, config.sensor, ids, ranges, bearings, particles, generator
     )
 
 
@@ -111,25 +129,10 @@ def _thesis_absorbed(
     return hybrid_thesis.absorbed(state, ids, means, translate.blocks_of(covariance))
 
 
-def _coded_begun(
-    config: RobotConfig,
-    pose: np.ndarray | None,
-    covariance: Matrix | None,
-    known: KnownMap,
-    generator: np.random.Generator,
-) -> CodedState:
+def _coded_begun(config: RobotConfig, start: Start, generator: np.random.Generator) -> CodedState:
     """The start is known exactly, as in the thesis."""
-    start = np.zeros(3) if pose is None else pose
-    return hybrid_thesis_coded.started(start, config.front_end.particles)
-
-
-def _coded_stepped(
-    state: CodedState, config: RobotConfig, step: Step, generator: np.random.Generator
-) -> CodedState:
-    increment, ids, ranges, bearings = step
-    return hybrid_thesis_coded.stepped(
-        state, increment, config.sensor, ids, ranges, bearings, generator
-    )
+    pose = np.zeros(3) if start.pose is None else start.pose
+    return hybrid_thesis_coded.started(pose, config.front_end.particles)
 
 
 def _coded_absorbed(
@@ -144,88 +147,39 @@ S = TypeVar("S")
 def _with_start(
     begun: Callable[[np.ndarray], S],
     stepped: Callable[..., S],
-    pose: np.ndarray | None,
-    covariance: Matrix | None,
+    start: Start,
     *generator: np.random.Generator,
 ) -> S:
     """The state at a start N(pose, covariance): a first motion by nothing, with that noise.
 
     The noise is turned into the pose's own axes: C = GᵀPG, G = blkdiag(R(θ), 1).
     """
-    at = np.zeros(3) if pose is None else pose
+    at = np.zeros(3) if start.pose is None else start.pose
     state = begun(at)
-    if covariance is None:
+    if start.covariance is None:
         return state
     c, s = np.cos(at[2]), np.sin(at[2])
     G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    own = G.T @ covariance @ G
+    own = G.T @ start.covariance @ G
     nothing = np.empty(0)
-    start = Increment(np.zeros(3), 0.5 * (own + own.T))
-    return stepped(state, start, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
-
-
-def _dead_begun(
-    config: RobotConfig,
-    pose: np.ndarray | None,
-    covariance: Matrix | None,
-    known: KnownMap,
-    generator: np.random.Generator,
-) -> DeadReckoning:
-    return _with_start(dead_reckoning.begun, dead_reckoning.stepped, pose, covariance)
-
-
-def _dead_stepped(
-    state: DeadReckoning, config: RobotConfig, step: Step, generator: np.random.Generator
-) -> DeadReckoning:
-    increment, ids, ranges, bearings = step
-    return dead_reckoning.stepped(state, increment, config.sensor, ids, ranges, bearings)
-
-
-def _ekf_begun(
-    config: RobotConfig,
-    pose: np.ndarray | None,
-    covariance: Matrix | None,
-    known: KnownMap,
-    generator: np.random.Generator,
-) -> EkfSlam:
-    return _with_start(ekf_slam.begun, ekf_slam.stepped, pose, covariance)
-
-
-def _ekf_stepped(
-    state: EkfSlam, config: RobotConfig, step: Step, generator: np.random.Generator
-) -> EkfSlam:
-    increment, ids, ranges, bearings = step
-    return ekf_slam.stepped(state, increment, config.sensor, ids, ranges, bearings)
+    still = Increment(np.zeros(3), 0.5 * (own + own.T))
+    return stepped(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
 
 
 def _plain(proposal: Proposal) -> Filter:
     """FastSLAM over the whole stream, whatever the front end's own proposal is."""
 
-    def begun(
-        config: RobotConfig,
-        pose: np.ndarray | None,
-        covariance: Matrix | None,
-        known: KnownMap,
-        generator: np.random.Generator,
-    ) -> PlainFastSlam:
+    def begun(config: RobotConfig, start: Start, generator: np.random.Generator) -> PlainFastSlam:
         front = config.front_end
 
-        def at(start: np.ndarray) -> PlainFastSlam:
-            return plain_fastslam.begun(start, front.particles, proposal, front.resample_below)
+        def at(pose: np.ndarray) -> PlainFastSlam:
+            return plain_fastslam.begun(pose, front.particles, proposal, front.resample_below)
 
-        return _with_start(at, plain_fastslam.stepped, pose, covariance, generator)
-
-    def stepped(
-        state: PlainFastSlam, config: RobotConfig, step: Step, generator: np.random.Generator
-    ) -> PlainFastSlam:
-        increment, ids, ranges, bearings = step
-        return plain_fastslam.stepped(
-            state, increment, config.sensor, ids, ranges, bearings, generator
-        )
+        return _with_start(at, plain_fastslam.stepped, start, generator)
 
     return Filter(
         begun,
-        stepped,
+        _random(plain_fastslam.stepped),
         plain_fastslam.pose_gaussian,
         plain_fastslam.landmark_gaussian,
         particles=lambda state: state.particles,
@@ -233,18 +187,15 @@ def _plain(proposal: Proposal) -> Filter:
 
 
 def _localisation_begun(
-    config: RobotConfig,
-    pose: np.ndarray | None,
-    covariance: Matrix | None,
-    known: KnownMap,
-    generator: np.random.Generator,
+    config: RobotConfig, start: Start, generator: np.random.Generator
 ) -> Localisation:
     """At an unknown start anywhere from where the sensor may see a landmark of the known map.
 
     That is the map's box widened by the sensor's reach, at most by half the box's longer side.
     """
-    front, landmarks = config.front_end, known.landmarks
-    if pose is None and len(landmarks):
+    front, known = config.front_end, start.known
+    landmarks = known.landmarks
+    if start.pose is None and len(landmarks):
         lowest, highest = landmarks.min(axis=0), landmarks.max(axis=0)
         reach = min(config.sensor.max_range, 0.5 * float((highest - lowest).max()))
         state = localisation.begun_anywhere(
@@ -252,24 +203,16 @@ def _localisation_begun(
         )
         return replace(state, resample_below=front.resample_below)
 
-    def at(start: np.ndarray) -> Localisation:
-        state = localisation.begun(start, front.particles, *known)
+    def at(pose: np.ndarray) -> Localisation:
+        state = localisation.begun(pose, front.particles, *known)
         return replace(state, resample_below=front.resample_below)
 
-    return _with_start(at, localisation.stepped, pose, covariance, generator)
-
-
-def _localisation_stepped(
-    state: Localisation, config: RobotConfig, step: Step, generator: np.random.Generator
-) -> Localisation:
-    increment, ids, ranges, bearings = step
-    return localisation.stepped(state, increment, config.sensor, ids, ranges, bearings, generator)
+    return _with_start(at, localisation.stepped, start, generator)
 
 
 FILTERS: Mapping[Estimator, Filter] = {
     "dead-reckoning": Filter(
-        _dead_begun,
-        _dead_stepped,
+        *_exact(dead_reckoning.begun, dead_reckoning.stepped),
         dead_reckoning.pose_gaussian,
         dead_reckoning.landmark_gaussian,
         used=IN_POSE,
@@ -278,14 +221,16 @@ FILTERS: Mapping[Estimator, Filter] = {
     ),
     "localisation": Filter(
         _localisation_begun,
-        _localisation_stepped,
+        _random(localisation.stepped),
         localisation.pose_gaussian,
         lambda state: NO_LANDMARKS,  # it was told its map, so there is nothing to say of one
         used=IN_POSE,
         maps=False,
     ),
     "ekf-slam": Filter(
-        _ekf_begun, _ekf_stepped, ekf_slam.pose_gaussian, ekf_slam.landmark_gaussian
+        *_exact(ekf_slam.begun, ekf_slam.stepped),
+        ekf_slam.pose_gaussian,
+        ekf_slam.landmark_gaussian,
     ),
     "fastslam1": _plain("fastslam1"),
     "fastslam2": _plain("fastslam2"),
@@ -299,7 +244,7 @@ FILTERS: Mapping[Estimator, Filter] = {
     ),
     "hybrid-thesis-coded": Filter(
         _coded_begun,
-        _coded_stepped,
+        _random(hybrid_thesis_coded.stepped),
         hybrid_thesis_coded.pose_gaussian,
         hybrid_thesis_coded.landmark_gaussian,
         _coded_absorbed,

@@ -11,7 +11,7 @@ from team.estimation.innovation import NOTHING, Innovation
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
-from team.robot.filters import FILTERS, KnownMap
+from team.robot.filters import FILTERS, KnownMap, Start
 from team.robot.member import NOT_USED, ClosedWindow, Cloud, Driven, thinned
 from team.stream.pose_grid import Looks
 from team.stream.segmenter import Segmenter
@@ -62,7 +62,9 @@ class RunningMember:
         self._state = self._begun(pose, covariance)
 
     def _begun(self, pose: Float[np.ndarray, "3"] | None, covariance: Matrix | None) -> Any:
-        return self._filter.begun(self._config, pose, covariance, self._known, self._generator)
+        return self._filter.begun(
+            self._config, Start(pose, covariance, self._known), self._generator
+        )
 
     def resume(self, closed: ClosedWindow) -> None:
         """It sends no submaps, so there is none to go on from."""

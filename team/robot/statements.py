@@ -88,9 +88,7 @@ class Speaker:
             joint,
             from_ids(landmarks.ids),
             from_floats(landmarks.means),
-            translate.joint_bytes(landmarks.covariance)
-            if joint
-            else translate.block_bytes(translate.blocks_of(landmarks.covariance)),
+            translate.covariance_bytes(landmarks.covariance, joint=joint),
         )
         return Outgoing(ch.OWN_MAP, self.robot, message)
 

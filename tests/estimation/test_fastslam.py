@@ -107,7 +107,7 @@ def simulated(seed, steps=5, covariance=MOTION.covariance):
 
 def filtered(motions, epochs, count, proposal, resample_below=0.5, seed=0):
     rng = np.random.default_rng(seed)
-    particles, log_evidence, infos = fastslam.at_origin(count), 0.0, []
+    particles, log_evidence, infos = fastslam.at_poses(np.zeros((count, 3))), 0.0, []
     for motion, readings in zip(motions, epochs, strict=True):
         z = np.array([reading for _, reading in readings])
         particles, info = fastslam.propagated_and_updated(
@@ -305,7 +305,7 @@ def test_the_motion_of_a_robot_that_turns_almost_on_the_spot_has_a_factor():
 def test_motion_without_a_covariance_is_refused_by_name(covariance):
     with pytest.raises(NotACovarianceError, match="the motion"):
         fastslam.propagated(
-            fastslam.at_origin(4),
+            fastslam.at_poses(np.zeros((4, 3))),
             Increment(np.zeros(3), covariance),
             np.random.default_rng(0),
         )

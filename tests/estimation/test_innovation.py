@@ -169,4 +169,7 @@ def test_the_particles_that_it_looks_at_are_as_they_were():
     innovation(of, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
     for field, kept in zip(dataclasses.fields(Particles), before, strict=True):
         np.testing.assert_array_equal(getattr(of, field.name), kept)
-    assert innovation(fastslam.at_origin(7), INCREMENT, SENSOR, IDS, RANGES, BEARINGS) == NOTHING
+    assert (
+        innovation(fastslam.at_poses(np.zeros((7, 3))), INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
+        == NOTHING
+    )

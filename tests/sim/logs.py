@@ -64,11 +64,7 @@ def final_map(
     ids: Sequence[int], means: np.ndarray, covariance: np.ndarray, *, joint: bool = True
 ) -> Outgoing:
     """A final map of the rule `join`."""
-    content = (
-        translate.joint_bytes(covariance)
-        if joint
-        else translate.block_bytes(translate.blocks_of(covariance))
-    )
+    content = translate.covariance_bytes(covariance, joint=joint)
     message = m.FusedMap(
         STEPS * 10**9, "join", bytes(8), "r1/1", True, False, 0, (), (), joint,
         from_ids(ids), from_floats(means), content, 30.0, 20,

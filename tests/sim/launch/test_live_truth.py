@@ -94,7 +94,7 @@ def test_the_map_is_judged_by_landmark_and_the_newest_counts(joint: bool) -> Non
     errors.take(ch.TRUTH_LANDMARKS, m.TruthLandmarks(0, from_ids(ids), from_floats(positions)))
     root = np.random.default_rng(3).normal(size=(6, 6)) * 0.1
     P = root @ root.T + 0.01 * np.eye(6)
-    content = translate.joint_bytes(P) if joint else translate.block_bytes(translate.blocks_of(P))
+    content = translate.covariance_bytes(P, joint=joint)
     for deviation in (np.array([5.0, 5.0]), np.array([0.1, -0.2])):
         fused = m.FusedMap(
             9, "join", bytes(8), "r1/1", False, False, 0, (), (), joint,
