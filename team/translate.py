@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.estimation.conditioning import RobotPrior
+from team.estimation.conditioning import RobotPrior, Shared
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.joining import Contribution, Sighting
 from team.estimation.joining import Start as StartValue
@@ -258,6 +258,8 @@ def prior_message(
         from_ids(prior.ids),
         from_floats(np.concatenate((prior.pose, prior.means.ravel()))),
         joint_bytes(prior.covariance),
+        prior.shared.covariance_factor,
+        tuple(m.BiasEstimate(robot, epoch, *each) for each in prior.shared.biases),
     )
 
 
@@ -266,7 +268,9 @@ def prior_of(message: m.Prior) -> RobotPrior:
     mean = floats(message.mean, "mean").astype(np.float64)
     covariance = unpacked(floats(message.covariance, "covariance"), len(mean))
     landmark_ids = ids(message.ids, "ids").astype(np.uint32)
-    return RobotPrior(mean[:3], landmark_ids, mean[3:].reshape(-1, 2), covariance)
+    biases = tuple((each.bias, each.value, each.sigma) for each in message.biases)
+    shared = Shared(message.covariance_factor, biases)
+    return RobotPrior(mean[:3], landmark_ids, mean[3:].reshape(-1, 2), covariance, shared)
 
 
 def trajectory_message(

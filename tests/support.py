@@ -154,7 +154,10 @@ def examples() -> Iterator[m.Message]:
         (m.BiasEstimate("alpha", 1, "bearing", 0.25, 0.125),), ("charlie joined: 5 landmarks",),
         ("charlie",),
     )  # fmt: skip
-    yield m.Prior(9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)))
+    yield m.Prior(
+        9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)),
+        2.5, (m.BiasEstimate("alpha", 1, "range_scale", 0.25, 0.125),),
+    )  # fmt: skip
     yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))
     yield m.Progress(9_000, "central", "alpha", 1, 128, 6)
     yield m.Rendezvous(9_000, "alpha", 1, ("bravo",), 3, 12.5)

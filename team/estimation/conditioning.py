@@ -1,7 +1,8 @@
 """A robot's pose in the team's map: the broadcast prior times the robot's own later submaps.
 
 The prior (the joint marginal of the robot's last joined end pose and the landmarks) and the submaps
-that are not in it are independent, so their product is exact, up to linearisation. A landmark that
+that are not in it are independent, so their product is exact, up to linearisation; what the centre
+knows of the errors that all of a robot's submaps share is applied to them first. A landmark that
 a submap sees where everything before contradicts it (a misread barcode) is left out of that submap,
 for this pose only: nothing outlives the next prior, so nobody is locked out. The result is for
 display and control; it never enters anything that the robot sends for fusion.
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 from scipy.stats import chi2
 
+from team.config import Bias
 from team.estimation.gaussian import PoseGaussian
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import WholeMap, end_pose, joined
@@ -23,16 +25,42 @@ GATE = float(chi2.ppf(0.9999, 2))
 tested for each pose, and a good one that is left out costs little."""
 
 
+class Shared(NamedTuple):
+    """How the centre takes a robot's submaps: their covariances times a factor f, their biases.
+
+    biases: of each error b that they share its name, the centre's estimate and its sigma.
+    """
+
+    covariance_factor: float = 1.0
+    biases: tuple[tuple[Bias, float, float], ...] = ()
+
+    def taken(self, local: LocalMap) -> LocalMap:
+        """N(mean + Sᵀ b, f P + Sᵀ diag(σ²) S): a submap as the centre takes it, S its sensitivity.
+
+        What is not known of b is taken as independent of the map; the map is correlated with it
+        such that this is rather too much than too little. A bias that is not named is zero.
+        """
+        mean, covariance = local.mean, self.covariance_factor * local.covariance
+        for name, value, sigma in self.biases:
+            if name in local.biases:
+                column = local.sensitivity[local.biases.index(name)]
+                mean = mean + value * column
+                covariance += sigma * sigma * np.outer(column, column)
+        return LocalMap(local.ids, mean, covariance, local.node_stamps)
+
+
 class RobotPrior(NamedTuple):
     """A robot's last joined end pose and landmarks: joint covariance of (x, y, θ, x₁, y₁, …).
 
     In the frame of the robot's island [m, rad]; ids ascending. A row of zeros is a known constant.
+    shared: how the submaps that are in it were taken, and those that are not are to be.
     """
 
     pose: Float[np.ndarray, "3"]
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]
     covariance: Float[np.ndarray, "n n"]
+    shared: Shared = Shared()
 
     @property
     def whole(self) -> WholeMap:

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt32
 
 from team.config import Bias
 from team.estimation import joining_kernel as kernel
-from team.estimation.conditioning import RobotPrior
+from team.estimation.conditioning import RobotPrior, Shared
 from team.estimation.contribution import Stream
 from team.estimation.gauss_newton import Island, joint_marginal
 from team.estimation.joining import Fold
@@ -82,13 +82,16 @@ class Agreement(NamedTuple):
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
     """The errors that each stream's submaps share, in the island that the stream is in."""
+    return sorted(each for island in fold.islands.values() for each in _biases_in(island))
+
+
+def _biases_in(island: Island) -> list[BiasEstimate]:
     found = []
-    for island in fold.islands.values():
-        for (stream, bias), node in island.graph.biases.items():
-            mean, covariance = _own_marginal(island, node)
-            sigma = float(np.sqrt(covariance[0, 0]))
-            found.append(BiasEstimate(stream, bias, float(mean[0]), sigma))
-    return sorted(found)
+    for (stream, bias), node in sorted(island.graph.biases.items()):
+        mean, covariance = _own_marginal(island, node)
+        sigma = float(np.sqrt(covariance[0, 0]))
+        found.append(BiasEstimate(stream, bias, float(mean[0]), sigma))
+    return found
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
@@ -127,14 +130,17 @@ def _priors_in(
     poses = [island.graph.streams[stream][-1] for stream in streams]
     mean, covariance = joint_marginal(island, [*poses, *_nodes(island, chosen)])
     shared = np.arange(3 * len(poses), len(mean))
+    biases = _biases_in(island)
     priors = {}
     for k, stream in enumerate(streams):
         kept = np.concatenate([np.arange(3 * k, 3 * k + 3), shared])
+        own = tuple((b.bias, b.value, b.sigma) for b in biases if b.stream == stream)
         priors[stream] = RobotPrior(
             mean[kept[:3]],
             np.array(chosen, dtype=np.uint32),
             mean[shared].reshape(-1, 2),
             covariance[np.ix_(kept, kept)],
+            Shared(island.settings.covariance_factor, own),
         )
     return priors
 

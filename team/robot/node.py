@@ -13,7 +13,6 @@ import numpy as np
 
 from team import translate
 from team.config import Exchange, RobotConfig
-from team.estimation.conditioning import pose_now
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
@@ -380,7 +379,7 @@ class RobotNode:
         if prior is None or prior.epoch != self._epoch:
             return out
         try:
-            posed = pose_now(self._team_map.given(prior, self._locals), window)
+            posed = self._team_map.pose(prior, self._locals, window)
         except (NotACovarianceError, np.linalg.LinAlgError) as error:
             self.warnings.append(f"no team pose from the fused map: {error}")
             return out

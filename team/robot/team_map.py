@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 from team import translate
-from team.estimation.conditioning import followed
+from team.estimation.conditioning import Shared, followed, pose_now
+from team.estimation.gaussian import PoseGaussian
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import WholeMap
 from team.wire import messages as m
@@ -16,14 +17,22 @@ class TeamMap:
         self._prior: m.Prior | None = None
         self._submaps = 0
         self._whole: WholeMap | None = None
+        self._shared = Shared()
+
+    def pose(
+        self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None
+    ) -> PoseGaussian:
+        """The robot's pose in the team's frame; `window`: the one in progress, if it has begun."""
+        whole = self.given(prior, submaps)
+        return pose_now(whole, None if window is None else self._shared.taken(window))
 
     def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> WholeMap:
         """The prior times those of the epoch's submaps that are not in it."""
         if self._whole is None or prior is not self._prior:
-            first = prior.sequence + 1
-            self._whole = followed(translate.prior_of(prior).whole, submaps[first:])
-            self._prior = prior
-        else:
-            self._whole = followed(self._whole, submaps[self._submaps :])
+            told, first = translate.prior_of(prior), prior.sequence + 1
+            self._prior, self._shared, self._whole = prior, told.shared, told.whole
+            self._submaps = first
+        pending = submaps[self._submaps :]
+        self._whole = followed(self._whole, (self._shared.taken(each) for each in pending))
         self._submaps = len(submaps)
         return self._whole

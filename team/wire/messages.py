@@ -372,7 +372,9 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
     """For one robot: the joint marginal of its last fused end pose and the landmarks.
 
     The set is named by digest; `sequence` is the robot's last submap in it (−1: none; the pose is
-    the start pose). mean: 3 + 2L floats; covariance: packed upper triangle.
+    the start pose). mean: 3 + 2L floats; covariance: packed upper triangle. The robot is to take
+    its submaps that are not in the set as the centre takes them: their covariances times
+    covariance_factor, their means moved by the errors that the robot's submaps share (biases).
     """
 
     robot: Name
@@ -382,6 +384,8 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
     ids: Ids
     mean: Floats
     covariance: Floats
+    covariance_factor: Annotated[float, Meta(ge=1.0, le=1e9)] = 1.0
+    biases: tuple[BiasEstimate, ...] = ()
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")

@@ -1,10 +1,12 @@
 """The broadcast prior times the robot's own later submaps is the full join."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from team.estimation import conditioning
-from team.estimation.conditioning import RobotPrior, followed, pose_now
+from team.estimation.conditioning import RobotPrior, Shared, followed, pose_now
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.gauss_newton import JoinSettings
 from team.estimation.joining import EMPTY_FOLD, converged, folded, started
@@ -17,11 +19,11 @@ OPTIONS = JoinSettings(step_tolerance=1e-11)
 LINEAR = (0.1, 1e-5, 0.2)
 
 
-def joined(submaps, starts):
+def joined(submaps, starts, settings=OPTIONS):
     fold = EMPTY_FOLD
     for start in starts:
         fold = started(fold, start)
-    return converged(folded(fold, submaps, OPTIONS), OPTIONS)
+    return converged(folded(fold, submaps, settings), settings)
 
 
 def team_pose(prior, pending, open_window):
@@ -165,6 +167,46 @@ def test_the_team_pose_is_consistent_and_counting_a_submap_twice_is_not():
     low, high = chi2_interval(3, 0.999, runs)
     assert low < honest < high
     assert twice > high
+
+
+FACTOR, SIGMA = 2.5, 0.3
+SHARED = JoinSettings(covariance_factor=FACTOR, bias_sigma={"range_scale": SIGMA})
+
+
+def with_shared_error(submap, error, rng):
+    """Errors of FACTOR times the stated covariance, and one that all of its robot's submaps have."""
+    local = submap.local
+    n = len(local.mean)
+    column = 0.5 * rng.standard_normal((1, n))
+    column[0, 2] *= 0.1
+    more = np.linalg.cholesky(local.covariance) @ rng.standard_normal(n)
+    mean = local.mean - error * column[0] + np.sqrt(FACTOR - 1.0) * more
+    return replace(
+        submap, local=replace(local, mean=mean, biases=("range_scale",), sensitivity=column)
+    )
+
+
+def test_a_team_pose_takes_later_submaps_as_the_centre_does_or_it_claims_too_much():
+    """The mutant takes them as they are: neither the factor nor the shared error of its prior."""
+    runs, told, untold = 150, 0.0, 0.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        world = team(seed, submaps=6)
+        error = {robot: SIGMA * rng.standard_normal() for robot in ("r0", "r1")}
+        world.submaps = [with_shared_error(each, error[each.robot], rng) for each in world.submaps]
+        before, after = later(world, "r0", 4)
+        prior = prior_for(joined(before, world.starts, SHARED), "r0", 0)
+        for shared in (prior.shared, Shared()):
+            pose, spread = team_pose(prior, [shared.taken(each.local) for each in after], None)
+            off = pose - world.paths["r0"][5]
+            off[2] = wrap(off[2])
+            share = nees(off, spread) / 3 / runs
+            told, untold = (
+                (told + share, untold) if shared is prior.shared else (told, untold + share)
+            )
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < told < high
+    assert untold > high
 
 
 def test_the_team_pose_is_consistent_whatever_the_lag_of_the_last_broadcast():
