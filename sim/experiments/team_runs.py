@@ -12,7 +12,7 @@ from sim.evaluation.evaluation import Evaluation, RobotResult, evaluate
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
 from sim.in_memory.team import run_team
-from sim.limit.limit import Limit, LimitError, batch_map
+from sim.limit.limit import Limit, LimitError, NoiseKind, batch_map
 from sim.scenario.scenario import Scenario, loads, with_options
 from sim.scenario.source import streams_of
 from sim.world.streams import WorldStreams
@@ -33,11 +33,16 @@ _UTIAS_COST_S = 40.0
 
 
 def team_task(
-    scenario: Scenario, *, batch: bool = False, dataset: Dataset | None = None, note: str = ""
+    scenario: Scenario,
+    *,
+    batch: bool = False,
+    dataset: Dataset | None = None,
+    note: str = "",
+    noise: NoiseKind = "white",
 ) -> Task:
     """A run of this scenario. batch: with the batch MAP of the same readings beside it.
 
-    note: what the scenario's name does not say.
+    note: what the scenario's name does not say. noise: the batch's.
     """
     world = scenario.world
     cost = (
@@ -50,7 +55,7 @@ def team_task(
     place += f", {note}" if note else ""
     return Task(
         "sim.experiments.team_runs:team_run",
-        {"scenario": msgspec.to_builtins(scenario), "batch": batch}
+        {"scenario": msgspec.to_builtins(scenario), "batch": batch, "noise": noise}
         | ({} if dataset is None else {"sha256": dataset.sha256}),
         f"{place}, {len(scenario.robots)} robots, {pair}, seed {scenario.seed}",
         cost,
@@ -64,7 +69,11 @@ def named(estimator: str, fusion: str) -> str:
 
 
 def team_run(
-    scenario: Mapping[str, Any], batch: bool, sha256: str = "", path: str | None = None
+    scenario: Mapping[str, Any],
+    batch: bool,
+    noise: NoiseKind = "white",
+    sha256: str = "",
+    path: str | None = None,
 ) -> Figures:
     """The figures of one run; `batch`, if asked for, holds those of the batch MAP.
 
@@ -78,7 +87,7 @@ def team_run(
     figures: Figures = {"seed": resolved.seed} | team_figures(evaluate(samples)) | run.figures()
     if batch:
         try:
-            figures["batch"] = limit_figures(batch_map(samples))
+            figures["batch"] = limit_figures(batch_map(samples, noise))
         except LimitError as error:
             figures["batch_error"] = str(error)
     return figures
@@ -189,11 +198,14 @@ def _robot_figures(robot: RobotResult) -> Figures:
 def limit_figures(limit: Limit) -> Figures:
     """The figures of the batch MAP under the same names."""
     errors = limit.errors
+    shape = None if errors is None else errors.shape
     return {
         "rmse": None if errors is None else errors.rmse_m,
         "rmse_aligned": None if errors is None else errors.aligned_rmse_m,
         "nees": None if errors is None else errors.nees_per_dof,
         "in_band": None if errors is None else errors.in_band,
+        "shape_nees": None if shape is None else shape.nees_per_landmark,
+        "coverage": None if shape is None else shape.coverage,
         "position_rmse": rms(limit.position_rmse_m.values()),
         "final_pose_nees": mean(limit.final_pose_nees_per_dof.values()),
     }

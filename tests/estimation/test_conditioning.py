@@ -174,7 +174,7 @@ SHARED = JoinSettings(covariance_factor=FACTOR, bias_sigma={"range_scale": SIGMA
 
 
 def with_shared_error(submap, error, rng):
-    """Errors of FACTOR times the stated covariance, and one that all of its robot's submaps have."""
+    """Errors of FACTOR times the stated covariance, and one that all its robot's submaps have."""
     local = submap.local
     n = len(local.mean)
     column = 0.5 * rng.standard_normal((1, n))
