@@ -22,8 +22,8 @@ from team.wire.codec import encoded
 
 Tail = Literal["final", "closed", "provisional"]
 
-PRIOR_LANDMARKS = 400
-"""Landmarks in a robot's prior at the most: the best known ones."""
+PRIOR_LANDMARKS = 100
+"""Landmarks in a robot's prior at the most: the nearest ones."""
 JOINT_LANDMARKS = 2000
 """With more landmarks than this the final map carries their own covariances only."""
 
@@ -250,26 +250,18 @@ class JoinRule:
         """For the latest stream of every robot that is in the team's frame."""
         if not fold.contributions:
             return []
-        priors = marginals.main_priors(fold, self._best_known(fold))
         latest: dict[str, int] = {}
         for robot, epoch in fold.home:
             latest[robot] = max(latest.get(robot, 0), epoch)
+        streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
+        priors = marginals.main_priors(fold, streams, PRIOR_LANDMARKS)
         stamp_ns = fold.contributions[-1].end_ns
         out = []
-        for (robot, epoch), prior in sorted(priors.items()):
-            if epoch == latest[robot]:
-                sequence = fold.next_sequence((robot, epoch)) - 1
-                message = translate.prior_message(stamp_ns, robot, epoch, sequence, digest, prior)
-                out.append(Outgoing(ch.PRIOR, robot, message))
+        for stream, prior in priors.items():
+            sequence = fold.next_sequence(stream) - 1
+            message = translate.prior_message(stamp_ns, *stream, sequence, digest, prior)
+            out.append(Outgoing(ch.PRIOR, stream[0], message))
         return out
-
-    @staticmethod
-    def _best_known(fold: Fold) -> list[int] | None:
-        if len(fold.main.graph.landmarks) <= PRIOR_LANDMARKS:
-            return None
-        ids, _, blocks = marginals.landmark_blocks(fold)
-        order = np.argsort(blocks[:, 0, 0] + blocks[:, 1, 1], kind="stable")
-        return sorted(int(i) for i in ids[order[:PRIOR_LANDMARKS]])
 
     def _paths(self, fold: Fold, digest: bytes) -> list[tuple[Stream, m.Trajectory]]:
         paths = []

@@ -118,9 +118,25 @@ def prior_for(fold: Fold, robot: str, epoch: int, ids: Sequence[int] | None = No
     return _priors_in(fold.island(robot, epoch), [stream], ids)[stream]
 
 
-def main_priors(fold: Fold, ids: Sequence[int] | None = None) -> dict[Stream, RobotPrior]:
-    """`prior_for` of every stream of the main island; the landmarks are solved for once."""
-    return _priors_in(fold.main, sorted(fold.main.graph.streams), ids)
+def main_priors(
+    fold: Fold, streams: Sequence[Stream], most: int | None = None
+) -> dict[Stream, RobotPrior]:
+    """`prior_for` of some streams of the main island.
+
+    most: with more landmarks than these each prior has those nearest to its pose only. What a
+    robot has no prior of is new to it until the next one: less accurate, and as consistent.
+    """
+    island = fold.main
+    if most is None or len(island.graph.landmarks) <= most:
+        return _priors_in(island, streams, None)  # the landmarks are solved for once
+    ids = np.array(sorted(island.graph.landmarks))
+    places = np.array([_mean(island, node) for node in _nodes(island, ids.tolist())])
+    priors: dict[Stream, RobotPrior] = {}
+    for stream in streams:
+        offsets = places - _mean(island, island.graph.streams[stream][-1])[:2]
+        nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")[:most]
+        priors |= _priors_in(island, [stream], ids[nearest].tolist())
+    return priors
 
 
 def _priors_in(
@@ -196,13 +212,16 @@ def _nodes(island: Island, ids: Sequence[int]) -> list[int]:
     return [island.graph.landmarks[id_] for id_ in ids]
 
 
+def _mean(island: Island, node: int) -> Float[np.ndarray, " k"]:
+    return island.state[island.graph.offset[node] : island.graph.offset[node + 1]]
+
+
 def _own_marginal(
     island: Island, node: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    begin, end = island.graph.offset[node], island.graph.offset[node + 1]
     block = island.graph.pattern.diagonal_block(island.selected_covariance, node)
     fixed = bool(island.graph.fixed[node])
-    return island.state[begin:end], np.zeros_like(block) if fixed else block
+    return _mean(island, node), np.zeros_like(block) if fixed else block
 
 
 def _sightings(island: Island) -> list[tuple[str, float, float]]:

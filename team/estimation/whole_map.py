@@ -185,10 +185,11 @@ def _by_id(
     mean: Float[np.ndarray, " n"],
     covariance: Float[np.ndarray, "n n"],
 ) -> WholeMap:
-    order = np.argsort(ids)
-    place = _entries(order)
-    sorted_covariance = covariance[np.ix_(place, place)]
-    return WholeMap(ids[order], mean[place], 0.5 * (sorted_covariance + sorted_covariance.T))
+    if (ids[1:] < ids[:-1]).any():
+        order = np.argsort(ids)
+        place = _entries(order)
+        ids, mean, covariance = ids[order], mean[place], covariance[np.ix_(place, place)]
+    return WholeMap(ids, mean, 0.5 * (covariance + covariance.T))
 
 
 def _composed(

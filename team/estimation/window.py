@@ -148,13 +148,15 @@ def moved(
     return replace(window, particles=particles, motions=_with_motion(window, increment, forward))
 
 
-def gaussian(window: Window) -> LocalMap:
+def gaussian(window: Window, *, running: bool = False) -> LocalMap:
     """The window so far as one Gaussian over (end pose, pose nodes, landmarks by ascending id).
 
     With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
     Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ, headings on the circle (Xu, eq. 4.5-4.6), plus
     POSE_JITTER. The landmarks given a path come from `landmarks_along_paths`, the derivatives by
     the biases from `sensitivity.columns`.
+    running: for a pose within the window, which is sent to nobody: the landmarks are those that the
+    particles hold. To solve them again at every epoch moves that pose little and costs the most.
     Raises NotACovarianceError if P is not finite or not positive definite.
     """
     particles = window.particles
@@ -169,15 +171,17 @@ def gaussian(window: Window) -> LocalMap:
         window.sensor.bearing_sigma**2,
         window.sensor.bearing_white,
     )
-    means, covariances = landmarks_along_paths(
-        particles.means[:, order],
-        particles.covariances[:, order],
-        window.paths,
-        np.searchsorted(slots[by_slot], np.arange(len(ids) + 1)),
-        window.epochs[by_slot],
-        window.readings[by_slot],
-        noise,
-    )
+    means, covariances = particles.means[:, order], particles.covariances[:, order]
+    if not running:
+        means, covariances = landmarks_along_paths(
+            means,
+            covariances,
+            window.paths,
+            np.searchsorted(slots[by_slot], np.arange(len(ids) + 1)),
+            window.epochs[by_slot],
+            window.readings[by_slot],
+            noise,
+        )
     poses = np.concatenate((particles.poses, *window.paths[window.node_epochs]), axis=1)
     weights = np.exp(particles.log_weights)
     mean, covariance = moments(poses, weights, means, covariances, sample_factor(weights))

@@ -171,13 +171,9 @@ class HybridMember:
             return Driven(), uncovered
         return Driven.with_submap(self._close(end_ns)), uncovered
 
-    def open_gaussian(self) -> LocalMap:
-        """The open window's Gaussian at its last epoch."""
-        return windows.gaussian(self._window)
-
     def open_window(self) -> LocalMap | None:
-        """The open window's Gaussian, if it has an epoch."""
-        return None if self.last_epoch_ns is None else self.open_gaussian()
+        """The open window's Gaussian at its last epoch, if it has one."""
+        return None if self.last_epoch_ns is None else windows.gaussian(self._window, running=True)
 
     def own_pose(self, window: LocalMap | None) -> PoseGaussian:
         """The pose of the own whole map, times the open window."""

@@ -314,10 +314,25 @@ def test_a_prior_for_some_landmarks_is_the_marginal_of_the_prior_for_all():
 def test_the_priors_of_all_streams_together_are_the_priors_of_each():
     world = team(9, robots=3)
     fold = joined(world.submaps, world.starts)
-    together = main_priors(fold)
+    together = main_priors(fold, sorted(fold.main.graph.streams))
     assert sorted(together) == [("r0", 0), ("r1", 0), ("r2", 0)]
     for (robot, epoch), prior in together.items():
-        for one, other in zip(prior, prior_for(fold, robot, epoch), strict=True):
+        for one, other in zip(prior[:4], prior_for(fold, robot, epoch)[:4], strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+
+
+def test_of_many_landmarks_a_prior_has_the_nearest():
+    world = team(9, robots=3)
+    fold = joined(world.submaps, world.starts)
+    streams = [("r0", 0), ("r2", 0)]
+    few = main_priors(fold, streams, most=4)
+    assert sorted(few) == streams
+    for robot, epoch in streams:
+        prior, everything = few[robot, epoch], prior_for(fold, robot, epoch)
+        distance = np.linalg.norm(everything.means - everything.pose[:2], axis=1)
+        assert set(prior.ids) == set(everything.ids[np.argsort(distance)[:4]])
+        same = prior_for(fold, robot, epoch, prior.ids.tolist())
+        for one, other in zip(prior[:4], same[:4], strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
 
 

@@ -72,7 +72,7 @@ def test_a_member_that_takes_over_earlier_windows_goes_on_byte_for_byte(taken, l
     for closed in whole[:taken]:
         member.resume(closed)
     for _ in range(looks):
-        member.open_gaussian()
+        member.open_window()
     first = whole[taken - 1].last_reading + 1 if taken else 0
     again = fed(member, READINGS[first:])
     assert len(again) == len(whole) - taken
