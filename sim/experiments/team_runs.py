@@ -11,6 +11,7 @@ from central.node import CentralNode
 from sim.evaluation.evaluation import Evaluation, RobotResult, evaluate
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
+from sim.experiments.true_minimum import true_minimum
 from sim.in_memory.team import run_team
 from sim.limit.limit import Limit, LimitError, NoiseKind, batch_map
 from sim.scenario.scenario import Scenario, loads, with_options
@@ -36,13 +37,15 @@ def team_task(
     scenario: Scenario,
     *,
     batch: bool = False,
+    minimum: bool = False,
     dataset: Dataset | None = None,
     note: str = "",
     noise: NoiseKind = "white",
 ) -> Task:
     """A run of this scenario. batch: with the batch MAP of the same readings beside it.
 
-    note: what the scenario's name does not say. noise: the batch's.
+    minimum: with how the map's minimum lies to the truth. note: what the scenario's name does not
+    say. noise: the batch's.
     """
     world = scenario.world
     cost = (
@@ -56,6 +59,7 @@ def team_task(
     return Task(
         "sim.experiments.team_runs:team_run",
         {"scenario": msgspec.to_builtins(scenario), "batch": batch, "noise": noise}
+        | ({"minimum": True} if minimum else {})
         | ({} if dataset is None else {"sha256": dataset.sha256}),
         f"{place}, {len(scenario.robots)} robots, {pair}, seed {scenario.seed}",
         cost,
@@ -72,10 +76,11 @@ def team_run(
     scenario: Mapping[str, Any],
     batch: bool,
     noise: NoiseKind = "white",
+    minimum: bool = False,
     sha256: str = "",
     path: str | None = None,
 ) -> Figures:
-    """The figures of one run; `batch`, if asked for, holds those of the batch MAP.
+    """The figures of one run; `batch` and `minimum`, if asked for, hold those of their own.
 
     sha256: of the data set at `path`; it stands for it in the task's name.
     """
@@ -84,7 +89,13 @@ def team_run(
     # Provisional maps and priors are the bulk of a large team's log, and nobody looks at them here.
     bulk = {ch.FUSED_MAP.key(), *(ch.PRIOR.key(robot.id) for robot in resolved.robots)}
     samples = [sample for sample in run.samples(resolved) if sample.key not in bulk]
-    figures: Figures = {"seed": resolved.seed} | team_figures(evaluate(samples)) | run.figures()
+    evaluation = evaluate(samples)
+    figures: Figures = {"seed": resolved.seed} | team_figures(evaluation) | run.figures()
+    if minimum:
+        found = true_minimum(samples, evaluation)
+        if found is not None:
+            told = {"wrong": found.wrong, "excluded": found.excluded}
+            figures["minimum"] = found._asdict() | told
     if batch:
         try:
             figures["batch"] = limit_figures(batch_map(samples, noise))

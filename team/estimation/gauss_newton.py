@@ -31,8 +31,12 @@ SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Of an undamped step, tried before damping: a long curved valley is gone along, not shunned."""
 LEAST_DAMPING = 1e-4
 MOST_DAMPING = 1e8
+STUCK = math.inf
+"""The damping that says that no step lowers the cost."""
 LEAST_WEIGHT = 1e-6
 """No landmark is discounted more, so that each stays determined."""
+FULL_AGE = 1_000_000
+"""Iterations after which every robust scale has come to its end."""
 ROUNDING = 1e-10
 """A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
 
@@ -265,6 +269,11 @@ def aged(island: Island, iterations: int | None) -> Island:
     return replace(island, age=age, sighting_age=sighting_age)
 
 
+def final_cost(island: Island) -> float:
+    """The cost with every robust scale at its end, so that islands can be compared."""
+    return aged(island, FULL_AGE).cost
+
+
 def _prior_terms(
     island: Island, k: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], float]:
@@ -294,11 +303,13 @@ def _moved(island: Island, step: Values) -> Island:
 def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
     """One iteration: the island, the damping for the next one, the whole step's largest change.
 
-    A step is taken if it lowers the cost; else, undamped, a share of it; else one more damped.
+    A step is taken if it lowers the cost; else, undamped, a share of it; else one more damped. None
+    is taken where no damping helps: the damping is then STUCK, the change that of the first step.
     """
     values, gradient = island.normal_equations
     diagonal = island.graph.diagonal
     before = island.quadratic(island.state)
+    refused = None
     while damping < MOST_DAMPING:
         damped = values.copy()
         damped[diagonal] *= 1.0 + damping
@@ -308,25 +319,34 @@ def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
             moved = _moved(island, share * step)
             if island.quadratic(moved.state) <= before * (1.0 + ROUNDING) + ROUNDING:
                 eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
-                largest = float(np.abs(step).max(initial=0.0))
-                return aged(moved, 1), eased, largest
+                return aged(moved, 1), eased, _largest(step)
+        refused = _largest(step) if refused is None else refused
         damping = max(10.0 * damping, LEAST_DAMPING)
-    return aged(island, 1), 0.0, 0.0
+    return aged(island, 1), STUCK, math.inf if refused is None else refused
+
+
+def _largest(step: Values) -> float:
+    return float(np.abs(step).max(initial=0.0))
 
 
 def iterated(island: Island) -> Island:
     """The iterations of one tick."""
     damping = 0.0
     for _ in range(island.settings.iterations_per_tick):
-        island, damping, _ = _iterated(island, damping)
+        island, damping, _ = _iterated(island, _eased(damping))
     return island
+
+
+def _eased(damping: float) -> float:
+    """What the next iteration begins with: a robust cost is another one at its next scale."""
+    return 0.0 if damping == STUCK else damping
 
 
 def settled(island: Island) -> tuple[Island, int, float]:
     """The full solution from here, the iterations it took and the last change [m, rad].
 
-    A robust scale is annealed anew for all factors. Ends at `max_iterations` at the latest: the
-    last change tells whether it converged.
+    A robust scale is annealed anew for all factors. Ends at `max_iterations` at the latest, or
+    where no step lowers the cost: the last change tells whether it converged.
     """
     settings = island.settings
     island = aged(island, None)
@@ -334,11 +354,27 @@ def settled(island: Island) -> tuple[Island, int, float]:
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
         narrow = settings.robust_c is None or bool((scales == settings.robust_c).all())
-        island, damping, change = _iterated(island, damping)
+        island, damping, change = _iterated(island, _eased(damping))
         count += 1
-        if narrow and damping == 0.0 and change < settings.step_tolerance:
+        if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):
             break
     return island, count, change
+
+
+def held(island: Island, unknown: int, by: float, iterations: int) -> Island:
+    """One number of the state moved by so much, everything else solved for given that.
+
+    With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose part
+    along w is what is missing: the point of the constraint with the least cost to second order.
+    """
+    missing = by
+    for _ in range(iterations):
+        right = np.column_stack([-island.normal_equations[1], np.zeros(len(island.state))])
+        right[unknown, 1] = 1.0
+        p, q = sparse.solved(island.posterior, right).T
+        step = p + (missing - p[unknown]) / q[unknown] * q
+        island, missing = _moved(island, step), missing - float(step[unknown])
+    return island
 
 
 def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:

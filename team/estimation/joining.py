@@ -14,9 +14,9 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from team.estimation.contribution import Contribution, Start, Stream, named
-from team.estimation.gauss_newton import Island, JoinSettings, iterated
+from team.estimation.gauss_newton import Island, JoinSettings, final_cost, iterated
 from team.estimation.merging import Merge, ages, merge, sighted
-from team.estimation.minima import doubts, final_cost, searched, suspicious
+from team.estimation.minima import doubts, searched, suspicious
 from team.estimation.sighting import Sighting
 from team.estimation.submap_graph import EMPTY_GRAPH, extended
 

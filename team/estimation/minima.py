@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
+from team.estimation.bends import bends
 from team.estimation.contribution import Stream, named
-from team.estimation.gauss_newton import Island, NotDeterminedError, aged, settled
+from team.estimation.gauss_newton import Island, NotDeterminedError, final_cost, settled
 from team.estimation.geometry import wrapped
 from team.estimation.relaxation import relaxed
 
@@ -29,8 +30,8 @@ SUSPICIOUS = 1.3
 """… and by this factor its degrees of freedom: submaps are Gaussian only nearly."""
 SETTLED_M = 1e-3
 """A solution whose last step was longer [m, rad] is no minimum yet."""
-FULL_AGE = 1_000_000
-"""Iterations after which every robust scale has come to its end."""
+MORE_SOLUTIONS = 4
+"""So often the best one is solved on before it is said not to settle."""
 FEW_LANDMARKS = 6
 """With so few a chain may fold wrongly at a cost that is not suspicious."""
 WIDE = 30.0
@@ -60,11 +61,6 @@ class Search(NamedTuple):
     def ambiguous(self) -> bool:
         """Whether a second minimum is about as likely as the best one."""
         return self.second is not None and self.second.cost - self.best.cost < likely_rise()
-
-
-def final_cost(island: Island) -> float:
-    """The cost with every robust scale at its end, so that islands can be compared."""
-    return aged(island, FULL_AGE).cost
 
 
 def minimum(island: Island) -> Minimum:
@@ -111,8 +107,8 @@ def searched(starts: Sequence[Island]) -> Search:
         found.append(minimum(start))
         if not few and not suspicious(starts[0], min(each.cost for each in found)):
             break
-    best = min(found, key=lambda each: each.cost)
-    others = [each for each in found if each.change < SETTLED_M and _elsewhere(each, best)]
+    best = _at_rest(min(found, key=lambda each: each.cost))
+    others = [each for each in found if each.change < SETTLED_M and elsewhere(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
     return Search(best, first.cost - best.cost, second)
 
@@ -137,7 +133,17 @@ def _further(island: Island) -> Iterator[Island]:
         yield replace(island, state=doubted.state)
 
 
-def _elsewhere(one: Minimum, best: Minimum) -> bool:
+def _at_rest(best: Minimum) -> Minimum:
+    """The minimum after further solutions from where it is, while it has not settled."""
+    for _ in range(MORE_SOLUTIONS):
+        if best.change <= SETTLED_M:
+            break
+        further = minimum(best.island)
+        best = further._replace(iterations=best.iterations + further.iterations)
+    return best
+
+
+def elsewhere(one: Minimum, best: Minimum) -> bool:
     """Whether a minimum is another map, not one that the best one's covariance allows for.
 
     With the difference d of the states and the information A at the best one, A alone would raise
@@ -190,6 +196,7 @@ def doubts(search: Search) -> list[str]:
         for stream, sigma in sorted(_heading_sigmas(island).items())
         if sigma > limit
     ]
+    found += bends(island)
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)
         points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]

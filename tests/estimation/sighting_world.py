@@ -1,6 +1,6 @@
 """Teams whose submaps have a pose node in the middle of each, from where teammates are seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from team.estimation.contribution import Contribution, Start
 from team.estimation.joining import EMPTY_FOLD, folded, started
 from team.estimation.sighting import Sighting
 from team.estimation.submap import LocalMap
-from tests.estimation.submap_world import correlated, drawn, seen_from, wrap
+from tests.estimation.submap_world import correlated, drawn, local_truth, seen_from, wrap
 
 
 @dataclass
@@ -87,3 +87,37 @@ def joined_with(submaps, starts, sightings, options, tick=4):
         seen = [each for each in sightings if (each.robot, each.sequence) in names]
         fold = folded(fold, taken, options, seen)
     return fold
+
+
+def mirrored(bearing_sigma, options):
+    """r1 drives straight beside r0, who sees how far it is but hardly where: left or right.
+
+    Two islands: as it is, and with r1 on the other side.
+    """
+    ranges_seen = []
+    stamps = np.arange(1, 5) * 1000
+    submaps = []
+    paths = {"r0": np.zeros(3), "r1": np.array([0.0, 3.0, 0.2])}
+    nodes = {}
+    for robot, start in paths.items():
+        c, s = np.cos(start[2]), np.sin(start[2])
+        along = [np.array([start[0] + k * c, start[1] + k * s, start[2]]) for k in range(1, 6)]
+        nodes[robot] = along[:4]
+        mean = np.concatenate(
+            [local_truth(start, pose, np.zeros((0, 2))) for pose in (along[4], *along[:4])]
+        )
+        local = LocalMap(np.zeros(0, np.uint32), mean, 1e-4 * np.eye(len(mean)), stamps)
+        submaps.append(Contribution(robot, 0, 0, 5000, local))
+    for stamp, observer, seen in zip(stamps.tolist(), nodes["r0"], nodes["r1"], strict=True):
+        to = seen_from(observer, seen[0] + 1j * seen[1])
+        bearing = np.angle(to) if bearing_sigma < 1.0 else 0.0
+        reading = np.array([abs(to), bearing])
+        covariance = np.diag([0.01, bearing_sigma]) ** 2
+        ranges_seen.append(Sighting("r0", 0, 0, stamp, "r1", reading, covariance))
+    starts = [Start("r0", 0, np.zeros(3)), Start("r1", 0, paths["r1"], np.diag([100.0, 100, 9]))]
+    island = joined_with(submaps, starts, ranges_seen, options).main
+    across = island.state.copy()
+    for node in (*island.graph.streams["r1", 0], *island.graph.poses.values()):
+        across[island.graph.offset[node] + 1] *= -1.0
+        across[island.graph.offset[node] + 2] *= -1.0
+    return [island, replace(island, state=across)]

@@ -7,16 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.estimation import gauss_newton
-from team.estimation.contribution import Contribution, Start
+from team.estimation import gauss_newton, minima
 from team.estimation.gauss_newton import JoinSettings
 from team.estimation.joining import EMPTY_FOLD, converged, folded, started
-from team.estimation.minima import doubts, minimum, searched, suspicious
+from team.estimation.minima import Search, doubts, minimum, searched, suspicious
 from team.estimation.relaxation import relaxed
-from team.estimation.sighting import Sighting
-from team.estimation.submap import LocalMap
-from tests.estimation.sighting_world import joined_with, meeting
-from tests.estimation.submap_world import local_truth, seen_from, team, wrap
+from tests.estimation.sighting_world import joined_with, meeting, mirrored
+from tests.estimation.submap_world import team, wrap
 
 OPTIONS = JoinSettings()
 
@@ -109,10 +106,32 @@ def test_a_long_curved_valley_is_gone_along_to_its_end(seed, monkeypatch):
     assert creeping.cost > found.cost + 10.0
 
 
-def test_a_map_that_is_not_settled_is_said():
+def test_a_map_that_is_not_settled_is_said(monkeypatch):
+    monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
     island = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
     hasty = replace(island, settings=replace(OPTIONS, max_iterations=1))
     assert any("is not settled: after 1 iterations" in text for text in doubts(searched([hasty])))
+
+
+def test_a_solution_that_is_stuck_is_told_from_one_that_has_converged(monkeypatch):
+    lost = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
+    monkeypatch.setattr(gauss_newton, "SHARES", (1.0,))
+    monkeypatch.setattr(gauss_newton, "MOST_DAMPING", gauss_newton.LEAST_DAMPING)
+    stuck = minimum(lost)
+    assert stuck.iterations < OPTIONS.max_iterations
+    assert stuck.change > 1.0, "the mutant says 0"
+    assert any("is not settled" in text for text in doubts(Search(stuck, 0.0, None)))
+
+
+def test_what_has_not_settled_is_solved_on(monkeypatch):
+    far = {"size": 100.0, "reach": 20.0, "sigmas": (0.02, 0.3, 3.0)}
+    island = island_of(team(1, robots=1, submaps=30, landmarks=3, **far))
+    state = relaxed(island.graph, island.state)
+    hasty = replace(island, state=state, settings=replace(OPTIONS, max_iterations=6))
+    assert minimum(hasty).change > minima.SETTLED_M
+    assert searched([hasty]).best.change <= minima.SETTLED_M
+    monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
+    assert searched([hasty]).best.change > minima.SETTLED_M, "the mutant leaves it"
 
 
 @pytest.mark.parametrize(("landmark_sigma", "said"), [(6.0, True), (0.2, False)])
@@ -125,42 +144,8 @@ def test_a_robot_whose_heading_no_landmark_gives_is_said(landmark_sigma, said):
     assert [text.split(" is ")[0] for text in found] == ["r1 (epoch 0)"] * said
 
 
-# --- two places for one robot ---
-
-
-def mirrored(bearing_sigma):
-    """r1 drives straight beside r0, who sees how far it is but hardly where: left or right."""
-    ranges_seen = []
-    stamps = np.arange(1, 5) * 1000
-    submaps = []
-    paths = {"r0": np.zeros(3), "r1": np.array([0.0, 3.0, 0.2])}
-    nodes = {}
-    for robot, start in paths.items():
-        c, s = np.cos(start[2]), np.sin(start[2])
-        along = [np.array([start[0] + k * c, start[1] + k * s, start[2]]) for k in range(1, 6)]
-        nodes[robot] = along[:4]
-        mean = np.concatenate(
-            [local_truth(start, pose, np.zeros((0, 2))) for pose in (along[4], *along[:4])]
-        )
-        local = LocalMap(np.zeros(0, np.uint32), mean, 1e-4 * np.eye(len(mean)), stamps)
-        submaps.append(Contribution(robot, 0, 0, 5000, local))
-    for stamp, observer, seen in zip(stamps.tolist(), nodes["r0"], nodes["r1"], strict=True):
-        to = seen_from(observer, seen[0] + 1j * seen[1])
-        bearing = np.angle(to) if bearing_sigma < 1.0 else 0.0
-        reading = np.array([abs(to), bearing])
-        covariance = np.diag([0.01, bearing_sigma]) ** 2
-        ranges_seen.append(Sighting("r0", 0, 0, stamp, "r1", reading, covariance))
-    starts = [Start("r0", 0, np.zeros(3)), Start("r1", 0, paths["r1"], np.diag([100.0, 100, 9]))]
-    island = joined_with(submaps, starts, ranges_seen, OPTIONS).main
-    across = island.state.copy()
-    for node in (*island.graph.streams["r1", 0], *island.graph.poses.values()):
-        across[island.graph.offset[node] + 1] *= -1.0
-        across[island.graph.offset[node] + 2] *= -1.0
-    return [island, replace(island, state=across)]
-
-
 def test_a_second_place_that_fits_as_well_is_found_and_said():
-    search = searched(mirrored(bearing_sigma=30.0))
+    search = searched(mirrored(30.0, OPTIONS))
     assert search.second is not None
     assert search.ambiguous
     (text,) = doubts(search)
@@ -168,6 +153,6 @@ def test_a_second_place_that_fits_as_well_is_found_and_said():
 
 
 def test_a_place_that_the_readings_exclude_is_no_second_place():
-    search = searched(mirrored(bearing_sigma=0.02))
+    search = searched(mirrored(0.02, OPTIONS))
     assert not search.ambiguous
     assert doubts(search) == []

@@ -138,22 +138,34 @@ def test_wrong_use_ends_with_2_and_says_what_is_wrong(arguments: list[str], said
     assert said in refused.output
 
 
-def few_run(first_chi2, shape_nees, said):
+def few_run(
+    first_chi2: float | None, shape_nees: float, said: list[str], wrong: bool = False
+) -> Figures:
     robots = {"r1": {"first_pose_chi2": 1.0}, "r2": {"first_pose_chi2": first_chi2}}
-    figures = {"rmse_aligned": 0.5, "shape_nees": shape_nees, "landmarks": 4.0}
+    figures: Figures = {"rmse_aligned": 0.5, "shape_nees": shape_nees, "landmarks": 4.0}
+    figures["minimum"] = {"wrong": wrong, "excluded": False}
     return figures | {"robots": robots, "not_joined": [], "said": said}
 
 
+SAID = ["another map fits about as well"]
+
+
 @pytest.mark.parametrize(
-    ("run", "wrong", "silent"),
+    ("run", "wrong", "silent", "beyond", "untold", "alarms"),
     [
-        (few_run(2.0, 2.0, []), 0, 0),
-        (few_run(20.0, 2.0, []), 1, 1),
-        (few_run(2.0, 12.0, []), 1, 1),
-        (few_run(20.0, 2.0, ["another map fits about as well"]), 1, 0),
-        (few_run(None, 2.0, []), 0, 0),
+        (few_run(2.0, 2.0, []), 0, 0, 0, 0, 0),
+        (few_run(2.0, 2.0, SAID), 0, 0, 0, 0, 1),
+        (few_run(20.0, 2.0, []), 0, 0, 1, 1, 0),
+        (few_run(2.0, 12.0, []), 0, 0, 1, 1, 0),
+        (few_run(20.0, 2.0, SAID), 0, 0, 1, 0, 0),
+        (few_run(None, 2.0, []), 0, 0, 0, 0, 0),
+        (few_run(2.0, 2.0, [], wrong=True), 1, 1, 0, 0, 0),
+        (few_run(2.0, 2.0, SAID, wrong=True), 1, 0, 0, 0, 0),
     ],
 )
-def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(run, wrong, silent):
+def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(
+    run: Figures, wrong: int, silent: int, beyond: int, untold: int, alarms: int
+) -> None:
     figures = accuracy_few.few_figures([run])
-    assert (figures["wrong"], figures["silent"]) == (wrong, silent)
+    names = ("wrong", "silent", "beyond", "beyond_silent", "alarms")
+    assert tuple(figures[name] for name in names) == (wrong, silent, beyond, untold, alarms)

@@ -1,0 +1,88 @@
+"""Where a covariance does not say all: a pose in a curved valley of the cost.
+
+One heading is moved away from its best value, everything else solved for given that: the profile of
+the cost (Bates & Watts 1988, chapter 6). For a quadratic cost its rise is the χ² by which the
+pose's own covariance says that it has moved. After a long way without a landmark that χ² may be ten
+times the rise: the robot may well be where its covariance excludes it, though the minimum is right.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from team.estimation.contribution import named
+from team.estimation.gauss_newton import FULL_AGE, Island, aged, held, joint_marginal
+from team.estimation.gaussian import information
+from team.estimation.geometry import compose, inverse, logarithm
+
+STEPS = (1.0, 2.0, 3.0)
+"""How far a heading is moved, in its standard deviations."""
+ITERATIONS = 4
+STRAIGHT_RAD = 0.1
+"""A heading known so well moves nothing far enough to bend."""
+BENT = 4.0
+"""χ² by the covariance over the rise of the cost: from here on the ellipse is too short by half."""
+UNLIKELY = float(chdtri(1, 1e-3))
+"""Where the cost has risen by more is not looked at: χ² of 1, 99.9 %."""
+
+
+class Bend(NamedTuple):
+    """A place of a pose so far [m] away: the rise of the cost, and χ² by the pose's covariance."""
+
+    distance: float
+    rise: float
+    chi2: float
+
+    @property
+    def ratio(self) -> float:
+        """1 where the cost is quadratic."""
+        return self.chi2 / max(self.rise, 1.0)
+
+
+def bend(island: Island, node: int) -> Bend | None:
+    """Of a pose of an island at its minimum: the likely place that its covariance denies most.
+
+    None where it denies none, and where the heading is known too well for that.
+    """
+    mean, covariance = joint_marginal(island, [node])
+    sigma = float(np.sqrt(covariance[2, 2]))
+    if sigma < STRAIGHT_RAD:
+        return None
+    # The χ² is that of the motion of the frame Exp(ξ), to first order ξ = A (dx, dy, dθ), so that a
+    # turn about a far point is not taken for a bend.
+    A = np.array([[1.0, 0.0, mean[1]], [0.0, 1.0, -mean[0]], [0.0, 0.0, 1.0]])
+    metric = information(A @ covariance @ A.T, "a pose")
+    at = int(island.graph.offset[node])
+    island = aged(island, FULL_AGE)
+    found = []
+    for sign in (1.0, -1.0):
+        walked = island
+        for before, after in zip((0.0, *STEPS), STEPS, strict=False):
+            walked = held(walked, at + 2, sign * (after - before) * sigma, ITERATIONS)
+            rise = walked.cost - island.cost
+            if rise > UNLIKELY:
+                break
+            pose = walked.state[at : at + 3]
+            xi = logarithm(compose(pose, inverse(mean)))
+            distance = float(np.hypot(*(pose - mean)[:2]))
+            found.append(Bend(distance, rise, float(xi @ metric @ xi)))
+    worst = max(found, key=lambda each: each.ratio, default=None)
+    return None if worst is None or worst.ratio < BENT else worst
+
+
+def bends(island: Island) -> list[str]:
+    """In words, the bends of the first and the last pose of every stream without a given start."""
+    graph, said = island.graph, []
+    for stream, nodes in sorted(graph.streams.items()):
+        if graph.fixed[nodes[0]]:
+            continue
+        for where, node in (("started", nodes[0]), ("ended", nodes[-1])):
+            found = bend(island, node)
+            if found is not None:
+                said.append(
+                    f"{named(stream)} may have {where} farther off than its covariance says: "
+                    f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "
+                    f"covariance {found.chi2:.0f}"
+                )
+    return said
