@@ -5,6 +5,7 @@ Admission is the ledger's gate: a submap whose readings overlap another's, or th
 else under a name that is taken, is refused with its reason.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from team.wire.messages import Member, SightingFactor, Submap
@@ -17,7 +18,8 @@ Stream = tuple[str, int]
 class SubmapSet:
     """Submaps by stream and sequence, as they came; sightings by stream, sequence, what and when.
 
-    used: the sighting that each reading of a stream went into, by (reading, teammate).
+    used: the sighting that each reading of a stream went into, by (reading, teammate). chains: of
+    each stream, as far as `chain` has found it; what is in a set stays there, so it only grows.
     """
 
     streams: dict[Stream, dict[int, Submap]] = field(default_factory=dict)
@@ -25,6 +27,7 @@ class SubmapSet:
         default_factory=dict
     )
     used: dict[Stream, dict[tuple[int, str], SightingFactor]] = field(default_factory=dict)
+    chains: dict[Stream, list[Submap]] = field(default_factory=dict)
 
     def admit(self, submap: Submap) -> str | None:
         """Take a submap; the reason if it is refused. One that is in the set already is accepted.
@@ -36,9 +39,7 @@ class SubmapSet:
         there = stream.get(submap.sequence)
         if there is not None:
             return None if there == submap else f"{name} differs from the one in the set"
-        before = max((s for s in stream if s < submap.sequence), default=None)
-        after = min((s for s in stream if s > submap.sequence), default=None)
-        for sequence in (before, after):
+        for sequence in _nearest(stream, submap.sequence):
             if sequence is None:
                 continue
             other = stream[sequence]
@@ -83,17 +84,20 @@ class SubmapSet:
 
     def chain(self, stream: Stream) -> list[Submap]:
         """The submaps of a stream from sequence 0 up to the first missing or incomplete one."""
-        found = self.streams.get(stream, {})
-        chain: list[Submap] = []
-        while (submap := found.get(len(chain))) is not None:
-            if len(self.sightings(submap)) < submap.sightings:
-                break
-            chain.append(submap)
-        return chain
+        return list(self._chain(stream))
 
     def count(self, stream: Stream) -> int:
         """How many submaps from sequence 0 on are there without a gap."""
-        return len(self.chain(stream))
+        return len(self._chain(stream))
+
+    def _chain(self, stream: Stream) -> list[Submap]:
+        found, seen = self.streams.get(stream, {}), self.seen.get(stream, {})
+        chain = self.chains.setdefault(stream, [])
+        while (submap := found.get(len(chain))) is not None:
+            if len(seen.get(submap.sequence, ())) < submap.sightings:
+                break
+            chain.append(submap)
+        return chain
 
     def missing(self) -> tuple[Member, ...]:
         """Of every stream that holds more than its chain, the submap that this waits for."""
@@ -103,3 +107,11 @@ class SubmapSet:
             if found and max(found) >= first:
                 gaps.append(Member(robot, epoch, first))
         return tuple(gaps)
+
+
+def _nearest(stream: Mapping[int, Submap], sequence: int) -> tuple[int | None, int | None]:
+    """The sequences of a stream next below and above this one; mostly the last one's and none."""
+    if sequence - 1 in stream and sequence > max(stream):
+        return sequence - 1, None
+    below = max((s for s in stream if s < sequence), default=None)
+    return below, min((s for s in stream if s > sequence), default=None)

@@ -75,7 +75,7 @@ class SvdJoinRule(JoinRule):
             )
         placed = [stream for stream in sorted(chains) if self._starts[stream].pose]
         first = placed[0] if placed else min(chains)
-        joined = {stream: self._extended(stream, chains[stream]) for stream in chains}
+        joined = {stream: self._extended(stream, chains[stream], final) for stream in chains}
         maps = {s: svd_joining.landmark_gaussian(x.state) for s, x in joined.items()}
         fused, reasons = tied(first, maps, full=self._weighting == "full")
         self.landmarks = len(fused.ids)
@@ -90,8 +90,12 @@ class SvdJoinRule(JoinRule):
             reasons=reasons,
         )
 
-    def _extended(self, stream: Stream, chain: Sequence[m.Submap]) -> _Joined:
-        """The map of a stream's chain, from the longest one that was made before."""
+    def _extended(self, stream: Stream, chain: Sequence[m.Submap], final: bool) -> _Joined:
+        """The map of a stream's chain, from the longest one that was made before.
+
+        Running maps have the solution that each submap has moved on; the final one is solved to the
+        end, wrong minima looked for.
+        """
         told = translate.pose_of(self._starts[stream])[0]
         begin = svd_joining.begun(
             {stream[0]: np.zeros(3) if told is None else told}, self._weighting
@@ -105,7 +109,7 @@ class SvdJoinRule(JoinRule):
             state = svd_joining.stepped(state, stream[0], local)
             digest = translate.digest_of(digest, encoded(submap))
         self._joined[stream] = _Joined(len(chain), state, digest)
-        return _Joined(len(chain), svd_joining.solved(state), digest)
+        return _Joined(len(chain), svd_joining.solved(state) if final else state, digest)
 
 
 def tied(

@@ -12,10 +12,19 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.stats import ttest_rel
 
 from sim.experiments import downs_printed
 from sim.experiments.downs_joined import his_protocol, spherical_task, whole_run_task
+from sim.experiments.downs_simulated import (
+    SIMULATED_5_1,
+    SIMULATED_5_2,
+    SIMULATED_5_3,
+    SIMULATED_5_4,
+    SIMULATED_5_5,
+    SimulatedTable,
+    paired_test,
+    sample_picture,
+)
 from sim.experiments.drawing import figure, ruled
 from sim.experiments.experiment import (
     Dataset,
@@ -24,6 +33,7 @@ from sim.experiments.experiment import (
     Picture,
     Results,
     Table,
+    combined,
     without_datasets,
 )
 from sim.experiments.task import Task
@@ -60,18 +70,24 @@ class Compared(NamedTuple):
 
 
 class PrintedTable(NamedTuple):
-    """A table of the thesis. printed: by the set's number, a figure for each column."""
+    """A table of the thesis. printed: by the set's number, a figure for each column.
+
+    sample: the run whose map on the first set is drawn, as in figure 5.1.
+    """
 
     title: str
     columns: tuple[str, ...]
     printed: Mapping[str, Sequence[float]]
     methods: tuple[Method, ...]
     remarks: tuple[str, ...]
+    simulated: SimulatedTable
     compared: Compared | None = None
+    sample: Callable[[Options, Dataset], Task] | None = None
 
     def tasks(self, options: Options) -> list[Task]:
-        """Every method's runs on every set; those that two methods share once."""
-        found = [
+        """Every method's runs on every set and the simulator's; what two methods share once."""
+        found = self.simulated.tasks(options)
+        found += [
             task
             for dataset in options.datasets
             for tasks in self._sources()
@@ -80,7 +96,11 @@ class PrintedTable(NamedTuple):
         return list({task.name: task for task in found}.values())
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """The rows of each set, the picture of them, the t-test."""
+        """The rows of each set and of the simulator, the picture of them, the t-tests."""
+        simulated = self.simulated.outcome(self.title, options, results)
+        return combined(self.title, (self._of_sets(options, results), simulated))
+
+    def _of_sets(self, options: Options, results: Results) -> Outcome:
         if not options.datasets:
             return Outcome(self.title, {}, missing=(without_datasets(self.title),))
         sets = {dataset.name: self._set(options, dataset, results) for dataset in options.datasets}
@@ -101,11 +121,22 @@ class PrintedTable(NamedTuple):
             f"{self.title}: every column of every set, on a logarithmic scale.",
             partial(self._draw, sets),
         )
+        pictures = [picture]
+        if self.sample is not None:
+            for dataset in options.datasets[:1]:
+                run = results.of(self.sample(options, dataset))
+                if run is not None:
+                    pictures.append(sample_picture("sample-real", dataset.name, run["sample"]))
         figures: Figures = {"sets": sets, "t_tests": tests}
         remarks = self.remarks
         if options.quick:
             remarks += (f"Quick: only the first {QUICK_S:g} s of each set.",)
-        return Outcome(self.title, figures, tables, (picture,), remarks=remarks)
+        given = {_number(dataset) for dataset in options.datasets}
+        absent = [f"MRCLAM_Dataset{number}" for number in self.printed if number not in given]
+        missing = (without_datasets(f"{', '.join(absent)} of this table"),) if absent else ()
+        return Outcome(
+            self.title, figures, tables, tuple(pictures), remarks=remarks, missing=missing
+        )
 
     def _sources(self) -> list[Callable[[Options, Dataset], list[Task]]]:
         compared = [] if self.compared is None else [self.compared.tasks]
@@ -263,15 +294,7 @@ def _paired(
 
 
 def _test(pairs_of_sets: Sequence[Sequence[tuple[float, float]]]) -> Figures:
-    """The paired t-test of all pairs; p None below two."""
-    pairs = np.array([pair for pairs in pairs_of_sets for pair in pairs]).reshape(-1, 2)
-    enough = len(pairs) > 1
-    return {
-        "pairs": len(pairs),
-        "mean_before_m": float(pairs[:, 0].mean()) if len(pairs) else None,
-        "mean_after_m": float(pairs[:, 1].mean()) if len(pairs) else None,
-        "p": float(ttest_rel(pairs[:, 0], pairs[:, 1]).pvalue) if enough else None,
-    }
+    return paired_test([pair for pairs in pairs_of_sets for pair in pairs])
 
 
 def _test_table(compared: Compared | None, tests: Mapping[str, Figures]) -> Table:
@@ -336,6 +359,8 @@ TABLE_5_1 = PrintedTable(
         "errors by linearisation; most of them is a turn of the whole map, which alignment takes "
         "away: the start heading and the odometry's first metres decide it.",
     ),
+    SIMULATED_5_1,
+    sample=_HIS_EKF,
 )
 TABLE_5_2 = PrintedTable(
     "Downs, table 5.2: paths of the EKF, one robot",
@@ -353,6 +378,7 @@ TABLE_5_2 = PrintedTable(
         "with, in one frame; how a path can be right within 0.04 m in a map that lies wrong by "
         "0.3 m the source does not say. Rows 3 and 8 of the printed table are the same.",
     ),
+    SIMULATED_5_2,
 )
 _JOINED = (
     _each(_spherical),
@@ -375,6 +401,7 @@ TABLE_5_3 = PrintedTable(
         "rows 6 and 7 of the printed table are the same: not to be taken as verified. "
         "The t-test of the 45 printed pairs gives another p than the text has.",
     ),
+    SIMULATED_5_3,
     Compared(
         "EKF maps (table 5.1) against joined maps (table 5.3)",
         downs_printed.P_EKF_JOINED,
@@ -393,6 +420,7 @@ TABLE_5_4 = PrintedTable(
         "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's own millimetre, so no "
         "estimate can be measured to be that good: it is most likely not a distance to the truth.",
     ),
+    SIMULATED_5_4,
 )
 
 
@@ -411,6 +439,7 @@ TABLE_5_5 = PrintedTable(
         "singular values over the landmarks that they share, so the robots' own positions are not "
         "among the points. Ours joins all submaps in one frame, with sightings of teammates.",
     ),
+    SIMULATED_5_5,
     Compared(
         "the mean of single joined maps (table 5.3) against the team's (table 5.5)",
         downs_printed.P_JOINED_TEAM,

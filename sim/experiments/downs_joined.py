@@ -17,6 +17,7 @@ from jaxtyping import Float
 from central.svd_rule import tied
 from sim.evaluation.errors import MapErrors, Path, map_errors, pose_errors
 from sim.evaluation.evaluation import Evaluation, evaluate
+from sim.experiments.curves import said_poses, true_landmarks
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
@@ -35,6 +36,7 @@ from team.wire.bus import Sample, opened
 
 STEP_S = 1.0
 NEVER_S = 1e6
+DRAWN_POINTS = 1000
 """The centre joins once, when the run has ended."""
 _COST_S = 3e-3
 _UTIAS_COST_S = 60.0
@@ -93,15 +95,38 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """By robot: the errors of its last own map, and of its online path."""
-    evaluation = evaluate(_samples(scenario, path))
+    """By robot: the errors of its last own map, and of its online path; one robot's map itself."""
+    samples = _samples(scenario, path)
+    evaluation = evaluate(samples)
     return {
+        "sample": _sample(samples, evaluation),
         "robots": {
             name: _map_figures(robot.own_map)
             | {"position_rmse": None if robot.online is None else robot.online.position_rmse_m}
             for name, robot in evaluation.robots.items()
-        }
+        },
     }
+
+
+def _sample(samples: Sequence[Sample], evaluation: Evaluation) -> Figures:
+    """The first robot's last map and its paths, to be drawn."""
+    name, robot = next(iter(evaluation.robots.items()))
+    said = [opened(s)[2] for s in samples if s.key == ch.OWN_MAP.key(name)]
+    last = next((each for each in reversed(said) if isinstance(each, m.MapEstimate)), None)
+    return {
+        "robot": name,
+        "means": [] if last is None else translate.landmarks_of(last)[1].tolist(),
+        "blocks": [] if last is None else translate.landmark_blocks_of(last).tolist(),
+        "landmarks": true_landmarks(samples)[1].tolist(),
+        "online": _thinned(said_poses(samples, (ch.OWN_POSE.key(name),))[0]),
+        "truth": _thinned(robot.truth),
+    }
+
+
+def _thinned(path: Path) -> list[list[float]]:
+    every = max(1, len(path.poses) // DRAWN_POINTS)
+    points: list[list[float]] = path.poses[::every, :2].round(3).tolist()
+    return points
 
 
 def spherical_run(
@@ -113,7 +138,8 @@ def spherical_run(
     """
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
-    truth = _true_landmarks(samples)
+    ids, positions = true_landmarks(samples)
+    truth = dict(zip(ids.tolist(), positions, strict=True))
     robots, maps = {}, {}
     for name in evaluation.robots:
         submaps = _submaps(samples, name)
@@ -190,16 +216,6 @@ def _path_error(
     unit = np.broadcast_to(np.eye(3), (len(poses), 3, 3))
     errors = pose_errors(Path(stamps, poses), unit, evaluation.robots[robot].truth)
     return None if errors is None else errors.position_rmse_m
-
-
-def _true_landmarks(samples: Sequence[Sample]) -> dict[int, Float[np.ndarray, "2"]]:
-    for sample in samples:
-        if sample.key == ch.TRUTH_LANDMARKS.key():
-            message = opened(sample)[2]
-            if isinstance(message, m.TruthLandmarks):
-                ids, positions = translate.landmarks_of(message)
-                return {int(id_): position for id_, position in zip(ids, positions, strict=True)}
-    return {}
 
 
 def _errors(

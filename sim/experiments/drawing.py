@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from jaxtyping import Float
 
+from sim.pictures.run import MAP_COLOUR, ellipse_of
+
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -85,6 +87,21 @@ def figure(width: float, height: float) -> "Figure":
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     return made
+
+
+def draw_map(
+    axis: "Axes", means: Sequence[Sequence[float]], blocks: Sequence[Any], colour: str = MAP_COLOUR
+) -> None:
+    """Landmarks as dots with their 95 % ellipses. blocks: a 2 × 2 covariance each [m²]."""
+    from matplotlib.patches import Ellipse
+
+    for mean, block in zip(means, blocks, strict=True):
+        width, height, turn_deg = ellipse_of(np.array(block))
+        axis.plot(*mean, marker=".", color=colour, zorder=5)
+        axis.add_patch(
+            Ellipse((mean[0], mean[1]), width, height, angle=turn_deg, fill=False,
+                    edgecolor=colour, zorder=5)
+        )  # fmt: skip
 
 
 def ruled(axis: "Axes") -> None:

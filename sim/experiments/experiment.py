@@ -8,7 +8,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from sim.experiments.task import Task
 
-UTIAS_SOURCE = "http://asrl.utias.utoronto.ca/datasets/mrclam/"
+UTIAS_SOURCE = (
+    "the UTIAS Multi-Robot Cooperative Localization and Mapping data set (MRCLAM; Leung, Halpern, "
+    "Barfoot, Liu, IJRR 30(8):969-974, 2011), which its authors give to everybody"
+)
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,6 @@ def combined(title: str, parts: Sequence[Outcome]) -> Outcome:
 def without_datasets(what: str) -> str:
     """The line for `Outcome.missing` of what needs a UTIAS data set."""
     return (
-        f"{what}: give the UTIAS data sets with --dataset MRCLAM_Dataset1.zip --dataset …; "
-        f"their authors have them at {UTIAS_SOURCE}"
+        f"{what}: give the sets with --dataset MRCLAM_Dataset1.zip --dataset …; they are of "
+        f"{UTIAS_SOURCE}"
     )

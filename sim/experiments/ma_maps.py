@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sim.experiments.drawing import figure, ruled
+from sim.experiments.drawing import draw_map, figure, ruled
 from sim.experiments.experiment import (
     Dataset,
     Options,
@@ -20,7 +20,7 @@ from sim.experiments.ma import DEAD_RECKONING, MULTI_3, MULTI_5, SINGLE, ma_task
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
 from sim.experiments.xu import Method
-from sim.pictures.run import MAP_COLOUR, ROBOT_COLOURS, TRUTH_COLOUR, ellipse_of
+from sim.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
@@ -108,15 +108,6 @@ class _Drawing:
 
 
 def _draw(axis: "Axes", run: Figures) -> None:
-    from matplotlib.patches import Ellipse
-
-    def ellipse(mean: list[float], block: list[list[float]], colour: str) -> None:
-        width, height, turn_deg = ellipse_of(np.array(block))
-        axis.add_patch(
-            Ellipse((mean[0], mean[1]), width, height, angle=turn_deg, fill=False,
-                    edgecolor=colour, zorder=5)
-        )  # fmt: skip
-
     for i, (name, robot) in enumerate(run["robots"].items()):
         colour = ROBOT_COLOURS[i % len(ROBOT_COLOURS)]
         axis.plot(*np.array(robot["truth"]).reshape(-1, 2).T, color=TRUTH_COLOUR, linewidth=0.9)
@@ -125,7 +116,7 @@ def _draw(axis: "Axes", run: Figures) -> None:
             label=f"{name}, online",
         )  # fmt: skip
         if robot["end_block"] is not None and run["map"] is None:
-            ellipse(robot["line"][-1], robot["end_block"], colour)
+            draw_map(axis, robot["line"][-1:], [robot["end_block"]], colour)
     for cloud in run["clouds"]:
         axis.plot(*np.array(cloud).T, linestyle="", marker=".", markersize=3, color=CLOUD_COLOUR,
                   zorder=4)  # fmt: skip
@@ -133,9 +124,7 @@ def _draw(axis: "Axes", run: Figures) -> None:
         *np.array(run["truth"]).T, linestyle="", marker="x", color="#C00000", label="true landmarks"
     )
     if run["map"] is not None:
-        for mean, block in zip(run["map"]["means"], run["map"]["blocks"], strict=True):
-            axis.plot(*mean, marker=".", color=MAP_COLOUR, zorder=5)
-            ellipse(mean, block, MAP_COLOUR)
+        draw_map(axis, run["map"]["means"], run["map"]["blocks"])
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")

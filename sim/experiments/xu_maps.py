@@ -10,13 +10,13 @@ import numpy as np
 
 from sim.evaluation.evaluation import evaluate
 from sim.experiments.curves import messages, pose_keys, said_poses, true_landmarks
-from sim.experiments.drawing import figure, ruled
+from sim.experiments.drawing import draw_map, figure, ruled
 from sim.experiments.experiment import Options, Outcome, Picture, Results, Table
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, TimedRun, rms
 from sim.experiments.xu import EKF, FASTSLAM, HYBRID, MULTI_HYBRID, OUR_TEAM, OURS, Method, Panel
 from sim.experiments.xu import task as curves_of
-from sim.pictures.run import MAP_COLOUR, ROBOT_COLOURS, TRUTH_COLOUR, ellipse_of
+from sim.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
 from sim.scenario.scenario import loads
 from team import translate
 from team.wire import channels as ch
@@ -137,8 +137,6 @@ class _Drawing:
 
 
 def _draw(axis: "Axes", shot: Figures, landmarks: np.ndarray) -> None:
-    from matplotlib.patches import Ellipse
-
     for i, (name, lines) in enumerate(shot["paths"].items()):
         colour = ROBOT_COLOURS[i % len(ROBOT_COLOURS)]
         for kind, each, width in (("truth", TRUTH_COLOUR, 0.8), ("online", colour, 1.4)):
@@ -146,13 +144,7 @@ def _draw(axis: "Axes", shot: Figures, landmarks: np.ndarray) -> None:
             label = f"{name}, online" if kind == "online" else None
             axis.plot(points[:, 0], points[:, 1], color=each, linewidth=width, label=label)
     axis.plot(*landmarks.T, linestyle="", marker="x", color="#C00000", label="true landmarks")
-    for mean, block in zip(shot["means"], shot["blocks"], strict=True):
-        width, height, turn_deg = ellipse_of(np.array(block))
-        axis.plot(*mean, marker=".", color=MAP_COLOUR, zorder=5)
-        axis.add_patch(
-            Ellipse((mean[0], mean[1]), width, height, angle=turn_deg, fill=False,
-                    edgecolor=MAP_COLOUR, zorder=5)
-        )  # fmt: skip
+    draw_map(axis, shot["means"], shot["blocks"])
     axis.set_xlim(-10, 110)
     axis.set_ylim(-10, 110)
     axis.set_aspect("equal")

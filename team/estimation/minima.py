@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
+from team.estimation import sparse_kernel
 from team.estimation.bends import bends
 from team.estimation.contribution import Stream, named
 from team.estimation.gauss_newton import Island, NotDeterminedError, final_cost, settled
@@ -163,15 +164,9 @@ def _difference(one: Island, other: Island) -> Values:
 def _quadratic(island: Island, x: Values) -> float:
     """xᵀAx with the information A of the island at its state."""
     values, _ = island.normal_equations
-    pattern, offset = island.graph.pattern, island.graph.offset
-    total = 0.0
-    columns = pattern.columns.tolist()
-    for entry, (row, column) in enumerate(zip(pattern.rows.tolist(), columns, strict=True)):
-        here, there = x[offset[row] : offset[row + 1]], x[offset[column] : offset[column + 1]]
-        begin, end = pattern.value_start[entry], pattern.value_start[entry + 1]
-        block = values[begin:end].reshape(len(here), len(there))
-        total += (1.0 if row == column else 2.0) * float(here @ block @ there)
-    return total
+    pattern = island.graph.pattern
+    entries = pattern.rows, pattern.columns, pattern.value_start
+    return sparse_kernel.quadratic(values, *entries, island.graph.offset, x)
 
 
 def doubts(search: Search) -> list[str]:

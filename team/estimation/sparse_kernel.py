@@ -213,3 +213,28 @@ def takahashi(structure: Structure, panels: Values) -> Values:
                     total -= result[k, i] * y[later, i]
                 result[later, k] = total
     return inverse
+
+
+@compiled
+def quadratic(
+    values: Values,
+    rows: Indices,
+    columns: Indices,
+    value_start: Indices,
+    offset: Indices,
+    x: Values,
+) -> float:
+    """xᵀAx of a symmetric A, given by the blocks of one triangle row by row.
+
+    Block k, of the variables rows[k] and columns[k], begins at values[value_start[k]].
+    """
+    total = 0.0
+    for k in range(len(rows)):
+        here, there = offset[rows[k]], offset[columns[k]]
+        width = offset[columns[k] + 1] - there
+        block = 0.0
+        for i in range(offset[rows[k] + 1] - here):
+            for j in range(width):
+                block += x[here + i] * values[value_start[k] + i * width + j] * x[there + j]
+        total += block if rows[k] == columns[k] else 2.0 * block
+    return total

@@ -6,13 +6,25 @@ import msgspec
 import numpy as np
 import pytest
 
+from sim.datasets.utias import utias
+from sim.datasets.utias_writer import write_utias
 from sim.experiments import downs_minima
 from sim.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
 from sim.experiments.downs_joined import spherical_task
 from sim.experiments.downs_printed import EKF_MAPS, JOINED_MAPS
+from sim.experiments.downs_simulated import (
+    SIMULATED_5_1,
+    SIMULATED_5_2,
+    SIMULATED_5_3,
+    SIMULATED_5_4,
+    SIMULATED_5_5,
+    WORLDS,
+)
 from sim.experiments.experiment import Dataset, Options, Results
 from sim.experiments.team_runs import Figures
 from sim.scenario.scenario import load, with_options
+from sim.scenario.source import streams_of
+from sim.world.worlds import UtiasWorld
 from team.estimation.alignment import procrustes
 
 SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
@@ -101,3 +113,50 @@ def test_a_curve_with_two_minima_is_said_to_have_two() -> None:
     turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
     assert downs_minima.minima(np.cos(2.0 * turns)) == 2
     assert downs_minima.minima(np.cos(turns)) == 1
+
+
+def test_his_simulator_stands_in_every_table_and_no_set_is_needed_for_it(tmp_path: Path) -> None:
+    options = Options((1, 2), quick=True)
+    short = SIMULATED_5_1.tasks(options)
+    assert len(short) == 2 * len(WORLDS)
+    results = Results({task.name: task.run() for task in short})
+    outcome = TABLE_5_1.outcome(options, results)
+    assert outcome.missing
+    (table,) = outcome.tables
+    assert [row[0] for row in table.rows][:2] == ["10, EKF", "10, EKF, aligned"]
+    assert all(row[1] == "2" for row in table.rows)
+    of_100 = outcome.figures["simulator"]["100, EKF"]
+    assert 0.0 < of_100["p10"] <= of_100["median"] <= of_100["p90"] < 0.5
+    assert [p.name for p in outcome.pictures] == [
+        "simulator",
+        "sample-downs-10",
+        "sample-downs-100",
+    ]
+    for picture in outcome.pictures:
+        picture.draw(tmp_path / "picture.png")
+        assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_the_tables_share_the_simulators_runs() -> None:
+    options = Options((1,))
+    tables = (SIMULATED_5_1, SIMULATED_5_2, SIMULATED_5_3, SIMULATED_5_4, SIMULATED_5_5)
+    every = {task.name for table in tables for task in table.tasks(options)}
+    # The EKF, his protocol, ours alone and ours as a team.
+    assert len(every) == 4 * len(WORLDS)
+
+
+def test_his_simulator_is_written_as_a_data_set_that_reads_the_same(tmp_path: Path) -> None:
+    scenario = load("downs-10")
+    world = msgspec.structs.replace(scenario.world, steps=120)
+    written = streams_of(msgspec.structs.replace(scenario, world=world))
+    write_utias(written, tmp_path)
+    read = utias(UtiasWorld(path=str(tmp_path)), scenario.robots)
+    (there,), (here,) = written.streams, read.streams
+    np.testing.assert_allclose(here.intervals.forward, there.intervals.forward, atol=1e-8)
+    np.testing.assert_allclose(here.intervals.yaw_rate, there.intervals.yaw_rate, atol=1e-8)
+    seen = there.landmark_detections
+    np.testing.assert_allclose(here.landmark_detections.ranges, seen.ranges, atol=1e-8)
+    assert len(seen.ranges) > 20
+    told = there.intervals
+    turned = np.abs(told.yaw_rate) > 0.05
+    assert (np.abs(told.forward[turned]) < 0.05).all(), "it turns, then drives"

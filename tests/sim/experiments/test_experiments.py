@@ -112,7 +112,7 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     assert 'name="viewport"' in page
     for said in ("a title", "a remark", "a data set", "MISSED", "version.numpy", "a curve"):
         assert said in page
-    assert "http" not in page.replace("http://asrl.utias.utoronto.ca", "")
+    assert "http" not in page
     assert (tmp_path / "some-curve.png").read_bytes() == b"\x89PNG"
     assert json.loads((tmp_path / "some.json").read_text())["experiment"] == "some"
 

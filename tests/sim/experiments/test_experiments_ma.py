@@ -85,4 +85,4 @@ def test_the_figures_of_a_set_are_tables_and_pictures(
 
 def test_without_a_set_the_figures_say_where_to_get_one() -> None:
     for experiment in (ma_errors.FIGURE_6A, ma_maps.FIGURE_5):
-        assert "asrl.utias.utoronto.ca" in experiment.outcome(Options((1,)), Results({})).missing[0]
+        assert "MRCLAM" in experiment.outcome(Options((1,)), Results({})).missing[0]
