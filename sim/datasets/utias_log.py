@@ -69,7 +69,10 @@ def log_of(
     subject = int(robot[1:]) if re.fullmatch(r"r[1-9]\d*", robot) else 0
     if subject not in present:
         known = ", ".join(f"r{number}" for number in present)
-        raise DatasetError(f"the data set has no readings of a robot {robot}; it has {known}")
+        raise DatasetError(
+            f"the data set has no readings of a robot {robot}; it has {known}: give --robots, or a "
+            "scenario of its own, such as `teamslam simulate` writes beside it"
+        )
     odometry = optional_table(files, f"Robot{subject}_Odometry.dat", ODOMETRY)
     measured = optional_table(files, f"Robot{subject}_Measurement.dat", MEASUREMENT)
     true_rows = optional_table(files, f"Robot{subject}_Groundtruth.dat", TRUTH)
