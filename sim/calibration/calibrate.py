@@ -81,7 +81,8 @@ def _by_truth(
         scales = []
         for label, world in worlds:
             progress(f"scale of the joined map of {label}, {turn + 1} of {ROUNDS}")
-            scales.append(_scale(joined_team(world, learnt), world))
+            team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
+            scales.append(_scale(team, world))
         factor, spread = float(np.mean(scales)), float(np.std(scales) / np.sqrt(len(scales)))
         of_sensor = tuple(
             replace(f, value=f.value * factor, sigma=float(np.hypot(f.sigma, spread)))
@@ -101,7 +102,8 @@ def _by_the_map(
         data, notes = [], []
         for label, world in worlds:
             progress(f"joined map of {label}, {turn + 1} of {ROUNDS}")
-            team = joined_team(world, _mistrusting(learnt))
+            mistrusting = _mistrusting(learnt)
+            team = joined_team(world, mistrusting, lambda robot: progress(f"  {robot} is done"))
             turning = _turning_first(world, scenario)
             data += references(world, team.paths, team.landmarks, JOINED_GAP_NS, label, turning)
             notes += _left_out(label, world, team.paths, "not in the team's joined map")

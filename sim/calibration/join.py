@@ -1,6 +1,6 @@
 """The team's map and paths from its own readings: the reference where there is no truth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -10,7 +10,14 @@ from jaxtyping import Float, Int64
 from central.tick_fold import join_settings
 from sim.evaluation.errors import Path, on_circle
 from sim.scenario.scenario import Scenario
-from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream, WorldStreams
+from sim.world.streams import (
+    OBSERVATIONS,
+    ODOMETRY,
+    ObservationReading,
+    OdometryReading,
+    RobotStream,
+    WorldStreams,
+)
 from team.config import RobotConfig
 from team.estimation.geometry import compose
 from team.estimation.joining import (
@@ -24,6 +31,9 @@ from team.estimation.joining import (
 )
 from team.estimation.window import Window
 from team.robot.member import ClosedWindow, HybridMember
+
+LONGEST_NS = 250_000_000
+"""Intervals of an arc are merged up to this: a window ends with one."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +53,18 @@ class JoinedTeam:
     paths: Mapping[str, Path]
 
 
-def joined_team(world: WorldStreams, scenario: Scenario) -> JoinedTeam:
+def joined_team(
+    world: WorldStreams, scenario: Scenario, progress: Callable[[str], None] = lambda _: None
+) -> JoinedTeam:
     """Every robot's windows with the scenario's models, joined; the main island's robots only.
 
     Between two ends of windows a path is the particles' mean, bent to end where the join ends it.
+    progress: is told the name of each robot whose windows are done.
     """
-    tracks = {s.robot: _tracks(config_of(s.robot, scenario), s) for s in world.streams}
+    tracks = {}
+    for each in world.streams:
+        tracks[each.robot] = _tracks(config_of(each.robot, scenario), each)
+        progress(each.robot)
     fold: Fold = EMPTY_FOLD
     for stream in world.streams:
         if stream.start is not None and tracks.get(stream.robot):
@@ -91,22 +107,54 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
     tracks: list[_Track] = []
     stamps: list[int] = []
     window = member.window
-    for counter in range(1, len(stream)):
-        kind = stream.kinds[counter]
-        member.consumed(counter)
-        if kind == OBSERVATIONS:
-            seen = stream.observations(counter)
-            member.observe(seen.stamp_ns, (seen.ids, seen.ranges, seen.bearings))
-        elif kind == ODOMETRY:
-            closed = member.drive(*stream.odometry(counter)).closed
-            if closed is not None:
-                tracks.append(_track(closed, stamps, window))
-                stamps = []
-            window = member.window
-            if member.last_epoch_ns is not None:
-                stamps += [member.last_epoch_ns] * (len(window.paths) - len(stamps))
+    for reading in _merged(stream, LONGEST_NS if config.motion.kind != "turn-then-drive" else 0):
+        if isinstance(reading, ObservationReading):
+            member.observe(reading.stamp_ns, (reading.ids, reading.ranges, reading.bearings))
+            continue
+        closed = member.drive(*reading).closed
+        if closed is not None:
+            tracks.append(_track(closed, stamps, window))
+            stamps = []
+        window = member.window
+        if member.last_epoch_ns is not None:
+            stamps += [member.last_epoch_ns] * (len(window.paths) - len(stamps))
     last = member.finish()[0].closed
     return tracks if last is None else [*tracks, _track(last, stamps, window)]
+
+
+def _merged(stream: RobotStream, longest_ns: int) -> Iterator[ObservationReading | OdometryReading]:
+    """The stream's scans and odometry; intervals of one command between two scans are made one.
+
+    None is made longer than longest_ns. A command that is logged ten times is one arc, and noise of
+    motion is a density: the estimate is the same, up to the correlation of the noises within an
+    interval and to where a window ends.
+    """
+    held: OdometryReading | None = None
+    for counter in range(1, len(stream)):
+        kind = stream.kinds[counter]
+        if kind == ODOMETRY:
+            interval = stream.odometry(counter)
+            if held is not None and _goes_on(held, interval, longest_ns):
+                interval = interval._replace(duration_ns=held.duration_ns + interval.duration_ns)
+            elif held is not None:
+                yield held
+            held = interval
+        elif kind == OBSERVATIONS:
+            if held is not None:
+                yield held
+            held = None
+            yield stream.observations(counter)
+    if held is not None:
+        yield held
+
+
+def _goes_on(one: OdometryReading, then: OdometryReading, longest_ns: int) -> bool:
+    """Whether the other follows without a gap, by the same command, and both are short."""
+    return (
+        then.stamp_ns - then.duration_ns == one.stamp_ns
+        and (then.forward, then.yaw_rate) == (one.forward, one.yaw_rate)
+        and one.duration_ns + then.duration_ns <= longest_ns
+    )
 
 
 def _track(closed: ClosedWindow, stamps: Sequence[int], window: Window) -> _Track:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sim.calibration import join
 from sim.calibration.calibrate import Calibration, calibrated, with_figures
 from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import CalibrationError, Figure, groups_of, jackknifed
@@ -23,9 +24,17 @@ from sim.cli.main import app
 from sim.datasets.utias_writer import write_utias
 from sim.evaluation.errors import Path, on_circle
 from sim.scenario.scenario import Scenario, load, with_options
-from sim.world.streams import Detections, Intervals, WorldStreams, grouped
+from sim.world.streams import (
+    Detections,
+    Intervals,
+    RobotStream,
+    WorldStreams,
+    grouped,
+    robot_stream,
+)
 from sim.world.worlds import SimulatedWorld
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.robot.member import Driven, HybridMember
 from team.wire.bus import opened
 from tests.sim.logs import scenario, streams, world_log
 
@@ -266,6 +275,51 @@ def test_the_joined_teams_paths_and_landmarks_lie_where_the_robots_were() -> Non
     assert world.landmarks is not None
     truth = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
     assert max(np.hypot(*(place - truth[i])) for i, place in joined.landmarks.items()) < 1.0
+
+
+def logged_often(world: WorldStreams, pieces: int) -> WorldStreams:
+    """The same world whose odometry is logged so many times as often, by the same commands."""
+
+    def of(stream: RobotStream) -> RobotStream:
+        each = stream.intervals
+        step = each.duration_ns // pieces
+        ends = each.end_ns[:, np.newaxis] - step[:, np.newaxis] * np.arange(pieces)[::-1]
+        ends = ends.ravel()
+        durations = np.diff(ends, prepend=ends[0] - step[0])
+        often = Intervals(
+            ends, durations, np.repeat(each.forward, pieces), np.repeat(each.yaw_rate, pieces)
+        )
+        return robot_stream(
+            stream.robot, int(ends[0] - step[0]), stream.start, often, stream.landmark_detections,
+            stream.teammate_detections, stream.teammates,
+        )  # fmt: skip
+
+    return replace(world, streams=tuple(of(each) for each in world.streams))
+
+
+def test_one_command_logged_many_times_is_one_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = scenario(robots=2)
+    arcs = (
+        msgspec.structs.replace(each, motion=msgspec.structs.replace(each.motion, kind="velocity"))
+        for each in plain.robots
+    )
+    team = msgspec.structs.replace(plain, robots=tuple(arcs))
+    world = logged_often(streams(team), 8)
+    drives = []
+
+    def counted(self: HybridMember, *interval: float) -> Driven:
+        drives.append(interval)
+        return drive(self, *interval)  # type: ignore[arg-type]
+
+    drive = HybridMember.drive
+    monkeypatch.setattr(HybridMember, "drive", counted)
+    merged = joined_team(world, team)
+    count = len(drives)
+    monkeypatch.setattr(join, "LONGEST_NS", 0)
+    each = joined_team(world, team)
+    assert len(drives) - count > 1.5 * count
+    for landmark, place in each.landmarks.items():
+        np.testing.assert_allclose(merged.landmarks[landmark], place, atol=5e-3)
 
 
 def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path: File) -> None:
