@@ -80,6 +80,7 @@ def launch(
     from sim.launch.launch import Plan
     from sim.launch.launch import launch as launched
     from sim.launch.live import shown
+    from sim.scenario.source import with_present_robots
 
     pace = parsed_speed(speed)
     name = scenario or ("utias" if dataset is not None else "thesis")
@@ -91,8 +92,9 @@ def launch(
         fusion=fusion,
         dataset=dataset,
     )
+    resolved, missing = with_present_robots(resolved)
     _check_world(resolved)
-    for text in doubts(resolved):
+    for text in (*doubts(resolved), *([missing] if missing else [])):
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)

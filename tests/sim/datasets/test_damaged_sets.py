@@ -16,8 +16,8 @@ import pytest
 from sim.datasets.utias_writer import write_utias
 from sim.evaluation.evaluation import Evaluation, evaluate
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import Scenario, load, with_options
-from sim.scenario.source import streams_of
+from sim.scenario.scenario import Scenario, dumps, load, loads, with_options
+from sim.scenario.source import streams_of, with_present_robots
 from sim.world.streams import WorldStreams
 from sim.world.worlds import SimulatedWorld, UtiasWorld
 
@@ -135,6 +135,36 @@ def test_a_set_with_a_fault_gives_a_sound_map_and_says_what_is_wrong(
     assert set(fault.said) <= set(found.notes)
     assert bool(found.notes) == bool(fault.said)
     assert_sound(found, fault)
+
+
+def test_a_set_without_the_files_of_a_robot_is_run_by_the_others(
+    simulated: WorldStreams, tmp_path: Path
+) -> None:
+    write_utias(simulated, tmp_path / "set")
+    for path in (tmp_path / "set").glob("Robot1_*"):
+        path.unlink()
+    asked = utias(tmp_path / "set")
+    assert isinstance(asked.world, UtiasWorld)
+    world = msgspec.structs.replace(asked.world, unknown_starts=("*", "!r1"))
+    scenario, said = with_present_robots(msgspec.structs.replace(asked, world=world))
+    assert said == "r1: no files in set; the team is r2"
+    found = evaluate(run_team(loads(dumps(scenario)), streams_of(scenario)))
+    assert list(found.robots) == ["r2"]
+    assert found.map is not None
+    assert len(found.map.ids) > 0
+    assert found.map.frame == "r2/1"
+
+
+@pytest.mark.parametrize("gone", [(), ("1", "2")], ids=["none is missing", "all are missing"])
+def test_of_a_whole_set_and_of_one_without_robots_nobody_is_left_out(
+    simulated: WorldStreams, tmp_path: Path, gone: tuple[str, ...]
+) -> None:
+    write_utias(simulated, tmp_path / "set")
+    for number in gone:
+        for path in (tmp_path / "set").glob(f"Robot{number}_*"):
+            path.unlink()
+    scenario = utias(tmp_path / "set")
+    assert with_present_robots(scenario) == (scenario, None)
 
 
 def assert_sound(found: Evaluation, fault: Fault) -> None:
