@@ -25,52 +25,74 @@ from team.wire import messages as m
 from team.wire.arrays import floats
 from team.wire.bus import Sample, opened
 
+STEP_S = 1.0
+"""Of the thesis' world."""
 _COST_S = 2.5e-3
+Map = m.FusedMap | m.MapEstimate
 DIGITS = 5
 """Significant digits of a kept curve: a picture shows three."""
 
 
 def curves_task(
-    scenario: Scenario, told: Scenario | None = None, label: str = "", *, late: bool = False
+    scenario: Scenario,
+    told: Scenario | None = None,
+    label: str = "",
+    *,
+    late: bool = False,
+    shots: Sequence[int] = (),
 ) -> Task:
     """The curves of a run. told: the scenario that the team is told, where the world's differs.
 
-    late: each step's readings are those of the step before.
+    late: each step's readings are those of the step before. shots: the steps at which maps and
+    paths are kept to be drawn.
     """
     steps = getattr(scenario.world, "steps", 500)
     return Task(
         "sim.experiments.curves:curves_run",
         {"world": msgspec.to_builtins(scenario)}
         | ({} if told is None else {"told": msgspec.to_builtins(told)})
-        | ({"late": True} if late else {}),
-        f"{label or scenario.name}, {named(scenario.estimator, scenario.fusion)}, "
-        f"seed {scenario.seed}",
+        | ({"late": True} if late else {})
+        | ({"shots": list(shots)} if shots else {}),
+        f"{'maps of ' if shots else ''}{label or scenario.name}, "
+        f"{named(scenario.estimator, scenario.fusion)}, seed {scenario.seed}",
         _COST_S * steps * len(scenario.robots),
     )
 
 
 def curves_run(
-    world: Mapping[str, Any], told: Mapping[str, Any] | None = None, late: bool = False
+    world: Mapping[str, Any],
+    told: Mapping[str, Any] | None = None,
+    late: bool = False,
+    shots: Sequence[int] = (),
 ) -> Figures:
-    """The curves of every robot's pose, and of the first landmark."""
+    """The curves of every robot's pose, of the first landmark, of the map; the map at `shots`."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if told is None else loads(msgspec.json.encode(told).decode())
     streams = streams_of(scenario)
     samples = list(TimedRun().samples(team, a_step_late(streams) if late else streams))
     evaluation = evaluate(samples)
     ids, positions = true_landmarks(samples)
+    truth = dict(zip(ids.tolist(), positions, strict=True))
     first = scenario.robots[0].id
-    return {
+    maps = _maps(samples, first)
+    paths = {name: said_poses(samples, pose_keys(team, name)) for name in evaluation.robots}
+    found: Figures = {
         "poses": {
             name: _pose_curve(errors)
             for name, robot in evaluation.robots.items()
-            if (errors := pose_errors(*said_poses(samples, pose_keys(team, name)), robot.truth))
-            is not None
+            if (errors := pose_errors(*paths[name], robot.truth)) is not None
         },
-        "landmark": _landmark_curve(
-            samples, first, dict(zip(ids.tolist(), positions, strict=True))
-        ),
+        "landmark": _landmark_curve(samples, maps, first, truth),
+        "map": {
+            "time_s": short(np.array([each.stamp_ns * 1e-9 for each in maps])),
+            "error_m": short(np.array([_map_rmse(each, truth) for each in maps])),
+        },
     }
+    if shots:
+        lines = {n: (paths[n][0], robot.truth) for n, robot in evaluation.robots.items()}
+        found["shots"] = [_shot(step, maps, lines, truth) for step in shots]
+        found["landmarks"] = positions.tolist()
+    return found
 
 
 def true_landmarks(
@@ -155,8 +177,51 @@ def _pose_curve(found: PoseErrors) -> Figures:
     }
 
 
+def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
+    """The team's maps with landmarks in them in their order; without any, those of the robot."""
+    for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
+        said = messages(samples, key)
+        maps = [each for each in said if isinstance(each, m.FusedMap | m.MapEstimate) and each.ids]
+        if maps:
+            return maps
+    return []
+
+
+def _map_rmse(said: Map, truth: Mapping[int, Float[np.ndarray, "2"]]) -> float:
+    ids, means = translate.landmarks_of(said)
+    true = np.array([truth[int(landmark)] for landmark in ids])
+    return float(np.sqrt(((means - true) ** 2).sum(axis=1).mean()))
+
+
+def _shot(
+    step: int,
+    maps: Sequence[Map],
+    lines: Mapping[str, tuple[Path, Path]],
+    truth: Mapping[int, Float[np.ndarray, "2"]],
+) -> Figures:
+    """The newest map, its landmarks' 2 × 2 blocks and its error, and the paths until then."""
+    now_ns = round(step * STEP_S * 1e9)
+    newest = next((each for each in reversed(maps) if each.stamp_ns <= now_ns), None)
+    return {
+        "step": step,
+        "means": [] if newest is None else translate.landmarks_of(newest)[1].tolist(),
+        "blocks": [] if newest is None else translate.landmark_blocks_of(newest).tolist(),
+        "rmse_m": None if newest is None else _map_rmse(newest, truth),
+        "paths": {
+            name: {
+                kind: path.poses[path.stamps_ns <= now_ns, :2].round(2).tolist()
+                for kind, path in (("online", online), ("truth", true))
+            }
+            for name, (online, true) in lines.items()
+        },
+    }
+
+
 def _landmark_curve(
-    samples: Sequence[Sample], robot: str, truth: Mapping[int, Float[np.ndarray, "2"]]
+    samples: Sequence[Sample],
+    maps: Sequence[Map],
+    robot: str,
+    truth: Mapping[int, Float[np.ndarray, "2"]],
 ) -> Figures | None:
     """The error of the first landmark that this robot saw; None if it saw none."""
     landmark = next(
@@ -167,15 +232,10 @@ def _landmark_curve(
         ),
         None,
     )
-    maps = list(messages(samples, ch.FUSED_MAP.key())) or list(
-        messages(samples, ch.OWN_MAP.key(robot))
-    )
     if landmark is None or not maps:
         return None
     times, errors, sigmas = [], [], []
     for fused in maps:
-        if not isinstance(fused, m.FusedMap | m.MapEstimate):
-            continue
         ids, means = translate.landmarks_of(fused)
         place = np.flatnonzero(ids == landmark)
         if not len(place):

@@ -41,8 +41,8 @@ class Curves:
         nees = [float(np.mean(run["nees"])) for run in runs if "nees" in run]
         return cls(
             times_s,
-            np.array([_at(times_s, run, "error_m", held=held) for run in runs]),
-            np.array([_at(times_s, run, "sigma_m", held=held) for run in runs]),
+            np.array([sampled(times_s, run, "error_m", held=held) for run in runs]),
+            np.array([sampled(times_s, run, "sigma_m", held=held) for run in runs]),
             np.array(nees) if nees else None,
         )
 
@@ -59,9 +59,10 @@ class Curves:
         return means
 
 
-def _at(
+def sampled(
     times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, held: bool
 ) -> Float[np.ndarray, " K"]:
+    """A curve of a run at these times; held: as `Curves.on` has it."""
     stamps, values = np.array(run["time_s"]), np.array(run[name])
     if not len(stamps):
         return np.full(len(times_s), np.nan)

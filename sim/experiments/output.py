@@ -24,7 +24,9 @@ th:first-child, td:first-child { text-align: left; }
 img { max-width: 100%; }
 figure { margin: 1.5rem 0; }
 figcaption, .note { color: #555; font-size: 90%; }
-nav a { margin-right: 1rem; }
+nav a { margin-right: 1rem; line-height: 2; }
+summary { cursor: pointer; }
+.kinds td { text-align: left; font-size: 85%; vertical-align: top; }
 """
 _WORDS = {True: "passed", False: "MISSED", None: "not computed"}
 _COLOURS = {True: "green", False: "red", None: "yellow"}
@@ -54,6 +56,10 @@ def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, An
         "quick": options.quick,
         "datasets": {each.name: each.sha256 for each in options.datasets},
         "runs": concluded.runs,
+        "parameters": [
+            {"run": label, "count": count, "parameters": said}
+            for label, count, said in concluded.kinds
+        ],
         **outcome.figures,
         "goals": [
             {
@@ -176,12 +182,28 @@ def _section(concluded: Concluded, figures: Sequence[str]) -> str:
             *figures,
             *(_html_table(table) for table in outcome.tables),
             _html_table(goals) if outcome.goals else "",
+            _kinds(concluded),
             *(f"<p><b>Missing:</b> {escape(text)}</p>" for text in outcome.missing),
             *(
                 f"<p><b>Failed:</b> {escape(label)}: {escape(error)}</p>"
                 for label, error in concluded.failed.items()
             ),
         ]
+    )
+
+
+def _kinds(concluded: Concluded) -> str:
+    """The runs and their parameters, folded away."""
+    if not concluded.kinds:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(label)}</td><td>{count}</td><td>{escape(said)}</td></tr>"
+        for label, count, said in concluded.kinds
+    )
+    head = "<tr><th>runs</th><th>seeds</th><th>where they differ from the scenario</th></tr>"
+    return (
+        f"<details><summary>{concluded.runs} runs and their parameters</summary>"
+        f'<table class="kinds">{head}{rows}</table></details>'
     )
 
 

@@ -12,6 +12,7 @@ from typing import cast
 from sim.datasets.tables import DatasetError
 from sim.experiments.catalogue import Entry
 from sim.experiments.experiment import Dataset, Experiment, Options, Outcome, Results
+from sim.experiments.parameters import kinds_of
 from sim.experiments.store import Store
 from sim.experiments.task import Task
 from sim.experiments.workers import Done, run
@@ -23,13 +24,17 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class Concluded:
-    """An experiment's outcome, and the runs of it that failed, with their errors."""
+    """An experiment's outcome, and the runs of it that failed, with their errors.
+
+    kinds: runs that differ in their seed only, how many, and their parameters.
+    """
 
     entry: Entry
     options: Options
     outcome: Outcome
     runs: int
     failed: Mapping[str, str] = field(default_factory=dict)
+    kinds: Sequence[tuple[str, int, str]] = ()
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,8 @@ def computed(
 def _concluded(plan: Plan, results: Results, failures: Mapping[str, Done]) -> Concluded:
     failed = {task.label: failures[task.name].error for task in plan.tasks if task.name in failures}
     outcome = plan.experiment.outcome(plan.options, results)
-    return Concluded(plan.entry, plan.options, outcome, len(plan.tasks), failed)
+    kinds = kinds_of(plan.tasks)
+    return Concluded(plan.entry, plan.options, outcome, len(plan.tasks), failed, kinds)
 
 
 def _write_failures(path: Path, failures: Sequence[Done]) -> None:

@@ -60,6 +60,9 @@ MULTI_CODED = Method(
 OUR_TEAM = Method("multi-Hybrid, ours", "hybrid", "join", 2, "#111111", None)
 
 
+Reading = Literal["stated", "exact", "coded"]
+
+
 class Panel(NamedTuple):
     """One world of a figure, its methods, and what the thesis says of each in metres.
 
@@ -73,7 +76,7 @@ class Panel(NamedTuple):
     methods: tuple[Method, ...]
     printed: Mapping[str, float]
     noise: tuple[float, float] | None = None
-    reading: Literal["stated", "exact", "coded"] = "stated"
+    reading: Reading = "stated"
 
 
 class ErrorFigure(NamedTuple):
@@ -142,8 +145,8 @@ class ErrorFigure(NamedTuple):
         return found
 
 
-def task(panel: Panel, method: Method, seed: int) -> Task:
-    """The run of one method in one panel's world."""
+def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -> Task:
+    """The run of one method in one panel's world; shots: the steps whose maps are drawn."""
     scenario = with_options(
         load("thesis"),
         seed=seed,
@@ -157,10 +160,10 @@ def task(panel: Panel, method: Method, seed: int) -> Task:
         scenario = with_noise(scenario, *panel.noise)
     label = f"thesis, {panel.name}" if panel.name else "thesis"
     if panel.reading == "stated":
-        return curves_task(scenario, None, label)
+        return curves_task(scenario, None, label, shots=shots)
     told = as_coded(scenario) if panel.reading == "coded" else scenario
     late = panel.reading == "coded"
-    return curves_task(with_noise(told, 0.0, 0.0), told, label, late=late)
+    return curves_task(with_noise(told, 0.0, 0.0), told, label, late=late, shots=shots)
 
 
 def as_coded(scenario: Scenario) -> Scenario:

@@ -3,118 +3,114 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import msgspec
 import numpy as np
 
-from sim.evaluation.evaluation import evaluate
-from sim.experiments.curves import messages, pose_keys, said_poses, true_landmarks
-from sim.experiments.drawing import draw_map, figure, ruled
+from sim.experiments.drawing import draw_map, figure, ruled, sampled, spread
 from sim.experiments.experiment import Options, Outcome, Picture, Results, Table
 from sim.experiments.task import Task
-from sim.experiments.team_runs import Figures, TimedRun, rms
-from sim.experiments.xu import EKF, FASTSLAM, HYBRID, MULTI_HYBRID, OUR_TEAM, OURS, Method, Panel
+from sim.experiments.team_runs import Figures
+from sim.experiments.xu import (
+    EKF,
+    FASTSLAM,
+    HYBRID,
+    HYBRID_CODED,
+    MULTI_CODED,
+    MULTI_HYBRID,
+    OUR_TEAM,
+    OURS,
+    STEP_S,
+    Method,
+    Panel,
+    Reading,
+)
 from sim.experiments.xu import task as curves_of
 from sim.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
-from sim.scenario.scenario import loads
-from team import translate
-from team.wire import channels as ch
-from team.wire import messages as m
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
 
 
 class MapFigure(NamedTuple):
-    """Maps of some methods at some steps, of the first seed's run."""
+    """Maps of some methods at some steps: one run drawn, and the error over the seeds.
+
+    shown: the methods, each in its reading of the thesis.
+    """
 
     title: str
-    methods: tuple[Method, ...]
+    shown: tuple[tuple[Method, Reading], ...]
     steps: tuple[int, ...]
-    remark: str
+    remarks: tuple[str, ...]
 
     def tasks(self, options: Options) -> list[Task]:
-        """One run of each method."""
-        return [self._task(method, options) for method in self.methods]
+        """A run of each method that is drawn, and those of the error figures."""
+        return [
+            each
+            for method, reading in self.shown
+            for each in (
+                self._drawn(method, reading, options),
+                *(_run(method, reading, seed) for seed in options.seeds),
+            )
+        ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
         """A picture and a row for each method."""
         rows, pictures, figures = [], [], {}
-        for method in self.methods:
-            run = results.of(self._task(method, options))
+        for method, reading in self.shown:
+            run = results.of(self._drawn(method, reading, options))
             if run is None:
                 continue
-            name = method.name.replace(" ", "-").replace(",", "").lower()
+            said = _named(method, reading)
+            name = said.replace(" ", "-").replace(",", "").lower()
             caption = (
-                f"{self.title}: {method.name}, seed {options.seeds[0]}. Ellipses hold 95 % of "
+                f"{self.title}: {said}, seed {options.seeds[0]}. Ellipses hold 95 % of "
                 "what the map believes; crosses are the true landmarks, grey the true paths."
             )
-            pictures.append(Picture(name, caption, _Drawing(f"{self.title}: {method.name}", run)))
-            errors = [shot["rmse_m"] for shot in run["shots"]]
-            rows.append((method.name, *("–" if e is None else f"{e:.2f}" for e in errors)))
-            figures[method.name] = dict(zip(map(str, self.steps), errors, strict=True))
+            pictures.append(Picture(name, caption, _Drawing(f"{self.title}: {said}", run)))
+            runs = results.of_all([_run(method, reading, seed) for seed in options.seeds])
+            curves = [each["map"] for each in runs if each["map"]["time_s"]]
+            times = STEP_S * np.array(self.steps, dtype=np.float64)
+            errors = np.array([sampled(times, each, "error_m", held=True) for each in curves])
+            errors = errors.reshape(-1, len(times))
+            figures[said] = {
+                str(shot["step"]): {"run_m": shot["rmse_m"]}
+                | (spread(errors[:, k]) if _known(errors[:, k : k + 1]) else {})
+                for k, shot in enumerate(run["shots"])
+            }
+            rows.append((said, *(_cell(each) for each in figures[said].values())))
         table = Table(
-            f"{self.title}: landmark RMSE [m]",
+            f"{self.title}: landmark RMSE [m], {len(options.seeds)} seeds",
             ("method", *(f"step {step}" for step in self.steps)),
             tuple(rows),
+            f"the drawn run, seed {options.seeds[0]}; in brackets median (10 … 90 %) of the seeds",
         )
         return Outcome(
-            self.title, {"rmse_m": figures}, (table,), tuple(pictures), remarks=(self.remark,)
+            self.title, {"rmse_m": figures}, (table,), tuple(pictures), remarks=self.remarks
         )
 
-    def _task(self, method: Method, options: Options) -> Task:
-        run = curves_of(Panel("", (method,), {}), method, options.seeds[0])
-        return Task(
-            "sim.experiments.xu_maps:maps_run",
-            {"world": run.parameters["world"], "steps": list(self.steps)},
-            f"maps of {run.label}",
-            run.cost,
-        )
+    def _drawn(self, method: Method, reading: Reading, options: Options) -> Task:
+        return _run(method, reading, options.seeds[0], self.steps)
 
 
-def maps_run(world: Mapping[str, Any], steps: list[int]) -> Figures:
-    """The map and the paths as they were known at these steps."""
-    scenario = loads(msgspec.json.encode(world).decode())
-    samples = list(TimedRun().samples(scenario))
-    evaluation = evaluate(samples)
-    ids, positions = true_landmarks(samples)
-    key = ch.FUSED_MAP.key()
-    fused = list(messages(samples, key))
-    if not any(isinstance(each, m.FusedMap) and each.ids for each in fused):
-        fused = list(messages(samples, ch.OWN_MAP.key(scenario.robots[0].id)))
-    paths = {name: said_poses(samples, pose_keys(scenario, name))[0] for name in evaluation.robots}
-    shots = []
-    for step in steps:
-        now_ns = round(step * 1e9)
-        known = [
-            each
-            for each in fused
-            if isinstance(each, m.FusedMap | m.MapEstimate) and each.stamp_ns <= now_ns
-        ]
-        shots.append(
-            _shot(known[-1] if known else None, dict(zip(ids.tolist(), positions, strict=True)))
-        )
-        for name, robot in evaluation.robots.items():
-            said, true = paths[name], robot.truth
-            shots[-1].setdefault("paths", {})[name] = {
-                "online": said.poses[said.stamps_ns <= now_ns, :2].round(2).tolist(),
-                "truth": true.poses[true.stamps_ns <= now_ns, :2].round(2).tolist(),
-            }
-    return {"steps": steps, "shots": shots, "landmarks": positions.tolist()}
+def _run(method: Method, reading: Reading, seed: int, shots: tuple[int, ...] = ()) -> Task:
+    return curves_of(Panel(_READ[reading], (method,), {}, reading=reading), method, seed, shots)
 
 
-def _shot(known: m.FusedMap | m.MapEstimate | None, truth: Mapping[int, np.ndarray]) -> Figures:
-    """The landmarks of one map, their 2 × 2 blocks, and their error."""
-    if known is None:
-        return {"means": [], "blocks": [], "rmse_m": None}
-    ids, means = translate.landmarks_of(known)
-    blocks = translate.landmark_blocks_of(known)
-    distances = [
-        float(np.hypot(*(mean - truth[int(landmark)])))
-        for landmark, mean in zip(ids, means, strict=True)
-    ]
-    return {"means": means.tolist(), "blocks": blocks.tolist(), "rmse_m": rms(distances)}
+def _named(method: Method, reading: Reading) -> str:
+    """The method's name with its reading, if it does not say it."""
+    return method.name if "," in method.name else f"{method.name}, {_READ[reading]}"
+
+
+def _known(errors: np.ndarray) -> bool:
+    return bool(errors.size) and not bool(np.isnan(errors).any())
+
+
+def _cell(of_step: Figures) -> str:
+    run = "–" if of_step["run_m"] is None else f"{of_step['run_m']:.2f}"
+    if "median" not in of_step:
+        return run
+    return f"{run} ({of_step['median']:.2f}; {of_step['p10']:.2f} … {of_step['p90']:.2f})"
 
 
 @dataclass(frozen=True)
@@ -124,14 +120,16 @@ class _Drawing:
 
     def __call__(self, path: Path) -> None:
         """One panel for each step."""
-        shots, steps = self.run["shots"], self.run["steps"]
+        shots = self.run["shots"]
         columns = min(2, len(shots))
         picture = figure(6.5 * columns, 6.3 * -(-len(shots) // columns) + 0.5)
         grid = picture.subplots(-(-len(shots) // columns), columns, squeeze=False)
-        for axis, step, shot in zip(grid.ravel(), steps, shots, strict=True):
+        for axis, shot in zip(grid.ravel(), shots, strict=True):
             _draw(axis, shot, np.array(self.run["landmarks"]))
             error = "" if shot["rmse_m"] is None else f", landmark RMSE {shot['rmse_m']:.2f} m"
-            axis.set_title(f"step {step}{error}", fontsize=10)
+            axis.set_title(f"step {shot['step']}{error}", fontsize=10)
+        handles = grid[0, 0].get_legend_handles_labels()
+        picture.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
         picture.suptitle(self.title)
         picture.savefig(path, dpi=110)
 
@@ -150,21 +148,47 @@ def _draw(axis: "Axes", shot: Figures, landmarks: np.ndarray) -> None:
     axis.set_aspect("equal")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")
-    axis.legend(fontsize=8, loc="upper left")
     ruled(axis)
 
 
+_READ: Mapping[Reading, str] = {
+    "stated": "as stated", "exact": "true controls", "coded": "as coded",
+}  # fmt: skip
 _PRINTED = (
-    "The thesis prints the maps without figures. Its program gives the filters the true controls "
-    "(see xu-4.4); here the odometry has the noise of section 4.4.2."
+    "The thesis prints the maps without figures. They are those of its program, whose controls are "
+    "exact and whose particles hardly spread (xu-4.4); as stated, with the noise of section 4.4.2 "
+    "in the odometry, the same filters end far from the truth."
 )
-FIGURE_4_1 = MapFigure("Thesis, figure 4.1", (EKF, OURS), (500,), _PRINTED)
-FIGURE_4_2 = MapFigure("Thesis, figure 4.2", (FASTSLAM, OURS), (500,), _PRINTED)
-FIGURE_4_3 = MapFigure("Thesis, figure 4.3", (HYBRID, OURS), (500,), _PRINTED)
+_ROBOT_1 = (
+    "The text of figures 4.1 and 4.2 has the robot start at the lower left, (10, 40); that is "
+    "robot 2's start in the appendix. Here, as in figure 4.3 and in the appendix, robot 1 starts "
+    "at the right, (80, 40)."
+)
+FIGURE_4_1 = MapFigure(
+    "Thesis, figure 4.1",
+    ((EKF, "stated"), (EKF, "coded"), (OURS, "stated")),
+    (500,),
+    (_PRINTED, _ROBOT_1),
+)
+FIGURE_4_2 = MapFigure(
+    "Thesis, figure 4.2",
+    ((FASTSLAM, "stated"), (FASTSLAM, "coded"), (OURS, "stated")),
+    (500,),
+    (_PRINTED, _ROBOT_1),
+)
+FIGURE_4_3 = MapFigure(
+    "Thesis, figure 4.3",
+    ((HYBRID, "stated"), (HYBRID_CODED, "coded"), (OURS, "stated")),
+    (500,),
+    (_PRINTED,),
+)
 FIGURE_5_1 = MapFigure(
     "Thesis, figure 5.1",
-    (MULTI_HYBRID, OUR_TEAM),
+    ((MULTI_HYBRID, "stated"), (MULTI_CODED, "coded"), (OUR_TEAM, "stated")),
     (20, 100, 200, 500),
-    _PRINTED + " As written, the ellipses shrink to nothing far from the true landmarks: each "
-    "exchange counts every reading again.",
+    (
+        _PRINTED,
+        "As written, the ellipses shrink to nothing far from the true landmarks: each exchange "
+        "counts every reading again.",
+    ),
 )
