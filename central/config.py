@@ -28,6 +28,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tick_s: the fold takes the submaps of this much team time at once.
     broadcast_s: at least this much team time lies between two broadcasts of the fused map.
     robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap; absent: plain squares.
+    landmark_submaps: a landmark enters the map once so many submaps have it and are believed; above
+    1 where readings may have nothing to do with what is there.
     covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors
     are independent from reading to reading.
     particles: of `joint-fastslam`.
@@ -40,6 +42,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tick_s: Positive = 10.0
     broadcast_s: Positive = 10.0
     robust_c: Positive | None = None
+    landmark_submaps: Annotated[int, Meta(ge=1, le=100)] = 1
     covariance_factor: Annotated[float, Meta(ge=1.0)] = 1.0
     gauss_newton_per_tick: Annotated[int, Meta(ge=1, le=50)] = 2
     bias_sigma: BiasSigmas = BiasSigmas()

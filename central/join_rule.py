@@ -1,6 +1,6 @@
 """The rule `join`: the team's map is a pure function of the set of submaps."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Literal
 
 import numpy as np
@@ -24,6 +24,8 @@ Tail = Literal["final", "closed", "provisional"]
 
 PRIOR_LANDMARKS = 100
 """Landmarks in a robot's prior at the most: the nearest ones."""
+NAMED = 10
+"""Landmarks that are left out of the map are named up to so many."""
 JOINT_LANDMARKS = 2000
 """With more landmarks than this the final map carries their own covariances only."""
 
@@ -205,14 +207,15 @@ class JoinRule:
             chi2, dof = agreement.chi2, agreement.dof
             self.finding = finding(agreement)
         joint = False
+        shown = self._shown(fold)
         if not fold.contributions:
             ids, means, covariance = np.empty(0, np.uint32), np.empty((0, 2)), b""
-        elif tail == "final" and len(fold.main.graph.landmarks) <= JOINT_LANDMARKS:
+        elif tail == "final" and len(shown) <= JOINT_LANDMARKS:
             joint = True
-            ids, means, matrix = marginals.landmark_map(fold)
+            ids, means, matrix = marginals.landmark_map(fold, shown)
             covariance = translate.joint_bytes(matrix)
         else:
-            ids, means, blocks = marginals.landmark_blocks(fold)
+            ids, means, blocks = marginals.landmark_blocks(fold, shown)
             covariance = translate.block_bytes(blocks)
         self.landmarks = len(ids)
         biases = marginals.bias_estimates(fold)
@@ -220,6 +223,7 @@ class JoinRule:
         self.reasons = (
             *(fold.reasons[k] for k in sorted(fold.reasons)),
             *fold.doubts,
+            *self._unconfirmed(fold, shown),
             *miscalibrations(biases),
         )
         frame = fold.frame
@@ -246,6 +250,24 @@ class JoinRule:
             self._ticks.withdrawn,
         )
 
+    def _shown(self, fold: Fold) -> list[int]:
+        """The landmarks that the map has, by ascending id."""
+        if not fold.contributions:
+            return []
+        return marginals.confirmed(fold, self._config.landmark_submaps)
+
+    def _unconfirmed(self, fold: Fold, shown: Sequence[int]) -> tuple[str, ...]:
+        """What is left out of the map, in words."""
+        known = fold.main.graph.landmarks.keys() if fold.contributions else set[int]()
+        out = sorted(known - set(shown))
+        if not out:
+            return ()
+        named = ", ".join(str(id_) for id_ in out[:NAMED]) + (", …" if len(out) > NAMED else "")
+        return (
+            f"left out, {self._config.landmark_submaps} submaps that agree needed: "
+            f"{len(out)} of {len(known)} landmarks ({named})",
+        )
+
     def _priors(self, fold: Fold, digest: bytes) -> list[Outgoing]:
         """For the latest stream of every robot that is in the team's frame."""
         if not fold.contributions:
@@ -254,7 +276,7 @@ class JoinRule:
         for robot, epoch in fold.home:
             latest[robot] = max(latest.get(robot, 0), epoch)
         streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
-        priors = marginals.main_priors(fold, streams, PRIOR_LANDMARKS)
+        priors = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, self._shown(fold))
         stamp_ns = fold.contributions[-1].end_ns
         out = []
         for stream, prior in priors.items():

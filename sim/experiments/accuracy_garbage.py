@@ -15,6 +15,8 @@ from sim.world.worlds import GarbageKind, SimulatedWorld
 
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
+LANDMARK_SUBMAPS = 2
+"""Of the centre, in the clean runs too: what one submap alone has may be garbage."""
 ROBUST_C = 2.0
 """Of the centre, in the clean runs too: garbage that agrees by chance is left to it."""
 KINDS: tuple[GarbageKind, ...] = ("drop", "reading", "identity")
@@ -92,5 +94,5 @@ def _spoilt(scenario: Scenario, kind: GarbageKind) -> Scenario:
         scenario,
         world=replace(scenario.world, garbage=SHARE, garbage_kind=kind),
         robots=robots,
-        central=replace(scenario.central, robust_c=ROBUST_C),
+        central=replace(scenario.central, robust_c=ROBUST_C, landmark_submaps=LANDMARK_SUBMAPS),
     )

@@ -17,6 +17,9 @@ from team.estimation.gauss_newton import Island, joint_marginal
 from team.estimation.joining import Fold
 from team.estimation.sighting_kernel import explained_by_sightings
 
+BELIEVED = 0.5
+"""A submap whose landmark has at least this weight is believed."""
+
 
 class LandmarkMap(NamedTuple):
     """Landmarks by ascending id: means [m], joint covariance [m²] of (x₁, y₁, x₂, …)."""
@@ -94,6 +97,20 @@ def _biases_in(island: Island) -> list[BiasEstimate]:
     return found
 
 
+def confirmed(fold: Fold, submaps: int) -> list[int]:
+    """The main island's landmarks, by id, that so many submaps or more have and are believed in.
+
+    A submap is believed where the robust loss does not discount its landmark below BELIEVED: of
+    two that contradict each other one is left, and nothing confirms it.
+    """
+    island = fold.main
+    if submaps <= 1:
+        return sorted(island.graph.landmarks)
+    ids = np.concatenate([each.local.ids for each, _ in island.graph.submaps])
+    found, counts = np.unique(ids[island.landmark_weight >= BELIEVED], return_counts=True)
+    return [int(id_) for id_ in found[counts >= submaps]]
+
+
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
     """The main island's landmarks (all, or those asked for) with their joint covariance."""
     chosen = sorted(fold.main.graph.landmarks if ids is None else ids)
@@ -101,10 +118,13 @@ def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
     return LandmarkMap(np.array(chosen, dtype=np.uint32), mean.reshape(-1, 2), covariance)
 
 
-def landmark_blocks(fold: Fold) -> LandmarkBlocks:
-    """The main island's landmarks, each with its own covariance, by selected inversion."""
+def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
+    """The main island's landmarks (all, or those asked for), each with its own covariance.
+
+    By selected inversion.
+    """
     island = fold.main
-    chosen = sorted(island.graph.landmarks)
+    chosen = sorted(island.graph.landmarks if ids is None else ids)
     means = np.zeros((len(chosen), 2))
     covariances = np.zeros((len(chosen), 2, 2))
     for k, node in enumerate(_nodes(island, chosen)):
@@ -119,17 +139,21 @@ def prior_for(fold: Fold, robot: str, epoch: int, ids: Sequence[int] | None = No
 
 
 def main_priors(
-    fold: Fold, streams: Sequence[Stream], most: int | None = None
+    fold: Fold,
+    streams: Sequence[Stream],
+    most: int | None = None,
+    chosen: Sequence[int] | None = None,
 ) -> dict[Stream, RobotPrior]:
     """`prior_for` of some streams of the main island.
 
-    most: with more landmarks than these each prior has those nearest to its pose only. What a
-    robot has no prior of is new to it until the next one: less accurate, and as consistent.
+    chosen: the landmarks by ascending id; None: all. most: of more than these each prior has those
+    nearest to its pose only. What a robot has no prior of is new to it until the next one: less
+    accurate, and as consistent.
     """
     island = fold.main
-    if most is None or len(island.graph.landmarks) <= most:
-        return _priors_in(island, streams, None)  # the landmarks are solved for once
-    ids = np.array(sorted(island.graph.landmarks))
+    ids = np.array(sorted(island.graph.landmarks) if chosen is None else chosen)
+    if most is None or len(ids) <= most:
+        return _priors_in(island, streams, ids.tolist())  # the landmarks are solved for once
     places = np.array([_mean(island, node) for node in _nodes(island, ids.tolist())])
     priors: dict[Stream, RobotPrior] = {}
     for stream in streams:

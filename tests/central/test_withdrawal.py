@@ -19,11 +19,11 @@ from sim.rerun.log import recorded
 from sim.rerun.verification import verify
 from sim.scenario.scenario import Scenario, with_options
 from sim.world.simulator import simulated
-from sim.world.worlds import SimulatedWorld
+from sim.world.worlds import GarbageKind, SimulatedWorld
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.joining import converged
-from team.estimation.marginals import Agreement, SubmapCost, landmark_map
+from team.estimation.marginals import Agreement, SubmapCost, joint_cost, landmark_map
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from tests.sim.reruns import written
@@ -75,9 +75,11 @@ def messages(samples: tuple[Sample, ...], kind: type[m.Message]) -> list[m.Messa
     return [each for _, _, each in map(opened, samples) if isinstance(each, kind)]
 
 
-def of_set(samples: tuple[Sample, ...], without: str = "") -> TickFold:
+def of_set(
+    samples: tuple[Sample, ...], without: str = "", central: CentralConfig | None = None
+) -> TickFold:
     """The fold over a run's submaps; without a robot: as if it had never been."""
-    ticks = TickFold(scenario().central)
+    ticks = TickFold(scenario().central if central is None else central)
     for start in messages(samples, m.Start):
         ticks.know_start(translate.start_of(start))
     sightings = messages(samples, m.SightingFactor)
@@ -171,6 +173,38 @@ def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong() -> None:
     samples = team_run()
     assert final_map(list(samples)).withdrawn == ()
     assert messages(samples, m.Withdrawal) == []
+
+
+def in_garbage(kind: GarbageKind, seed: int) -> Scenario:
+    """The small world with three in ten readings spoilt, which windows and centre expect."""
+    of = scenario(robust_c=2.0, landmark_submaps=2)
+    replaced = msgspec.structs.replace
+    team = tuple(
+        replaced(r, front_end=replaced(r.front_end, garbage=0.3, particles=40)) for r in of.robots
+    )
+    world = replaced(of.world, garbage=0.3, garbage_kind=kind)
+    return replaced(of, world=world, robots=team, seed=seed)
+
+
+@pytest.mark.parametrize("kind", ["reading", "identity"])
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_no_good_robot_is_withdrawn_for_the_garbage_that_it_reads(
+    kind: GarbageKind, seed: int
+) -> None:
+    """Nor is anybody a suspect; by windows that take every reading all are (2000 and more)."""
+    of = in_garbage(kind, seed)
+    samples = tuple(run(of))
+    assert final_map(list(samples)).withdrawn == ()
+    ticks = of_set(samples, central=of.central)
+    ticks.take_until(math.inf)
+    found = disagreement(joint_cost(converged(ticks.fold, ticks.settings)))
+    assert set(found) == {"r1", "r2", "r3"}, "each has submaps enough to be judged"
+    assert max(found.values()) < 2.0
+
+
+@pytest.mark.parametrize("kind", ["reading", "identity"])
+def test_a_robot_that_is_wrong_is_withdrawn_in_garbage_too(kind: GarbageKind) -> None:
+    assert final_map(run(in_garbage(kind, 3), "odometry")).withdrawn == ("r3",)
 
 
 def test_a_robot_whose_withdrawal_only_an_operator_may_order_stays() -> None:

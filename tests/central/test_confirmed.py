@@ -1,0 +1,110 @@
+"""A landmark that one submap alone has does not enter the map where that may be garbage."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.config import CentralConfig
+from central.join_rule import JoinRule
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_ids, ids
+from tests.teams import of, published, stream, submaps_of
+
+STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
+SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+FALSE = 9
+"""The name of a landmark that is not there."""
+END_NS = 15_000_000_000
+
+
+def misread(submap: m.Submap) -> m.Submap:
+    """The submap with its last landmark taken for another one, which no other submap has."""
+    seen = ids(submap.ids, "ids")
+    return msgspec.structs.replace(submap, ids=from_ids(np.array([*seen[:-1], FALSE], np.uint32)))
+
+
+def last_seen(robot: str, k: int) -> int:
+    return int(ids(SUBMAPS[robot][k].ids, "ids")[-1])
+
+
+def rule(spoilt: set[tuple[str, int]], **options: object) -> JoinRule:
+    """The submaps of both robots, some misread, joined."""
+    config = CentralConfig(tick_s=3.0, broadcast_s=3.0, **options)
+    found = JoinRule(config, b"settings")
+    for each in STREAMS.values():
+        found.take_start(published(each)[0])
+    for k in range(5):
+        for name in STREAMS:
+            submap = SUBMAPS[name][k]
+            found.take_submap(misread(submap) if (name, k) in spoilt else submap)
+    return found
+
+
+def final(found: JoinRule) -> m.FusedMap:
+    return of(found.conclude(END_NS), ch.FINAL_MAP)[0]
+
+
+def left_out(fused: m.FusedMap) -> list[str]:
+    return [text for text in fused.reasons if "left out" in text]
+
+
+SAME = [("r1", 3), ("r2", 3)]
+APART = [("r1", 1), ("r2", 3)]
+
+
+def test_of_these_submaps_two_mistake_the_same_landmark_and_two_do_not() -> None:
+    assert len({last_seen(*each) for each in SAME}) == 1
+    assert len({last_seen(*each) for each in APART}) == 2
+
+
+@pytest.mark.parametrize(("least", "stands"), [(1, True), (2, False)])
+def test_what_one_submap_alone_has_stands_in_the_map_only_if_one_is_enough(
+    least: int, stands: bool
+) -> None:
+    fused = final(rule({("r1", 3)}, landmark_submaps=least))
+    assert (FALSE in ids(fused.ids, "ids")) is stands
+    assert len(left_out(fused)) == (not stands)
+    assert all(f"of 6 landmarks ({FALSE})" in text for text in left_out(fused))
+
+
+def test_what_two_submaps_agree_on_enters_the_map_with_both() -> None:
+    fused = final(rule(set(SAME), landmark_submaps=2, robust_c=2.0))
+    assert FALSE in ids(fused.ids, "ids")
+    assert left_out(fused) == []
+
+
+@pytest.mark.parametrize(("robust_c", "stands"), [(2.0, False), (None, True)])
+def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
+    robust_c: float | None, stands: bool
+) -> None:
+    """Without a robust loss nobody is doubted: the centre has been told to expect no garbage."""
+    fused = final(rule(set(APART), landmark_submaps=2, robust_c=robust_c))
+    assert (FALSE in ids(fused.ids, "ids")) is stands
+
+
+def test_running_maps_and_priors_have_the_same_landmarks() -> None:
+    found = rule({("r1", 3)}, landmark_submaps=2)
+    out = found.advance(END_NS, END_NS)
+    (fused,) = of(out, ch.FUSED_MAP)
+    shown = ids(fused.ids, "ids").tolist()
+    assert shown
+    assert FALSE not in shown
+    priors = of(out, ch.PRIOR)
+    assert len(priors) == 2
+    assert all(ids(each.ids, "ids").tolist() == shown for each in priors)
+
+
+def test_the_rest_of_the_map_is_what_it_was() -> None:
+    """Who is left out is in the solution still: its submap's chain and the others lose nothing."""
+    whole, less = (final(rule({("r1", 3)}, landmark_submaps=least)) for least in (1, 2))
+    kept = [k for k, id_ in enumerate(ids(whole.ids, "ids").tolist()) if id_ != FALSE]
+    means = (np.frombuffer(each.means).reshape(-1, 2) for each in (whole, less))
+    np.testing.assert_array_equal(next(means)[kept], next(means))
+
+
+def test_a_map_in_which_nothing_is_confirmed_yet_is_empty() -> None:
+    fused = final(rule(set(), landmark_submaps=100))
+    assert fused.ids == b""
+    assert fused.means == b""
+    assert len(left_out(fused)) == 1
