@@ -5,6 +5,7 @@ The truth and the readings are made here by a few lines of their own, without th
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -185,6 +186,20 @@ def test_solving_the_landmarks_again_takes_out_the_bias_of_the_first_reading():
         with_ekf.append(nees(state_error(mean, truth), P))
         again.append(nees(state_error(local.mean, truth), local.covariance))
     assert np.mean(again) < 0.98 * np.mean(with_ekf)
+
+
+def test_a_running_pose_is_near_the_windows_and_knows_of_the_sensors_constant_errors():
+    run = drive(3, ACCURATE)
+    white = driven(run, ACCURATE)
+    solved, running = windows.gaussian(white), windows.gaussian(white, running=True)
+    sigma = np.sqrt(np.diag(solved.covariance))
+    assert (running.mean != solved.mean).any()
+    assert np.abs((running.mean - solved.mean) / sigma)[:3].max() < 0.2
+    np.testing.assert_allclose(np.sqrt(np.diag(running.covariance))[:3], sigma[:3], rtol=0.1)
+    constant = driven(run, msgspec.structs.replace(ACCURATE, range_white=0.3))
+    solved, running = windows.gaussian(constant), windows.gaussian(constant, running=True)
+    assert running.mean.tobytes() == solved.mean.tobytes()
+    assert running.covariance.tobytes() == solved.covariance.tobytes()
 
 
 def test_a_submap_reports_its_landmarks_by_id_in_the_frame_of_its_start():
