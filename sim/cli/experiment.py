@@ -79,7 +79,7 @@ def _run(
 
     from rich.console import Console
 
-    from sim.experiments.experiment import Options
+    from sim.experiments.experiment import Options, without_datasets
     from sim.experiments.output import printed, to_json, write
     from sim.experiments.progress import shown
     from sim.experiments.runner import FAILURES, computed, cores, dataset, planned
@@ -89,6 +89,8 @@ def _run(
         fail(f"--json {json_file}: no such folder; make it first", WRONG_USE)
     datasets = tuple(dataset(path) for path in paths)
     plans = [planned(entry, Options(seeds(entry), quick, datasets)) for entry in entries]
+    if not any(plan.tasks for plan in plans):
+        fail(without_datasets(name), WRONG_USE)
     try:
         concluded = computed(plans, output, jobs or cores(), shown)
     except KeyboardInterrupt:

@@ -20,6 +20,7 @@ from sim.cli.options import (
     Robots,
     Seed,
     SpeedText,
+    counted,
     fail,
     parsed_speed,
     scenario_of,
@@ -139,7 +140,8 @@ def scenarios(
         return
     for name in builtin_names():
         found = load(name)
-        typer.echo(f"{name:12} {len(found.robots)} robots, {found.estimator} with {found.fusion}")
+        team = counted(len(found.robots), "robot")
+        typer.echo(f"{name:12} {team:10} {found.estimator} with {found.fusion}")
 
 
 def _keep_showing(url: str, log: Path) -> None:

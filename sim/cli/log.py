@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sim.cli.logs import repair
-from sim.cli.options import FAILED, WRONG_USE, fail
+from sim.cli.options import FAILED, WRONG_USE, counted, fail, refuse_existing
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -129,7 +129,7 @@ def cut(
     if not (all(abs(s) < 4e9 for s in given) and bounds[0] < bounds[1]):
         fail(f"--from {from_s} --to {to_s}: give seconds, the first before the second", WRONG_USE)
     chosen = _channels(channels)
-    _refuse_existing(output)
+    refuse_existing(output)
     typer.echo(f"{output}: {cut_log(open_log(log), output, from_s, to_s, chosen)} messages")
 
 
@@ -142,7 +142,7 @@ def merge(
     from team.recording.merge import merge as merge_logs
     from team.recording.reader import open_log
 
-    _refuse_existing(output)
+    refuse_existing(output)
     merged = merge_logs([open_log(log) for log in logs], output)
     typer.echo(f"{output}: {merged.messages} messages; {merged.duplicates} duplicates left out")
 
@@ -180,7 +180,7 @@ def export(
         return
     exported = _exporter(form)(opened, output, chosen)
     for path, rows in exported.rows.items():
-        typer.echo(f"{path}: {rows} rows")
+        typer.echo(f"{path}: {counted(rows, 'row')}")
     if exported.unsound:
         typer.echo(f"left out: {exported.unsound} unsound messages", err=True)
 
@@ -209,11 +209,6 @@ def _channels(names: str | None) -> "list[Channel] | None":
     if unknown:
         fail(f"--channels: no channel {unknown[0]!r}; there are {', '.join(known)}", WRONG_USE)
     return [known[name] for name in dict.fromkeys(given)]
-
-
-def _refuse_existing(path: Path) -> None:
-    if path.exists():
-        fail(f"{path} exists: choose another name or remove it", WRONG_USE)
 
 
 def _line(text: str) -> str:

@@ -15,6 +15,7 @@ from sim.cli.options import (
     SpeedText,
     fail,
     parsed_speed,
+    refuse_existing,
     scenario_of,
 )
 from sim.scenario.scenario import with_options
@@ -140,6 +141,7 @@ def repair(
     """Complete a log whose recorder was killed: everything up to its last flush."""
     from team.recording.repair import repaired
 
+    refuse_existing(output)
     result = repaired(log, output)
     until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
     typer.echo(f"{output}: {result.messages} messages{until}")

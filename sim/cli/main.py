@@ -57,6 +57,10 @@ def main() -> None:
     except (ScenarioError, DatasetError, LogError, BusError) as error:
         typer.secho(f"error: {error}", fg="red", err=True)
         sys.exit(WRONG_USE)
+    except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+        text = f"error: {error.filename}: {error.strerror}; give another path"
+        typer.secho(text, fg="red", err=True)
+        sys.exit(WRONG_USE)
     except (LaunchError, RecorderError, OSError) as error:
         typer.secho(f"error: {error}", fg="red", err=True)
         sys.exit(FAILED)

@@ -20,6 +20,7 @@ from sim.cli.options import (
     SpeedText,
     fail,
     parsed_speed,
+    refuse_existing,
     scenario_of,
 )
 from sim.scenario.scenario import Scenario, doubts, with_options
@@ -154,6 +155,7 @@ def record(
     from team.wire.zenoh_bus import ZenohBus
 
     resolved = scenario_of(scenario)
+    refuse_existing(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     metadata = {
         **provenance(),

@@ -26,15 +26,19 @@ ScenarioArgument = Annotated[
 Connect = Annotated[
     str, typer.Option(help="The router's endpoint, as tcp/HOST:PORT.", metavar="ENDPOINT")
 ]
-Seed = Annotated[int | None, typer.Option(help="Seed of the world and of every estimator.", min=0)]
-Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 100.")]
-EstimatorOption = Annotated[str | None, typer.Option(help=_either(Estimator))]
-FusionOption = Annotated[str | None, typer.Option(help=_either(FusionRule))]
+Seed = Annotated[
+    int | None, typer.Option(help="Seed of the world and of every estimator.", min=0, metavar="N")
+]
+Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 100.", metavar="N")]
+EstimatorOption = Annotated[str | None, typer.Option(help=_either(Estimator), metavar="NAME")]
+FusionOption = Annotated[str | None, typer.Option(help=_either(FusionRule), metavar="RULE")]
 Dataset = Annotated[
-    Path | None, typer.Option(help="A UTIAS data set: folder, or zip as distributed.")
+    Path | None,
+    typer.Option(help="A UTIAS data set: folder, or zip as distributed.", metavar="SET"),
 ]
 SpeedText = Annotated[
-    str, typer.Option(help="Multiple of real time, or max: as fast as everyone keeps up.")
+    str,
+    typer.Option(help="Multiple of real time, or max: as fast as everyone keeps up.", metavar="X"),
 ]
 
 
@@ -42,6 +46,17 @@ def fail(message: str, status: int) -> NoReturn:
     """Print an error and end with its status."""
     typer.secho(f"error: {message}", fg="red", err=True)
     raise typer.Exit(status)
+
+
+def refuse_existing(path: Path) -> None:
+    """End with an error where there is something already."""
+    if path.exists():
+        fail(f"{path} exists: choose another name or remove it", WRONG_USE)
+
+
+def counted(count: int, what: str) -> str:
+    """A count with its noun: `1 robot`, `3 robots`."""
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 def parsed_speed(text: str) -> float:

@@ -264,7 +264,8 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     from team.recording.reader import open_log
 
     try:
-        found = ledger(recorded(open_log(log)))
+        opened = open_log(log)
+        found = ledger(recorded(opened))
     except RerunError as error:
         fail(f"{log}: {error}", FAILED)
     robots = sorted({robot for robot, _ in found.entries})
@@ -279,6 +280,8 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     console.print(table)
     used = sum(1 for maps in found.maps.values() if maps)
     console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
+    if not opened.complete:
+        typer.echo(f"{log} is cut: what came after the cut counts as lost", err=True)
     if json_file is not None:
         json_file.write_text(json.dumps(found.to_json(), indent=2) + "\n")
     for offender in found.offenders[:OFFENDERS]:

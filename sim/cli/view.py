@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sim.cli.nodes import LOOPBACK
-from sim.cli.options import WRONG_USE, Connect, ScenarioArgument, fail, scenario_of
+from sim.cli.options import WRONG_USE, Connect, ScenarioArgument, fail, refuse_existing, scenario_of
 
 if TYPE_CHECKING:
     from sim.view.session import Shown
     from team.recording.reader import Log
 
 _LOG = logging.getLogger("teamslam")
-Port = Annotated[int, typer.Option(help="Where the page is served; 0: any free port.", min=0)]
+Port = Annotated[
+    int, typer.Option(help="Where the page is served; 0: any free port.", min=0, metavar="PORT")
+]
 FoxglovePort = Annotated[
-    int, typer.Option(help="Where Foxglove can connect; 0: any free port.", min=0)
+    int, typer.Option(help="Where Foxglove can connect; 0: any free port.", min=0, metavar="PORT")
 ]
 Open = Annotated[
     bool | None,
@@ -119,8 +121,8 @@ def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
     from team.wire.channels import ROBOT_CONFIG
 
     for path in (export, layout):
-        if path is not None and path.exists():
-            fail(f"{path} exists: choose another name or remove it", WRONG_USE)
+        if path is not None:
+            refuse_existing(path)
     if export is not None:
         typer.echo(f"{export}: {export_views(log, export)} messages")
     if layout is not None:

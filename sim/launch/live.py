@@ -19,6 +19,8 @@ from team.wire import messages as m
 
 LINE_S = 5.0
 """Wall time between two plain lines."""
+SETTLED_S = 2.0
+"""A warning that a node takes back sooner, as while a team starts, is no line."""
 PATIENCE_S = 8.0
 """Processes start slowly on a busy machine: nobody is missed before."""
 
@@ -31,7 +33,11 @@ def shown(title: str) -> Iterator[Callable[[Watch], None]]:
         with Live(console=console, refresh_per_second=4, transient=True) as live:
             yield lambda watch: live.update(_view(title, watch))
     else:
-        yield _Lines(console).show
+        lines = _Lines(console)
+        try:
+            yield lines.show
+        finally:
+            lines.end()
 
 
 class _Lines:
@@ -41,12 +47,12 @@ class _Lines:
         self._console = console
         self._due = 0.0
         self._said: set[str] = set()
+        self._since: dict[str, float] = {}
+        self._last: Watch | None = None
 
     def show(self, watch: Watch) -> None:
-        for warning in _warnings(watch):
-            if without_figures(warning) not in self._said:
-                self._said.add(without_figures(warning))
-                self._print(watch, f"warning: {warning}")
+        self._last = watch
+        self._warn(watch, SETTLED_S)
         for words in () if watch.fused is None else watch.fused.joined:
             if words not in self._said:
                 self._said.add(words)
@@ -66,10 +72,25 @@ class _Lines:
         honesty = _honesty(watch)
         self._print(
             watch,
-            f"{_done(world):4.0%}  team time {world.get('team_time_s', 0.0):.0f} s, "
+            f"{_done(watch):4.0%}  team time {world.get('team_time_s', 0.0):.0f} s, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
             f"{'; ' if honesty else ''}{honesty}",
         )
+
+    def end(self) -> None:
+        """What is warned of in the end is said, however short it has been."""
+        if self._last is not None:
+            self._warn(self._last, 0.0)
+
+    def _warn(self, watch: Watch, settled_s: float) -> None:
+        now, warnings = time.monotonic(), _warnings(watch)
+        self._since = {w: self._since.get(w, now) for w in map(without_figures, warnings)}
+        for warning in warnings:
+            key = without_figures(warning)
+            lasting = warning in watch.failures or now - self._since[key] >= settled_s
+            if lasting and key not in self._said:
+                self._said.add(key)
+                self._print(watch, f"warning: {warning}")
 
     def _print(self, watch: Watch, text: str) -> None:
         elapsed = time.monotonic() - watch.began
@@ -78,9 +99,12 @@ class _Lines:
         )
 
 
-def _done(world: Mapping[str, float]) -> float:
-    total = world.get("of", 0.0)
-    return world.get("readings", 0.0) / total if total else 0.0
+def _done(watch: Watch) -> float:
+    """The share of the world's readings that the robots have taken; it may be far ahead of them."""
+    total = watch.statuses["world"].figures.get("of", 0.0)
+    robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
+    taken = sum(robot.figures.get("readings", 0.0) for robot in robots)
+    return min(taken / total, 1.0) if total else 0.0
 
 
 def _warnings(watch: Watch) -> list[str]:
@@ -112,8 +136,8 @@ def _view(title: str, watch: Watch) -> Group:
     else:
         bar = Table.grid(padding=(0, 2))
         bar.add_row(
-            ProgressBar(total=1.0, completed=_done(world.figures), width=36),
-            f"{_done(world.figures):.0%}",
+            ProgressBar(total=1.0, completed=_done(watch), width=36),
+            f"{_done(watch):.0%}",
             f"team time {world.figures.get('team_time_s', 0.0):,.0f} s, world {world.state}",
         )
         parts.append(bar)

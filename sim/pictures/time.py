@@ -65,6 +65,7 @@ def consistency_picture(evaluation: Evaluation, history: History, path: FilePath
         return False
     figure, axes = new_figure(9.0, 0.6 + 2.9 * len(panels), len(panels), 1)
     for (axis,), draw in zip(axes, panels, strict=True):
+        axis.sharex(axes[0][0])
         draw(axis, evaluation, history)
         axis.grid(color="#eeeeee", linewidth=0.6)
         axis.set_axisbelow(True)

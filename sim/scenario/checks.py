@@ -9,6 +9,12 @@ import msgspec
 SAID_ONCE = ("seed", "estimator", "fusion")
 """Fields of robots and centre that the scenario says once, at its top, for all of them."""
 
+_IN_WORDS = {
+    "^[a-z][a-z0-9_]{0,31}$": "a small letter, then small letters, digits and _ (32 at most)",
+    "^[A-Za-z0-9_.-]{1,64}$": "letters, digits, _, . and - (64 at most)",
+}
+"""The patterns of names."""
+
 
 class ScenarioError(ValueError):
     """A scenario that can not be run; the text names file, field and remedy."""
@@ -59,6 +65,8 @@ def plain(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
     field = path.rstrip("`").removeprefix("$").lstrip(".")
     where = ".".join(part for part in (at, field) if part)
     problem = problem[:1].lower() + problem[1:].replace("`", "")
+    for pattern, words in _IN_WORDS.items():
+        problem = problem.replace(f"str matching regex '{pattern}'", words)
     return ScenarioError(f"{problem} at {where}" if where else problem)
 
 

@@ -42,6 +42,10 @@ def named_document(name: str) -> tuple[Fields, str]:
     if name in builtin_names():
         return _builtin(name), name
     path = Path(name)
+    if path.is_dir():
+        raise ScenarioError(
+            "a folder, not a scenario: give a .toml file in it; a data set goes with --dataset"
+        )
     if not path.is_file():
         raise ScenarioError(
             f"no such scenario; built in: {', '.join(builtin_names())}; "

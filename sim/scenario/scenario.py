@@ -134,7 +134,8 @@ def _converted(fields: Fields) -> Scenario:
     kind = world.get("kind")
     if not isinstance(kind, str) or kind not in WORLDS:
         known = ", ".join(f'"{each}"' for each in WORLDS)
-        raise ScenarioError(f"expected one of {known}, got {kind!r} at world.kind")
+        got = "nothing" if kind is None else repr(kind)
+        raise ScenarioError(f"expected one of {known}, got {got} at world.kind")
     check_fields(world, WORLDS[kind], "world")
     for choice, declared in (
         ("estimator", Estimator),
@@ -172,6 +173,18 @@ def _filled(scenario: Scenario) -> Scenario:
     return msgspec.structs.replace(scenario, robots=robots, central=central)
 
 
+def _check_way_points(robots: int, world: SimulatedWorld) -> None:
+    """Robots without a path of their own go from one random way-point to the next, for ever."""
+    width = world.size_m if world.radius_m is None else 2.0 * world.radius_m
+    endless = robots > len(world.paths) and not world.way_point_count
+    if endless and world.way_point_tolerance_m > 0.5 * width:
+        raise ScenarioError(
+            f"world.way_point_tolerance_m is {world.way_point_tolerance_m:g} in a place "
+            f"{width:g} m wide: a robot would be at its way-points without moving; "
+            "give at most half the width"
+        )
+
+
 def _check_team(ids: list[str], world: World) -> None:
     if not ids:
         raise ScenarioError("no robots: give robot_count, [[robots]], or a base that has some")
@@ -184,6 +197,8 @@ def _check_team(ids: list[str], world: World) -> None:
                 f"the robot {robot}: in a UTIAS world robots are r1, r2, …, "
                 "the number being the data set's"
             )
+    if isinstance(world, SimulatedWorld):
+        _check_way_points(len(ids), world)
     for named in world.unknown_starts:
         if named != "*" and named.removeprefix("!") not in ids:
             raise ScenarioError(

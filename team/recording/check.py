@@ -66,7 +66,7 @@ def checked(log: Log) -> list[Finding]:
 
 def _of_file(log: Log) -> list[Finding]:
     if not log.complete:
-        return [Finding(FILE, "its recorder did not finish it")]
+        return [Finding(FILE, "its recorder did not finish it; `teamslam repair` completes it")]
     with log.path.open("rb") as file:
         damage = index_damage(file)
     return [] if damage is None else [Finding(FILE, damage)]

@@ -172,7 +172,9 @@ def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
         elif frame.opcode != Opcode.HEADER:
             break
     raise LogError(
-        path, "an MCAP file of another program", f"a log of ours begins with metadata {METADATA!r}"
+        path,
+        "an MCAP file of another program, or cut off at its very beginning",
+        f"a log of ours begins with metadata {METADATA!r}",
     )
 
 

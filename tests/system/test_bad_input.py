@@ -57,6 +57,10 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
         (["launch", "utias"], ["no data set given", "--dataset"]),
         (["robot", "thesis", "r9"], ["thesis has no robot 'r9'", "r1, r2"]),
         (["launch", "thesis", "--record", "/dev/null"], ["/dev/null: not a regular file"]),
+        (["launch", "thesis", "-o", "/dev/null"], ["/dev/null: File exists; give another path"]),
+        (["repair", "/dev/null", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
+        (["record", "thesis", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
+        (["experiment", "ma-6a"], ["ma-6a: give the sets with --dataset"]),
         (["replay", "nowhere.mcap"], ["nowhere.mcap: not found"]),
         (["view", "nowhere.mcap"], ["nowhere.mcap: not found"]),
         (

@@ -26,11 +26,13 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     watch.statuses["world"] = status("world", "waiting", readings=0.0, of=100.0)
     watch.statuses["robot/r1"] = status("robot/r1", "waiting")
     lines.show(watch)
-    watch.statuses["world"] = status("world", "publishing", readings=50.0, of=100.0)
+    watch.statuses["world"] = status("world", "publishing", readings=90.0, of=100.0)
+    watch.statuses["robot/r1"] = status("robot/r1", "mapping", readings=30.0)
+    watch.statuses["robot/r2"] = status("robot/r2", "mapping", readings=20.0)
     lines.show(watch)
     waiting, running = out.getvalue().splitlines()
     assert waiting.endswith("] waiting: 1 of 3 robots")
-    assert " 50%  team time 0 s, 1 robots" in running
+    assert " 50%  team time 0 s, 2 robots" in running
 
 
 def told(robots: int, *, truth: bool) -> Watch:
@@ -111,4 +113,25 @@ def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.Monk
         warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
         watch.statuses["central"] = m.Status(0, "central", "joining", {}, (warning,))
         lines.show(watch)
+    assert "submap 20" not in out.getvalue()  # it could be taken back
+    monkeypatch.setattr(live, "SETTLED_S", 0.0)
+    lines.show(watch)
+    lines.show(watch)
+    lines.end()
     assert out.getvalue().count("submap 20 disagrees") == 1
+
+
+def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one() -> None:
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=100))
+    watch = Watch(robots=1, began=-1e9)
+    watch.statuses["world"] = status("world", "waiting")
+    watch.statuses["world"] = m.Status(0, "world", "waiting", {}, ("waiting for robot/r2",))
+    lines.show(watch)
+    watch.statuses["world"] = m.Status(0, "world", "ended", {}, ())
+    watch.statuses["central"] = m.Status(0, "central", "joining", {}, ("two maps disagree",))
+    lines.show(watch)
+    assert "waiting for" not in out.getvalue()
+    lines.end()
+    said = [line for line in out.getvalue().splitlines() if "warning" in line]
+    assert [line.partition("warning: ")[2] for line in said] == ["central: two maps disagree"]

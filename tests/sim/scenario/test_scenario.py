@@ -187,9 +187,13 @@ UTIAS = 'world = { kind = "utias" }\n'
         ("central = 3\n" + SMALL, "expected a table, got int at central"),
         ("robot_count = 2\n" + SMALL + "[[robots]]", "robot_count and [[robots]] exclude each"),
         (SMALL + "[[robots]]\nid = 'a'\n[[robots]]\nid = 'a'", "two robots have the id a"),
-        (SMALL + "[[robots]]\nid = 'A 1'", "expected str matching regex"),
+        (
+            SMALL + "[[robots]]\nid = 'A 1'",
+            "expected a small letter, then small letters, digits and _",
+        ),
+        ("name = 'a b'\nrobot_count = 1\n" + SMALL, "expected letters, digits, _, . and -"),
         (SMALL + "[defaults]\nid = 'a'", "`id` at defaults would be every robot's"),
-        ("seed = 1", 'expected one of "simulated", "utias", got None at world.kind'),
+        ("seed = 1", 'expected one of "simulated", "utias", got nothing at world.kind'),
         ("world = { kind = [1] }", "got [1] at world.kind"),
         ("world = 3", "expected a table, got int at world"),
         ("base = [1]\n" + SMALL, "expected a built-in scenario, got [1] at base"),
@@ -198,6 +202,14 @@ UTIAS = 'world = { kind = "utias" }\n'
         (
             "robot_count = 1\n" + SMALL + "unknown_starts = ['r2']",
             "world.unknown_starts names r2, no such robot",
+        ),
+        (
+            "robot_count = 3\n" + SMALL + "size_m = 1.9",
+            "way_point_tolerance_m is 1 in a place 1.9 m wide",
+        ),
+        (
+            "robot_count = 3\n" + SMALL + "radius_m = 0.9\npaths = [[[0, 0], [1, 1]]]",
+            "way_point_tolerance_m is 1 in a place 1.8 m wide",
         ),
         ("world = { kind = 'simulated' }", "missing required field steps"),
         (
@@ -236,6 +248,17 @@ def test_an_unknown_name_lists_what_is_built_in() -> None:
         f"thesis2: no such scenario; built in: {', '.join(builtin_names())}; "
         "or give a path to a .toml file"
     )
+
+
+def test_a_small_place_is_one_where_robots_have_paths_or_few_way_points(tmp_path: Path) -> None:
+    small = "robot_count = 1\n" + SMALL + "size_m = 1.0\n"
+    load(written(tmp_path, small + "paths = [[[0, 0], [1, 1]]]"))
+    load(written(tmp_path, small + "way_point_count = 3"))
+
+
+def test_a_folder_is_no_scenario_and_may_be_a_data_set(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"a folder, .* a data set goes with --dataset"):
+        load(tmp_path)
 
 
 def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
