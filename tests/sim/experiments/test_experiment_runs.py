@@ -10,9 +10,11 @@ import msgspec
 import pytest
 
 from sim.datasets.tables import DatasetError
-from sim.experiments.catalogue import Entry
+from sim.experiments import xu_localisation
+from sim.experiments.catalogue import ENTRIES, Entry
 from sim.experiments.experiment import Options, Outcome, Results
-from sim.experiments.runner import FAILURES, Plan, computed, dataset
+from sim.experiments.output import write
+from sim.experiments.runner import FAILURES, Plan, computed, dataset, planned
 from sim.experiments.store import Store
 from sim.experiments.task import Task, sources_of
 from sim.experiments.team_runs import team_run, team_task
@@ -159,3 +161,24 @@ def test_a_data_set_is_known_by_its_content(tmp_path: Path) -> None:
     assert dataset(tmp_path / "b").sha256 != a.sha256
     with pytest.raises(DatasetError, match="no such file"):
         dataset(tmp_path / "c")
+
+
+def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_not(
+    tmp_path: Path,
+) -> None:
+    entry = next(each for each in ENTRIES if each.name == "xu-3.5")
+    options = Options((1, 2), quick=True)
+    tasks = tuple(xu_localisation.tasks(options)[:4])
+    experiment = planned(entry, options).experiment
+    whole = Plan(entry, options, experiment, tasks)
+    begun = Plan(entry, options, experiment, tasks[:1])
+    computed([begun], tmp_path / "resumed", 1, silent)
+    (resumed,) = computed([whole], tmp_path / "resumed", 2, silent)
+    (at_once,) = computed([whole], tmp_path / "at once", 1, silent)
+    pages = []
+    for name, concluded in (("resumed", resumed), ("at once", at_once)):
+        folder = tmp_path / name
+        pages.append(write([concluded], folder, "index", {}).read_bytes())
+        assert (folder / "xu-3.5.json").exists()
+    assert pages[0] == pages[1]
+    assert sum(count for _, count, _ in resumed.kinds) == len(tasks)

@@ -1,6 +1,8 @@
 """What experiments say: figures over seeds, goals, the page, the command line."""
 
 import json
+from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -9,10 +11,14 @@ from typer.testing import CliRunner
 from sim.cli.main import app
 from sim.experiments import accuracy_few, accuracy_worlds
 from sim.experiments.catalogue import ENTRIES, Entry
+from sim.experiments.curves import curves_task
 from sim.experiments.experiment import Goal, Options, Outcome, Picture, Results, Table
 from sim.experiments.output import to_json, write
+from sim.experiments.parameters import kinds_of
 from sim.experiments.runner import Concluded, planned
 from sim.experiments.team_runs import Figures, over_seeds
+from sim.experiments.xu import with_particles
+from sim.scenario.scenario import load, with_options
 
 
 def run(rmse: float, nees: float = 1.0, batch: float | None = 0.5, seed: int = 1) -> Figures:
@@ -115,6 +121,50 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     assert "http" not in page
     assert (tmp_path / "some-curve.png").read_bytes() == b"\x89PNG"
     assert json.loads((tmp_path / "some.json").read_text())["experiment"] == "some"
+
+
+class Parsed(HTMLParser):
+    """What a page links to, holds and leaves open."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.links: set[str] = set()
+        self.ids: set[str] = set()
+        self.images: list[str] = []
+        self.open: list[str] = []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self.ids |= {found["id"] or ""} if "id" in found else set()
+        self.links |= {found["href"] or ""} if tag == "a" else set()
+        self.images += [found["src"] or ""] if tag == "img" else []
+        if tag not in ("img", "meta"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_of_all_is_sound_html_whose_links_and_pictures_are_in_it(tmp_path: Path) -> None:
+    first, second = concluded(), concluded()
+    other = replace(second, entry=Entry("other", "", "Another."), kinds=[("a run", 2, "a = 1")])
+    parsed = Parsed(write([first, other], tmp_path, "index", {"version.numpy": "2"}).read_text())
+    assert parsed.open == []
+    assert parsed.links == {"#some", "#other"} == {f"#{each}" for each in parsed.ids}
+    assert len(parsed.images) == 2
+    assert all(image.startswith("data:image/png;base64,") for image in parsed.images)
+
+
+def test_the_parameters_of_a_run_are_said_where_they_differ_from_its_scenario() -> None:
+    scenario = with_particles(with_options(load("thesis"), seed=7, robots=1), 50)
+    tasks = [curves_task(with_options(scenario, seed=seed), label="t") for seed in (1, 2)]
+    ((label, count, said),) = kinds_of(tasks)
+    assert (label, count) == ("t, hybrid + join", 2)
+    assert "world: thesis, robots.front_end.particles = 50, central.particles = 50" in said
+    ((_, _, said),) = kinds_of([curves_task(load("thesis"))])
+    assert said.endswith("thesis, as it is")
 
 
 def test_help_lists_every_experiment() -> None:
