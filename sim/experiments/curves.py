@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt32
 from sim.evaluation.errors import Path, PoseErrors, pose_errors
 from sim.evaluation.evaluation import evaluate
 from sim.experiments.task import Task
-from sim.experiments.team_runs import Figures, TimedRun, named
+from sim.experiments.team_runs import Figures, TimedRun, expected_s, named
 from sim.scenario.scenario import Scenario, loads
 from sim.scenario.source import streams_of
 from sim.world.streams import Detections, RobotStream, WorldStreams, robot_stream
@@ -27,7 +27,6 @@ from team.wire.bus import Sample, opened
 
 STEP_S = 1.0
 """Of the thesis' world."""
-_COST_S = 2.5e-3
 Map = m.FusedMap | m.MapEstimate
 DIGITS = 5
 """Significant digits of a kept curve: a picture shows three."""
@@ -46,7 +45,6 @@ def curves_task(
     late: each step's readings are those of the step before. shots: the steps at which maps and
     paths are kept to be drawn.
     """
-    steps = getattr(scenario.world, "steps", 500)
     return Task(
         "sim.experiments.curves:curves_run",
         {"world": msgspec.to_builtins(scenario)}
@@ -55,7 +53,7 @@ def curves_task(
         | ({"shots": list(shots)} if shots else {}),
         f"{'maps of ' if shots else ''}{label or scenario.name}, "
         f"{named(scenario.estimator, scenario.fusion)}, seed {scenario.seed}",
-        _COST_S * steps * len(scenario.robots),
+        expected_s(scenario),
     )
 
 

@@ -20,11 +20,11 @@ from sim.evaluation.evaluation import Evaluation, evaluate
 from sim.experiments.curves import said_poses, true_landmarks
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
-from sim.experiments.team_runs import Figures
+from sim.experiments.team_runs import Figures, expected_s
 from sim.in_memory.team import run_team
 from sim.scenario.scenario import Scenario, loads, with_options
 from sim.scenario.source import streams_of
-from sim.world.worlds import SimulatedWorld, UtiasWorld
+from sim.world.worlds import UtiasWorld
 from team import translate
 from team.estimation import joining, svd_joining
 from team.estimation.contribution import Contribution
@@ -38,8 +38,6 @@ STEP_S = 1.0
 NEVER_S = 1e6
 DRAWN_POINTS = 1000
 """The centre joins once, when the run has ended."""
-_COST_S = 3e-3
-_UTIAS_COST_S = 60.0
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
@@ -76,12 +74,6 @@ def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
 
 
 def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> Task:
-    world = scenario.world
-    cost = (
-        _COST_S * world.steps * len(scenario.robots)
-        if isinstance(world, SimulatedWorld)
-        else _UTIAS_COST_S
-    )
     place = scenario.name if dataset is None else dataset.name
     return Task(
         f"sim.experiments.downs_joined:{work}",
@@ -89,7 +81,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
         | ({} if dataset is None else {"sha256": dataset.sha256}),
         f"{place}, {scenario.estimator}{f', {note}' if note else ''}, "
         f"{len(scenario.robots)} robots, seed {scenario.seed}",
-        cost,
+        expected_s(scenario),
         {} if dataset is None else {"path": str(dataset.path)},
     )
 

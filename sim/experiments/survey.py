@@ -16,13 +16,15 @@ from team.config import Estimator, FusionRule
 from team.pairs import PAIRS
 
 WORLDS = ("thesis", "thesis-b")
-MOST_SEEDS = 10
+MOST_SEEDS = 30
 PARTICLES = (50, 200, 1000)
 SHOWN: Shown = (
     ("rmse", "map [m]", "{:.3f}"),
     ("rmse_aligned", "aligned", "{:.3f}"),
     ("online_position_rmse", "pose [m]", "{:.2f}"),
+    ("online_position_rmse_aligned", "aligned", "{:.2f}"),
     ("position_rmse", "smoothed", "{:.2f}"),
+    ("position_rmse_aligned", "aligned", "{:.2f}"),
     ("nees", "NEES/dof", "{:.3g}"),
     ("in_band", "in band", "{:.0%}"),
     ("online_pose_nees", "pose NEES", "{:.3g}"),
