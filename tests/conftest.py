@@ -21,6 +21,12 @@ settings.load_profile("repeatable")
 install_import_hook(["team", "central", "sim"], f"{tests.shapes.__name__}.checked")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Before a test's own fixtures; those of a module are checked with its first test."""
+    tests.shapes.begin_test()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that start processes share one worker, so that they do not starve each other."""
     for item in items:
