@@ -6,12 +6,13 @@ pose's own covariance says that it has moved. After a long way without a landmar
 times the rise: the robot may well be where its covariance excludes it, though the minimum is right.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
-from team.estimation.contribution import named
+from team.estimation.contribution import Stream, named
 from team.estimation.gauss_newton import FULL_AGE, Island, aged, held, joint_marginal
 from team.estimation.gaussian import information
 from team.estimation.geometry import compose, inverse, logarithm
@@ -40,49 +41,68 @@ class Bend(NamedTuple):
         return self.chi2 / max(self.rise, 1.0)
 
 
+def walks(island: Island, node: int) -> Iterator[tuple[Island, float]]:
+    """The likely islands with the heading of a pose moved, and by how much their cost is higher.
+
+    None where the heading is known too well for a bend.
+    """
+    _, covariance = joint_marginal(island, [node])
+    sigma = float(np.sqrt(covariance[2, 2]))
+    if sigma < STRAIGHT_RAD:
+        return
+    island = aged(island, FULL_AGE)
+    for sign in (1.0, -1.0):
+        walked = island
+        for before, after in zip((0.0, *STEPS), STEPS, strict=False):
+            by = sign * (after - before) * sigma
+            walked = held(walked, int(island.graph.offset[node]) + 2, by, ITERATIONS)
+            rise = walked.cost - island.cost
+            if rise > UNLIKELY:
+                break
+            yield walked, rise
+
+
+def ends(island: Island) -> list[tuple[Stream, str, int]]:
+    """Every stream's first and last pose that is not given, with the word for it."""
+    return [
+        (stream, where, nodes[k])
+        for stream, nodes in sorted(island.graph.streams.items())
+        for where, k in (("started", 0), ("ended", -1))
+        if not island.graph.fixed[nodes[k]]
+    ]
+
+
 def bend(island: Island, node: int) -> Bend | None:
     """Of a pose of an island at its minimum: the likely place that its covariance denies most.
 
-    None where it denies none, and where the heading is known too well for that.
+    None where it denies none.
     """
     mean, covariance = joint_marginal(island, [node])
-    sigma = float(np.sqrt(covariance[2, 2]))
-    if sigma < STRAIGHT_RAD:
-        return None
     # The χ² is that of the motion of the frame Exp(ξ), to first order ξ = A (dx, dy, dθ), so that a
     # turn about a far point is not taken for a bend.
     A = np.array([[1.0, 0.0, mean[1]], [0.0, 1.0, -mean[0]], [0.0, 0.0, 1.0]])
     metric = information(A @ covariance @ A.T, "a pose")
     at = int(island.graph.offset[node])
-    island = aged(island, FULL_AGE)
     found = []
-    for sign in (1.0, -1.0):
-        walked = island
-        for before, after in zip((0.0, *STEPS), STEPS, strict=False):
-            walked = held(walked, at + 2, sign * (after - before) * sigma, ITERATIONS)
-            rise = walked.cost - island.cost
-            if rise > UNLIKELY:
-                break
-            pose = walked.state[at : at + 3]
-            xi = logarithm(compose(pose, inverse(mean)))
-            distance = float(np.hypot(*(pose - mean)[:2]))
-            found.append(Bend(distance, rise, float(xi @ metric @ xi)))
+    for walked, rise in walks(island, node):
+        pose = walked.state[at : at + 3]
+        xi = logarithm(compose(pose, inverse(mean)))
+        distance = float(np.hypot(*(pose - mean)[:2]))
+        found.append(Bend(distance, rise, float(xi @ metric @ xi)))
     worst = max(found, key=lambda each: each.ratio, default=None)
     return None if worst is None or worst.ratio < BENT else worst
 
 
 def bends(island: Island) -> list[str]:
     """In words, the bends of the first and the last pose of every stream without a given start."""
-    graph, said = island.graph, []
-    for stream, nodes in sorted(graph.streams.items()):
-        if graph.fixed[nodes[0]]:
-            continue
-        for where, node in (("started", nodes[0]), ("ended", nodes[-1])):
-            found = bend(island, node)
-            if found is not None:
-                said.append(
-                    f"{named(stream)} may have {where} farther off than its covariance says: "
-                    f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "
-                    f"covariance {found.chi2:.0f}"
-                )
+    said = []
+    for stream, where, node in ends(island):
+        found = bend(island, node)
+        given = island.graph.fixed[island.graph.streams[stream][0]]
+        if found is not None and not given:
+            said.append(
+                f"{named(stream)} may have {where} farther off than its covariance says: "
+                f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "
+                f"covariance {found.chi2:.0f}"
+            )
     return said

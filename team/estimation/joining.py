@@ -16,7 +16,7 @@ import numpy as np
 from team.estimation.contribution import Contribution, Start, Stream, named
 from team.estimation.gauss_newton import Island, JoinSettings, final_cost, iterated
 from team.estimation.merging import Merge, ages, merge, sighted
-from team.estimation.minima import doubts, searched, suspicious
+from team.estimation.minima import doubts, searched, suspicious, widened
 from team.estimation.sighting import Sighting
 from team.estimation.submap_graph import EMPTY_GRAPH, extended
 
@@ -211,8 +211,14 @@ def converged(fold: Fold, settings: JoinSettings) -> Fold:
         change=main.best.change,
     )
     merged = _with_merges(solved, at_last=True)
-    last = main if merged.main is main.best.island else searched([merged.main])
-    return replace(merged, doubts=tuple(doubts(last)))
+    last = widened(main if merged.main is main.best.island else searched([merged.main]))
+    return replace(
+        merged,
+        islands={**merged.islands, fold.main_key: last.best.island},
+        iterations=last.best.iterations,
+        change=last.best.change,
+        doubts=tuple(doubts(last)),
+    )
 
 
 def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:

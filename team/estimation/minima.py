@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.special import chdtri
 
 from team.estimation import sparse_kernel
-from team.estimation.bends import bends
+from team.estimation.bends import bends, ends, walks
 from team.estimation.contribution import Stream, named
 from team.estimation.gauss_newton import Island, NotDeterminedError, final_cost, settled
 from team.estimation.geometry import wrapped
@@ -108,10 +108,70 @@ def searched(starts: Sequence[Island]) -> Search:
         found.append(minimum(start))
         if not few and not suspicious(starts[0], min(each.cost for each in found)):
             break
+    return _lowest(found)
+
+
+def widened(search: Search) -> Search:
+    """The search with the minima beside the best one; with few landmarks.
+
+    Each heading of a first or last pose that is known badly is moved as far as is likely, and each
+    stream is mirrored where it goes from one landmark to another, as a chain folds over to the
+    other side of the line between two points. A solution that does not come back has crossed into
+    another valley.
+    """
+    best = search.best.island
+    if len(best.graph.landmarks) > FEW_LANDMARKS:
+        return search
+    found = [search.best] if search.second is None else [search.best, search.second]
+    for _, _, node in ends(best):
+        found += [minimum(walked) for walked, _ in walks(best, node)]
+    found += [minimum(each) for each in _mirrored(best)]
+    wider = _lowest(found)
+    return wider._replace(gained=search.gained + search.best.cost - wider.best.cost)
+
+
+def _mirrored(island: Island) -> Iterator[Island]:
+    """The island with a stream's poses on the other side of a line through two landmarks.
+
+    With the line's direction α: p' = a + R(2α) conj(p − a), θ' = 2α − θ.
+    """
+    graph = island.graph
+    for stream in sorted(graph.streams):
+        own = [node for (of, _), node in graph.poses.items() if of == stream]
+        poses = np.array([n for n in (*graph.streams[stream], *own) if not graph.fixed[n]])
+        at = graph.offset[poses]
+        for pair in _passages(island, stream):
+            a, b = (complex(*island.state[at_l : at_l + 2]) for at_l in pair)
+            if a == b:
+                continue
+            turned = ((b - a) / abs(b - a)) ** 2
+            p = island.state[at] + 1j * island.state[at + 1]
+            p = a + turned * np.conj(p - a)
+            state = island.state.copy()
+            state[at], state[at + 1] = p.real, p.imag
+            state[at + 2] = [wrapped(np.angle(turned) - h) for h in island.state[at + 2].tolist()]
+            yield replace(island, state=state)
+
+
+def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
+    """The pairs of landmarks, as places in the state, that a stream sees one after the other."""
+    graph, before = island.graph, set[int]()
+    pairs: set[tuple[int, int]] = set()
+    for contribution, _ in graph.submaps:
+        seen = {graph.landmarks[id_] for id_ in contribution.local.ids.tolist()}
+        if contribution.stream != stream or not seen:
+            continue
+        pairs |= {(min(a, b), max(a, b)) for a in before for b in seen - before if a not in seen}
+        before = seen
+    return [(int(graph.offset[a]), int(graph.offset[b])) for a, b in sorted(pairs)]
+
+
+def _lowest(found: Sequence[Minimum]) -> Search:
+    """Of minima of one graph, the first of them the one that would be taken without a search."""
     best = _at_rest(min(found, key=lambda each: each.cost))
     others = [each for each in found if each.change < SETTLED_M and elsewhere(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
-    return Search(best, first.cost - best.cost, second)
+    return Search(best, found[0].cost - best.cost, second)
 
 
 def _further(island: Island) -> Iterator[Island]:

@@ -8,10 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team.estimation import gauss_newton, minima
+from team.estimation.contribution import Contribution, Start
 from team.estimation.gauss_newton import JoinSettings
 from team.estimation.joining import EMPTY_FOLD, converged, folded, started
-from team.estimation.minima import Search, doubts, minimum, searched, suspicious
+from team.estimation.minima import Search, doubts, minimum, searched, suspicious, widened
 from team.estimation.relaxation import relaxed
+from team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import team, wrap
 
@@ -156,3 +158,57 @@ def test_a_place_that_the_readings_exclude_is_no_second_place():
     search = searched(mirrored(0.02, OPTIONS))
     assert not search.ambiguous
     assert doubts(search) == []
+
+
+def hinged(apart, turn=0.1, sigma=0.8):
+    """r1 passes one landmark, turns by `turn` ± `sigma` [rad], and passes the other one 10 m on.
+
+    How far the two lie apart [m], r0 knows: r1 has turned by so much to the left or to the right.
+    """
+    near, point = [0.05, 0.05, 0.02], [0.05, 0.05]
+    said = [
+        ("r0", 0, [1.0, 0.0, 0.0, 0.0, 0.0, apart, 0.0], [*near, *point, *point], [0, 1]),
+        ("r1", 0, [5.0, 0.0, 0.0, 0.0, 0.0], [*near, *point], [0]),
+        ("r1", 1, [0.1, 0.0, turn], [0.05, 0.05, sigma], []),
+        ("r1", 2, [9.0, 0.0, 0.0, 10.0, 0.0], [*near, *point], [1]),
+    ]
+    submaps = [
+        Contribution(robot, 0, k, 1000 * (k + 1), LocalMap(np.array(ids, np.uint32), mean, P))
+        for robot, k, mean, P, ids in (
+            (robot, k, np.array(mean), np.diag(sigmas) ** 2, ids)
+            for robot, k, mean, sigmas, ids in said
+        )
+    ]
+    fold = started(EMPTY_FOLD, Start("r0", 0, np.zeros(3)))
+    return folded(fold, sorted(submaps, key=lambda each: each.key), OPTIONS)
+
+
+@pytest.mark.parametrize("apart", [9.0, 13.0])
+def test_a_chain_that_may_be_folded_to_the_other_side_is_said(apart):
+    fold = hinged(apart)
+    assert not searched([fold.main]).ambiguous, "the mutant that does not mirror sees one map"
+    wider = widened(searched([fold.main]))
+    assert wider.ambiguous
+    turns = [
+        each.state[each.graph.offset[each.graph.streams["r1", 0][2]] + 2]
+        - each.state[each.graph.offset[each.graph.streams["r1", 0][1]] + 2]
+        for each in (wider.best.island, wider.second.island)
+    ]
+    cosine = (apart**2 - 5.0**2 - 10.0**2) / (2.0 * 5.0 * 10.0)
+    np.testing.assert_allclose(np.cos(turns), cosine, atol=0.1)
+    assert turns[0] * turns[1] < 0.0
+    (text,) = converged(fold, OPTIONS).doubts
+    assert "another map fits about as well" in text
+
+
+def test_a_chain_that_is_known_to_turn_left_is_not_said():
+    assert converged(hinged(13.0, turn=1.1, sigma=0.2), OPTIONS).doubts == ()
+
+
+def test_the_lower_one_of_two_sides_is_the_map():
+    fold = hinged(13.0, turn=0.8, sigma=0.8)
+    lower = widened(searched([fold.main]))
+    other = Search(lower.second, 0.0, None)
+    found = widened(other)
+    assert found.best.cost == pytest.approx(lower.best.cost)
+    assert found.gained == pytest.approx(lower.second.cost - lower.best.cost)
