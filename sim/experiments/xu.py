@@ -154,6 +154,8 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
         estimator=method.estimator,
         fusion=method.fusion,
     )
+    if method.estimator != "hybrid":
+        scenario = _telling(scenario)
     if method.particles is not None:
         scenario = with_particles(scenario, method.particles)
     if panel.noise is not None:
@@ -164,6 +166,16 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
     told = as_coded(scenario) if panel.reading == "coded" else scenario
     late = panel.reading == "coded"
     return curves_task(with_noise(told, 0.0, 0.0), told, label, late=late, shots=shots)
+
+
+def _telling(scenario: Scenario) -> Scenario:
+    """A filter over the whole run says its map at every step; it has no windows otherwise."""
+    replace = msgspec.structs.replace
+    robots = tuple(
+        replace(robot, front_end=replace(robot.front_end, window_s=STEP_S))
+        for robot in scenario.robots
+    )
+    return replace(scenario, robots=robots, central=replace(scenario.central, broadcast_s=STEP_S))
 
 
 def as_coded(scenario: Scenario) -> Scenario:
