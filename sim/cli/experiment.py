@@ -19,8 +19,7 @@ FOLDER = Path("runs") / "experiments"
 FILE_WIDTH = 120
 """Columns of the tables where they are not shown in a terminal."""
 MOST_SEEDS = 100_000
-ALL_SEEDS = 30
-"""Of `all`, at the most: within three quarters of an hour on two cores."""
+ALL = "all"
 Seeds = Annotated[
     int | None,
     typer.Option(help="How many seeds; default: the experiment's own.", min=1, max=MOST_SEEDS),
@@ -42,8 +41,8 @@ Quick = Annotated[bool, typer.Option("--quick", help="Few seeds, and no run beyo
 Check = Annotated[bool, typer.Option("--check", help="Exit status 1 if a goal is missed.")]
 
 
-def _command(name: str, summary: str, entries: Sequence[Entry], most: int = MOST_SEEDS) -> None:
-    """One command for these experiments; most: seeds of each, if the user does not say."""
+def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
+    """One command for these experiments."""
 
     def run(
         seeds: Seeds = None,
@@ -56,7 +55,8 @@ def _command(name: str, summary: str, entries: Sequence[Entry], most: int = MOST
         check: Check = False,
     ) -> None:
         def chosen(entry: Entry) -> tuple[int, ...]:
-            count = seeds or (entry.quick_seeds if quick else min(entry.seeds, most))
+            own = min(entry.seeds, entry.seeds_in_all) if name == ALL else entry.seeds
+            count = seeds or (entry.quick_seeds if quick else own)
             return tuple(range(first, first + count))
 
         _run(name, entries, chosen, json_file, output, jobs, dataset or [], quick, check)
@@ -101,10 +101,10 @@ def _run(
         console.width = FILE_WIDTH
     for each in concluded:
         console.print(*printed(each), sep="\n")
-    page = write(concluded, output, "index" if name == "all" else name, origin)
+    page = write(concluded, output, "index" if name == ALL else name, origin)
     if json_file is not None:
         contents = {each.entry.name: to_json(each, origin) for each in concluded}
-        content = contents if name == "all" else contents[name]
+        content = contents if name == ALL else contents[name]
         json_file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
     typer.echo(f"{page}: all of it with its pictures; JSON and PNG beside it")
     failed = sum(len(each.failed) for each in concluded)
@@ -117,4 +117,4 @@ def _run(
 
 for _entry in ENTRIES:
     _command(_entry.name, _entry.summary, [_entry])
-_command("all", "All of them, as one page that can be browsed.", ENTRIES, ALL_SEEDS)
+_command(ALL, "All of them, as one page that can be browsed.", ENTRIES)

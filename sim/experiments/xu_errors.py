@@ -104,8 +104,8 @@ FIGURE_5_2 = ErrorFigure(
     ),
     (
         "Printed: multi-Hybrid within 0.5 m, multi-FastSLAM above it, single Hybrid worst. As "
-        "stated the order is like this, at errors of metres; as coded multi-Hybrid comes to metres "
-        "instead of ten, and within 0.5 m in neither reading.",
+        "stated multi-Hybrid is the worst of them, in some runs by tens of metres; as coded all "
+        "come to one to three metres, in no clear order. Within 0.5 m it is in neither reading.",
         _READINGS,
         "The appendix' function that merges two maps multiplies a 2 × 1 by a 2 × 2 matrix from the "
         "wrong side and can not run as printed, so both readings merge by equations 5.1 to 5.4, "
