@@ -194,11 +194,21 @@ def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Tr
         axis.plot(
             centres, total / width_s, color=_colour(k), linestyle=style, linewidth=1.2, label=name
         )
-    axis.set_yscale("log")
+    _log_scale(axis)
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
     if groups:
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+
+
+def _log_scale(axis: "Axes") -> None:
+    """A logarithmic scale with plain numbers; between powers of ten only where there is one."""
+    from matplotlib.ticker import NullFormatter
+
+    axis.set_yscale("log")
+    low, high = axis.get_ylim()
+    axis.yaxis.set_major_formatter("{x:,g}")
+    axis.yaxis.set_minor_formatter("{x:,g}" if high < 20.0 * low else NullFormatter())
 
 
 def latency_picture(history: History, path: FilePath) -> bool:
@@ -218,7 +228,7 @@ def latency_picture(history: History, path: FilePath) -> bool:
     axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last reading")
     axis.plot([], [], color="#555555", linestyle=":", label="from its first reading")
     if all((of.last_s > 0.0).all() for of in history.latencies.values()):
-        axis.set_yscale("log")  # clocks of two machines may disagree
+        _log_scale(axis)  # clocks of two machines may disagree
     axis.set_xlabel("end of the submap, team time [s]")
     axis.set_ylabel("wall time to the map [s]")
     axis.grid(color="#eeeeee", linewidth=0.6)
