@@ -287,7 +287,10 @@ def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], uni
     above.set_xlabel(unit)
     above.set_ylabel("distance to the truth [m]")
     above.set_xlim(0, max(curves.times_s[-1] for curves in found.values()))
-    above.set_ylim(bottom=0)
+    # One method that is lost in some runs would press all the others to the floor.
+    largest = max(float(np.nanmax(curves.quantile(BAND[1]))) for curves in found.values())
+    middle = max(float(np.nanmax(curves.quantile(0.5))) for curves in found.values())
+    above.set_ylim(0, 1.05 * min(largest, 2.0 * middle))
     picture.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=10)
     ruled(above)
     for column, method in enumerate(methods):
