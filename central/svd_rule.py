@@ -8,6 +8,7 @@ robot fixes the frame; what the others are told of theirs has no influence.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -19,11 +20,20 @@ from central.submap_set import Stream
 from team import translate
 from team.estimation import svd_joining
 from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.svd_joining import SubmapJoining, TooFewPointsError, Weighting
+from team.estimation.geometry import Pose
+from team.estimation.svd_joining import (
+    NO_PAIRS,
+    PointPairs,
+    SubmapJoining,
+    TooFewPointsError,
+    Weighting,
+)
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
+
+NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -113,22 +123,37 @@ class SvdJoinRule(JoinRule):
 
 
 def tied(
-    first: Stream, maps: Mapping[Stream, LandmarkGaussian], *, full: bool
+    first: Stream,
+    maps: Mapping[Stream, LandmarkGaussian],
+    *,
+    full: bool,
+    sightings: Mapping[tuple[Stream, Stream], PointPairs] = NO_SIGHTINGS,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
     """The maps in the frame of the first, one by one: next who shares most with those that are in.
 
-    Who shares too few landmarks stays out, with the reason.
+    sightings: by two streams in their order, the robots' own places in both maps where they saw
+    each other (`mutual_sighting`); they tie beside the common landmarks, not with `full`. Who
+    shares too few points stays out, with the reason.
     """
     fused = maps[first]
+    frames = {first: np.zeros(3)}
     waiting = {stream: maps[stream] for stream in sorted(maps) if stream != first}
-    exchanged = svd_joining.exchanged_fully if full else svd_joining.exchanged
     while waiting:
-        shared = {s: len(np.intersect1d(fused.ids, x.ids)) for s, x in waiting.items()}
+        seen = {s: _seen(s, frames, sightings) for s in waiting}
+        shared = {
+            s: len(np.intersect1d(fused.ids, x.ids)) + len(seen[s].in_a) for s, x in waiting.items()
+        }
         stream = max(waiting, key=lambda s: shared[s])
         try:
-            fused = exchanged(fused, waiting[stream]).landmarks
+            exchange = (
+                svd_joining.exchanged_fully(fused, waiting[stream])
+                if full
+                else svd_joining.exchanged(fused, waiting[stream], seen[stream])
+            )
         except TooFewPointsError:
             break
+        fused = exchange.landmarks
+        frames[stream] = exchange.a_from_b.mean
         del waiting[stream]
     reasons = []
     for (robot, epoch), alone in waiting.items():
@@ -137,3 +162,19 @@ def tied(
         needed = f"{count} shared landmark{plural}, {svd_joining.NEEDED} needed"
         reasons.append(f"{robot}, epoch {epoch}, not joined: {needed}")
     return fused, tuple(reasons)
+
+
+def _seen(
+    stream: Stream,
+    frames: Mapping[Stream, Pose],
+    sightings: Mapping[tuple[Stream, Stream], PointPairs],
+) -> PointPairs:
+    """The points of a stream with all those in the map, in the map's frame and in its own."""
+    found = [NO_PAIRS]
+    for other, frame in frames.items():
+        pairs = sightings.get((min(stream, other), max(stream, other)))
+        if pairs is not None:
+            theirs, own = pairs if other < stream else (pairs.in_b, pairs.in_a)
+            c, s = np.cos(frame[2]), np.sin(frame[2])
+            found.append(PointPairs(theirs @ np.array([[c, s], [-s, c]]) + frame[:2], own))
+    return PointPairs(*(np.concatenate(each) for each in zip(*found, strict=True)))

@@ -435,9 +435,9 @@ TABLE_5_5 = PrintedTable(
     _pair((_each(_spherical), _each(_team)), _team_row, (HIS, OURS), _MAPS),
     (
         _DIFFERS,
-        "He ties two maps where the robots see each other; here the robots' whole maps are tied by "
-        "singular values over the landmarks that they share, so the robots' own positions are not "
-        "among the points. Ours joins all submaps in one frame, with sightings of teammates.",
+        "He exchanges maps at each mutual sighting. Here the robots' whole maps are tied once, by "
+        "singular values over the landmarks that they share and the robots' own places at every "
+        "mutual sighting. Ours joins all submaps in one frame, with sightings of teammates.",
     ),
     SIMULATED_5_5,
     Compared(

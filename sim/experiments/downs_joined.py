@@ -14,10 +14,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from central.submap_set import Stream
 from central.svd_rule import tied
 from sim.evaluation.errors import MapErrors, Path, map_errors, pose_errors
 from sim.evaluation.evaluation import Evaluation, evaluate
-from sim.experiments.curves import said_poses, true_landmarks
+from sim.experiments.curves import messages, said_poses, true_landmarks
 from sim.experiments.experiment import Dataset
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, expected_s
@@ -26,10 +27,18 @@ from sim.scenario.scenario import Scenario, loads, with_options
 from sim.scenario.source import streams_of
 from sim.world.worlds import UtiasWorld
 from team import translate
+from team.config import Sensor
 from team.estimation import joining, svd_joining
 from team.estimation.contribution import Contribution
 from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.svd_joining import SETTINGS, SubmapJoining, weighted
+from team.estimation.models import corrected
+from team.estimation.svd_joining import (
+    SETTINGS,
+    PointPairs,
+    SubmapJoining,
+    mutual_sighting,
+    weighted,
+)
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -132,7 +141,7 @@ def spherical_run(
     evaluation = evaluate(samples)
     ids, positions = true_landmarks(samples)
     truth = dict(zip(ids.tolist(), positions, strict=True))
-    robots, maps = {}, {}
+    robots, maps, paths = {}, {}, {}
     for name in evaluation.robots:
         submaps = _submaps(samples, name)
         if not submaps:
@@ -140,8 +149,9 @@ def spherical_run(
         state = _joined(name, _start(samples, name), submaps)
         found = svd_joining.landmark_gaussian(state)
         maps[name, 0] = found
+        paths[name] = _path(name, state, submaps)
         robots[name] = _map_figures(_errors(found, truth)) | {
-            "position_rmse": _path_error(evaluation, name, state, submaps),
+            "position_rmse": _path_error(evaluation, name, paths[name]),
             "submaps": len(submaps),
             "map": {
                 "ids": found.ids.tolist(),
@@ -151,10 +161,15 @@ def spherical_run(
         }
     if not maps:
         return {"robots": {}, "team": _map_figures(None), "reasons": []}
-    team, reasons = tied(min(maps), maps, full=False)
+    sensors = {
+        robot["id"]: msgspec.convert(robot["sensor"], Sensor) for robot in scenario["robots"]
+    }
+    sightings = _mutual(samples, sensors, paths)
+    team, reasons = tied(min(maps), maps, full=False, sightings=sightings)
     return {
         "robots": robots,
         "team": _map_figures(_errors(team, truth)),
+        "sightings": sum(len(pairs.in_a) for pairs in sightings.values()),
         "with_covariances": _map_figures(None if evaluation.map is None else evaluation.map.errors),
         "reasons": list(reasons),
     }
@@ -197,17 +212,69 @@ def _joined(
     )
 
 
-def _path_error(
-    evaluation: Evaluation, robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]
-) -> float | None:
-    """Of the submaps' ends, which lie at their stamps [m]."""
+def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path:
+    """The ends of the submaps, which lie at their stamps."""
     graph = state.fold.main.graph
     ends = graph.offset[np.array(graph.streams[robot, 0][1:])]
     poses = state.fold.main.state[ends[:, None] + np.arange(3)]
-    stamps = np.array([submap.stamp_ns for submap in submaps], dtype=np.int64)
-    unit = np.broadcast_to(np.eye(3), (len(poses), 3, 3))
-    errors = pose_errors(Path(stamps, poses), unit, evaluation.robots[robot].truth)
+    return Path(np.array([submap.stamp_ns for submap in submaps], dtype=np.int64), poses)
+
+
+def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
+    """Of a joined path [m]."""
+    unit = np.broadcast_to(np.eye(3), (len(path.poses), 3, 3))
+    errors = pose_errors(path, unit, evaluation.robots[robot].truth)
     return None if errors is None else errors.position_rmse_m
+
+
+def _mutual(
+    samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
+) -> dict[tuple[Stream, Stream], PointPairs]:
+    """Where two robots saw each other in the same step: both places in both maps, one a step."""
+    looks = {name: _looks(samples, name, sensors[name]) for name in paths}
+    found: dict[tuple[Stream, Stream], PointPairs] = {}
+    for a in sorted(paths):
+        for b in sorted(paths):
+            steps = sorted(looks[a].get(b, {}).keys() & looks[b].get(a, {}).keys()) if a < b else []
+            pairs = [
+                mutual_sighting(
+                    paths[a].poses[at_a],
+                    *looks[a][b][step],
+                    paths[b].poses[at_b],
+                    *looks[b][a][step],
+                )
+                for step in steps
+                if (at_a := _at(paths[a], step)) is not None
+                and (at_b := _at(paths[b], step)) is not None
+            ]
+            if pairs:
+                found[(a, 0), (b, 0)] = PointPairs(
+                    *(np.concatenate(each) for each in zip(*pairs, strict=True))
+                )
+    return found
+
+
+def _looks(
+    samples: Sequence[Sample], robot: str, sensor: Sensor
+) -> dict[str, dict[int, tuple[float, float]]]:
+    """By teammate and step the last (range [m], bearing [rad]) of that step, calibrated."""
+    found: dict[str, dict[int, tuple[float, float]]] = {}
+    for message in messages(samples, ch.SIGHTINGS.key(robot)):
+        if isinstance(message, m.Sightings):
+            teammates, *read = translate.looks_of(message)
+            ranges, bearings = corrected(sensor, *read)
+            for name, seen, bearing in zip(teammates, ranges, bearings, strict=True):
+                look = float(seen) - sensor.marker_range_offset, float(bearing)
+                found.setdefault(name, {})[round(message.stamp_ns / STEP_S * 1e-9)] = look
+    return found
+
+
+def _at(path: Path, step: int) -> int | None:
+    """The pose at a step; None where the robot has none within half of one."""
+    stamp_ns = round(step * STEP_S * 1e9)
+    nearest = int(np.argmin(np.abs(path.stamps_ns - stamp_ns)))
+    near = abs(int(path.stamps_ns[nearest]) - stamp_ns) <= 0.5e9 * STEP_S
+    return nearest if near else None
 
 
 def _errors(

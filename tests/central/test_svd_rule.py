@@ -7,8 +7,13 @@ from hypothesis import strategies as st
 
 from central.config import CentralConfig
 from central.node import CentralNode
+from central.submap_set import Stream
+from central.svd_rule import tied
 from team import translate
 from team.estimation import svd_joining
+from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.geometry import inverse, transformed
+from team.estimation.svd_joining import PointPairs
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -99,3 +104,37 @@ def test_a_robot_that_shares_too_little_stays_out_with_the_reason(rule):
 def test_a_team_without_submaps_has_an_empty_map(rule):
     found, _ = final(messages({"r1": [], "r2": []}), rule)
     assert (found.ids, found.means, found.members) == (b"", b"", ())
+
+
+def _map_of(points: np.ndarray, ids: list[int], frame: np.ndarray) -> LandmarkGaussian:
+    """These points as a robot has them whose start lies at `frame` in the team's."""
+    back = inverse(frame)
+    own = np.array([transformed(back, point) for point in points])
+    return LandmarkGaussian(np.array(ids, np.uint32), own, 0.01 * np.eye(2 * len(ids)))
+
+
+def test_maps_without_a_common_landmark_are_tied_where_their_robots_saw_each_other() -> None:
+    generator = np.random.default_rng(1)
+    points = generator.uniform(-5.0, 5.0, (9, 2))
+    frames = {("r1", 0): np.zeros(3), ("r2", 0): np.array([2.0, -1.0, 0.7]),
+              ("r3", 0): np.array([-3.0, 1.0, -2.0])}  # fmt: skip
+    maps = {
+        stream: _map_of(points[3 * k : 3 * k + 3], [3 * k, 3 * k + 1, 3 * k + 2], frame)
+        for k, (stream, frame) in enumerate(frames.items())
+    }
+    robots = generator.uniform(-5.0, 5.0, (4, 2))
+
+    def seen(a: Stream, b: Stream, at: slice) -> PointPairs:
+        return PointPairs(*(
+            np.array([transformed(inverse(frames[s]), point) for point in robots[at]])
+            for s in (a, b)
+        ))  # fmt: skip
+
+    r1, r2, r3 = frames
+    sightings = {(r1, r2): seen(r1, r2, slice(0, 2)), (r2, r3): seen(r2, r3, slice(2, 4))}
+    fused, reasons = tied(r1, maps, full=False, sightings=sightings)
+    assert reasons == ()
+    np.testing.assert_allclose(fused.means, points, atol=1e-9)
+    alone, reasons = tied(r1, maps, full=False)
+    assert len(alone.ids) == 3
+    assert len(reasons) == 2
