@@ -48,7 +48,7 @@ ROBOT: Shown = (
 def tasks(options: Options) -> list[Task]:
     """Each set with known starts and without; there is no randomness but the estimator's."""
     return [
-        task for dataset in options.datasets for task in (_task(dataset), _unknown_task(dataset))
+        task for dataset in options.datasets for task in (team_on(dataset), _unknown_task(dataset))
     ]
 
 
@@ -61,7 +61,7 @@ def outcome(options: Options, results: Results) -> Outcome:
     figures = {
         dataset.name: set_figures(run)
         for dataset in options.datasets
-        if (run := results.of(_task(dataset))) is not None
+        if (run := results.of(team_on(dataset))) is not None
     }
     unknown = {
         dataset.name: set_figures(run)
@@ -115,7 +115,8 @@ def set_figures(run: Figures) -> Figures:
     return figures
 
 
-def _task(dataset: Dataset) -> Task:
+def team_on(dataset: Dataset) -> Task:
+    """The team on a set, with the batch under the profile's noise beside it."""
     return team_task(load("utias"), dataset=dataset, batch=True, noise="profile")
 
 

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from sim.experiments import downs_printed
+from sim.experiments.accuracy_utias import team_on
 from sim.experiments.downs_joined import his_protocol, spherical_task, whole_run_task
 from sim.experiments.downs_simulated import (
     SIMULATED_5_1,
@@ -223,7 +224,8 @@ def _spherical(options: Options, dataset: Dataset) -> Task:
 
 
 def _team(options: Options, dataset: Dataset) -> Task:
-    return team_task(_profile(options), dataset=dataset)
+    """Whole sets as in `accuracy`: the same runs."""
+    return team_task(_profile(options), dataset=dataset) if options.quick else team_on(dataset)
 
 
 def _singles(options: Options, dataset: Dataset) -> list[Task]:

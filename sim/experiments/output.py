@@ -24,7 +24,7 @@ th:first-child, td:first-child { text-align: left; }
 img { max-width: 100%; }
 figure { margin: 1.5rem 0; }
 figcaption, .note { color: #555; font-size: 90%; }
-nav a { margin-right: 1rem; line-height: 2; }
+nav a { margin-right: 1rem; line-height: 2; white-space: nowrap; }
 summary { cursor: pointer; }
 .kinds td { text-align: left; font-size: 85%; vertical-align: top; }
 """

@@ -124,10 +124,11 @@ class _Drawing:
         columns = min(2, len(shots))
         picture = figure(6.5 * columns, 6.3 * -(-len(shots) // columns) + 0.5)
         grid = picture.subplots(-(-len(shots) // columns), columns, squeeze=False)
-        for axis, shot in zip(grid.ravel(), shots, strict=True):
+        for k, (axis, shot) in enumerate(zip(grid.ravel(), shots, strict=True)):
             _draw(axis, shot, np.array(self.run["landmarks"]))
             error = "" if shot["rmse_m"] is None else f", landmark RMSE {shot['rmse_m']:.2f} m"
-            axis.set_title(f"step {shot['step']}{error}", fontsize=10)
+            letter = f"({chr(ord('a') + k)}) " if len(shots) > 1 else ""
+            axis.set_title(f"{letter}step {shot['step']}{error}", fontsize=10)
         handles = grid[0, 0].get_legend_handles_labels()
         picture.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
         picture.suptitle(self.title)
