@@ -39,7 +39,7 @@ ENTRIES = (
     Entry("xu-4.2", "xu_maps:FIGURE_4_2", "Thesis: the map of FastSLAM.", 1, 1),
     Entry("xu-4.3", "xu_maps:FIGURE_4_3", "Thesis: the map of Hybrid-SLAM.", 1, 1),
     Entry("xu-4.4", "xu_errors:FIGURE_4_4", "Thesis: pose error of EKF, FastSLAM, Hybrid."),
-    Entry("xu-4.5", "xu_errors:FIGURE_4_5", "Thesis: paths under low and high odometry noise."),
+    Entry("xu-4.5", "xu_maps:FIGURE_4_5", "Thesis: paths under low and high odometry noise."),
     Entry("xu-4.6", "xu_errors:FIGURE_4_6", "Thesis: error of the first landmark over time."),
     Entry("xu-5.1", "xu_maps:FIGURE_5_1", "Thesis: the two robots' map at four steps.", 1, 1),
     Entry("xu-5.2", "xu_errors:FIGURE_5_2", "Thesis: pose error, one robot against two."),

@@ -1,14 +1,16 @@
 """Figures 4.1 to 4.3 and 5.1 of W. Xu's thesis: maps of one run, with the paths so far."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sim.experiments import xu_errors
 from sim.experiments.drawing import draw_map, figure, ruled, sampled, spread
-from sim.experiments.experiment import Options, Outcome, Picture, Results, Table
+from sim.experiments.experiment import Options, Outcome, Picture, Results, Table, combined
 from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
 from sim.experiments.xu import (
@@ -21,6 +23,7 @@ from sim.experiments.xu import (
     OUR_TEAM,
     OURS,
     STEP_S,
+    ErrorFigure,
     Method,
     Panel,
     Reading,
@@ -30,6 +33,9 @@ from sim.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
+
+
+STEPS = 500
 
 
 class MapFigure(NamedTuple):
@@ -136,20 +142,73 @@ class _Drawing:
 
 
 def _draw(axis: "Axes", shot: Figures, landmarks: np.ndarray) -> None:
+    axis.plot(*landmarks.T, linestyle="", marker="x", color="#C00000", label="true landmarks")
+    draw_map(axis, shot["means"], shot["blocks"])
+    _draw_paths(axis, shot)
+
+
+def _draw_paths(axis: "Axes", shot: Figures) -> None:
     for i, (name, lines) in enumerate(shot["paths"].items()):
         colour = ROBOT_COLOURS[i % len(ROBOT_COLOURS)]
         for kind, each, width in (("truth", TRUTH_COLOUR, 0.8), ("online", colour, 1.4)):
             points = np.array(lines[kind]).reshape(-1, 2)
-            label = f"{name}, online" if kind == "online" else None
+            label = f"{name}, online" if kind == "online" else "true path" if not i else None
             axis.plot(points[:, 0], points[:, 1], color=each, linewidth=width, label=label)
-    axis.plot(*landmarks.T, linestyle="", marker="x", color="#C00000", label="true landmarks")
-    draw_map(axis, shot["means"], shot["blocks"])
     axis.set_xlim(-10, 110)
     axis.set_ylim(-10, 110)
     axis.set_aspect("equal")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")
     ruled(axis)
+
+
+class PathFigure(NamedTuple):
+    """Figure 4.5: paths of one run, without landmarks as in the source, beside the errors."""
+
+    errors: ErrorFigure
+
+    def tasks(self, options: Options) -> list[Task]:
+        """The error figure's runs, and one of each panel and method to be drawn."""
+        drawn = [
+            self._run(panel, method, options)
+            for panel in self.errors.panels
+            for method in panel.methods
+        ]
+        return self.errors.tasks(options) + drawn
+
+    def outcome(self, options: Options, results: Results) -> Outcome:
+        """A picture of the paths for each panel, then the errors."""
+        pictures = []
+        for panel in self.errors.panels:
+            runs = [
+                (method, results.of(self._run(panel, method, options))) for method in panel.methods
+            ]
+            drawn = [(method.name, run["shots"][0]) for method, run in runs if run is not None]
+            if drawn:
+                name = f"paths-{panel.name.partition(',')[0].replace(' ', '-')}"
+                caption = (
+                    f"As figure 4.5, paths: {panel.name}, seed {options.seeds[0]}; grey: the truth."
+                )
+                pictures.append(
+                    Picture(name, caption, partial(_draw_side_by_side, panel.name, drawn))
+                )
+        errors = self.errors.outcome(options, results)
+        return combined(errors.title, (Outcome(errors.title, {}, pictures=tuple(pictures)), errors))
+
+    def _run(self, panel: Panel, method: Method, options: Options) -> Task:
+        return curves_of(panel, method, options.seeds[0], (STEPS,))
+
+
+def _draw_side_by_side(title: str, drawn: Sequence[tuple[str, Figures]], path: Path) -> None:
+    picture = figure(5.2 * len(drawn), 5.8)
+    row = picture.subplots(1, len(drawn), squeeze=False)[0]
+    for axis, (name, shot) in zip(row, drawn, strict=True):
+        _draw_paths(axis, shot)
+        axis.set_title(name, fontsize=11)
+    handles = row[0].get_legend_handles_labels()
+    picture.legend(*handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    picture.suptitle(f"Thesis, figure 4.5: {title}")
+    picture.savefig(path, dpi=110)
 
 
 _READ: Mapping[Reading, str] = {
@@ -168,28 +227,29 @@ _ROBOT_1 = (
 FIGURE_4_1 = MapFigure(
     "Thesis, figure 4.1",
     ((EKF, "stated"), (EKF, "coded"), (OURS, "stated")),
-    (500,),
+    (STEPS,),
     (_PRINTED, _ROBOT_1),
 )
 FIGURE_4_2 = MapFigure(
     "Thesis, figure 4.2",
     ((FASTSLAM, "stated"), (FASTSLAM, "coded"), (OURS, "stated")),
-    (500,),
+    (STEPS,),
     (_PRINTED, _ROBOT_1),
 )
 FIGURE_4_3 = MapFigure(
     "Thesis, figure 4.3",
     ((HYBRID, "stated"), (HYBRID_CODED, "coded"), (OURS, "stated")),
-    (500,),
+    (STEPS,),
     (_PRINTED,),
 )
 FIGURE_5_1 = MapFigure(
     "Thesis, figure 5.1",
     ((MULTI_HYBRID, "stated"), (MULTI_CODED, "coded"), (OUR_TEAM, "stated")),
-    (20, 100, 200, 500),
+    (20, 100, 200, STEPS),
     (
         _PRINTED,
         "As written, the ellipses shrink to nothing far from the true landmarks: each exchange "
         "counts every reading again.",
     ),
 )
+FIGURE_4_5 = PathFigure(xu_errors.FIGURE_4_5)
