@@ -74,9 +74,9 @@ FIGURE_4_5 = ErrorFigure(
     (
         "The thesis pairs 50 cm with 3° as the high noise and 5 cm with 10° as the low one; meant "
         "are, by its words of a low and a high level of each, 50 cm with 10° and 5 cm with 3°. "
-        "Both pairings are here. It prints paths and no figures. Its text has FastSLAM fail at high "
-        "noise and Hybrid not: with the noise in the odometry Hybrid as written is no better than "
-        "FastSLAM at the noise that is printed as high.",
+        "Both pairings are here. It prints paths and no figures. Its text has FastSLAM fail at "
+        "high noise and Hybrid not: with the noise in the odometry Hybrid as written has the "
+        "smoother path, as it says, but is no better at the noise that is printed as high.",
         _FORGETS,
     ),
 )  # fmt: skip
