@@ -1,0 +1,39 @@
+"""Real data of which only one start pose is declared: the team finds together all the same."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from sim.evaluation.evaluation import evaluate
+from sim.experiments.accuracy_starts import WRONG_CHI2, unknown_starts
+from sim.experiments.team_runs import Figures, team_figures
+from sim.in_memory.team import run_team
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.scenario.source import streams_of
+from sim.world.worlds import UtiasWorld
+
+SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
+
+
+def slice_of_set_6() -> Scenario:
+    """Its first 100 s, with poses once a window: nothing here judges the running ones."""
+    scenario = with_options(load("utias"), dataset=SET_6)
+    assert isinstance(scenario.world, UtiasWorld)
+    world = msgspec.structs.replace(scenario.world, duration_s=100.0)
+    robots = tuple(msgspec.structs.replace(robot, pose_s=60.0) for robot in scenario.robots)
+    return msgspec.structs.replace(scenario, world=world, robots=robots)
+
+
+def figures(scenario: Scenario) -> Figures:
+    return team_figures(evaluate(run_team(scenario, streams_of(scenario))))
+
+
+@pytest.mark.skipif(not SET_6.exists(), reason="the data set is not here: it is not shipped")
+def test_one_declared_start_gives_the_map_that_five_give_and_joins_nobody_wrongly() -> None:
+    declared = figures(slice_of_set_6())
+    found = figures(unknown_starts(slice_of_set_6()))
+    assert found["not_joined"] == []
+    assert all(each["first_pose_chi2"] < WRONG_CHI2 for each in found["robots"].values())
+    assert found["landmarks"] == declared["landmarks"]
+    assert found["rmse_aligned"] == pytest.approx(declared["rmse_aligned"], rel=0.1)
