@@ -16,7 +16,7 @@ from team.config import Estimator, FusionRule
 from team.pairs import PAIRS
 
 WORLDS = ("thesis", "thesis-b")
-MOST_SEEDS = 15
+MOST_SEEDS = 12
 """The methods differ by factors, and there are two dozen pairs of a second or two each."""
 PARTICLES = (50, 200, 1000)
 SHOWN: Shown = (
