@@ -30,6 +30,7 @@ SHOWN: Shown = (
     ("nees", "NEES/dof", "{:.3g}"),
     ("in_band", "in band", "{:.0%}"),
     ("not_joined", "not joined", "{:.0f}"),
+    ("withdrawn", "withdrawn", "{:.0f}"),
 )
 
 
@@ -47,7 +48,8 @@ def outcome(options: Options, results: Results) -> Outcome:
         for kind in KINDS:
             runs = results.of_all(_tasks(world, kind, options))
             of_kind = over_seeds(runs)
-            of_kind["not_joined"] = sum(bool(run["not_joined"]) for run in runs)
+            for name in ("not_joined", "withdrawn"):
+                of_kind[name] = sum(bool(run[name]) for run in runs)
             of_world[NAMES[kind]] = of_kind
         clean = of_world[NAMES["drop"]].get("rmse_aligned")
         for kind in KINDS[1:]:
@@ -56,6 +58,8 @@ def outcome(options: Options, results: Results) -> Outcome:
             of_kind["ratio_clean"] = aligned / clean if aligned and clean else None
             name = f"{world}, 30 % {NAMES[kind]}: ratio_clean"
             goals.append(Goal(name, of_kind["ratio_clean"], 0.0, MOST_RATIO))
+            withdrawn = float(of_kind["withdrawn"]) if of_kind["seeds"] else None
+            goals.append(Goal(f"{world}, 30 % {NAMES[kind]}: withdrawn", withdrawn, 0.0, 0.0))
         figures[world] = of_world
     rows = tuple(
         (f"{world}, {name}", *cells_of(of_kind, SHOWN))
@@ -66,7 +70,7 @@ def outcome(options: Options, results: Results) -> Outcome:
         f"30 % garbage, {len(options.seeds[:MOST_SEEDS])} seeds",
         ("world", *(heading for _, heading, _ in SHOWN)),
         rows,
-        "not joined: runs in which a robot is missing in the final map",
+        "not joined, withdrawn: runs in which a robot, all of them good, is not in the final map",
     )
     return Outcome("garbage", {"garbage": figures}, (table,), goals=tuple(goals))
 
