@@ -48,6 +48,7 @@ class MapResult:
 
     truth: the true positions, rows without truth zero; known: which rows have it. errors: of those.
     payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
+    withdrawn: the robots that the map goes without.
     """
 
     rule: str
@@ -64,6 +65,7 @@ class MapResult:
     cost_per_dof: float | None
     reasons: tuple[str, ...]
     joined: tuple[str, ...] = ()
+    withdrawn: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -188,6 +190,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "final_map_frame": None if fused is None else fused.frame,
         "not_joined": [] if fused is None else list(fused.reasons),
         "joined": [] if fused is None else list(fused.joined),
+        "withdrawn": [] if fused is None else list(fused.withdrawn),
         "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},
         "channels": {
             key: {"messages": traffic.messages, "bytes": traffic.bytes}
@@ -274,6 +277,7 @@ def _map_result(
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
         reasons=message.reasons,
         joined=message.joined,
+        withdrawn=message.withdrawn,
     )
 
 
