@@ -172,9 +172,8 @@ class MemoryBus:
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """Everything that has arrived; a memory bus never waits."""
-        samples = list(self._arrived)
-        self._arrived.clear()
-        return samples
+        arrived = self._arrived  # one by one: another thread may be publishing
+        return [arrived.popleft() for _ in range(len(arrived))]
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answer queries, within `ask`."""

@@ -87,7 +87,7 @@ def test_without_pyarrow_the_command_says_what_to_install(
     monkeypatch.undo()
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
-    assert "odometry.parquet: 1 rows" in done.output
+    assert "odometry.parquet: 1 row\n" in done.output
 
 
 def test_paths_are_exported_and_a_log_without_any_says_so(tmp_path: Path) -> None:

@@ -42,13 +42,14 @@ class Centre(threading.Thread):
 
 
 def ordered(monkeypatch: pytest.MonkeyPatch, robot: str = "r3", **answer: object) -> Centre:
-    monkeypatch.setattr(orders, "CENTRE_S", 1.0)
+    """An order that is given; one that is answered may take its time, the others are given up."""
+    monkeypatch.setattr(orders, "CENTRE_S", 30.0 if robot == "r3" else 1.0)
     network = MemoryNetwork()
     reply = msgspec.structs.replace(FUSED, **answer) if answer else None
     centre = Centre(network, reply)
     centre.start()
     try:
-        withdraw(MemoryBus(network), robot, "a flat wheel", 1.0)
+        withdraw(MemoryBus(network), robot, "a flat wheel", 30.0 if answer else 1.0)
         wait_until(lambda: bool(centre.orders), what="the order")
     finally:
         centre.over.set()
