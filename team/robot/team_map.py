@@ -34,5 +34,5 @@ class TeamMap:
             self._submaps = first
         pending = submaps[self._submaps :]
         self._whole = followed(self._whole, (self._shared.taken(each) for each in pending))
-        self._submaps = len(submaps)
+        self._submaps += len(pending)  # the prior may have more than a robot that has come back
         return self._whole
