@@ -91,14 +91,22 @@ def figure(width: float, height: float) -> "Figure":
 
 
 def draw_map(
-    axis: "Axes", means: Sequence[Sequence[float]], blocks: Sequence[Any], colour: str = MAP_COLOUR
+    axis: "Axes",
+    means: Sequence[Sequence[float]],
+    blocks: Sequence[Any],
+    colour: str = MAP_COLOUR,
+    label: str | None = None,
 ) -> None:
-    """Landmarks as dots with their 95 % ellipses. blocks: a 2 × 2 covariance each [m²]."""
+    """Landmarks as dots with their 95 % ellipses. blocks: a 2 × 2 covariance each [m²].
+
+    label: of the dots, in a legend.
+    """
     from matplotlib.patches import Ellipse
 
+    dots = np.array(means, dtype=np.float64).reshape(-1, 2)
+    axis.plot(*dots.T, linestyle="", marker=".", color=colour, zorder=5, label=label)
     for mean, block in zip(means, blocks, strict=True):
         width, height, turn_deg = ellipse_of(np.array(block))
-        axis.plot(*mean, marker=".", color=colour, zorder=5)
         axis.add_patch(
             Ellipse((mean[0], mean[1]), width, height, angle=turn_deg, fill=False,
                     edgecolor=colour, zorder=5)

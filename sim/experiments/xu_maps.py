@@ -1,10 +1,9 @@
 """Figures 4.1 to 4.3 and 5.1 of W. Xu's thesis: maps of one run, with the paths so far."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -68,12 +67,7 @@ class MapFigure(NamedTuple):
             if run is None:
                 continue
             said = _named(method, reading)
-            name = said.replace(" ", "-").replace(",", "").lower()
-            caption = (
-                f"{self.title}: {said}, seed {options.seeds[0]}. Ellipses hold 95 % of "
-                "what the map believes; crosses are the true landmarks, grey the true paths."
-            )
-            pictures.append(Picture(name, caption, _Drawing(f"{self.title}: {said}", run)))
+            pictures += self._pictures(said, run, options.seeds[0])
             runs = results.of_all([_run(method, reading, seed) for seed in options.seeds])
             curves = [each["map"] for each in runs if each["map"]["time_s"]]
             times = STEP_S * np.array(self.steps, dtype=np.float64)
@@ -98,6 +92,22 @@ class MapFigure(NamedTuple):
     def _drawn(self, method: Method, reading: Reading, options: Options) -> Task:
         return _run(method, reading, options.seeds[0], self.steps)
 
+    def _pictures(self, said: str, run: Figures, seed: int) -> list[Picture]:
+        """One for each step, lettered as in the source where there are several."""
+        name = said.replace(" ", "-").replace(",", "").lower()
+        pictures = []
+        for k, shot in enumerate(run["shots"]):
+            letter = chr(ord("a") + k) if len(self.steps) > 1 else ""
+            title = f"{self.title}{f' ({letter})' if letter else ''}: {said}"
+            caption = (
+                f"{title}, seed {seed}, step {shot['step']}. Ellipses hold 95 % of what the map "
+                "believes; crosses are the true landmarks, grey the true paths."
+            )
+            file = f"{name}-{letter}-step-{shot['step']}" if letter else name
+            drawing = partial(_draw_shot, title, shot, run["landmarks"])
+            pictures.append(Picture(file, caption, drawing))
+        return pictures
+
 
 def _run(method: Method, reading: Reading, seed: int, shots: tuple[int, ...] = ()) -> Task:
     return curves_of(Panel(_READ[reading], (method,), {}, reading=reading), method, seed, shots)
@@ -119,31 +129,21 @@ def _cell(of_step: Figures) -> str:
     return f"{run} ({of_step['median']:.2f}; {of_step['p10']:.2f} … {of_step['p90']:.2f})"
 
 
-@dataclass(frozen=True)
-class _Drawing:
-    title: str
-    run: Figures
-
-    def __call__(self, path: Path) -> None:
-        """One panel for each step."""
-        shots = self.run["shots"]
-        columns = min(2, len(shots))
-        picture = figure(6.5 * columns, 6.3 * -(-len(shots) // columns) + 0.5)
-        grid = picture.subplots(-(-len(shots) // columns), columns, squeeze=False)
-        for k, (axis, shot) in enumerate(zip(grid.ravel(), shots, strict=True)):
-            _draw(axis, shot, np.array(self.run["landmarks"]))
-            error = "" if shot["rmse_m"] is None else f", landmark RMSE {shot['rmse_m']:.2f} m"
-            letter = f"({chr(ord('a') + k)}) " if len(shots) > 1 else ""
-            axis.set_title(f"{letter}step {shot['step']}{error}", fontsize=10)
-        handles = grid[0, 0].get_legend_handles_labels()
-        picture.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-        picture.suptitle(self.title)
-        picture.savefig(path, dpi=110)
+def _draw_shot(title: str, shot: Figures, landmarks: Sequence[Any], path: Path) -> None:
+    picture = figure(6.5, 6.8)
+    axis = picture.subplots()
+    _draw(axis, shot, np.array(landmarks))
+    error = "" if shot["rmse_m"] is None else f", landmark RMSE {shot['rmse_m']:.2f} m"
+    axis.set_title(f"step {shot['step']}{error}", fontsize=10)
+    handles = axis.get_legend_handles_labels()
+    picture.legend(*handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    picture.suptitle(title)
+    picture.savefig(path, dpi=110)
 
 
 def _draw(axis: "Axes", shot: Figures, landmarks: np.ndarray) -> None:
     axis.plot(*landmarks.T, linestyle="", marker="x", color="#C00000", label="true landmarks")
-    draw_map(axis, shot["means"], shot["blocks"])
+    draw_map(axis, shot["means"], shot["blocks"], label="map, 95 %")
     _draw_paths(axis, shot)
 
 
