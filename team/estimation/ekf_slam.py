@@ -15,6 +15,7 @@ from team.estimation import ekf_kernel
 from team.estimation.fastslam_kernel import slots_of
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
+from team.estimation.innovation import Innovation, joint_innovation
 from team.estimation.models import Increment, variances
 from team.estimation.submap import LocalMap
 
@@ -68,6 +69,20 @@ def stepped(
         variances(sensor),
     )
     return EkfSlam(ids_after, mean, P)
+
+
+def innovation(
+    state: EkfSlam,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """Of the readings that `stepped` would take; of landmarks that are known already."""
+    return joint_innovation(
+        state.ids, state.mean, state.covariance, increment, sensor, ids, ranges, bearings
+    )
 
 
 def pose_gaussian(state: EkfSlam) -> PoseGaussian:

@@ -18,7 +18,14 @@ from team.estimation.fastslam_kernel import semidefinite_factor, slots_of
 from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import compose, wrapped
 from team.estimation.landmark_kernel import Triple, seen
-from team.estimation.models import Increment, variances
+from team.estimation.models import (
+    Increment,
+    landmark_jacobian,
+    noise,
+    pose_jacobian,
+    predicted,
+    variances,
+)
 
 
 class Innovation(NamedTuple):
@@ -80,6 +87,55 @@ def innovation(
         np.column_stack((ranges, bearings))[known],
         variances(sensor),
     )
+    return _squared(error, S)
+
+
+def joint_innovation(
+    landmarks: UInt32[np.ndarray, " L"],
+    mean: Float[np.ndarray, " N"],
+    covariance: Float[np.ndarray, "N N"],
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """As `innovation`, of one Gaussian over the pose and the landmarks, such as that of an EKF.
+
+        S = A P Aᵀ + Hₓ Q Hₓᵀ + R,  A = (Hₓ Gᵀ F, Hₗ),
+
+    F = ∂(pose ∘ mean)/∂pose, and G = blkdiag(R(θ'), 1) turns the tangent of the predicted pose into
+    (x, y, θ). mean: (x, y, θ) and the position of each of `landmarks`, N = 3 + 2 L.
+    """
+    _, at, _ = slots_of(landmarks, ids)
+    known = at < len(landmarks)
+    if not known.any():
+        return NOTHING
+    read, slots = np.unique(at[known], return_inverse=True)
+    columns = np.concatenate((np.arange(3), (3 + 2 * read[:, None] + np.arange(2)).ravel()))
+    places = mean[columns[3:]].reshape(-1, 2)
+    pose = compose(mean[:3], increment.mean)
+    dx, dy = pose[:2] - mean[:2]
+    F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    to_own = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ F
+    m = 2 * len(slots)
+    error, A, H = np.empty(m), np.zeros((m, len(columns))), np.empty((m, 3))
+    R = np.empty(m)
+    readings = np.column_stack((ranges, bearings))[known]
+    for k, slot in enumerate(slots):
+        rows = slice(2 * k, 2 * k + 2)
+        distance, bearing = predicted(pose, places[slot])
+        error[rows] = readings[k, 0] - distance, wrapped(readings[k, 1] - bearing)
+        R[rows] = noise(sensor, distance)
+        H[rows] = pose_jacobian(distance, bearing)
+        A[rows, :3] = H[rows] @ to_own
+        A[rows, 3 + 2 * slot : 5 + 2 * slot] = landmark_jacobian(distance, pose[2] + bearing)
+    S = A @ covariance[np.ix_(columns, columns)] @ A.T + H @ increment.covariance @ H.T + np.diag(R)
+    return _squared(error, S)
+
+
+def _squared(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> Innovation:
     L = cholesky_factor(S, "the prediction of readings")
     whitened = solve_triangular(L, error, lower=True)
     return Innovation(float(whitened @ whitened), len(error))

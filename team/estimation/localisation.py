@@ -13,10 +13,12 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.config import Sensor
 from team.estimation import fastslam
+from team.estimation import innovation as innovations
 from team.estimation.compiled import compiled
 from team.estimation.fastslam import Particles
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose, wrapped
+from team.estimation.innovation import Innovation
 from team.estimation.landmark_kernel import Triple, seen
 from team.estimation.models import Increment, variances
 from team.estimation.plain_fastslam import pose_moments
@@ -95,6 +97,29 @@ def stepped(
     )
     log_weights, _ = fastslam.normalised(log_weights)
     return replace(state, cloud=replace(cloud, log_weights=log_weights))
+
+
+def innovation(
+    state: Localisation,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """Of the readings that `stepped` would take, where the map is exact.
+
+    A cloud of several modes predicts a broad mixture, so it says little, as its Gaussian does.
+    """
+    read = np.isin(state.ids, ids)
+    count, known = len(state.cloud.poses), int(read.sum())
+    on_map = replace(
+        state.cloud,
+        ids=state.ids[read],
+        means=np.tile(state.landmarks[read], (count, 1, 1)),
+        covariances=np.zeros((count, known, 3)),
+    )
+    return innovations.innovation(on_map, increment, sensor, ids, ranges, bearings)
 
 
 def pose_gaussian(state: Localisation) -> PoseGaussian:

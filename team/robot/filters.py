@@ -12,6 +12,7 @@ from team.config import Estimator, RobotConfig, Sensor
 from team.estimation import (
     dead_reckoning,
     ekf_slam,
+    fastslam,
     hybrid_thesis,
     hybrid_thesis_coded,
     localisation,
@@ -20,6 +21,7 @@ from team.estimation import (
 from team.estimation.fastslam import Particles, Proposal
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.hybrid_thesis_coded import CodedState
+from team.estimation.innovation import NOTHING, Innovation, innovation
 from team.estimation.localisation import Localisation
 from team.estimation.models import Increment
 from team.estimation.plain_fastslam import PlainFastSlam
@@ -51,6 +53,7 @@ Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray]
 """The motion since the last epoch; landmark ids, ranges [m] and bearings [rad] at its end."""
 Begun = Callable[[RobotConfig, Start, np.random.Generator], Any]
 Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
+Judged = Callable[[Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray], Innovation]
 
 
 class Filter(NamedTuple):
@@ -58,13 +61,14 @@ class Filter(NamedTuple):
 
     looks: it takes landmarks; maps: it has a map of its own. joint: with the covariance between
     landmarks. absorbed: the state with these landmarks in place of its own. particles: those of a
-    state, for viewers.
+    state, for viewers. innovation: of a step's readings, as the state before it predicts them.
     """
 
     begun: Begun
     stepped: Stepped
     pose: Callable[[Any], PoseGaussian]
     landmarks: Callable[[Any], LandmarkGaussian]
+    innovation: Judged
     absorbed: Callable[[Any, np.ndarray, np.ndarray, Matrix], Any] | None = None
     used: str = IN_MAP
     looks: bool = True
@@ -114,6 +118,21 @@ def _thesis_stepped(
     return hybrid_thesis.stepped(
         state, increment, config.sensor, ids, ranges, bearings, particles, generator
     )
+
+
+def _thesis_before(state: hybrid_thesis.ThesisState) -> Particles:
+    """All that its next step knows: the mean pose, and landmarks that do not depend on it."""
+    blocks = state.covariances
+    triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
+    at = fastslam.at_poses(state.pose[np.newaxis])
+    return replace(
+        at, ids=state.ids, means=state.landmarks[np.newaxis], covariances=triangles[np.newaxis]
+    )
+
+
+def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
+    """The innovation against the particles of a state."""
+    return lambda state, *readings: innovation(particles(state), *readings)
 
 
 def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
@@ -182,6 +201,7 @@ def _plain(proposal: Proposal) -> Filter:
         _random(plain_fastslam.stepped),
         plain_fastslam.pose_gaussian,
         plain_fastslam.landmark_gaussian,
+        _of_particles(lambda state: state.particles),
         particles=lambda state: state.particles,
     )
 
@@ -215,6 +235,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         *_exact(dead_reckoning.begun, dead_reckoning.stepped),
         dead_reckoning.pose_gaussian,
         dead_reckoning.landmark_gaussian,
+        lambda *readings: NOTHING,
         used=IN_POSE,
         looks=False,
         maps=False,
@@ -224,6 +245,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         _random(localisation.stepped),
         localisation.pose_gaussian,
         lambda state: NO_LANDMARKS,  # it was told its map, so there is nothing to say of one
+        localisation.innovation,
         used=IN_POSE,
         maps=False,
     ),
@@ -231,6 +253,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         *_exact(ekf_slam.begun, ekf_slam.stepped),
         ekf_slam.pose_gaussian,
         ekf_slam.landmark_gaussian,
+        ekf_slam.innovation,
     ),
     "fastslam1": _plain("fastslam1"),
     "fastslam2": _plain("fastslam2"),
@@ -239,6 +262,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         _thesis_stepped,
         lambda state: PoseGaussian(state.pose, state.pose_covariance),
         _thesis_landmarks,
+        _of_particles(_thesis_before),
         _thesis_absorbed,
         joint=False,
     ),
@@ -247,6 +271,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         _random(hybrid_thesis_coded.stepped),
         hybrid_thesis_coded.pose_gaussian,
         hybrid_thesis_coded.landmark_gaussian,
+        _of_particles(lambda state: state.particles),
         _coded_absorbed,
         joint=False,
     ),

@@ -68,12 +68,14 @@ class Driven:
     """What an odometry interval gave: a submap; the stamps of a new running pose and map.
 
     cloud: the particles at map_ns of an estimator that keeps them over the whole stream.
+    judged: how well such an estimator predicted what it read since it last said so, and when.
     """
 
     closed: ClosedWindow | None = None
     pose_ns: int | None = None
     map_ns: int | None = None
     cloud: Cloud | None = None
+    judged: tuple[Innovation, int] | None = None
 
     @classmethod
     def with_submap(cls, closed: ClosedWindow) -> Self:

@@ -21,8 +21,7 @@ class Member(Protocol):
     """One epoch of a robot's stream: readings in, submaps, running poses and maps out.
 
     sequence: by what its running poses and maps are named. used: the disposition of a reading that
-    it takes. joint: whether its map has a joint covariance. innovation: of what it predicted, where
-    it keeps that.
+    it takes. joint: whether its map has a joint covariance. innovation: of all that it predicted.
     """
 
     sequence: int

@@ -295,6 +295,9 @@ class RobotNode:
         if driven.closed is not None:
             return self._send(driven.closed)
         out = self._poses(driven.pose_ns)
+        if driven.judged is not None:
+            judged, stamp_ns = driven.judged
+            out.append(self._speaker.innovation(stamp_ns, self._member.sequence, judged))
         if driven.map_ns is None:
             return out
         out += self._speaker.cloud(driven.map_ns, driven.cloud)
@@ -304,7 +307,7 @@ class RobotNode:
         self._locals.append(closed.local)
         out = self._held.put([*self._sightings(closed), self._speaker.submap(closed)])
         out += self._speaker.cloud(closed.end_ns, closed.cloud)
-        out.append(self._speaker.innovation(closed))
+        out.append(self._speaker.innovation(closed.end_ns, closed.sequence, closed.innovation))
         self._gated += closed.gated
         out += self._poses(closed.end_ns)
         out += self._mapped(closed.end_ns)

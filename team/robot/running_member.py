@@ -38,6 +38,8 @@ class RunningMember:
         self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
         self._generator = generator(config.seed, config.id, epoch, 0)
         self._map_ns: int | None = None
+        self._innovation = NOTHING
+        self._unsaid = NOTHING
         self._state: Any = self._begun(np.zeros(3), None)
         self.sequence = 0
         self.last_epoch_ns: int | None = None
@@ -54,8 +56,8 @@ class RunningMember:
 
     @property
     def innovation(self) -> Innovation:
-        """It keeps none."""
-        return NOTHING
+        """Of all epochs so far."""
+        return self._innovation.plus(self._unsaid)
 
     def start(self, pose: Float[np.ndarray, "3"] | None, covariance: Matrix | None) -> None:
         """The start pose, if it is known; without one the map's frame is the start itself."""
@@ -102,11 +104,16 @@ class RunningMember:
         now_ns = self.last_epoch_ns
         if now_ns is None or self._map_ns is None:
             return Driven()
-        due = last or now_ns - self._map_ns >= self._map_every_ns
+        pose_ns = now_ns if self.sequence > before else None
         fresh = self.sequence > before or (last and now_ns != self._map_ns)
-        map_ns = now_ns if self._filter.maps and fresh and due else None
-        self._map_ns = self._map_ns if map_ns is None else map_ns
-        return Driven(None, now_ns if self.sequence > before else None, map_ns, self._cloud(map_ns))
+        if not fresh or not (last or now_ns - self._map_ns >= self._map_every_ns):
+            return Driven(None, pose_ns)
+        self._map_ns = now_ns
+        judged, self._unsaid = self._unsaid, NOTHING
+        self._innovation = self._innovation.plus(judged)
+        map_ns = now_ns if self._filter.maps else None
+        said = (judged, now_ns) if judged.dof else None
+        return Driven(None, pose_ns, map_ns, self._cloud(map_ns), said)
 
     def _cloud(self, map_ns: int | None) -> Cloud | None:
         """The particles, where there are any and a map is said."""
@@ -122,6 +129,10 @@ class RunningMember:
         ranges: np.ndarray,
         bearings: np.ndarray,
     ) -> None:
+        judged = self._filter.innovation(
+            self._state, increment, self._config.sensor, ids, ranges, bearings
+        )
+        self._unsaid = self._unsaid.plus(judged)
         self._state = self._filter.stepped(
             self._state, self._config, (increment, ids, ranges, bearings), self._generator
         )

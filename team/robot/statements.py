@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from team import translate
 from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.innovation import Innovation
 from team.estimation.sighting import Sighting
 from team.robot.member import ClosedWindow, Cloud
 from team.stream.pose_grid import NodeSighting
@@ -62,11 +63,9 @@ class Speaker:
         message = m.ParticleCloud(stamp_ns, self.robot, poses, weights)
         return [Outgoing(ch.PARTICLES, self.robot, message)]
 
-    def innovation(self, closed: ClosedWindow) -> Outgoing:
-        """How well the window's readings were predicted."""
-        message = m.Innovation(
-            closed.end_ns, self.robot, self.epoch, closed.sequence, *closed.innovation
-        )
+    def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
+        """How well the readings of a window, or since the last of these, were predicted."""
+        message = m.Innovation(stamp_ns, self.robot, self.epoch, sequence, *found)
         return Outgoing(ch.INNOVATION, self.robot, message)
 
     def own_map(

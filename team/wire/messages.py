@@ -297,7 +297,8 @@ class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovatio
     """Σ νᵀ S⁻¹ ν of a window's readings against their prediction; χ² where the models are right.
 
     dof: its degrees of freedom, two for each reading of a landmark that the window knew already.
-    (robot, epoch, sequence) and stamp_ns are those of the window's submap.
+    (robot, epoch, sequence) and stamp_ns are those of the window's submap; an estimator over the
+    whole stream says it of the readings since the last of these, named by its epochs so far.
     """
 
     robot: Name

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from team.config import Sensor
 from team.estimation import ekf_slam
+from team.estimation import innovation as innovations
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.ekf_slam import EkfSlam
 from team.estimation.gaussian import cholesky_factor
@@ -80,9 +81,10 @@ def textbook(state, motion, slots, readings):
     innovation[1::2] = wrap(innovation[1::2])
     K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
     A = np.eye(len(mean)) - K @ H
+    squared = innovation @ np.linalg.solve(H @ P @ H.T + R, innovation)
     mean = mean + K @ innovation
     mean[2] = wrap(mean[2])
-    return mean, A @ P @ A.T + K @ R @ K.T
+    return mean, A @ P @ A.T + K @ R @ K.T, squared
 
 
 @quick
@@ -95,7 +97,10 @@ def test_a_step_is_the_textbooks_with_all_readings_of_the_epoch_at_once(seed):
     readings = [observed(there, k) + rng.normal(scale=[0.2, 0.03]) for k in slots]
     z = np.array(readings)
     after = ekf_slam.stepped(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
-    mean, P = textbook(state, motion, slots, readings)
+    mean, P, squared = textbook(state, motion, slots, readings)
+    judged = ekf_slam.innovation(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
+    assert judged.dof == 2 * len(slots)
+    assert judged.squared == pytest.approx(squared, rel=1e-5)
     np.testing.assert_allclose(after.mean, mean, atol=1e-7)
     np.testing.assert_allclose(after.covariance, P, atol=1e-7)
     np.testing.assert_array_equal(after.covariance, after.covariance.T)
@@ -211,12 +216,12 @@ def test_the_map_grows_to_a_thousand_landmarks():
 
 
 def short_run(seed, repeat):
-    """NEES and dof of ten steps among six landmarks, each reading told `repeat` times."""
+    """NEES, NIS and their dofs of ten steps among six landmarks, each reading `repeat` times."""
     rng = np.random.default_rng(seed)
     landmarks = rng.uniform(-12.0, 12.0, (6, 2))
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.005)
     motion = Increment(np.array([0.5, 0.0, 0.15]), np.diag([0.02, 0.01, 0.01]) ** 2)
-    truth, state = np.zeros(3), ekf_slam.begun(np.zeros(3))
+    truth, state, judged = np.zeros(3), ekf_slam.begun(np.zeros(3)), innovations.NOTHING
     for _ in range(10):
         xi = np.array([0.02, 0.01, 0.01]) * rng.standard_normal(3)
         truth = compose(compose(truth, motion.mean), exponential(xi))
@@ -227,17 +232,30 @@ def short_run(seed, repeat):
         z = z + np.array([0.05, 0.005]) * rng.standard_normal(z.shape)
         ids = np.repeat(seen.astype(np.uint32), repeat)
         z = np.repeat(z, repeat, axis=0)
-        state = ekf_slam.stepped(state, motion, sensor, ids, z[:, 0], wrap(z[:, 1]))
+        epoch = ids, z[:, 0], wrap(z[:, 1])
+        judged = judged.plus(ekf_slam.innovation(state, motion, sensor, *epoch))
+        state = ekf_slam.stepped(state, motion, sensor, *epoch)
     local = ekf_slam.local_map(state)
     error = state_error(local.mean, np.concatenate((truth, landmarks[local.ids].ravel())))
-    return nees(error, local.covariance), len(error)
+    return nees(error, local.covariance), len(error), *judged
 
 
-def test_a_short_window_is_consistent_and_one_that_counts_readings_twice_is_not():
+@pytest.mark.parametrize("column", [0, 2], ids=["NEES", "NIS"])
+def test_a_short_window_is_consistent_and_one_that_counts_readings_twice_is_not(column):
     honest, twice = (np.array([short_run(seed, k) for seed in range(200)]) for k in (1, 2))
-    low, high = chi2_interval(int(honest[:, 1].sum()), 0.999, 1)
-    assert low < honest[:, 0].sum() / honest[:, 1].sum() < high
-    assert not low < twice[:, 0].sum() / twice[:, 1].sum() < high
+    for runs, is_right in ((honest, True), (twice, False)):
+        dof = runs[:, column + 1].sum()
+        low, high = chi2_interval(int(dof), 0.999, 1)
+        assert (low < runs[:, column].sum() / dof < high) == is_right
+
+
+def test_what_an_epoch_shows_first_was_not_predicted():
+    state, motion = some_state(np.random.default_rng(3)), some_motion(np.random.default_rng(4))
+    unknown = np.array([91, 92], np.uint32)
+    assert (
+        ekf_slam.innovation(state, motion, SENSOR, unknown, np.ones(2), np.ones(2))
+        == innovations.NOTHING
+    )
 
 
 @pytest.mark.parametrize(("name", "at_least"), [("thesis", 3.0), ("thesis-b", 10.0)])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from team.config import Sensor
 from team.estimation import fastslam, localisation
+from team.estimation import innovation as innovations
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.geometry import compose, exponential, transformed
 from team.estimation.models import Increment
@@ -92,6 +93,11 @@ def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
         truth = compose(truth, MOTION.mean)
         ranges, bearings = sights(truth)
         epoch = (IDS[k % 3 :], ranges[k % 3 :] + 0.2, bearings[k % 3 :] - 0.05)
+        judged = innovations.innovation(particles, MOTION, SENSOR, *epoch)
+        assert judged.dof == 2 * len(epoch[0])
+        assert localisation.innovation(state, MOTION, SENSOR, *epoch).squared == pytest.approx(
+            judged.squared, rel=1e-9
+        )
         state = localisation.stepped(state, MOTION, SENSOR, *epoch, random)
         particles, _ = fastslam.propagated_and_updated(
             particles, MOTION, SENSOR, *epoch, "fastslam1", 0.5, other
@@ -182,8 +188,8 @@ def test_without_readings_the_cloud_spreads_and_stays_equally_weighted():
 
 
 def short_run(seed, repeat):
-    """NEES of the pose after eight steps, each reading told `repeat` times."""
-    random = np.random.default_rng(seed)
+    """NEES of the pose after eight steps and their NIS, each reading told `repeat` times."""
+    random, judged = np.random.default_rng(seed), innovations.NOTHING
     truth, state = np.zeros(3), localisation.begun(np.zeros(3), 1000, IDS, LANDMARKS)
     for _ in range(8):
         xi = np.array([0.1, 0.05, 0.05]) * random.standard_normal(3)
@@ -192,16 +198,20 @@ def short_run(seed, repeat):
         sigma = np.hypot(0.8, 0.02 * ranges)
         ranges = ranges + sigma * random.standard_normal(3)
         bearings = wrap(bearings + 0.15 * random.standard_normal(3))
-        epoch = (np.repeat(part, repeat) for part in (IDS, ranges, bearings))
+        epoch = [np.repeat(part, repeat) for part in (IDS, ranges, bearings)]
+        judged = judged.plus(localisation.innovation(state, MOTION, SENSOR, *epoch))
         state = localisation.stepped(state, MOTION, SENSOR, *epoch, random)
     pose = localisation.pose_gaussian(state)
-    return nees(state_error(pose.mean, truth), pose.covariance)
+    return nees(state_error(pose.mean, truth), pose.covariance), 3, *judged
 
 
-def test_it_is_consistent_and_one_that_counts_readings_twice_is_not():
-    low, high = chi2_interval(3, 0.999, 200)
-    assert low < np.mean([short_run(seed, 1) for seed in range(200)]) / 3.0 < high
-    assert not low < np.mean([short_run(seed, 2) for seed in range(200)]) / 3.0 < high
+@pytest.mark.parametrize("column", [0, 2], ids=["NEES", "NIS"])
+def test_it_is_consistent_and_one_that_counts_readings_twice_is_not(column):
+    for repeat in (1, 2):
+        runs = np.array([short_run(seed, repeat) for seed in range(200)])
+        dof = runs[:, column + 1].sum()
+        low, high = chi2_interval(int(dof), 0.999, 1)
+        assert (low < runs[:, column].sum() / dof < high) == (repeat == 1)
 
 
 @pytest.mark.parametrize("name", ["thesis", "thesis-b"])

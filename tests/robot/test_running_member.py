@@ -9,7 +9,7 @@ from team.estimation import dead_reckoning, ekf_slam, localisation, plain_fastsl
 from team.estimation.gaussian import NO_LANDMARKS
 from team.estimation.models import Increment, corrected, increment_of
 from team.estimation.randomness import generator
-from team.pairs import LOCALISERS, MAPPERS
+from team.pairs import LOCALISERS, MAPPERS, PAIRS, rules_for
 from team.robot.filters import NOTHING_KNOWN, KnownMap
 from team.robot.members import member_of
 from team.robot.node import RobotNode
@@ -23,6 +23,7 @@ STREAM = stream("r1", 12)
 READINGS = published(STREAM)
 KNOWN = KnownMap(np.arange(1, len(LANDMARKS) + 1, dtype=np.uint32), LANDMARKS)
 TOLD = m.KnownMap(0, from_ids(KNOWN.ids), from_floats(KNOWN.landmarks))
+ALL = sorted({estimator for estimator, _ in PAIRS})
 WHOLE = sorted({*MAPPERS, *LOCALISERS} - {"hybrid", "hybrid-thesis"})
 SPREAD = np.diag([0.2, 0.1, 0.02])
 
@@ -123,6 +124,28 @@ def test_a_map_is_said_once_per_window_and_at_the_end():
     ended, _ = member.finish()
     assert ended.map_ns == 11_000_000_000
     assert member.finish()[0].map_ns is None, "the last map has been said"
+
+
+@pytest.mark.parametrize("estimator", ALL)
+def test_a_node_says_how_well_its_readings_were_predicted(estimator):
+    node = RobotNode(config(estimator=estimator, fusion=rules_for(estimator)[-1]))
+    said = of(node.handle(TOLD, 0) + driven(node, READINGS), ch.INNOVATION)
+    if estimator == "dead-reckoning":
+        assert not said, "it predicts no readings"
+        return
+    dof = sum(each.dof for each in said)
+    squared = sum(each.squared for each in said)
+    assert len({(each.epoch, each.sequence) for each in said}) == len(said) >= 4
+    figures = node.status().figures
+    assert figures["nis_dof"] == dof
+    assert figures["nis_per_dof"] == pytest.approx(squared / dof)
+    seen = STREAM.landmark_detections.ids
+    first = 0 if estimator == "localisation" else len(np.unique(seen))
+    predicted = 2 * (len(seen) - first)
+    if estimator == "hybrid":
+        assert 0 < dof < predicted, "each window sees its landmarks for the first time"
+    else:
+        assert dof == predicted, "each but the first of a landmark"
 
 
 @pytest.mark.parametrize("keyframe_s", [0.0, 2.5])
