@@ -47,7 +47,7 @@ class Chronicle:
                 self._ended = True
                 notes = "".join(f"; {note}" for note in message.notes)
                 return [Event(now_ns, "done", "world", f"the world has ended{notes}")]
-            case m.Withdrawal():
+            case m.Withdrawal() if message.robot not in self._withdrawn:
                 self._withdrawn.add(message.robot)
                 by = "centre" if message.by == "central" else message.by
                 text = f"{message.robot} is withdrawn by the {by}: {message.reason}"

@@ -65,6 +65,7 @@ class RobotNode:
         self._last_map = -1
         self._ledger: Counter[str] = Counter()
         self._sighted: set[int] = set()
+        self._withdrawn: set[str] = set()
         self._ended: list[m.Done] = []
         self._end: m.StreamEnd | None = None
         self._exchange_ns: int | None = None
@@ -97,7 +98,7 @@ class RobotNode:
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
         """The channels of teammates to subscribe to."""
-        return (ch.RENDEZVOUS,) if self._held.waits else ()
+        return (ch.WITHDRAWAL, ch.RENDEZVOUS) if self._held.waits else (ch.WITHDRAWAL,)
 
     def wanted(self) -> m.ReadingsWanted | None:
         """The readings that are missing and must be asked for at their source."""
@@ -155,6 +156,8 @@ class RobotNode:
                 self._take_end(message)
             case m.Rendezvous():
                 return self._met(message) + self._go_on()
+            case m.Withdrawal():
+                return self._kept(message) + self._go_on()
             case _:
                 self.warnings.append(f"no use for a {type(message).__name__}")
         return self._go_on()
@@ -316,6 +319,13 @@ class RobotNode:
     def _met(self, rendezvous: m.Rendezvous) -> list[Outgoing]:
         """A teammate sends what it holds: who is seen by it does so too."""
         return self._release(()) if self.robot in rendezvous.teammates else []
+
+    def _kept(self, order: m.Withdrawal) -> list[Outgoing]:
+        """Repeat it once, so that a centre that is started again hears of it."""
+        if order.robot in self._withdrawn:
+            return []
+        self._withdrawn.add(order.robot)
+        return [Outgoing(ch.WITHDRAWAL, order.robot, order)]
 
     def _release(self, seen: tuple[str, ...]) -> list[Outgoing]:
         """Send what is held; `seen`: who is to do so too."""

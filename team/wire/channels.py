@@ -96,7 +96,7 @@ FUSED_MAP = Channel("fused_map", "central/map", m.FusedMap, "one per broadcast",
                     True, "the team's map")  # fmt: skip
 PRIOR = Channel("prior", "central/prior/{robot}", m.Prior, "one per broadcast", "latest", True,
                 True, "the joint marginal that a robot needs")  # fmt: skip
-WITHDRAWAL = Channel("withdrawal", "withdrawal/{robot}", m.Withdrawal, "at most once, or never", "all",
+WITHDRAWAL = Channel("withdrawal", "withdrawal/{robot}", m.Withdrawal, "once, and by who hears it", "all",
                      True, False, "the team goes on without the robot; by an operator or the centre")  # fmt: skip
 FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
                     "the team's map with its joint covariance")  # fmt: skip

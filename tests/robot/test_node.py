@@ -365,3 +365,14 @@ def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
     rest = of(driven(node, READINGS[-8:]), ch.INNOVATION)
     figures = node.status().figures
     assert figures["nis_dof"] == closed + sum(window.dof for window in rest)
+
+
+@pytest.mark.parametrize("exchange", ["continuous", "rendezvous"])
+def test_an_order_to_withdraw_a_robot_is_repeated_once_for_a_centre_that_comes_later(exchange):
+    node = RobotNode(config(), exchange)
+    assert ch.WITHDRAWAL in node.overhears
+    orders = [m.Withdrawal(0, name, "operator", "a flat wheel") for name in ("r2", "r3", "r2")]
+    assert [of(node.handle(order, 0), ch.WITHDRAWAL) for order in orders] == [
+        [orders[0]], [orders[1]], [],
+    ]  # fmt: skip
+    assert not node.warnings

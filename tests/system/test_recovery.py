@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from sim.scenario.scenario import load
 from team.recording.reader import open_log
 from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import decoded
 from tests.support import Link
 from tests.system.observer import Observer
 from tests.system.processes import Process, Processes
@@ -101,3 +104,29 @@ async def test_readings_that_a_cut_link_loses_are_asked_for_at_their_source(
         await found.ends_well()
     assert "are missing: asked for" in found.robots["r1"].said()
     assert found.final_map() == map_in_memory(found.scenario)
+
+
+async def test_an_order_to_withdraw_a_robot_outlives_the_centre_that_heard_it(
+    team: Processes,
+) -> None:
+    found = await assembled(team, "4")
+    found.robots["r1"] = await robot(team, found, found.endpoint, "r1")
+    there = ["--connect", found.endpoint]
+    with Observer(found.endpoint, [ch.SUBMAP]) as seen:
+        await seen.sees(2, ch.SUBMAP, "r2")
+        order = await team.start(
+            "withdraw", "r2", "--team", load(found.scenario).team, *there, name="order"
+        )
+        assert await order.ended() == 0, order.said()
+        assert "r2 is withdrawn; the map of" in order.said()
+        centre = found.others.pop(1)
+        centre.signal(signal.SIGKILL)
+        await centre.ended()
+    again = await team.start("central", found.scenario, *there, "--patience", PATIENCE_S)
+    found.others.append(again)
+    await found.ends_well()
+    fused = decoded(found.final_map(), m.FusedMap)
+    assert fused.withdrawn == ("r2",)
+    assert {member.robot for member in fused.members} == {"r1"}
+    verified = await team.start("rerun", found.log, "--verify", name="verified")
+    assert await verified.ended() == 0, verified.said()
