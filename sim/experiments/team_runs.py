@@ -31,7 +31,9 @@ OURS: tuple[Estimator, FusionRule] = ("hybrid", "join")
 _HYBRID_STEP_S, _STEP_S = 2e-3, 5e-4
 """Of a robot's step, about."""
 _STEPS_TO_A_WAY_POINT = 22
-_UTIAS_S = 40.0
+_DOUBLING_LANDMARKS = 100
+"""With so many more a step takes once more its time."""
+_UTIAS_S, _UTIAS_BATCH_S = 40.0, 160.0
 
 
 def team_task(
@@ -57,20 +59,22 @@ def team_task(
         | ({"minimum": True} if minimum else {})
         | ({} if dataset is None else {"sha256": dataset.sha256}),
         f"{place}, {len(scenario.robots)} robots, {pair}, seed {scenario.seed}",
-        expected_s(scenario),
+        expected_s(scenario, batch=batch, minimum=minimum),
         {} if dataset is None else {"path": str(dataset.path)},
     )
 
 
-def expected_s(scenario: Scenario) -> float:
+def expected_s(scenario: Scenario, *, batch: bool = False, minimum: bool = False) -> float:
     """About how many seconds of a processor a run takes: long ones begin first."""
     world = scenario.world
     if not isinstance(world, SimulatedWorld):
-        return _UTIAS_S
+        return _UTIAS_S + batch * _UTIAS_BATCH_S
     steps = world.steps
     if world.way_point_count:
         steps = min(steps, _STEPS_TO_A_WAY_POINT * world.way_point_count)
     a_step = _HYBRID_STEP_S if scenario.estimator == "hybrid" else _STEP_S
+    landmarks = world.landmark_count or len(world.landmarks)
+    a_step *= (1.0 + landmarks / _DOUBLING_LANDMARKS) * (1.0 + batch) * (1.0 + minimum)
     return a_step * steps * len(scenario.robots)
 
 
