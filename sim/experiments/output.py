@@ -22,6 +22,7 @@ table { border-collapse: collapse; margin: 1rem 0; display: block; overflow-x: a
 th, td { text-align: right; padding: .25rem .7rem; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; }
 img { max-width: 100%; }
+.wide { overflow-x: auto; } /* on a phone a picture of several panels is scrolled, not shrunk */
 figure { margin: 1.5rem 0; }
 figcaption, .note { color: #555; font-size: 90%; }
 nav a { margin-right: 1rem; line-height: 2; white-space: nowrap; }
@@ -217,8 +218,11 @@ def _html_table(table: Table) -> str:
 
 
 def _figure(path: Path, caption: str) -> str:
-    data = base64.b64encode(path.read_bytes()).decode()
+    png = path.read_bytes()
+    data = base64.b64encode(png).decode()
+    width = int.from_bytes(png[16:20], "big")
     return (
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
+        f'<figure><div class="wide"><img alt="{escape(caption)}" style="min-width: {width // 2}px" '
+        f'src="data:image/png;base64,{data}"></div>'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
