@@ -285,7 +285,7 @@ def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], uni
         )  # fmt: skip
     above.set_title(title, fontsize=12)
     above.set_xlabel(unit)
-    above.set_ylabel("distance to the truth [m]")
+    above.set_ylabel("distance to the truth,\nmedian and 10 … 90 % of the seeds [m]")
     above.set_xlim(0, max(curves.times_s[-1] for curves in found.values()))
     # One method that is lost in some runs would press all the others to the floor.
     largest = max(float(np.nanmax(curves.quantile(BAND[1]))) for curves in found.values())
@@ -298,7 +298,7 @@ def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], uni
         _draw_run(below, method, found[method.name], panel.printed.get(method.name))
         below.set_xlabel(unit)
         if column == 0:
-            below.set_ylabel("one run [m]")
+            below.set_ylabel("one run, shaded: its 3σ [m]")
     picture.savefig(path, dpi=120)
 
 
