@@ -21,10 +21,11 @@ def fused_message(
     joint: bool = True,
     exchange: int = 0,
     frame: str = START_POSES,
+    cost: tuple[float, int] = (0.0, 0),
     reasons: tuple[str, ...] = (),
 ) -> m.FusedMap:
     """A map with its members and the name of its inputs; with landmarks' own covariances only
-    unless `joint`. exchange: of the lockstep round, if there are rounds.
+    unless `joint`. exchange: of the lockstep round, if there are rounds. cost: (χ², dof).
     """
     return m.FusedMap(
         stamp_ns,
@@ -40,7 +41,6 @@ def fused_message(
         from_ids(value.ids),
         from_floats(value.means),
         translate.covariance_bytes(value.covariance, joint=joint),
-        0.0,
-        0,
+        *cost,
         reasons,
     )

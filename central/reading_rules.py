@@ -1,6 +1,8 @@
-"""The rule on raw readings: multi-robot FastSLAM at the centre (Ma & Ma, section IV-D)."""
+"""What rules on raw readings share: the team's epochs in, poses and the map out."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -12,55 +14,73 @@ from central.rules import NOTHING, MapEstimate
 from central.team_epochs import RobotEpoch, TeamEpochs
 from team import translate
 from team.config import RobotConfig
-from team.estimation import joint_fastslam
-from team.estimation.gaussian import Matrix
+from team.estimation.gaussian import Matrix, PoseGaussian
 from team.estimation.geometry import Pose
-from team.estimation.joint_fastslam import JointFastSlam, Turn
-from team.estimation.models import Increment
-from team.estimation.randomness import generator
+from team.estimation.turn import Turn
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 
-RESAMPLE_BELOW = 1.0
-"""Algorithm 1 resamples at every step."""
-POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a pose's covariance [m², m², rad²]: fewer than four particles may differ."""
+
+@dataclass(frozen=True)
+class Told:
+    """What a map is made of: the landmarks and, where the rule has one, the joint cost.
+
+    before: messages that go out before it.
+    """
+
+    landmarks: MapEstimate = NOTHING
+    chi2: float = 0.0
+    dof: int = 0
+    before: tuple[Outgoing, ...] = ()
 
 
-class JointFastSlamRule:
-    """One particle filter over all robots' paths and one map, on their raw readings.
+class ReadingRule(ABC):
+    """An estimate over all robots' raw readings at the centre.
 
-    The particles are those of FastSLAM 1.0, `particles` of them; the epochs of one team time are
-    one step. The robots' models come with what they announce. A robot whose start pose is not known
-    is left out; where no start is known the first robot's is the frame. A map's members name each
-    robot's last reading in it.
+    The epochs of one team time are one step. The robots' models come with what they announce. A
+    robot whose start pose is not known is left out; where no start is known the first robot's is
+    the frame. A map's members name each robot's last reading in it.
     """
 
     listens = (*ch.SENSORS, ch.ROBOT_CONFIG)
     submaps = 0
-    findings: tuple[str, ...] = ()
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
         self._config = config
         self._config_digest = digest
         self._epochs = TeamEpochs(robots)
-        self._state: JointFastSlam | None = None
         self._robots: dict[str, RobotConfig] = {}
         self._members: dict[str, m.Member] = {}
         self._pose_ns: dict[str, int] = {}
         self._reasons: list[str] = []
         self._frame = START_POSES
-        self._generator = generator(0, "team", 0, 0)
         self._broadcast_ns: int | None = None
         self._now_ns = 0
         self.landmarks = 0
         self.warnings: list[str] = []
 
+    @abstractmethod
+    def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
+        """The robots' start poses; covariances in (x, y, θ), None: exactly known."""
+
+    @abstractmethod
+    def _take(self, step: Sequence[RobotEpoch], turns: Sequence[Turn]) -> list[Outgoing]:
+        """One step of the team, which the members already name; the poses that it gives."""
+
+    @abstractmethod
+    def _told(self, *, final: bool) -> Told:
+        """The map of all steps so far."""
+
     @property
+    @abstractmethod
     def figures(self) -> Mapping[str, float]:
-        """The particles."""
-        return {"particles": float(self._config.particles)}
+        """Figures for people."""
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What a reader of the map must know; the final map says it too."""
+        return ()
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """File a reading, a robot's models or the last counters."""
@@ -93,17 +113,17 @@ class JointFastSlamRule:
 
     def advance(self, roll: Roll) -> list[Outgoing]:
         """Every step whose turn has come: the poses, and the map at broadcasts."""
-        if self._state is None and not self._begin():
+        if not self._robots and not self._begin():
             return []
         out: list[Outgoing] = []
         for step in self._epochs.steps():
             out += self._broadcast(step[0].stamp_ns)
-            out += self._take_step(step)
+            out += self._take_step([each for each in step if each.robot in self._robots])
         return out
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
         """The map after the last step."""
-        return [Outgoing(ch.FINAL_MAP, "", self._fused(final=True))]
+        return self._said(final=True)
 
     def chain(self, robot: str) -> tuple[m.Start, Sequence[m.Submap]] | None:
         """It keeps no submaps: a robot that was started again takes its stream from the start."""
@@ -114,7 +134,7 @@ class JointFastSlamRule:
         return self._epochs.wanted(now_ns)
 
     def _begin(self) -> bool:
-        """The particles at the start poses, when all of them are here."""
+        """The start poses, when all of them are here."""
         starts = self._epochs.starts
         if not starts:
             return False
@@ -126,25 +146,18 @@ class JointFastSlamRule:
         self._robots = {name: starts[name][0] for name in sorted(placed)}
         away = sorted(starts.keys() - placed.keys())
         self._reasons += [f"{name}: its start pose is not known" for name in away]
-        first = self._robots[min(self._robots)]
-        self._generator = generator(first.seed, "team", 0, 0)
         known = {name: translate.pose_of(placed[name]) for name in self._robots}
-        poses = {n: np.zeros(3) if pose is None else pose for n, (pose, _) in known.items()}
-        particles = self._config.particles
-        self._state = joint_fastslam.begun(poses, particles, "fastslam1", RESAMPLE_BELOW)
-        turns = [
-            _uncertain(name, poses[name], covariance, self._robots[name])
-            for name, (_, covariance) in known.items()
-            if covariance is not None
-        ]
-        if turns:
-            self._state = joint_fastslam.stepped(self._state, turns, self._generator)
         self._members = {n: m.Member(n, placed[n].epoch, 0) for n in self._robots}
+        self._start(
+            {
+                name: (np.zeros(3) if pose is None else pose, covariance)
+                for name, (pose, covariance) in known.items()
+            }
+        )
         return True
 
     def _take_step(self, step: Sequence[RobotEpoch]) -> list[Outgoing]:
-        step = [each for each in step if each.robot in self._robots]
-        if not step or self._state is None:
+        if not step:
             return []
         turns = [
             Turn(
@@ -157,31 +170,25 @@ class JointFastSlamRule:
             )
             for each in step
         ]
-        self._state = joint_fastslam.stepped(self._state, turns, self._generator)
         self._now_ns = step[-1].stamp_ns
-        out = []
         for each in step:
-            member = self._members[each.robot]
-            self._members[each.robot] = m.Member(each.robot, member.epoch, each.reading)
-            out += self._pose(self._state, each)
-        return out
+            epoch = self._members[each.robot].epoch
+            self._members[each.robot] = m.Member(each.robot, epoch, each.reading)
+        return self._take(step, turns)
 
-    def _pose(self, state: JointFastSlam, each: RobotEpoch) -> list[Outgoing]:
-        last_ns, robot = self._pose_ns.get(each.robot), each.robot
-        if last_ns is not None and each.stamp_ns - last_ns < self._robots[robot].pose_s * 1e9:
-            return []
-        self._pose_ns[robot] = each.stamp_ns
-        mean, covariance = joint_fastslam.pose_gaussian(state, robot)
+    def _pose_is_due(self, each: RobotEpoch) -> bool:
+        last_ns = self._pose_ns.get(each.robot)
+        pose_ns = self._robots[each.robot].pose_s * 1e9
+        return last_ns is None or each.stamp_ns - last_ns >= pose_ns
+
+    def _pose(self, each: RobotEpoch, pose: PoseGaussian) -> Outgoing:
+        """The pose at the end of an epoch."""
+        self._pose_ns[each.robot] = each.stamp_ns
+        epoch = self._members[each.robot].epoch
         message = translate.pose_message(
-            each.stamp_ns,
-            robot,
-            self._members[robot].epoch,
-            each.reading,
-            translate.NO_MAP,
-            mean,
-            covariance + POSE_FLOOR,
+            each.stamp_ns, each.robot, epoch, each.reading, translate.NO_MAP, *pose
         )
-        return [Outgoing(ch.CENTRAL_POSE, robot, message)]
+        return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 
     def _broadcast(self, stamp_ns: int) -> list[Outgoing]:
         """The map before the first step of each broadcast_s of team time."""
@@ -190,33 +197,28 @@ class JointFastSlamRule:
         if stamp_ns - self._broadcast_ns < self._config.broadcast_s * 1e9:
             return []
         self._broadcast_ns = stamp_ns
-        return [Outgoing(ch.FUSED_MAP, "", self._fused(final=False))]
+        return self._said(final=False)
 
-    def _fused(self, *, final: bool) -> m.FusedMap:
-        members = tuple(self._members[robot] for robot in sorted(self._members))
-        value = NOTHING
-        if self._state is not None:
-            value = MapEstimate(*joint_fastslam.landmark_gaussian(self._state))
-        self.landmarks = len(value.ids)
-        lost = [f"{robot}: its stream began anew" for robot in self._epochs.broken]
+    @property
+    def _digest(self) -> bytes:
+        """The name of the readings so far."""
+        members = (self._members[robot] for robot in sorted(self._members))
         named = b"".join(f"{x.robot}/{x.epoch}/{x.sequence} ".encode() for x in members)
-        return fused_message(
+        return translate.digest_of(self._config_digest, named)
+
+    def _said(self, *, final: bool) -> list[Outgoing]:
+        told = self._told(final=final) if self._robots else Told()
+        self.landmarks = len(told.landmarks.ids)
+        lost = [f"{robot}: its stream began anew" for robot in self._epochs.broken]
+        fused = fused_message(
             self._config,
-            translate.digest_of(self._config_digest, named),
-            value,
-            members,
+            self._digest,
+            told.landmarks,
+            tuple(self._members[robot] for robot in sorted(self._members)),
             stamp_ns=self._now_ns,
             final=final,
             frame=self._frame,
-            reasons=(*self._reasons, *lost) if final else (),
+            cost=(told.chi2, told.dof),
+            reasons=(*self._reasons, *lost, *self.findings) if final else (),
         )
-
-
-def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> Turn:
-    """A start with this covariance in (x, y, θ): a motion by nothing with its noise."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    own = G.T @ covariance @ G
-    nothing = np.empty(0)
-    start = Increment(np.zeros(3), 0.5 * (own + own.T))
-    return Turn(robot, start, config.sensor, np.empty(0, np.uint32), nothing, nothing)
+        return [*told.before, Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]

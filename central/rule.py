@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 from central.config import CentralConfig
+from central.joint_fastslam_rule import JointFastSlamRule
 from central.map_rules import AloneRule, ExchangeRule, LatestRule
-from central.reading_rules import JointFastSlamRule
 from central.roll import Roll
 from central.submap_rules import submap_rule
 from team.pairs import FEEDBACK

@@ -20,6 +20,7 @@ from sim.scenario.scenario import Scenario, loads
 from sim.scenario.source import streams_of
 from sim.world.streams import Detections, RobotStream, WorldStreams, robot_stream
 from team import translate
+from team.pairs import PAIRS
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
@@ -139,7 +140,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
     """Where a robot's online pose is said: by the centre if it is the one that estimates it; else
     by the robot, with the team's map once it has one.
     """
-    if scenario.fusion == "joint-fastslam":
+    if PAIRS[scenario.estimator, scenario.fusion] == "readings":
         return (ch.CENTRAL_POSE.key(robot),)
     return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
 

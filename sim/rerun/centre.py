@@ -8,8 +8,8 @@ from central.config import CentralConfig
 from central.feedback_rule import FeedbackRule
 from central.join_rule import JoinRule, Tail
 from central.map_rules import AloneRule, LatestRule
-from central.reading_rules import JointFastSlamRule
 from central.roll import Roll
+from central.rule import rule_of
 from central.svd_rule import SvdJoinRule
 from sim.rerun.log import Identity, Recorded, Stream, identity
 from team.config import FusionRule
@@ -150,7 +150,7 @@ def _heard(
     """Everything again from the raw readings and what the robots announced."""
     nodes = sorted(node for node in log.configured if node.startswith("robot/"))
     robots = [node.removeprefix("robot/") for node in nodes]
-    rule, roll = JointFastSlamRule(config, digest, robots), Roll.of(robots)
+    rule, roll = rule_of(config, digest, robots), Roll.of(robots)
     ends = [m.StreamEnd(*stream, count) for stream, count in log.published.items()]
     streams = (log.readings[stream] for stream in sorted(log.readings))
     for message in (

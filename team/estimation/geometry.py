@@ -110,3 +110,10 @@ def adjoint(a_from_b: Pose) -> Float[np.ndarray, "3 3"]:
     """Ad with T ∘ Exp(xi) = Exp(Ad_T xi) ∘ T: carries a perturbation from the right to the left."""
     c, s = math.cos(a_from_b[2]), math.sin(a_from_b[2])
     return np.array([[c, -s, a_from_b[1]], [s, c, -a_from_b[0]], [0.0, 0.0, 1.0]])
+
+
+@compiled
+def tangent(heading: float) -> Float[np.ndarray, "3 3"]:
+    """∂(x, y, theta)/∂xi of pose ∘ Exp(xi) for a pose of this heading."""
+    c, s = math.cos(heading), math.sin(heading)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

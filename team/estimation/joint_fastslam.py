@@ -8,32 +8,16 @@ paths, so over-confidence comes sooner than with one robot's (`plain_fastslam`).
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import Sensor
 from team.estimation import fastslam
 from team.estimation.fastslam import Particles, Proposal
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
-from team.estimation.models import Increment
 from team.estimation.plain_fastslam import landmark_moments, pose_moments
-
-
-class Turn(NamedTuple):
-    """What one robot adds: its motion since its last turn, then its readings at the end of it.
-
-    ranges [m] and bearings [rad] are corrected by the calibration of its sensor.
-    """
-
-    robot: str
-    increment: Increment
-    sensor: Sensor
-    ids: UInt32[np.ndarray, " n"]
-    ranges: Float[np.ndarray, " n"]
-    bearings: Float[np.ndarray, " n"]
+from team.estimation.turn import Turn
 
 
 @dataclass(frozen=True)

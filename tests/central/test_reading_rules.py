@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from central.config import CentralConfig
+from central.joint_fastslam_rule import RESAMPLE_BELOW
 from central.node import CentralNode
-from central.reading_rules import RESAMPLE_BELOW
 from team import translate
 from team.estimation import joint_fastslam
-from team.estimation.joint_fastslam import Turn
 from team.estimation.models import increment_of
 from team.estimation.randomness import generator
+from team.estimation.turn import Turn
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats

@@ -5,47 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.config import Sensor
 from team.estimation import fastslam, joint_fastslam, plain_fastslam
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.geometry import compose, exponential
-from team.estimation.joint_fastslam import Turn
 from team.estimation.models import Increment
+from team.estimation.turn import Turn
 from tests.estimation.estimator_runs import epochs_of, map_errors, world
+from tests.estimation.team_rounds import LANDMARKS, OTHER, SENSOR, STARTS, team_run, wrap
 
 PROPOSALS = ["fastslam1", "fastslam2"]
-SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.01)
-OTHER = Sensor(range_sigma=0.3, bearing_sigma=0.005)
-MOTION = Increment(np.array([0.5, 0.0, 0.15]), np.diag([0.03, 0.02, 0.01]) ** 2)
 STANDING = Increment.identity()
-LANDMARKS = np.array([[6.0, 1.0], [-3.0, 5.0], [0.0, -7.0], [4.0, 8.0]])
-STARTS = {"r1": np.array([0.5, -1.0, 0.0]), "r2": np.array([1.0, 3.0, -2.0])}
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
-
-
-def team_run(seed, starts=STARTS, steps=8, seen=None):
-    """Rounds of (robot, sensor, motion, readings) and the truth; both robots see all landmarks."""
-    random = np.random.default_rng(seed)
-    truth, rounds = dict(starts), []
-    for _ in range(steps):
-        turns = []
-        for robot, sensor in zip(starts, (SENSOR, OTHER), strict=False):
-            xi = np.array([0.03, 0.02, 0.01]) * random.standard_normal(3)
-            truth[robot] = compose(compose(truth[robot], MOTION.mean), exponential(xi))
-            d = LANDMARKS - truth[robot][:2]
-            ranges = np.hypot(*d.T)
-            near = np.flatnonzero(ranges > 1.5)
-            if seen is not None:
-                near = np.intersect1d(near, seen[robot])
-            ranges = ranges[near] + sensor.range_sigma * random.standard_normal(len(near))
-            bearings = np.arctan2(d[near, 1], d[near, 0]) - truth[robot][2]
-            bearings = wrap(bearings + sensor.bearing_sigma * random.standard_normal(len(near)))
-            turns.append(Turn(robot, MOTION, sensor, near.astype(np.uint32), ranges, bearings))
-        rounds.append(turns)
-    return rounds, truth
 
 
 def filtered(rounds, state, random):

@@ -1,0 +1,23 @@
+"""What one robot adds to an estimate over all robots' raw readings."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import Sensor
+from team.estimation.models import Increment
+
+
+class Turn(NamedTuple):
+    """A robot's motion since its last turn, then its readings at the end of it.
+
+    ranges [m] and bearings [rad] are corrected by the calibration of its sensor.
+    """
+
+    robot: str
+    increment: Increment
+    sensor: Sensor
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
