@@ -11,15 +11,10 @@ from jaxtyping import Float
 
 from sim.evaluation.evaluation import MapResult
 from sim.limit.readings import Chain
+from team.estimation.batch import EXACT_SIGMA, FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
-from team.estimation.geometry import Point, Pose
+from team.estimation.geometry import Point, Pose, tangent
 from team.estimation.models import located, noise, predicted
-
-FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
-"""Added to each epoch's motion (forward [m], left [m], turn [rad]): the covariance of a robot that
-can not slip is singular, and that of no motion at all is zero."""
-EXACT_SIGMA = 1e-5
-"""Of a start pose that is exactly known [m, rad]."""
 
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32
@@ -102,12 +97,6 @@ def _start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) 
         turn = tangent(start[2])
         model = gtsam.noiseModel.Gaussian.Covariance(turn.T @ covariance @ turn)
     return gtsam.PriorFactorPose2(key, gtsam.Pose2(*start), model)
-
-
-def tangent(heading: float) -> Matrix:
-    """∂(x, y, θ)/∂ξ of a pose perturbed on the right, pose ∘ Exp(ξ)."""
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def values_of(gtsam: Any, poses: Sequence[Poses], landmarks: Mapping[int, Point]) -> Any:

@@ -29,9 +29,10 @@ from sim.evaluation.errors import (
 )
 from sim.evaluation.evaluation import Evaluation, evaluate
 from sim.limit.errors import add_errors, bias_key, has_biases, profile_graph
-from sim.limit.graph import factor_graph, landmark_starts, pose_key, tangent, values_of
+from sim.limit.graph import factor_graph, landmark_starts, pose_key, values_of
 from sim.limit.readings import Chain, anchored, chains_of
 from team.estimation.gaussian import Matrix
+from team.estimation.geometry import tangent
 from team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3

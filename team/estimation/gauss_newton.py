@@ -307,7 +307,7 @@ def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
     is taken where no damping helps: the damping is then STUCK, the change that of the first step.
     """
     values, gradient = island.normal_equations
-    diagonal = island.graph.diagonal
+    diagonal = island.graph.pattern.diagonal
     before = island.quadratic(island.state)
     refused = None
     while damping < MOST_DAMPING:

@@ -63,6 +63,14 @@ class Pattern:
         """First unknown of each variable; the last number is the number of unknowns."""
         return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(self.sizes)])
 
+    @cached_property
+    def diagonal(self) -> Indices:
+        """Where the diagonal lies in the numbers of a matrix."""
+        begin = np.repeat(self.value_start[self.column_start[:-1]], self.sizes)
+        within = np.arange(self.offset[-1]) - np.repeat(self.offset[:-1], self.sizes)
+        diagonal: Indices = begin + within * (np.repeat(self.sizes, self.sizes) + 1)
+        return diagonal
+
     def diagonal_block(self, values: Values, variable: int) -> Float[np.ndarray, "k k"]:
         """Block (variable, variable) of a matrix on this pattern."""
         size = int(self.sizes[variable])

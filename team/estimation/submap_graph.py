@@ -136,15 +136,6 @@ class Graph:
         headings: Indices = self.offset[:-1][np.diff(self.offset) == 3] + 2
         return headings
 
-    @cached_property
-    def diagonal(self) -> Indices:
-        """Where the diagonal of the normal equations lies in the numbers of the pattern."""
-        sizes = self.pattern.sizes
-        begin = np.repeat(self.pattern.value_start[self.pattern.column_start[:-1]], sizes)
-        within = np.arange(self.offset[-1]) - np.repeat(self.offset[:-1], sizes)
-        diagonal: Indices = begin + within * (np.repeat(sizes, sizes) + 1)
-        return diagonal
-
     @property
     def unknowns(self) -> int:
         """Numbers to be estimated."""

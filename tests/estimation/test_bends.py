@@ -55,7 +55,7 @@ def test_a_number_is_held_where_the_rest_has_the_least_cost():
     gradient = found.normal_equations[1]
     assert abs(gradient[at]) > 0.1
     others = np.delete(gradient, at)
-    scale = np.sqrt(np.delete(found.normal_equations[0][found.graph.diagonal], at))
+    scale = np.sqrt(np.delete(found.normal_equations[0][found.graph.pattern.diagonal], at))
     assert np.abs(others / scale).max() < 1e-3, "no other number could lower the cost"
 
 

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from sim.evaluation.errors import Path
-from sim.limit.graph import FLOOR_SIGMAS, factor_graph, tangent, values_of
+from sim.limit.graph import factor_graph, values_of
 from sim.limit.limit import Limit, LimitError, batch_map
 from sim.limit.readings import Chain, Scan, anchored, chains_of
 from sim.scenario.scenario import Scenario
 from team.config import MotionModel, MotionNoise, RobotConfig
-from team.estimation.geometry import between, compose, exponential
+from team.estimation.batch import FLOOR_SIGMAS
+from team.estimation.geometry import between, compose, exponential, tangent
 from team.estimation.models import increment_of
 from team.wire import channels as ch
 from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
