@@ -27,7 +27,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     counts readings more than once, save that of `covariance-intersection`.
     tick_s: the fold takes the submaps of this much team time at once.
     broadcast_s: at least this much team time lies between two broadcasts of the fused map.
-    robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap; absent: plain squares.
+    robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2)
+    of each reading (a range and a bearing); absent: plain squares.
     landmark_submaps: a landmark enters the map once so many submaps have it and are believed; above
     1 where readings may have nothing to do with what is there.
     covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors

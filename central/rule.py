@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
+from central.batch_rule import BatchRule
 from central.config import CentralConfig
 from central.joint_fastslam_rule import JointFastSlamRule
 from central.map_rules import AloneRule, ExchangeRule, LatestRule
@@ -65,6 +66,8 @@ def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> Rule
         return LatestRule(config, digest)
     if config.fusion == "joint-fastslam":
         return JointFastSlamRule(config, digest, robots)
+    if config.fusion == "batch":
+        return BatchRule(config, digest, robots)
     if config.fusion == "alone":
         return AloneRule(config, digest, robots)
     return submap_rule(config, digest)

@@ -38,6 +38,7 @@ FusionRule = Literal[
     "svd-join",
     "svd-join-spherical",
     "joint-fastslam",
+    "batch",
 ]
 
 

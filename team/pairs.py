@@ -21,6 +21,7 @@ _CONSUMES: Mapping[FusionRule, tuple[Channel, tuple[Estimator, ...]]] = {
     "svd-join": ("submap", ("hybrid",)),
     "svd-join-spherical": ("submap", ("hybrid",)),
     "joint-fastslam": ("readings", ("hybrid", "dead-reckoning")),
+    "batch": ("readings", ("hybrid", "dead-reckoning")),
 }
 
 PAIRS: Mapping[tuple[Estimator, FusionRule], Channel] = MappingProxyType(

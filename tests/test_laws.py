@@ -349,7 +349,7 @@ def unequal(rng):
 
 SEEDS = {
     "join": 50, "kalman": 20, "kalman-per-axis": 20, "covariance-intersection": 15, "latest": 8,
-    "alone": 4, "joint-fastslam": 8, "svd-join": 8, "svd-join-spherical": 4,
+    "alone": 4, "joint-fastslam": 8, "batch": 8, "svd-join": 8, "svd-join-spherical": 4,
 }  # fmt: skip
 
 

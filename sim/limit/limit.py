@@ -113,7 +113,7 @@ def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
 
 
 def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
-    """The batch MAP of a log of a run under the rule `join`, from start to end.
+    """The batch MAP of a log of a run under the rule `join` or `batch`, from start to end.
 
     Raises LimitError without GTSAM, without a scenario, without a joined map, or when the optimiser
     does not come to rest.

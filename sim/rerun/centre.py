@@ -192,4 +192,5 @@ _RETOLD: Mapping[FusionRule, Retell] = {
     "svd-join": _tied,
     "svd-join-spherical": _tied,
     "joint-fastslam": _heard,
+    "batch": _heard,
 }

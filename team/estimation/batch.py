@@ -163,6 +163,21 @@ class Batch:
         return sparse.factorised(self.factors.analysis, self.normal_equations[0])
 
     @cached_property
+    def newton_step(self) -> Values:
+        """−A⁻¹g: ξ of each pose, then the landmarks' δ."""
+        step: Values = -sparse.solved(self.posterior, self.normal_equations[1][:, None])[:, 0]
+        return step
+
+    @property
+    def newton_decrement(self) -> float:
+        """√(gᵀA⁻¹g): how far the next Newton step goes, in standard deviations."""
+        return math.sqrt(max(-float(self.normal_equations[1] @ self.newton_step), 0.0))
+
+    def converged(self, least_decrement: float) -> bool:
+        """Whether every robust scale is at its end and the next step goes no farther than that."""
+        return self.narrow and self.newton_decrement <= least_decrement
+
+    @cached_property
     def selected_covariance(self) -> Values:
         """Entries of the covariance in the layout of the factors' pattern."""
         return sparse.selected_inverse(self.posterior)
@@ -268,41 +283,38 @@ def extended(batch: Batch, turns: Sequence[Turn]) -> Batch:
     )
 
 
-def solved(batch: Batch, iterations: int, least_decrement: float) -> tuple[Batch, float]:
-    """The estimate after at most so many iterations of Gauss-Newton, damped where it must be.
+def solved(batch: Batch, iterations: int, least_decrement: float) -> Batch:
+    """The estimate after at most so many iterations of Gauss-Newton, ended where it has converged.
 
-    Ends when a whole step goes no farther than √(gᵀA⁻¹g) = least_decrement standard deviations with
-    every robust scale at its end. Returns that decrement of the last step: ∞ if it was damped, or
-    if a scale had still to narrow.
+    A step that does not lower the cost is shortened, then damped. Where no damping helps it ends,
+    too: `converged` tells.
     """
-    damping, decrement = 0.0, math.inf
+    damping = 0.0
     for _ in range(iterations):
-        narrow = batch.narrow
-        batch, damping, decrement = _iterated(batch, damping)
-        decrement = decrement if narrow else math.inf
-        if decrement <= least_decrement or damping >= MOST_DAMPING:
+        if batch.converged(least_decrement) or damping >= MOST_DAMPING:
             break
-    return batch, decrement
+        batch, damping = _iterated(batch, damping)
+    return batch
 
 
-def _iterated(batch: Batch, damping: float) -> tuple[Batch, float, float]:
-    """One step that lowers the cost, the damping for the next one, and the Newton decrement."""
+def _iterated(batch: Batch, damping: float) -> tuple[Batch, float]:
+    """One step that lowers the cost, and the damping for the next one."""
     values, gradient = batch.normal_equations
     diagonal = batch.factors.pattern.diagonal
     before = batch.cost
     while damping < MOST_DAMPING:
-        damped = values.copy()
-        damped[diagonal] *= 1.0 + damping
-        cholesky = sparse.factorised(batch.factors.analysis, damped) if damping else batch.posterior
-        step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
+        step = batch.newton_step
+        if damping:
+            damped = values.copy()
+            damped[diagonal] *= 1.0 + damping
+            cholesky = sparse.factorised(batch.factors.analysis, damped)
+            step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
         for share in (1.0,) if damping else SHARES:
             moved = _moved(batch, share * step)
             if batch.cost_of(moved) <= before * (1.0 + ROUNDING) + ROUNDING:
-                whole = damping == 0.0 and share == 1.0
-                decrement = math.sqrt(max(-float(gradient @ step), 0.0)) if whole else math.inf
-                return moved, damping / 10.0 if damping > LEAST_DAMPING else 0.0, decrement
+                return moved, damping / 10.0 if damping > LEAST_DAMPING else 0.0
         damping = max(10.0 * damping, LEAST_DAMPING)
-    return batch, damping, math.inf
+    return batch, damping
 
 
 def _moved(batch: Batch, step: Values) -> Batch:

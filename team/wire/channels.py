@@ -101,9 +101,9 @@ WITHDRAWAL = Channel("withdrawal", "withdrawal/{robot}", m.Withdrawal, "once, an
 FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
                     "the team's map with its joint covariance")  # fmt: skip
 TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per life of the stream",
-                     "all", True, True, "smoothed end poses of the submaps")  # fmt: skip
-CENTRAL_POSE = Channel("central_pose", "central/pose/{robot}", m.PoseEstimate, "one per keyframe", "latest",
-                       True, True, "running pose by a rule on raw readings")  # fmt: skip
+                     "all", True, True, "smoothed end poses of the submaps, or of all keyframes")  # fmt: skip
+CENTRAL_POSE = Channel("central_pose", "central/pose/{robot}", m.PoseEstimate, "one per keyframe or broadcast",
+                       "latest", True, True, "running pose by a rule on raw readings")  # fmt: skip
 CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress,
                            "one per submap", "latest", True, False, "credit for the robots")  # fmt: skip
 

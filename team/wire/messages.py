@@ -396,7 +396,10 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
 
 
 class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajectory/1"):
-    """A robot's smoothed submap end poses in the final map: K stamps, K × 3 poses, K × 9 floats."""
+    """A robot's smoothed poses in the final map: K stamps, K × 3 poses, K × 9 floats.
+
+    Under `join` those of its submaps' ends, under `batch` those of its keyframes.
+    """
 
     robot: Name
     epoch: Count

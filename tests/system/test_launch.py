@@ -107,6 +107,7 @@ async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, ob
         ("hybrid-thesis", "kalman-per-axis"),
         ("hybrid", "covariance-intersection"),
         ("hybrid", "joint-fastslam"),
+        ("dead-reckoning", "batch"),
         ("ekf-slam", "latest"),
     ],
 )
