@@ -19,7 +19,7 @@ from team.wire.bus import Outgoing
 
 RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
 """Of a broadcast's map: from the last solution few are needed, to a Newton step of so many σ."""
-FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-6
+FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
 """Of the final map; what is not there by then is said."""
 
 
