@@ -118,8 +118,13 @@ def _grid(table: Table) -> Grid:
         box=box.SIMPLE_HEAD,
         padding=(0, 0, 0, 1),
     )
+    words = " ".join(row[0] for row in table.rows).split()
+    widest = max((len(word) for word in words), default=0)
     for k, column in enumerate(table.columns):
-        grid.add_column(Text(column), justify="right" if k else "left", no_wrap=bool(k))
+        if k:
+            grid.add_column(Text(column), justify="right", no_wrap=True)
+        else:  # it is wrapped where the terminal is narrow, but not within a word
+            grid.add_column(Text(column), min_width=widest)
     for row in table.rows:
         grid.add_row(*(Text(cell) for cell in row))
     return grid
