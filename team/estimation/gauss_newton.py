@@ -378,15 +378,12 @@ def held(island: Island, unknown: int, by: float, iterations: int) -> Island:
 
 
 def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:
-    """Mean and joint covariance of some nodes in their given order; a fixed node has covariance 0.
-
-    By back-substitution of unit vectors, one per number of the nodes.
-    """
+    """Mean and joint covariance of some nodes in their order; a fixed node has covariance 0."""
     graph = island.graph
     spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
     unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
-    covariance = sparse.inverse_columns(island.posterior, unknowns)[unknowns]
+    covariance = sparse.inverse_block(island.posterior, unknowns)
     constant = np.repeat(graph.fixed[list(nodes)], [len(span) for span in spans])
     covariance[constant] = 0.0
     covariance[:, constant] = 0.0
-    return island.state[unknowns], 0.5 * (covariance + covariance.T)
+    return island.state[unknowns], covariance

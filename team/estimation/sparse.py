@@ -150,6 +150,22 @@ def inverse_columns(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, 
     return columns
 
 
+def inverse_block(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "k k"]:
+    """A⁻¹ between these unknowns: their joint covariance, symmetric."""
+    structure = cholesky.analysis.structure
+    if sparse_kernel.has_big_panel(structure):
+        place = cholesky.analysis.permutation[unknowns]
+        order = np.argsort(place, kind="stable")
+        block = np.empty((len(unknowns), len(unknowns)))
+        block[np.ix_(order, order)] = sparse_kernel.inverse_among(
+            structure, cholesky.panels, place[order]
+        )
+    else:
+        block = inverse_columns(cholesky, unknowns)[unknowns]
+    symmetric: Float[np.ndarray, "k k"] = 0.5 * (block + block.T)
+    return symmetric
+
+
 def selected_inverse(cholesky: Cholesky) -> Values:
     """The entries of A⁻¹ on the pattern of A, in the layout of A's numbers.
 

@@ -1,14 +1,14 @@
 """The kernels of the sparse Cholesky factorisation, its solutions and its selected inverse.
 
 They walk the panels of `sparse_layout`. Inner loops add a multiple of one contiguous column to
-another, which a compiler turns into vector instructions without changing the order of any sum.
+another, which a compiler turns into vector instructions without changing the order of any sum. Big
+panels go to `panel_products` instead.
 """
-
-import math
 
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import panel_products as products
 from team.estimation.compiled import compiled
 from team.estimation.sparse_layout import Structure
 
@@ -43,18 +43,9 @@ def _places(wanted: Indices, present: Indices, place: Indices) -> None:
 def _factorise_panel(panel: Float[np.ndarray, "w m"], least: Values) -> int:
     """Dense Cholesky of a panel in place; the first column whose pivot is ≤ least, else −1."""
     width, m = panel.shape
-    for k in range(width):
-        pivot = panel[k, k]
-        if not pivot > least[k]:
-            return k
-        root = math.sqrt(pivot)
-        for i in range(k, m):
-            panel[k, i] /= root
-        for later in range(k + 1, width):
-            factor = panel[k, later]
-            for i in range(later, m):
-                panel[later, i] -= factor * panel[k, i]
-    return -1
+    if products.is_big(width, m):
+        return products.factorise_by_blocks(panel, least)
+    return products.factorise_columns(panel, 0, width, least)
 
 
 @compiled
@@ -63,7 +54,9 @@ def _subtract_product(structure: Structure, panels: Values, s: int, place: Indic
     columns_of, row_start, row, panel_start, supernode_of = structure
     rows, panel = _panel(structure, panels, s)
     width, m = panel.shape
-    update = np.empty(m)
+    big = products.is_big(width, m)
+    below = np.ascontiguousarray(panel[:, width:].T) if big else np.empty((0, 0))
+    product = np.empty((1, m))
     reached = -1
     begin = 0
     for j in range(width, m):
@@ -73,15 +66,23 @@ def _subtract_product(structure: Structure, panels: Values, s: int, place: Indic
             reached = t
             begin = j
             _places(rows[j:], present, place)
-        for i in range(j, m):
-            update[i] = panel[0, j] * panel[0, i]
-        for k in range(1, width):
-            factor = panel[k, j]
+        if big:
+            within = (j - width) % products.CHUNK
+            if within == 0:
+                last = min(j - width + products.CHUNK, m - width)
+                product = products.rows_of_product(below, j - width, last)
+            update = product[within, within:]
+        else:
+            update = product[0, : m - j]
             for i in range(j, m):
-                update[i] += factor * panel[k, i]
+                update[i - j] = panel[0, j] * panel[0, i]
+            for k in range(1, width):
+                factor = panel[k, j]
+                for i in range(j, m):
+                    update[i - j] += factor * panel[k, i]
         column = panel_start[t] + (rows[j] - columns_of[t]) * len(present)
         for i in range(j, m):
-            panels[column + place[i - begin]] -= update[i]
+            panels[column + place[i - begin]] -= update[i - j]
 
 
 @compiled
@@ -147,10 +148,10 @@ def _gather(
 ) -> None:
     """known[R, R] := the entries of the inverse on the rows R below supernode s, symmetric."""
     columns_of, row_start, row, panel_start, supernode_of = structure
-    rows = row[row_start[s] : row_start[s + 1]]
+    rows = row[row_start[s] + columns_of[s + 1] - columns_of[s] : row_start[s + 1]]
     reached = -1
     begin = 0
-    for j in range(columns_of[s + 1] - columns_of[s], len(rows)):
+    for j in range(len(rows)):
         t = supernode_of[rows[j]]
         present = row[row_start[t] : row_start[t + 1]]
         if t != reached:
@@ -191,20 +192,24 @@ def takahashi(structure: Structure, panels: Values) -> Values:
     """The entries of (L Lᵀ)⁻¹ on the pattern of L, lower triangle, in panels like L's."""
     columns_of, row_start, _, _, _ = structure
     inverse = np.zeros_like(panels)
-    longest = np.max(np.diff(row_start))
-    place = np.empty(longest, dtype=np.int64)
-    known = np.empty((longest, longest))
+    below = np.max(np.diff(row_start) - np.diff(columns_of))
+    place = np.empty(below, dtype=np.int64)
+    space = np.empty(below * below)
     for s in range(len(columns_of) - 2, -1, -1):
         _, panel = _panel(structure, panels, s)
         _, result = _panel(structure, inverse, s)
         width, m = panel.shape
+        known = space[: (m - width) ** 2].reshape(m - width, m - width)
         _gather(structure, inverse, s, place, known)
+        if products.is_big(width, m):
+            products.selected_by_blocks(panel, known, result)
+            continue
         y = _over_own_triangle(panel)
         for k in range(width):
             for j in range(width, m):
                 factor = y[k, j]
                 for i in range(width, m):
-                    result[k, i] -= factor * known[j, i]
+                    result[k, i] -= factor * known[j - width, i - width]
             for later in range(k + 1):
                 total = 0.0
                 for i in range(k, width):
@@ -213,6 +218,63 @@ def takahashi(structure: Structure, panels: Values) -> Values:
                     total -= result[k, i] * y[later, i]
                 result[later, k] = total
     return inverse
+
+
+@compiled
+def has_big_panel(structure: Structure) -> bool:
+    """Whether one of the panels goes to `panel_products`."""
+    columns_of, row_start, _, _, _ = structure
+    for s in range(len(columns_of) - 1):
+        width = columns_of[s + 1] - columns_of[s]
+        if products.is_big(width, row_start[s + 1] - row_start[s]):
+            return True
+    return False
+
+
+@compiled
+def _first_columns(structure: Structure) -> Indices:
+    """The first column of each supernode's subtree, which lies in one piece before it."""
+    columns_of, row_start, row, _, supernode_of = structure
+    first = columns_of[:-1].copy()
+    for s in range(len(first)):
+        below = row_start[s] + columns_of[s + 1] - columns_of[s]
+        if below < row_start[s + 1]:
+            parent = supernode_of[row[below]]
+            first[parent] = min(first[parent], first[s])
+    return first
+
+
+@compiled
+def inverse_among(
+    structure: Structure, panels: Values, wanted: Indices
+) -> Float[np.ndarray, "k k"]:
+    """(L Lᵀ)⁻¹ among ascending unknowns: Wᵀ W with L W = their unit vectors.
+
+    A unit vector fills the supernodes from its own up to the root, so at each supernode those of
+    its subtree are at work, which are neighbours.
+    """
+    columns_of, _, _, _, _ = structure
+    first = _first_columns(structure)
+    solution = np.zeros((columns_of[-1], len(wanted)))
+    for c in range(len(wanted)):
+        solution[wanted[c], c] = 1.0
+    result = np.zeros((len(wanted), len(wanted)))
+    for s in range(len(columns_of) - 1):
+        begin = np.searchsorted(wanted, first[s])
+        end = np.searchsorted(wanted, columns_of[s + 1])
+        if begin == end:
+            continue
+        rows, panel = _panel(structure, panels, s)
+        width, m = panel.shape
+        own = np.ascontiguousarray(solution[columns_of[s] : columns_of[s + 1], begin:end])
+        products.solve_forward(panel, own)
+        if m > width:
+            reached = np.dot(np.ascontiguousarray(panel[:, width:]).T, own)
+            for i in range(width, m):
+                for c in range(begin, end):
+                    solution[rows[i], c] -= reached[i - width, c - begin]
+        result[begin:end, begin:end] += np.dot(own.T, own)
+    return result
 
 
 @compiled

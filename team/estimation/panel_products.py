@@ -1,0 +1,146 @@
+"""Dense algebra on big panels, by blocks: nearly all of it is products, which BLAS computes.
+
+A panel is Lᵀ on a supernode's columns J, a row per column of L (see `sparse_layout`); R are the
+rows below J. Of panels that are not big no sum depends on BLAS (docs/decisions/0028).
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.compiled import compiled
+
+Values = Float[np.ndarray, " _"]
+ROWS = 512
+WIDTH = 16
+"""A panel is big from so many rows and columns on."""
+BLOCK = 48
+"""Columns that are factored, solved or inverted by loops."""
+CHUNK = 64
+"""Rows of a product that are there at once."""
+
+
+@compiled
+def is_big(width: int, m: int) -> bool:
+    """Whether products pay in a panel of this shape."""
+    return m >= ROWS and width >= WIDTH
+
+
+@compiled
+def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, least: Values) -> int:
+    """Dense Cholesky of these columns in place, later ones untouched.
+
+    The first column whose pivot is ≤ least, else −1.
+    """
+    _, m = panel.shape
+    for k in range(begin, end):
+        pivot = panel[k, k]
+        if not pivot > least[k]:
+            return k
+        root = math.sqrt(pivot)
+        for i in range(k, m):
+            panel[k, i] /= root
+        for later in range(k + 1, end):
+            factor = panel[k, later]
+            for i in range(later, m):
+                panel[later, i] -= factor * panel[k, i]
+    return -1
+
+
+@compiled
+def factorise_by_blocks(panel: Float[np.ndarray, "w m"], least: Values) -> int:
+    """`factorise_columns` of all columns: a block by loops, then its product off the later ones."""
+    width, m = panel.shape
+    for begin in range(0, width, BLOCK):
+        end = min(begin + BLOCK, width)
+        failed = factorise_columns(panel, begin, end, least)
+        if failed >= 0:
+            return failed
+        rows = np.ascontiguousarray(panel[begin:end, end:].T)
+        for first in range(0, width - end, CHUNK):
+            product = rows_of_product(rows, first, min(first + CHUNK, width - end))
+            for j in range(len(product)):
+                later = end + first + j
+                for i in range(later, m):
+                    panel[later, i] -= product[j, i - end - first]
+    return -1
+
+
+@compiled
+def rows_of_product(
+    rows: Float[np.ndarray, "h w"], first: int, last: int
+) -> Float[np.ndarray, "c _"]:
+    """Rows first … last − 1 of A Aᵀ, from column `first` on."""
+    product: Float[np.ndarray, "c _"] = np.dot(rows[first:last], rows[first:].T)
+    return product
+
+
+@compiled
+def inverse_by_blocks(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w w"]:
+    """L_JJ⁻ᵀ.
+
+    With L = (A 0; B C): L⁻¹ = (A⁻¹ 0; −C⁻¹ B A⁻¹  C⁻¹), a block of rows after the other.
+    """
+    width = len(panel)
+    inverse = np.zeros((width, width))
+    for begin in range(0, width, BLOCK):
+        end = min(begin + BLOCK, width)
+        own = np.zeros((end - begin, end - begin))
+        for k in range(begin, end):
+            own[k - begin, k - begin] = 1.0 / panel[k, k]
+            for i in range(k + 1, end):
+                total = 0.0
+                for p in range(k, i):
+                    total += panel[p, i] * own[k - begin, p - begin]
+                own[k - begin, i - begin] = -total / panel[i, i]
+        inverse[begin:end, begin:end] = own
+        if begin > 0:
+            before = np.ascontiguousarray(inverse[:begin, :begin])
+            coupled = np.dot(before, np.ascontiguousarray(panel[:begin, begin:end]))
+            inverse[:begin, begin:end] = -np.dot(coupled, own)
+    return inverse
+
+
+@compiled
+def selected_by_blocks(
+    panel: Float[np.ndarray, "w m"],
+    known: Float[np.ndarray, "h h"],
+    result: Float[np.ndarray, "w m"],
+) -> None:
+    """Takahashi's step: Z_RJ = −Z_RR Y and Z_JJ = L_JJ⁻ᵀ L_JJ⁻¹ − Yᵀ Z_RJ, Y = L_RJ L_JJ⁻¹."""
+    width, m = panel.shape
+    inverse = inverse_by_blocks(panel)
+    for first in range(0, width, CHUNK):
+        rest = np.ascontiguousarray(inverse[first:, first:])
+        own = np.dot(rest[:CHUNK], rest.T)
+        for j in range(len(own)):
+            for k in range(first + j, width):
+                result[first + j, k] = own[j, k - first]
+    if m > width:
+        y = np.dot(inverse, np.ascontiguousarray(panel[:, width:]))
+        below = np.dot(y, known)
+        coupled = np.dot(below, y.T)
+        for k in range(width):
+            for later in range(k, width):
+                result[k, later] += coupled[k, later]
+            for i in range(width, m):
+                result[k, i] = -below[k, i - width]
+
+
+@compiled
+def solve_forward(panel: Float[np.ndarray, "w m"], right: Float[np.ndarray, "w k"]) -> None:
+    """Overwrite `right` with L_JJ⁻¹ right."""
+    width, many = right.shape
+    for begin in range(0, width, BLOCK):
+        end = min(begin + BLOCK, width)
+        for k in range(begin, end):
+            for c in range(many):
+                right[k, c] /= panel[k, k]
+            for i in range(k + 1, end):
+                factor = panel[k, i]
+                for c in range(many):
+                    right[i, c] -= factor * right[k, c]
+        if end < width:
+            later = np.ascontiguousarray(panel[begin:end, end:width])
+            right[end:] -= np.dot(later.T, right[begin:end])
