@@ -16,11 +16,12 @@ from sim.experiments.experiment import Options, Outcome, Results
 from sim.experiments.output import write
 from sim.experiments.runner import FAILURES, Plan, computed, dataset, planned
 from sim.experiments.store import Store
-from sim.experiments.task import Task, sources_of
+from sim.experiments.task import ROOTS, Task
 from sim.experiments.team_runs import team_run, team_task
 from sim.experiments.workers import Done, run
 from sim.scenario.scenario import Scenario, load, with_options
 from sim.world.worlds import SimulatedWorld
+from team.sources import sources_of
 
 WORK = "json:loads"
 """A function that a process imports at once."""
@@ -136,7 +137,7 @@ def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> N
 
 
 def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
-    sources = sources_of("sim.experiments.team_runs")
+    sources = sources_of("sim.experiments.team_runs", ROOTS)
     wanted = {"team.estimation.fastslam_kernel", "central.join_rule", "sim.limit.graph", "sim"}
     assert wanted <= sources.keys()
     assert "sim.experiments.output" not in sources

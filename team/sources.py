@@ -1,0 +1,52 @@
+"""Which of our sources a module depends on: what its results, or its compiled code, hang on."""
+
+import ast
+import sys
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+
+
+def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
+    """The text of a module and of every module of these packages that it imports, near or far.
+
+    They are found by their import statements, those inside functions too.
+    """
+    found: dict[str, bytes] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in found or name.partition(".")[0] not in packages:
+            continue
+        path = _path(name)
+        if path is None:
+            continue
+        found[name] = path.read_bytes()
+        waiting.append(name.rpartition(".")[0])
+        waiting += _imported(found[name])
+    return found
+
+
+@lru_cache
+def _imported(source: bytes) -> tuple[str, ...]:
+    """Modules that a source may import: `from a import b` may mean a.b."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(names)
+
+
+@lru_cache
+def _path(module: str) -> Path | None:
+    """The source of a module; None if the name is no module's."""
+    if not module:
+        return None
+    loaded = sys.modules.get(module)
+    try:
+        spec = find_spec(module) if loaded is None else loaded.__spec__
+    except ModuleNotFoundError:
+        return None
+    return None if spec is None or not spec.has_location else Path(str(spec.origin))
