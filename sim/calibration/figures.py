@@ -63,7 +63,8 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
 def jackknifed(fit: Fit, data: Sequence[Reference], units: Mapping[str, str]) -> tuple[Figure, ...]:
     """The fit of all, σ² = (G − 1)/G Σ (fit without group − their mean)²; Efron and Stein 1981.
 
-    Errors within a group may be correlated as they will; between groups they are independent.
+    Errors within a group may be correlated as they will; between groups they are independent. What
+    hangs on one group, so that the rest does not tell it, is not a figure.
     """
     groups = groups_of(data)
     values = fit([part for group in groups for part in group])
@@ -73,6 +74,8 @@ def jackknifed(fit: Fit, data: Sequence[Reference], units: Mapping[str, str]) ->
     ]
     figures = []
     for name, value in values.items():
+        if not all(name in each for each in rest):
+            continue
         left_out = np.array([each[name] for each in rest])
         spread = float(np.sum((left_out - left_out.mean()) ** 2))
         sigma = float(np.sqrt((len(groups) - 1) / len(groups) * spread))

@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from sim.datasets.tables import DatasetError
+from sim.datasets.tables import opened
 from sim.experiments.catalogue import Entry
 from sim.experiments.experiment import Dataset, Experiment, Options, Outcome, Results
 from sim.experiments.parameters import kinds_of
@@ -99,12 +99,9 @@ def _write_failures(path: Path, failures: Sequence[Done]) -> None:
 
 def dataset(path: Path) -> Dataset:
     """A data set with its checksum; raises DatasetError where there is none."""
-    if path.is_file():
-        files = [path]
-    elif path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.is_file())
-    else:
-        raise DatasetError(f"{path}: no such file or folder")
+    with opened(str(path), "Barcodes.dat"):
+        pass
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     digest = hashlib.sha256()
     for file in files:
         if file is not path:

@@ -43,7 +43,8 @@ class Outcome:
 class Watch:
     """What is known of the team while it runs: the last status of each node, and the last map.
 
-    robots: how many there are to be. errors: against the truth, where there is one.
+    robots: how many there are to be. errors: against the truth, where there is one. place: by what
+    other commands reach the team.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -52,6 +53,7 @@ class Watch:
     began: float = field(default_factory=time.monotonic)
     robots: int = 0
     errors: LiveErrors = field(default_factory=LiveErrors)
+    place: str = ""
 
     def take(self, bus: Bus) -> None:
         """Take what has come since."""
@@ -97,6 +99,7 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     watch = Watch(began=began, robots=len(plan.scenario.robots))
     with _interruptible(), _children() as children:
         endpoint = _start_router(plan, children)
+        watch.place = f"--team {plan.scenario.team} --connect {endpoint}"
         with ZenohBus(plan.scenario.team, endpoint) as bus:
             bus.subscribe(ch.STATUS)
             bus.subscribe(ch.FUSED_MAP)

@@ -51,6 +51,8 @@ class _Lines:
         self._last: Watch | None = None
 
     def show(self, watch: Watch) -> None:
+        if self._last is None and watch.place:
+            self._print(watch, f"other commands reach the team by {watch.place}")
         self._last = watch
         self._warn(watch, SETTLED_S)
         for words in () if watch.fused is None else watch.fused.joined:
@@ -130,6 +132,8 @@ def _view(title: str, watch: Watch) -> Group:
     elapsed = time.monotonic() - watch.began
     world = watch.statuses.get("world")
     parts: list[Text | Table] = [Text(f"{title}   {elapsed:.1f} s", style="bold")]
+    if watch.place:
+        parts.append(Text(f"other commands reach the team by {watch.place}", style="dim"))
     robots = {n: s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")}
     if world is None or world.state == "waiting":
         parts.append(Text(f"starting: {len(robots)} of {watch.robots} robots are there"))

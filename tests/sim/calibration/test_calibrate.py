@@ -1,6 +1,7 @@
 """Calibration: what was put into readings comes out of them, within its own uncertainty."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path as File
 
@@ -179,6 +180,16 @@ def test_leaving_out_gives_the_standard_error_of_a_mean(bases: list[Reference]) 
     values = np.array(list(marks.values()))
     assert figure.value == pytest.approx(values.mean())
     assert figure.sigma == pytest.approx(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def test_what_hangs_on_one_group_is_no_figure(bases: list[Reference]) -> None:
+    def fit(part: Sequence[Reference]) -> dict[str, float]:
+        marker = {"marker": 2.0} if bases[0].name in [each.name for each in part] else {}
+        return {"scale": float(len(part)), **marker}
+
+    assert [figure.name for figure in jackknifed(fit, bases, {"scale": "", "marker": "m"})] == [
+        "scale"
+    ]
 
 
 def test_one_robots_log_is_cut_into_stretches_that_lose_no_reading(bases: list[Reference]) -> None:

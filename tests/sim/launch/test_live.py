@@ -22,7 +22,7 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     monkeypatch.setattr(live, "LINE_S", 0.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
-    watch = Watch(robots=3)
+    watch = Watch(robots=3, place="--team t --connect tcp/127.0.0.1:1")
     watch.statuses["world"] = status("world", "waiting", readings=0.0, of=100.0)
     watch.statuses["robot/r1"] = status("robot/r1", "waiting")
     lines.show(watch)
@@ -30,7 +30,8 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     watch.statuses["robot/r1"] = status("robot/r1", "mapping", readings=30.0)
     watch.statuses["robot/r2"] = status("robot/r2", "mapping", readings=20.0)
     lines.show(watch)
-    waiting, running = out.getvalue().splitlines()
+    place, waiting, running = out.getvalue().splitlines()
+    assert place.endswith("by --team t --connect tcp/127.0.0.1:1")
     assert waiting.endswith("] waiting: 1 of 3 robots")
     assert " 50%  team time 0 s, 2 robots" in running
 
