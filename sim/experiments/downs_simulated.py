@@ -190,12 +190,12 @@ def _draw_sample(title: str, sample: Figures, path: Path) -> None:
         *np.array(sample["landmarks"]).reshape(-1, 2).T, linestyle="", marker="x",
         color="#C00000", label="true landmarks",
     )  # fmt: skip
-    draw_map(axis, sample["means"], sample["blocks"])
+    draw_map(axis, sample["means"], sample["blocks"], label="map, 95 %")
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")
     axis.set_title(f"EKF: {title}", fontsize=11)
-    picture.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    picture.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     ruled(axis)
     picture.savefig(path, dpi=110)
 
