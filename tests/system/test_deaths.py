@@ -15,10 +15,12 @@ from tests.system.observer import Observer, endpoint_of
 from tests.system.processes import Process, Processes, until
 from tests.system.scenarios import STEPS, short
 
+SLOW = "3"
+"""What is to be met alive is still running on a busy machine."""
 SUBMAPS = STEPS // 12  # windows of 12 s, steps of 1 s
 
 
-async def launched(team: Processes, speed: str = "8") -> tuple[Process, Path]:
+async def launched(team: Processes, speed: str = "5") -> tuple[Process, Path]:
     """A launch that has r1's second submap, seconds before its end; and its run's folder."""
     folder = team.folder / "run"
     launch = await team.start(
@@ -75,7 +77,7 @@ async def test_a_robot_that_is_killed_is_named_and_the_others_finish_the_map(
 async def test_a_process_without_which_no_team_runs_ends_the_run_and_is_named(
     name: str, team: Processes
 ) -> None:
-    launch, folder = await launched(team)
+    launch, folder = await launched(team, SLOW)
     pid = await team.pid(name)
     os.kill(pid, signal.SIGKILL)
     assert await launch.ended() == 1
@@ -89,7 +91,7 @@ async def test_a_process_without_which_no_team_runs_ends_the_run_and_is_named(
 async def test_a_recorder_that_is_killed_leaves_a_log_that_reads_and_can_be_repaired(
     team: Processes,
 ) -> None:
-    launch, folder = await launched(team)
+    launch, folder = await launched(team, SLOW)
     path = folder / "log.mcap"
     await until(lambda: submaps_in(path) > 0, "the recorder flushes", 10.0)
     os.kill(await team.pid("record"), signal.SIGKILL)
@@ -125,7 +127,7 @@ async def test_a_robot_that_dies_before_the_world_begins_ends_the_run(team: Proc
 async def test_an_interrupt_ends_every_process_and_completes_the_log(
     number: signal.Signals, team: Processes
 ) -> None:
-    launch, folder = await launched(team)
+    launch, folder = await launched(team, SLOW)
     launch.signal(number)
     assert await launch.ended(20.0) == 1
     await team.none_left(0.0)
@@ -137,7 +139,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
 
 
 async def test_no_process_outlives_a_launch_that_is_killed(team: Processes) -> None:
-    launch, folder = await launched(team)
+    launch, folder = await launched(team, SLOW)
     assert len(team.alive()) == 8
     launch.signal(signal.SIGKILL)
     assert await launch.ended() == -signal.SIGKILL
