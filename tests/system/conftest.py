@@ -1,6 +1,8 @@
 """What the system tests share: their processes, short scenarios, and one finished launch."""
 
 import json
+import signal
+import threading
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,10 @@ import pytest_asyncio
 
 from tests.system.processes import Processes
 from tests.system.scenarios import short
+
+# A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @dataclass(frozen=True)
