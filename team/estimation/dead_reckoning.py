@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt32
 
 from team.config import Sensor
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from team.estimation.geometry import Pose
+from team.estimation.geometry import Pose, tangent
 from team.estimation.models import Increment
 
 
@@ -44,8 +44,7 @@ def stepped(
 
 def pose_gaussian(state: DeadReckoning) -> PoseGaussian:
     """In the coordinates (x, y, theta), to first order: P = G C Gᵀ with G = blkdiag(R(θ), 1)."""
-    c, s = np.cos(state.pose.mean[2]), np.sin(state.pose.mean[2])
-    G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    G = tangent(state.pose.mean[2])
     P = G @ state.pose.covariance @ G.T
     return PoseGaussian(state.pose.mean, 0.5 * (P + P.T))
 

@@ -59,18 +59,15 @@ def stepped(
     The landmarks that are not read keep their values exactly. ranges [m] and bearings [rad] are
     corrected by the calibration.
     """
-    read = np.isin(state.ids, ids)
-    blocks = state.covariances[read]
-    triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
-    reset = Particles(
-        poses=np.tile(state.pose, (particles, 1)),
-        log_weights=np.full(particles, -np.log(particles)),
-        ids=state.ids[read],
-        means=np.tile(state.landmarks[read], (particles, 1, 1)),
-        covariances=np.tile(triangles, (particles, 1, 1)),
-    )
     after, _ = fastslam.stepped(
-        reset, increment, sensor, ids, ranges, bearings, "fastslam1", generator
+        reset(state, ids, particles),
+        increment,
+        sensor,
+        ids,
+        ranges,
+        bearings,
+        "fastslam1",
+        generator,
     )
     mean, P = moments(after.poses, np.exp(after.log_weights), after.means, after.covariances)
     columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)
@@ -79,6 +76,23 @@ def stepped(
         after.ids,
         mean[3:].reshape(-1, 2),
         P[columns[:, :, None], columns[:, None, :]],
+    )
+
+
+def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> Particles:
+    """So many particles, all of them at the mean: what a step knows of these landmarks before it.
+
+    Nothing in it depends on anything else, and of the pose's covariance nothing is left.
+    """
+    kept = np.isin(state.ids, ids)
+    blocks = state.covariances[kept]
+    triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
+    return Particles(
+        poses=np.tile(state.pose, (particles, 1)),
+        log_weights=np.full(particles, -np.log(particles)),
+        ids=state.ids[kept],
+        means=np.tile(state.landmarks[kept], (particles, 1, 1)),
+        covariances=np.tile(triangles, (particles, 1, 1)),
     )
 
 

@@ -16,7 +16,7 @@ from team.estimation.compiled import compiled
 from team.estimation.fastslam import Particles
 from team.estimation.fastslam_kernel import semidefinite_factor, slots_of
 from team.estimation.gaussian import cholesky_factor
-from team.estimation.geometry import compose, wrapped
+from team.estimation.geometry import compose, tangent, wrapped
 from team.estimation.landmark_kernel import Triple, seen
 from team.estimation.models import (
     Increment,
@@ -117,8 +117,7 @@ def joint_innovation(
     pose = compose(mean[:3], increment.mean)
     dx, dy = pose[:2] - mean[:2]
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    to_own = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ F
+    to_own = tangent(pose[2]).T @ F
     m = 2 * len(slots)
     error, A, H = np.empty(m), np.zeros((m, len(columns))), np.empty((m, 3))
     R = np.empty(m)

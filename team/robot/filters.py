@@ -12,7 +12,6 @@ from team.config import Estimator, RobotConfig, Sensor
 from team.estimation import (
     dead_reckoning,
     ekf_slam,
-    fastslam,
     hybrid_thesis,
     hybrid_thesis_coded,
     localisation,
@@ -20,6 +19,7 @@ from team.estimation import (
 )
 from team.estimation.fastslam import Particles, Proposal
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.geometry import tangent
 from team.estimation.hybrid_thesis_coded import CodedState
 from team.estimation.innovation import NOTHING, Innovation, innovation
 from team.estimation.localisation import Localisation
@@ -120,16 +120,6 @@ def _thesis_stepped(
     )
 
 
-def _thesis_before(state: hybrid_thesis.ThesisState) -> Particles:
-    """All that its next step knows: the mean pose, and landmarks that do not depend on it."""
-    blocks = state.covariances
-    triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
-    at = fastslam.at_poses(state.pose[np.newaxis])
-    return replace(
-        at, ids=state.ids, means=state.landmarks[np.newaxis], covariances=triangles[np.newaxis]
-    )
-
-
 def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
     """The innovation against the particles of a state."""
     return lambda state, *readings: innovation(particles(state), *readings)
@@ -177,8 +167,7 @@ def _with_start(
     state = begun(at)
     if start.covariance is None:
         return state
-    c, s = np.cos(at[2]), np.sin(at[2])
-    G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    G = tangent(at[2])
     own = G.T @ start.covariance @ G
     nothing = np.empty(0)
     still = Increment(np.zeros(3), 0.5 * (own + own.T))
@@ -262,7 +251,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         _thesis_stepped,
         lambda state: PoseGaussian(state.pose, state.pose_covariance),
         _thesis_landmarks,
-        _of_particles(_thesis_before),
+        _of_particles(lambda state: hybrid_thesis.reset(state, state.ids, 1)),
         _thesis_absorbed,
         joint=False,
     ),
