@@ -7,8 +7,8 @@ start     r = Log(mean⁻¹ ∘ x),                      ∂r/∂ξ = Jr⁻¹(r)
 odometry  r = Log(mean⁻¹ ∘ h), h = a⁻¹ ∘ b,         ∂r/∂ξ_b = Jr⁻¹(r), ∂r/∂ξ_a = −Jr⁻¹(r) Ad(h⁻¹)
 reading   r = (predicted − read) of range and bearing, the bearing's on the circle.
 
-Log and Jr⁻¹ are those of SE(2): Solà et al., A micro Lie theory, eq. 158 and 163. Everything is
-numpy over rows, and every sum runs in the order of the factors.
+Log and Jr⁻¹ are those of SE(2): Solà et al., A micro Lie theory, eq. 158 and 163. Each
+row is what `geometry` and `models` say of one, and every sum runs in the order of the factors.
 """
 
 from dataclasses import dataclass
@@ -18,8 +18,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation.compiled import compiled
+from team.estimation.geometry import (
+    adjoint,
+    between,
+    compose,
+    exponential,
+    inverse,
+    logarithm,
+    wrapped,
+)
 from team.estimation.joining_kernel import block_pattern
-from team.estimation.models import NEAREST_M
+from team.estimation.models import landmark_jacobian, pose_jacobian, predicted
 from team.estimation.sparse import Analysis, Pattern, analysed
 
 Indices = Int64[np.ndarray, " _"]
@@ -30,7 +40,7 @@ Poses = Float[np.ndarray, "K 3"]
 Points = Float[np.ndarray, "L 2"]
 
 SMALL_TURN = 1e-4
-"""Below it [rad] the quotients of Log and of Jr are taken from their series."""
+"""Below it [rad] the quotients of Jr are taken from their series."""
 
 
 class Starts(NamedTuple):
@@ -72,48 +82,40 @@ class Linear(NamedTuple):
     second: Float[np.ndarray, "n k j"]
 
 
-def wrapped_all(angles: Values) -> Values:
-    """The same directions in (−π, π]."""
-    turned: Values = angles + 2.0 * np.pi * np.floor((np.pi - angles) / (2.0 * np.pi))
-    return turned
-
-
+@compiled
 def composed(a_from_b: Rows, b_from_c: Rows) -> Rows:
     """a_from_c of each row."""
-    c, s = np.cos(a_from_b[:, 2]), np.sin(a_from_b[:, 2])
-    x, y, turn = b_from_c.T
-    return np.column_stack(
-        [
-            a_from_b[:, 0] + c * x - s * y,
-            a_from_b[:, 1] + s * x + c * y,
-            wrapped_all(a_from_b[:, 2] + turn),
-        ]
-    )
+    found = np.empty_like(a_from_b)
+    for k in range(len(found)):
+        found[k] = compose(a_from_b[k], b_from_c[k])
+    return found
 
 
+@compiled
 def parted(a_from_b: Rows, a_from_c: Rows) -> Rows:
     """b_from_c of each row."""
-    c, s = np.cos(a_from_b[:, 2]), np.sin(a_from_b[:, 2])
-    dx, dy, turn = (a_from_c - a_from_b).T
-    return np.column_stack([c * dx + s * dy, -s * dx + c * dy, wrapped_all(turn)])
+    found = np.empty_like(a_from_b)
+    for k in range(len(found)):
+        found[k] = between(a_from_b[k], a_from_c[k])
+    return found
 
 
+@compiled
 def exponentials(xi: Rows) -> Rows:
-    """Exp of each row, V(θ) as in `geometry.swept`."""
-    turn = xi[:, 2]
-    small = np.abs(turn) < SMALL_TURN
-    safe = np.where(small, 1.0, turn)
-    a = np.where(small, 1.0 - turn**2 / 6.0, np.sin(safe) / safe)
-    b = np.where(small, turn * (0.5 - turn**2 / 24.0), (1.0 - np.cos(safe)) / safe)
-    x, y = a * xi[:, 0] - b * xi[:, 1], b * xi[:, 0] + a * xi[:, 1]
-    return np.column_stack([x, y, wrapped_all(turn)])
+    """Exp of each row."""
+    found = np.empty_like(xi)
+    for k in range(len(found)):
+        found[k] = exponential(xi[k])
+    return found
 
 
+@compiled
 def logarithms(poses: Rows) -> Rows:
     """Log of each row, |θ| < π."""
-    a, half = _half_turn(poses[:, 2])
-    x, y = poses[:, 0], poses[:, 1]
-    return np.column_stack([a * x + half * y, -half * x + a * y, poses[:, 2]])
+    found = np.empty_like(poses)
+    for k in range(len(found)):
+        found[k] = logarithm(poses[k])
+    return found
 
 
 def _half_turn(turn: Values) -> tuple[Values, Values]:
@@ -147,16 +149,13 @@ def inverse_right_jacobians(xi: Rows) -> Blocks:
     return J
 
 
+@compiled
 def _adjoints_of_inverse(poses: Rows) -> Blocks:
     """Ad(T⁻¹) of each row."""
-    x, y, turn = poses.T
-    c, s = np.cos(turn), np.sin(turn)
-    Ad = np.zeros((len(poses), 3, 3))
-    Ad[:, 0, 0] = Ad[:, 1, 1] = c
-    Ad[:, 0, 1], Ad[:, 1, 0] = s, -s
-    Ad[:, 0, 2], Ad[:, 1, 2] = s * x - c * y, c * x + s * y
-    Ad[:, 2, 2] = 1.0
-    return Ad
+    found = np.empty((len(poses), 3, 3))
+    for k in range(len(found)):
+        found[k] = adjoint(inverse(poses[k]))
+    return found
 
 
 def start_residuals(starts: Starts, poses: Poses) -> tuple[Rows, Blocks]:
@@ -173,28 +172,26 @@ def motion_residuals(motions: Motions, poses: Poses) -> Linear:
     return Linear(residual, -after @ _adjoints_of_inverse(moved), after)
 
 
-def predictions(readings: Readings, poses: Poses, landmarks: Points) -> tuple[Values, Values]:
-    """Range (at least NEAREST_M) and direction in the map frame of each reading's landmark."""
-    dx, dy = (landmarks[readings.landmark] - poses[readings.pose, :2]).T
-    return np.maximum(np.sqrt(dx * dx + dy * dy), NEAREST_M), np.arctan2(dy, dx)
-
-
 def reading_residuals(readings: Readings, poses: Poses, landmarks: Points) -> Linear:
     """R of (range, bearing), ∂r/∂ξ of the pose and ∂r/∂ of the landmark, as in `models`."""
-    distance, direction = predictions(readings, poses, landmarks)
-    bearing = direction - poses[readings.pose, 2]
-    residual = np.column_stack(
-        [distance - readings.ranges, wrapped_all(bearing - readings.bearings)]
-    )
-    c, s = np.cos(bearing), np.sin(bearing)
-    of_pose = np.zeros((len(distance), 2, 3))
-    of_pose[:, 0, 0], of_pose[:, 0, 1] = -c, -s
-    of_pose[:, 1, 0], of_pose[:, 1, 1], of_pose[:, 1, 2] = s / distance, -c / distance, -1.0
-    c, s = np.cos(direction), np.sin(direction)
-    of_landmark = np.empty((len(distance), 2, 2))
-    of_landmark[:, 0, 0], of_landmark[:, 0, 1] = c, s
-    of_landmark[:, 1, 0], of_landmark[:, 1, 1] = -s / distance, c / distance
-    return Linear(residual, of_pose, of_landmark)
+    z = np.column_stack([readings.ranges, readings.bearings])
+    return Linear(*_linearised(poses[readings.pose], landmarks[readings.landmark], z))
+
+
+@compiled
+def _linearised(
+    poses: Rows, landmarks: Float[np.ndarray, "n 2"], readings: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 2"]]:
+    count = len(readings)
+    residual = np.empty((count, 2))
+    of_pose, of_landmark = np.empty((count, 2, 3)), np.empty((count, 2, 2))
+    for k in range(count):
+        distance, bearing = predicted(poses[k], landmarks[k])
+        residual[k, 0] = distance - readings[k, 0]
+        residual[k, 1] = wrapped(bearing - readings[k, 1])
+        of_pose[k] = pose_jacobian(distance, bearing)
+        of_landmark[k] = landmark_jacobian(distance, poses[k, 2] + bearing)
+    return residual, of_pose, of_landmark
 
 
 @dataclass(frozen=True, eq=False)
