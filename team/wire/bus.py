@@ -12,7 +12,14 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from team.wire.channels import ALIVE, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
-from team.wire.messages import Liveliness, Message
+from team.wire.messages import (
+    FusedMap,
+    Liveliness,
+    MapEstimate,
+    Message,
+    ParticleCloud,
+    Prior,
+)
 
 
 @dataclass(frozen=True)
@@ -57,8 +64,11 @@ class Bus(Protocol):
     def publish_raw(self, sample: Sample) -> None:
         """Publish a sample of a log again: its bytes, its stamps and its counter."""
 
-    def subscribe(self, channel: Channel, name: str = "*") -> None:
-        """From now on `receive` returns what others publish there, each sample once."""
+    def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
+        """From now on `receive` returns what others publish there, each sample once.
+
+        whole: of a `latest` channel not the newest one, but all that there still is.
+        """
 
     def receive(self, timeout_s: float) -> list[Sample]:
         """What has arrived, in order; waits at most `timeout_s` for the first."""
@@ -98,6 +108,24 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     return channel, name, message
 
 
+LATEST_KEPT = 8_192
+"""Publications of a `latest` key that a publisher keeps: a robot may be 4096 readings ahead."""
+CLOUDS_KEPT = 1_024
+"""… of particles: kilobytes each."""
+MAPS_KEPT = 256
+"""… of maps: tens of kilobytes each, a joint covariance more."""
+ALL_KEPT = 1_000_000
+
+
+def kept_of(channel: Channel) -> int:
+    """How many publications of a key its publisher keeps, for who comes late or was cut off."""
+    if channel.delivery == "all":
+        return ALL_KEPT
+    if channel.message in (FusedMap, MapEstimate, Prior):
+        return MAPS_KEPT
+    return CLOUDS_KEPT if channel.message is ParticleCloud else LATEST_KEPT
+
+
 @dataclass
 class MemoryNetwork:
     """The keys of one process: publications are delivered at once, in order, to every other bus.
@@ -106,19 +134,16 @@ class MemoryNetwork:
     """
 
     buses: list["MemoryBus"] = field(default_factory=list)
-    kept: dict[str, list[tuple["MemoryBus", Sample]]] = field(
-        default_factory=lambda: defaultdict(list)
-    )
+    kept: dict[str, deque[tuple["MemoryBus", Sample]]] = field(default_factory=dict)
     answers: list[tuple[Channel, str, Answer]] = field(default_factory=list)
     alive: dict[str, tuple["MemoryBus", Sample]] = field(default_factory=dict)
 
     def deliver(self, source: "MemoryBus", sample: Sample) -> None:
         """Hand a sample to every other bus that subscribed, and keep it for late joiners."""
         found = channel_of(sample.key)
-        delivery = "stream" if found is None else found[0].delivery
-        if delivery != "stream":
-            kept = self.kept[sample.key]
-            kept[:] = [*(kept if delivery == "all" else []), (source, sample)]
+        if found is not None and found[0].delivery != "stream":
+            kept = self.kept.setdefault(sample.key, deque(maxlen=kept_of(found[0])))
+            kept.append((source, sample))
         for bus in self.buses:
             if bus is not source:
                 bus.offer(sample)
@@ -147,11 +172,12 @@ class MemoryBus:
         """Deliver at once, as it is."""
         self._network.deliver(self, sample)
 
-    def subscribe(self, channel: Channel, name: str = "*") -> None:
+    def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
         """Receive this channel, what is kept for late joiners first."""
         for key, kept in self._network.kept.items():
             if _is_of(channel, name, key) and not self._subscribed(key):
-                self._arrived.extend(sample for source, sample in kept if source is not self)
+                wanted = list(kept) if whole or channel.delivery == "all" else [kept[-1]]
+                self._arrived.extend(sample for source, sample in wanted if source is not self)
         self._want(channel, name)
 
     def _want(self, channel: Channel, name: str) -> None:

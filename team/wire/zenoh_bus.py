@@ -11,6 +11,10 @@ latest: a cache and heartbeats; a late joiner asks for the newest one, after a c
         for what the heartbeat says it missed, as far back as the cache goes.
 all:    as `latest` with everything cached, and a late joiner asks for everything.
 
+Zenoh's advanced subscriber does most of this, but not all: of late joiners some get a part of the
+history. So the bus counts what arrives of each publisher (`team.wire.arrivals`), compares with the
+heartbeats, and asks the publisher's cache for what has been missing for half a second.
+
 Samples, queries and liveliness go from Zenoh's receiving thread straight into one unbounded queue:
 no thread is ours, the order of arrival is kept across subscriptions, and a slow node never stops
 the link (the team's credit bounds the queue). A bus does not receive what it publishes itself.
@@ -22,7 +26,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -32,19 +36,21 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
-from team.wire.bus import Answer, BusError, Outgoing, Sample
+from team.wire.arrivals import Arrivals
+from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of
 from team.wire.channels import ALIVE, Channel, channel_of
 from team.wire.codec import LARGEST_PAYLOAD, encoded
-from team.wire.messages import FusedMap, Liveliness, MapEstimate, Message, Prior
+from team.wire.messages import Liveliness, Message
 
 _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
 _BLOCK_US = 10_000_000  # that a full queue may stop a publisher before its link is closed
 _HEARTBEAT_S = 0.25
 _ALIVE_TIMEOUT_S = 5.0
-_LATEST_KEPT = 1_024  # of a `latest` key, so that a cut of minutes recovers; 1 would recover 1
-_MAPS_KEPT = 16  # of a `latest` key of maps: a joint covariance may take megabytes
-_ALL_KEPT = 1_000_000
+_ADVANCED = "/@adv/pub/"  # in the key of what an advanced publisher says beside its publications
+_BEAT = struct.Struct("<I")  # a heartbeat's payload: the number of the last publication
+_LOOK_S = 0.1  # between two looks at what is missing
+_ANSWER_S = 10.0
 _LOG = logging.getLogger(__name__)
 
 _BLOCK = zenoh.CongestionControl.BLOCK
@@ -65,7 +71,26 @@ class _Question:
     answer: Answer
 
 
-_Item = zenoh.Sample | _Token | _Question | None
+@dataclass(frozen=True)
+class _Heartbeat:
+    key: str
+    publisher: str
+    newest: int
+
+
+@dataclass
+class _Cached:
+    """An answer of a publisher's cache that has come to its end: what was asked, what came."""
+
+    key: str
+    publisher: str
+    first: int
+    repeated: bool
+    newest: int = -1
+    failed: bool = False
+
+
+_Item = zenoh.Sample | _Token | _Question | _Heartbeat | _Cached | None
 """What the receiving thread hands over; None wakes a receiver when the bus closes."""
 
 
@@ -83,6 +108,11 @@ class ZenohBus:
         self._counters: dict[str, int] = {}
         self._wanted: set[tuple[str, str]] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._whole: set[str] = set()
+        self._beats: dict[str, bytes] = {}
+        self._arrivals: dict[tuple[str, str], Arrivals[Sample]] = {}
+        self._incomplete: set[tuple[str, str]] = set()
+        self._look_due = 0.0
         self._closed = threading.Event()
         self._session = _client(connect, patience_s)
 
@@ -151,7 +181,7 @@ class ZenohBus:
             congestion_control=_BLOCK,
             priority=_PRIORITY,
             reliability=_RELIABLE,
-            cache=ext.CacheConfig(max_samples=_kept(found[0]), replies_config=_REPLIES),
+            cache=ext.CacheConfig(max_samples=kept_of(found[0]), replies_config=_REPLIES),
             # Periodic, not sporadic: a sporadic heartbeat that falls into a cut is never repeated.
             sample_miss_detection=ext.MissDetectionConfig(
                 heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
@@ -159,8 +189,11 @@ class ZenohBus:
             publisher_detection=True,
         )
 
-    def subscribe(self, channel: Channel, name: str = "*") -> None:
-        """From now on `receive` returns what is published there; asking twice changes nothing."""
+    def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
+        """From now on `receive` returns what is published there; asking twice changes nothing.
+
+        whole: of a `latest` channel not the newest one, but all that the publishers still have.
+        """
         self._check_open()
         if {(channel.name, "*"), (channel.name, name)} & self._wanted:
             return
@@ -169,6 +202,8 @@ class ZenohBus:
                 f"{channel.name}: subscribed by name already, so `*` would deliver twice"
             )
         self._wanted.add((channel.name, name))
+        if whole:
+            self._whole.add(channel.name)
         key = self._prefix + channel.key(_every(channel, name))
         callback = Callback(self._queue.put, indirect=False)
         remote = zenoh.Locality.REMOTE
@@ -180,41 +215,133 @@ class ZenohBus:
             key,
             callback,
             allowed_origin=remote,
-            history=_history(channel),
+            history=_history(channel, whole=whole),
             recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
+        self._session.declare_subscriber(
+            f"{key}{_ADVANCED}**", Callback(self._note_beat, indirect=False), allowed_origin=remote
+        )
+
+    def _note_beat(self, sample: zenoh.Sample) -> None:
+        """On the receiving thread: a heartbeat that says something new."""
+        name, said = str(sample.key_expr), sample.payload.to_bytes()
+        if len(said) == _BEAT.size and self._beats.get(name) != said:
+            self._beats[name] = said
+            key, _, rest = name.removeprefix(self._prefix).partition(_ADVANCED)
+            publisher = "/".join(rest.split("/")[:2])
+            self._queue.put(_Heartbeat(key, publisher, *_BEAT.unpack(said)))
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """All that has arrived, in order; waits at most `timeout_s` for the first.
 
-        Queries are answered here, on the caller's thread: a node's state needs no lock.
+        Queries are answered here, on the caller's thread: a node's state needs no lock. What has
+        been missing for a while is asked for; it comes as it arrives, behind what came after it.
         """
         self._check_open()
         samples: list[Sample] = []
-        try:
-            item = self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait()
-            while item is not None:
+        until = time.monotonic() + timeout_s
+        with suppress(Empty):
+            while True:
+                wait = 0.0 if samples else until - time.monotonic()
+                item = self._queue.get(timeout=wait) if wait > 0.0 else self._queue.get_nowait()
+                if item is None:
+                    break
                 self._take(item, samples)
-                item = self._queue.get_nowait()
-        except Empty:
-            pass
-        return samples
+        return samples + self._complete(time.monotonic())
 
-    def _take(self, item: zenoh.Sample | _Token | _Question, samples: list[Sample]) -> None:
-        if isinstance(item, _Question):
-            _reply(item)
-        elif isinstance(item, _Token):
-            node = ALIVE.owner(str(item.sample.key_expr).removeprefix(self._prefix))
-            if node is not None and node not in self._tokens:
-                alive = item.sample.kind == zenoh.SampleKind.PUT
-                payload = encoded(Liveliness(0, node, alive))
-                samples.append(Sample(ALIVE.key(node), payload, 0, time.time_ns(), 0))
-        elif item.attachment is None or len(item.attachment) != _ATTACHMENT.size:
+    def _take(self, item: _Item, samples: list[Sample]) -> None:
+        match item:
+            case _Question():
+                _reply(item)
+            case _Token():
+                node = ALIVE.owner(str(item.sample.key_expr).removeprefix(self._prefix))
+                if node is not None and node not in self._tokens:
+                    alive = item.sample.kind == zenoh.SampleKind.PUT
+                    payload = encoded(Liveliness(0, node, alive))
+                    samples.append(Sample(ALIVE.key(node), payload, 0, time.time_ns(), 0))
+            case _Heartbeat():
+                self._arrivals_of(item.key, item.publisher, item.newest).know(item.newest)
+                self._incomplete.add((item.key, item.publisher))
+            case _Cached():
+                if item.repeated and not item.failed and item.newest >= 0:
+                    arrivals = self._arrivals_of(item.key, item.publisher, item.newest)
+                    samples += arrivals.answered(item.first, item.newest)
+            case zenoh.Sample():
+                self._take_sample(item, samples)
+
+    def _take_sample(self, item: zenoh.Sample, samples: list[Sample]) -> None:
+        if item.attachment is None or len(item.attachment) != _ATTACHMENT.size:
             _LOG.warning("%s: dropped, no attachment of 24 bytes beside it", item.key_expr)
-        else:
-            stamp_ns, wall_ns, counter = _ATTACHMENT.unpack(item.attachment.to_bytes())
-            key = str(item.key_expr).removeprefix(self._prefix)
-            samples.append(Sample(key, item.payload.to_bytes(), stamp_ns, wall_ns, counter))
+            return
+        key = str(item.key_expr).removeprefix(self._prefix)
+        stamp_ns, wall_ns, counter = _ATTACHMENT.unpack(item.attachment.to_bytes())
+        sample = Sample(key, item.payload.to_bytes(), stamp_ns, wall_ns, counter)
+        if item.source_info is None:  # of a plain publisher
+            samples.append(sample)
+            return
+        publisher, number = _numbered(item.source_info)
+        arrivals = self._arrivals_of(key, publisher, number)
+        samples += arrivals.take(number, sample)
+        if arrivals.missing is not None:
+            self._incomplete.add((key, publisher))
+
+    def _arrivals_of(self, key: str, publisher: str, heard: int) -> Arrivals[Sample]:
+        """Of a `latest` channel nothing is asked for that is older than the first heard of."""
+        found = self._arrivals.get((key, publisher))
+        if found is None:
+            row = channel_of(key)
+            whole = row is None or row[0].delivery == "all" or row[0].name in self._whole
+            found = Arrivals(0 if whole else heard, in_order=whole)
+            self._arrivals[key, publisher] = found
+        return found
+
+    def _complete(self, now_s: float) -> list[Sample]:
+        """Ask for what has been missing for a while, without waiting; what waited in vain."""
+        if now_s < self._look_due or not self._incomplete:
+            return []
+        self._look_due = now_s + _LOOK_S
+        late: list[Sample] = []
+        for key, publisher in sorted(self._incomplete):
+            arrivals = self._arrivals[key, publisher]
+            wanted = arrivals.due(now_s)
+            if arrivals.missing is None:
+                self._incomplete.discard((key, publisher))
+            elif wanted is not None:
+                self._ask_cache(key, publisher, *wanted)
+            late += arrivals.overdue(now_s)
+        return late
+
+    def _ask_cache(self, key: str, publisher: str, first: int, last: int | None) -> None:
+        cached = _Cached(key, publisher, first, repeated=last is None)
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is None:
+                cached.failed = True
+            elif reply.ok.source_info is not None:
+                cached.newest = max(cached.newest, _numbered(reply.ok.source_info)[1])
+                self._queue.put(reply.ok)
+
+        until = "" if last is None else str(last)
+        _LOG.info("%s: %d to %s are missing, asked for", key, first, until or "the newest")
+        self._session.get(
+            f"{self._prefix}{key}{_ADVANCED}{publisher}/**?_anyke;_sn={first}..{until}",
+            Callback(take, drop=lambda: self._queue.put(cached), indirect=False),
+            timeout=_ANSWER_S,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            target=zenoh.QueryTarget.ALL,
+            congestion_control=_BLOCK,
+        )
+
+    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+        """What is known of and has not arrived: by key, intervals of a publisher's numbers.
+
+        Of what a publisher does not have any more, too.
+        """
+        found: dict[str, list[tuple[int, int]]] = {}
+        for (key, _), arrivals in sorted(self._arrivals.items()):
+            if intervals := arrivals.lacking:
+                found.setdefault(key, []).extend(intervals)
+        return found
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answer the queries of `channel`, within `receive`; a ValueError is told to the asker."""
@@ -286,18 +413,17 @@ def _every(channel: Channel, name: str) -> str:
     return "**" if name == "*" and "{robot}" not in channel.template else name
 
 
-def _kept(channel: Channel) -> int:
-    if channel.delivery == "all":
-        return _ALL_KEPT
-    return _MAPS_KEPT if channel.message in (FusedMap, MapEstimate, Prior) else _LATEST_KEPT
+def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:
+    """The publisher, as its heartbeats name it, and its number of the publication."""
+    return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn
 
 
-def _history(channel: Channel) -> ext.HistoryConfig:
+def _history(channel: Channel, *, whole: bool) -> ext.HistoryConfig:
     # Where one is wanted, no detection of late publishers: after a cut the publisher counts as
     # late, and a query for one sample would take the place of the recovery of all.
-    if channel.delivery == "latest":
+    if channel.delivery == "latest" and not whole:
         return ext.HistoryConfig(max_samples=1, detect_late_publishers=False)
-    return ext.HistoryConfig(max_samples=_ALL_KEPT, detect_late_publishers=True)
+    return ext.HistoryConfig(max_samples=ALL_KEPT, detect_late_publishers=True)
 
 
 def _reply(question: _Question) -> None:

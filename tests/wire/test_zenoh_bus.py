@@ -9,9 +9,10 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
+from benchmarks.late_joins import storm
 from team.wire import channels as c
 from team.wire import messages as m
-from team.wire.bus import BusError, Outgoing, Sample, opened
+from team.wire.bus import MAPS_KEPT, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from team.wire.zenoh_bus import ZenohBus, router
 from tests.support import ROOT, Link, odometry, received, submap, wait_until
@@ -40,6 +41,9 @@ def flowing(source: ZenohBus, sink: ZenohBus, *channels: c.Channel) -> None:
 
 def progress(i: int) -> Outgoing:
     return Outgoing(c.ROBOT_PROGRESS, "alpha", m.Progress(i, "robot/alpha", "alpha", 0, i, 0))
+
+
+MORE = 34
 
 
 def counters(samples: list[Sample], key: str) -> list[int]:
@@ -96,16 +100,19 @@ def test_of_more_maps_than_are_kept_a_cut_link_still_gets_the_newest(endpoint: s
         ZenohBus("t", link.endpoint) as sink,
     ):
         flowing(source, sink, c.FUSED_MAP)
-        for i in range(60):
+        for i in range(10 + MORE + MAPS_KEPT):
             if i == 10:
                 arrived = received(sink, 10)
                 link.cut()
             source.publish_raw(Sample("central/map", b"map", i, 0, i))
         link.mend()
-        wait_until(lambda: bool(arrived.extend(sink.receive(0.02)) or arrived[-1].counter == 59))
-        source.publish_raw(Sample("central/map", b"map", 60, 0, 60))
+        wait_until(lambda: bool(arrived.extend(sink.receive(0.02)) or arrived[-1].counter == i))
+        source.publish_raw(Sample("central/map", b"map", i + 1, 0, i + 1))
         arrived += received(sink, 1)
-    assert counters(arrived, "central/map") == [*range(10), *range(44, 61)]
+        wait_until(
+            lambda: bool(sink.receive(0.02) or sink.lacking() == {"central/map": [(10, 9 + MORE)]})
+        )
+    assert counters(arrived, "central/map") == [*range(10), *range(10 + MORE, i + 2)]
 
 
 def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None:
@@ -268,3 +275,17 @@ def test_a_subscription_to_all_after_one_by_name_is_refused(endpoint: str) -> No
         bus.subscribe(c.SUBMAP, "alpha")
         with pytest.raises(BusError, match="deliver twice"):
             bus.subscribe(c.SUBMAP)
+
+
+def test_who_joins_while_others_publish_gets_everything_once_and_in_order() -> None:
+    partial, _, _ = storm(joins=12, publishers=4, seed=5)
+    assert partial == 0
+
+
+def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint: str) -> None:
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
+        for i in range(50):
+            source.publish(progress(i))
+        sink.subscribe(c.ROBOT_PROGRESS, whole=True)
+        assert counters(received(sink, 50), "robot/alpha/progress") == list(range(50))
+        assert sink.lacking() == {}
