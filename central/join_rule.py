@@ -77,10 +77,15 @@ class JoinRule:
     def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
         """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
         robot = withdrawal.robot
-        if robot not in self._ticks.withdrawn:
+        if robot not in self.withdrawn:
             self._ticks.withdraw(robot)
             said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
             self.warnings.append(said)
+
+    @property
+    def withdrawn(self) -> tuple[str, ...]:
+        """The robots that the team goes on without, ascending."""
+        return self._ticks.withdrawn
 
     def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
         """A refused submap, or one with a refused sighting, may never be in the map."""

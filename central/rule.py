@@ -70,4 +70,4 @@ def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> Rule
         return BatchRule(config, digest, robots)
     if config.fusion == "alone":
         return AloneRule(config, digest, robots)
-    return submap_rule(config, digest)
+    return submap_rule(config, digest, robots)

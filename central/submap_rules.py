@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from central.config import CentralConfig
+from central.hearsay import Hearsay
 from central.join_rule import JoinRule
 from central.roll import Roll
 from central.svd_rule import SvdJoinRule
@@ -14,10 +15,11 @@ from team.wire.bus import Outgoing
 class SubmapRule:
     """A set of submaps and the map that it gives; every submap is acknowledged."""
 
-    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.WITHDRAWAL)
+    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.ORDER, ch.WITHDRAWALS_HEARD)
 
-    def __init__(self, rule: JoinRule) -> None:
+    def __init__(self, rule: JoinRule, robots: Sequence[str]) -> None:
         self.joined = rule
+        self._hearsay = Hearsay(robots)
 
     @property
     def landmarks(self) -> int:
@@ -37,7 +39,8 @@ class SubmapRule:
     @property
     def findings(self) -> tuple[str, ...]:
         """The monitor's, and why robots are not joined or the map is to be doubted, in words."""
-        return (*self.joined.finding.warnings, *self.joined.reasons)
+        unconfirmed = self._hearsay.unconfirmed(self.joined.withdrawn)
+        return (*self.joined.finding.warnings, *self.joined.reasons, *unconfirmed)
 
     @property
     def warnings(self) -> list[str]:
@@ -56,10 +59,20 @@ class SubmapRule:
                 count = self.joined.take_sighting(message)
                 return _credit(message, count, now_ns) if count > before else []
             case m.Withdrawal():
-                self.joined.take_withdrawal(message)
+                return self._follow(message)
+            case m.WithdrawalHeard():
+                order = self._hearsay.take(message)
+                return [] if order is None else self._follow(order)
             case _:
                 pass
         return []
+
+    def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
+        """Who joins later hears of every order from the centre: an operator does not stay."""
+        if order.robot in self.joined.withdrawn:
+            return []
+        self.joined.take_withdrawal(order)
+        return [Outgoing(ch.WITHDRAWAL, order.robot, order)]
 
     def dealt(self, done: m.Done) -> bool:
         """Every submap that the robot has sent is in the fold's reach."""
@@ -89,10 +102,10 @@ class SubmapRule:
         return []
 
 
-def submap_rule(config: CentralConfig, digest: bytes) -> SubmapRule:
+def submap_rule(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> SubmapRule:
     """The rule on submaps that the configuration names."""
     rule = JoinRule if config.fusion == "join" else SvdJoinRule
-    return SubmapRule(rule(config, digest))
+    return SubmapRule(rule(config, digest), robots)
 
 
 def _credit(of: m.Submap | m.SightingFactor, count: int, now_ns: int) -> list[Outgoing]:

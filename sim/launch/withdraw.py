@@ -27,7 +27,7 @@ def withdraw(bus: Bus, robot: str, reason: str, patience_s: float) -> m.FusedMap
     robots: set[str] = set()
     _await_team(bus, robot, robots)
     order = m.Withdrawal(0, robot, "operator", reason)
-    bus.publish(Outgoing(ch.WITHDRAWAL, robot, order))
+    bus.publish(Outgoing(ch.ORDER, robot, order))
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         for fused in _maps(bus, robots):

@@ -97,8 +97,9 @@ class RobotNode:
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """The channels of teammates to subscribe to."""
-        return (ch.WITHDRAWAL, ch.RENDEZVOUS) if self._held.waits else (ch.WITHDRAWAL,)
+        """The channels to subscribe to whoever they name: orders, and teammates that meet."""
+        orders = (ch.ORDER, ch.WITHDRAWAL)
+        return (*orders, ch.RENDEZVOUS) if self._held.waits else orders
 
     def wanted(self) -> m.ReadingsWanted | None:
         """The readings that are missing and must be asked for at their source."""
@@ -325,7 +326,8 @@ class RobotNode:
         if order.robot in self._withdrawn:
             return []
         self._withdrawn.add(order.robot)
-        return [Outgoing(ch.WITHDRAWAL, order.robot, order)]
+        heard = m.WithdrawalHeard(order.stamp_ns, self.robot, order.robot, order.by, order.reason)
+        return [Outgoing(ch.WITHDRAWALS_HEARD, self.robot, heard)]
 
     def _release(self, seen: tuple[str, ...]) -> list[Outgoing]:
         """Send what is held; `seen`: who is to do so too."""

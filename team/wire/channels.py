@@ -1,8 +1,12 @@
 """The table of channels: the only place where a key is spelt.
 
-Keys are relative to the team; a bus puts `team/<team name>/` before them. `{robot}` stands for a
-robot's name, `{node}` for `world`, `central`, `recorder`, `viewer` or `robot/<name>`, `{view}` for a
-view (`team.wire.views`). In the rates a life is one incarnation of a robot's stream (the messages'
+Keys are relative to the team; a bus puts `team/<team name>/` before them. Who says something owns
+the key's prefix: a robot's process `robot/{robot}/…`, its driver `source/{robot}/…`, an operator
+`operator/…`, the others those of their name. So a certificate for a prefix is one for a voice. The
+world is the source of every robot, and the truth is its own too.
+
+`{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer` or
+`robot/<name>`, `{view}` for a view (`team.wire.views`). In the rates a life is one incarnation of a robot's stream (the messages'
 `epoch`), a keyframe one epoch of observation.
 """
 
@@ -23,6 +27,8 @@ all:    a late joiner and a cut link get every one.
 
 
 _PLACE = re.compile(r"\{(robot|node|view)\}")
+_NAME = "[a-z][a-z0-9_]{0,31}"
+_PATTERNS = {"robot": _NAME, "node": f"{_NAME}(?:/{_NAME})?", "view": ".+"}
 
 
 @dataclass(frozen=True)
@@ -44,18 +50,21 @@ class Channel:
 
     def owner(self, key: str) -> str | None:
         """The robot or node that `key` belongs to on this channel; None when it is another's."""
-        pattern = re.escape(self.template).replace(r"\{robot\}", "(?P<name>[^/]+)")
-        match = re.fullmatch(re.sub(r"\\{(node|view)\\}", "(?P<name>.+)", pattern), key)
+        parts = _PLACE.split(self.template)
+        pattern = re.escape(parts[0])
+        if len(parts) > 1:
+            pattern += f"(?P<name>{_PATTERNS[parts[1]]}){re.escape(parts[2])}"
+        match = re.fullmatch(pattern, key)
         return None if match is None else match.groupdict().get("name", "")
 
 
-START = Channel("start", "robot/{robot}/start", m.Start, "once per life of the stream", "all", True, False,
+START = Channel("start", "source/{robot}/start", m.Start, "once per life of the stream", "all", True, False,
                 "reading 0: the start pose, if known")  # fmt: skip
-ODOMETRY = Channel("odometry", "robot/{robot}/odometry", m.Odometry, "8-100 Hz", "stream", True,
+ODOMETRY = Channel("odometry", "source/{robot}/odometry", m.Odometry, "8-100 Hz", "stream", True,
                    False, "one odometry interval")  # fmt: skip
-OBSERVATIONS = Channel("observations", "robot/{robot}/observations", m.Observations, "1-30 Hz",
+OBSERVATIONS = Channel("observations", "source/{robot}/observations", m.Observations, "1-30 Hz",
                        "stream", True, False, "landmarks seen")  # fmt: skip
-SIGHTINGS = Channel("sightings", "robot/{robot}/sightings", m.Sightings, "0-10 Hz", "stream", True,
+SIGHTINGS = Channel("sightings", "source/{robot}/sightings", m.Sightings, "0-10 Hz", "stream", True,
                     False, "teammates seen")  # fmt: skip
 SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)
 
@@ -96,8 +105,13 @@ FUSED_MAP = Channel("fused_map", "central/map", m.FusedMap, "one per broadcast",
                     True, "the team's map")  # fmt: skip
 PRIOR = Channel("prior", "central/prior/{robot}", m.Prior, "one per broadcast", "latest", True,
                 True, "the joint marginal that a robot needs")  # fmt: skip
-WITHDRAWAL = Channel("withdrawal", "withdrawal/{robot}", m.Withdrawal, "once, and by who hears it", "all",
-                     True, False, "the team goes on without the robot; by an operator or the centre")  # fmt: skip
+ORDER = Channel("order", "operator/withdrawal/{robot}", m.Withdrawal, "once", "all", True, False,
+                "an operator's order: the team goes on without the robot")  # fmt: skip
+WITHDRAWAL = Channel("withdrawal", "central/withdrawal/{robot}", m.Withdrawal, "once", "all", True, False,
+                     "the team goes on without the robot; every order that the centre follows")  # fmt: skip
+WITHDRAWALS_HEARD = Channel("withdrawals_heard", "robot/{robot}/withdrawals", m.WithdrawalHeard,
+                            "once per order", "all", True, False,
+                            "an order that the robot has heard, for a centre that is started again")  # fmt: skip
 FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
                     "the team's map with its joint covariance")  # fmt: skip
 TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per life of the stream",
@@ -121,7 +135,7 @@ STATUS = Channel("status", "{node}/status", m.Status, "1 Hz", "latest", True, Fa
 ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", True, False,
                 "liveliness token; its changes are logged as messages")  # fmt: skip
 
-READINGS = Channel("readings", "world/readings/{robot}", m.ReadingsWanted, "query", "stream", False,
+READINGS = Channel("readings", "source/{robot}/readings", m.ReadingsWanted, "query", "stream", False,
                    False, "a query; the replies are the readings")  # fmt: skip
 SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "stream", False, False,
                   "a query; the replies are the submaps in the centre's set")  # fmt: skip

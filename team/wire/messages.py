@@ -233,10 +233,23 @@ class Withdrawal(Message, frozen=True, array_like=True, gc=False, tag="withdrawa
     """The team goes on without a robot: the map is that of the set without its submaps, and without
     the sightings by it or of it. A member of the set like a submap: there is no way back.
 
-    by: "operator" or "central". reason: in words.
+    by: who ordered it, "operator" or "central". reason: in words.
     """
 
     robot: Name
+    by: Text
+    reason: Text
+
+
+class WithdrawalHeard(Message, frozen=True, array_like=True, gc=False, tag="withdrawal_heard/1"):
+    """A robot has heard that the team goes on without `withdrawn`, and keeps the order for a centre
+    that is started again. Hearsay, which a centre weighs (`central.hearsay`).
+
+    robot: who says so. by, reason: as the order had them.
+    """
+
+    robot: Name
+    withdrawn: Name
     by: Text
     reason: Text
 

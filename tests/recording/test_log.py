@@ -74,7 +74,7 @@ def test_every_recorded_message_comes_back_sound(path: Path) -> None:
     st.lists(
         st.builds(
             Sample,
-            st.sampled_from(["view/scene", "robot/alpha/odometry", "central/map"]),
+            st.sampled_from(["view/scene", "source/alpha/odometry", "central/map"]),
             st.binary(max_size=60),
             st.integers(1, 2**62 - 1),
             st.integers(0, 2**63 - 1),
@@ -112,7 +112,7 @@ def test_channels_can_be_selected(path: Path) -> None:
 
 
 def test_a_counter_comes_back_modulo_two_to_the_32(path: Path) -> None:
-    log = recorded(path, [Sample("robot/alpha/odometry", b"\x90", 1, 2, 2**32 + 3)])
+    log = recorded(path, [Sample("source/alpha/odometry", b"\x90", 1, 2, 2**32 + 3)])
     assert [one.counter for one in log.samples()] == [3]
 
 

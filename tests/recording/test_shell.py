@@ -75,7 +75,7 @@ def test_unsound_payloads_are_recorded_as_they_came(path: Path) -> None:
     network = MemoryNetwork()
     world, bus = MemoryBus(network), MemoryBus(network)
     unsound = [
-        Sample("robot/alpha/odometry", payload, i, 0, i)
+        Sample("source/alpha/odometry", payload, i, 0, i)
         for i, payload in enumerate([b"", b"\x91" * 200, b"\xc1", b"\x94\xc0\xc0\xc0\xc0", b"\x94"])
     ]
     with Recorder(path, "t", {}) as recorder:
@@ -141,7 +141,7 @@ def flows(source: ZenohBus, path: Path) -> None:
 
     def heard() -> bool:
         source.publish(Outgoing(c.SIGHTINGS, "probe", PROBE))
-        return any(sample.key == "robot/probe/sightings" for sample in open_log(path).samples())
+        return any(sample.key == "source/probe/sightings" for sample in open_log(path).samples())
 
     wait_until(heard)
 
@@ -195,7 +195,7 @@ def test_a_replay_is_the_log_byte_by_byte_in_its_order(path: Path, endpoint: str
     with plain_subscriber(endpoint, arrived), ZenohBus("t", endpoint) as bus:
 
         def heard() -> bool:
-            bus.publish_raw(Sample("robot/probe/sightings", b"", 0, 0, 0))
+            bus.publish_raw(Sample("source/probe/sightings", b"", 0, 0, 0))
             return bool(arrived)
 
         wait_until(heard)

@@ -85,13 +85,13 @@ def test_nothing_is_wrong_with_a_sound_log(whole: Log) -> None:
 
 def test_lost_messages_are_named_by_their_counters(path: Path) -> None:
     lost = [s for s in drive("alpha", 2) if s.counter not in (3, 4, 8) or "odometry" not in s.key]
-    assert found(recorded(path, lost)) == ["robot/alpha/odometry: 3 messages missing: 3–4, 8"]
+    assert found(recorded(path, lost)) == ["source/alpha/odometry: 3 messages missing: 3–4, 8"]
 
 
 def test_a_recorder_that_came_late_is_told_but_a_cut_is_not(tmp_path: Path) -> None:
     late = drive("alpha", 2)[6:]
     assert found(recorded(tmp_path / "a.mcap", late)) == [
-        "robot/alpha/odometry: 5 messages missing: 0–4"
+        "source/alpha/odometry: 5 messages missing: 0–4"
     ]
     assert found(recorded(tmp_path / "b.mcap", late, cut="said")) == []
 
@@ -104,7 +104,9 @@ def test_a_publisher_that_starts_again_has_lost_nothing(path: Path) -> None:
 def test_a_publisher_that_starts_again_unheard_is_told(path: Path) -> None:
     first = [s for s in drive("alpha", 1) if "odometry" in s.key][:3]
     again = [replace(s, wall_ns=s.wall_ns + 10**9) for s in first[2:]]
-    assert found(recorded(path, first + again)) == ["robot/alpha/odometry: 2 messages missing: 0–1"]
+    assert found(recorded(path, first + again)) == [
+        "source/alpha/odometry: 2 messages missing: 0–1"
+    ]
 
 
 def test_what_no_publisher_counts_is_not_held_against_its_counters(path: Path) -> None:
@@ -121,8 +123,8 @@ def test_a_message_that_is_there_twice_or_late_is_named(path: Path) -> None:
     samples = drive("alpha", 1)
     samples[2], samples[5] = samples[5], samples[2]
     assert found(recorded(path, [*samples, samples[-2]])) == [
-        "robot/alpha/odometry: 1 message twice, the first is 9",
-        "robot/alpha/odometry: 2 messages out of order, the first is 2",
+        "source/alpha/odometry: 1 message twice, the first is 9",
+        "source/alpha/odometry: 2 messages out of order, the first is 2",
     ]
 
 
@@ -133,7 +135,7 @@ def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(
 ) -> None:
     """Each life of a publisher is known by its message 0."""
     samples = [
-        Sample("robot/alpha/odometry", b"", 0, 1_000 * life + counter, counter)
+        Sample("source/alpha/odometry", b"", 0, 1_000 * life + counter, counter)
         for life, kept in enumerate(lives)
         for counter in sorted({0, *kept})
     ]
@@ -152,7 +154,7 @@ def test_unsound_messages_are_counted_and_the_first_is_explained(path: Path) -> 
     samples[4] = replace(samples[4], payload=encoded(odometry(4, "bravo")))
     samples[5] = replace(samples[5], stamp_ns=5)
     (line,) = found(recorded(path, samples))
-    assert line.startswith("robot/alpha/odometry: 3 unsound, the first: message 2: truncated")
+    assert line.startswith("source/alpha/odometry: 3 unsound, the first: message 2: truncated")
     samples[3:5] = drive("alpha", 1)[3:5]
     (line,) = found(recorded(path.with_name("b.mcap"), samples))
     assert line.endswith("message 4: logged at 5 ns, of 100400000000 ns")
@@ -245,7 +247,7 @@ def test_a_summary_counts_and_its_span_is_that_of_the_readings(whole: Log) -> No
         key: count.messages for key, count in whole.counts().items()
     }
     assert summary.span_ns() == (100 * SECOND, 105_900_000_000)
-    assert of["robot/alpha/odometry"].rate_hz == pytest.approx(10.0)
+    assert of["source/alpha/odometry"].rate_hz == pytest.approx(10.0)
     assert of["robot/alpha/submap"].rate_hz == pytest.approx(1.0)
     assert of["robot/alpha/config"].rate_hz is None
 
@@ -390,7 +392,7 @@ def test_numbers_read_back_from_csv_are_the_same(
     log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
     export_csv(log, folder / "out")
     (row,) = rows_of(folder / "out" / "observations.csv")
-    assert (row["key"], row["counter"], row["reading"]) == ("robot/alpha/observations", "3", "9")
+    assert (row["key"], row["counter"], row["reading"]) == ("source/alpha/observations", "3", "9")
     assert from_ids([int(word) for word in row["ids"].split()]) == message.ids
     for name in ("ranges", "bearings"):
         back = np.array([float(word) for word in row[name].split()])

@@ -370,9 +370,10 @@ def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
 @pytest.mark.parametrize("exchange", ["continuous", "rendezvous"])
 def test_an_order_to_withdraw_a_robot_is_repeated_once_for_a_centre_that_comes_later(exchange):
     node = RobotNode(config(), exchange)
-    assert ch.WITHDRAWAL in node.overhears
+    assert {ch.ORDER, ch.WITHDRAWAL} <= set(node.overhears)
     orders = [m.Withdrawal(0, name, "operator", "a flat wheel") for name in ("r2", "r3", "r2")]
-    assert [of(node.handle(order, 0), ch.WITHDRAWAL) for order in orders] == [
-        [orders[0]], [orders[1]], [],
+    heard = [m.WithdrawalHeard(0, "r1", o.robot, o.by, o.reason) for o in orders]
+    assert [of(node.handle(order, 0), ch.WITHDRAWALS_HEARD) for order in orders] == [
+        [heard[0]], [heard[1]], [],
     ]  # fmt: skip
     assert not node.warnings

@@ -43,7 +43,7 @@ def test_the_json_of_a_launch_has_every_figure(launched: Launched) -> None:
     for robot in result["robots"].values():
         assert {name for name in ROBOT_FIGURES if robot.get(name) is None} == set()
         assert robot["steps"] == STEPS
-    for key in ("robot/r1/odometry", "robot/r2/submap", "central/final"):
+    for key in ("source/r1/odometry", "robot/r2/submap", "central/final"):
         assert set(result["channels"][key]) == {"messages", "bytes"}
         assert result["channels"][key]["messages"] > 0
 

@@ -58,7 +58,7 @@ async def test_a_replay_arrives_byte_by_byte_in_the_order_of_the_log(
     with plain_subscriber(endpoint) as arrived, ZenohBus("probe", endpoint) as probe:
 
         def heard() -> bool:
-            probe.publish_raw(Sample("robot/probe/sightings", b"", 0, 0, 0))
+            probe.publish_raw(Sample("source/probe/sightings", b"", 0, 0, 0))
             return bool(arrived)
 
         await until(heard, "the subscriber hears")

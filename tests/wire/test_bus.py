@@ -137,7 +137,7 @@ def test_order_holds_across_keys_and_deliveries(joined: Joined) -> None:
             (c.SUBMAP, "alpha", submap(i)),
             (c.ROBOT_PROGRESS, "alpha", progress),
         )
-    keys = ["robot/alpha/odometry", "robot/alpha/submap", "robot/alpha/progress"]
+    keys = ["source/alpha/odometry", "robot/alpha/submap", "robot/alpha/progress"]
     arrived = received(sink, 900)
     assert [(sample.key, sample.counter) for sample in arrived] == [
         (key, i) for i in range(300) for key in keys

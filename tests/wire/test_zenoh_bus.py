@@ -28,7 +28,7 @@ def flowing(source: ZenohBus, sink: ZenohBus, *channels: c.Channel) -> None:
     """Subscribe and return when publications of `source` reach `sink`."""
     for channel in (*channels, c.SIGHTINGS):
         sink.subscribe(channel)
-    probe = Sample("robot/probe/sightings", b"", 0, 0, 0)
+    probe = Sample("source/probe/sightings", b"", 0, 0, 0)
 
     def heard() -> bool:
         source.publish_raw(probe)
@@ -68,7 +68,7 @@ def test_what_was_published_before_close_arrives(endpoint: str) -> None:
         for i in range(5_000):
             source.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
         source.close()
-        assert counters(received(sink, 5_000), "robot/alpha/odometry") == list(range(5_000))
+        assert counters(received(sink, 5_000), "source/alpha/odometry") == list(range(5_000))
 
 
 @pytest.mark.parametrize("behind", ["source", "sink"])
@@ -244,9 +244,9 @@ def test_a_publication_without_its_attachment_is_dropped_and_logged(
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
         flowing(source, sink, c.ODOMETRY)
         with zenoh.open(config) as stranger:
-            stranger.put("team/t/robot/alpha/odometry", encoded(odometry(0)))
+            stranger.put("team/t/source/alpha/odometry", encoded(odometry(0)))
         wait_until(lambda: sink.receive(0.02) == [] and bool(caplog.records))
-    assert "team/t/robot/alpha/odometry: dropped" in caplog.text
+    assert "team/t/source/alpha/odometry: dropped" in caplog.text
 
 
 def test_receive_waits_for_the_first_and_no_longer(endpoint: str) -> None:

@@ -57,7 +57,7 @@ def test_info_fits_eighty_columns_and_steers_no_terminal(
     assert "\x1b" not in out
     assert "team small, complete: " in out
     assert [line for line in lines if line.startswith("note: xxx")]
-    assert ("robot/r1/odometry" if options else "odometry") in out
+    assert ("source/r1/odometry" if options else "odometry") in out
 
 
 def test_what_is_said_before_the_readings_has_neither_time_nor_rate(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_what_is_said_before_the_readings_has_neither_time_nor_rate(tmp_path: Pa
 def test_the_figures_of_info_are_written_for_machines(log: Path, tmp_path: Path) -> None:
     assert run("info", log, "--json", tmp_path / "info.json")[0] == 0
     figures = json.loads((tmp_path / "info.json").read_text())
-    odometry = next(each for each in figures["keys"] if each["key"] == "robot/r1/odometry")
+    odometry = next(each for each in figures["keys"] if each["key"] == "source/r1/odometry")
     assert (odometry["messages"], odometry["rate_hz"]) == (20, pytest.approx(1.0))
     assert (figures["team"], figures["complete"], figures["metadata"]["seed"]) == (
         "small", True, "1",
@@ -89,7 +89,7 @@ def test_check_ends_with_1_and_a_line_for_each_finding(log: Path, tmp_path: Path
         recorder.write([s for s in published() if s.counter != 3])
     status, out, _ = run("check", lost)
     assert status == 1
-    assert "robot/r1/odometry: 1 message missing: 3" in out.splitlines()
+    assert "source/r1/odometry: 1 message missing: 3" in out.splitlines()
     assert all(": 1 message missing: 3" in line for line in out.splitlines())
 
 

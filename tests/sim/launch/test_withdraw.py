@@ -25,7 +25,7 @@ class Centre(threading.Thread):
         super().__init__(daemon=True)
         self.bus, self.answer = MemoryBus(network), answer
         self.bus.declare_alive("central")
-        self.bus.subscribe(ch.WITHDRAWAL)
+        self.bus.subscribe(ch.ORDER)
         self.orders: list[m.Withdrawal] = []
         self.over = threading.Event()
 
