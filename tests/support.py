@@ -144,7 +144,7 @@ def examples() -> Iterator[m.Message]:
         8_500, "alpha", 1, 5, digest, "bravo", 6.0, -3.0, packed(spd(2)), (12, 14)
     )
     yield m.Withdrawal(9_000, "alpha", "operator", "its wheel is flat")
-    yield m.WithdrawalHeard(9_000, "bravo", "alpha", "operator", "its wheel is flat")
+    yield m.WithdrawalHeard(9_000, "alpha", "bravo", "operator", "its wheel is flat")
     yield m.MapEstimate(9_000, "alpha", 1, 5, 0, False, two, means, blocks)
     yield m.PoseEstimate(9_000, "alpha", 1, 5, digest, three, from_floats(spd(3)))
     yield m.ParticleCloud(9_000, "alpha", from_floats(range(6)), from_floats([0.25, 0.75]))
