@@ -87,6 +87,11 @@ class JoinRule:
         """The robots that the team goes on without, ascending."""
         return self._ticks.withdrawn
 
+    def refuse(self, of: m.Submap | m.SightingFactor, why: str) -> int:
+        """What raised is not in the map; how many of its stream have been dealt with."""
+        self._judge(of, why)
+        return self.count((of.robot, of.epoch))
+
     def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
         """A refused submap, or one with a refused sighting, may never be in the map."""
         if reason is not None:

@@ -12,7 +12,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids
 from team.wire.bus import Bus, BusError, Sample, opened
-from team.wire.codec import decoded
+from team.wire.codec import WireError
 
 PATIENCE_S = 3.0
 """A robot whose token went has this long to come back before the team goes on without it."""
@@ -49,12 +49,12 @@ class CentralShell:
         for channel in self.node.listens:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
-        self._bus.answer(ch.SUBMAPS, "", self.node.answer_submaps)
+        self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
         self._shell.begin()
         while self._shell.going:
             self._shell.take(self._patient(self._bus.receive(WAIT_S)))
             self._shell.take(self._given_up())
-            self._mend()
+            self._shell.contained("wanted", self._mend)
             self._shell.report()
         self._shell.report(last=True)
         final = self.node.final
@@ -64,6 +64,7 @@ class CentralShell:
             digest = final.digest.hex()
             _LOG.info("final map of %d landmarks, set %s", len(ids(final.ids, "ids")), digest)
         self._leave_last()
+        self._shell.end()
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
         """The samples, less the news of lost robots: they may come back."""
@@ -71,7 +72,11 @@ class CentralShell:
         passed = []
         for sample in samples:
             if sample.key.endswith("/alive"):
-                _, node, message = opened(sample)
+                try:
+                    _, node, message = opened(sample)
+                except WireError:
+                    passed.append(sample)  # the door counts it
+                    continue
                 assert isinstance(message, m.Liveliness)
                 (self._alive.add if message.alive else self._alive.discard)(node)
                 self._lost.pop(node, None)
@@ -108,8 +113,7 @@ class CentralShell:
         except BusError as error:
             _LOG.warning("%s", error)
             return
-        for reply in replies:
-            self._shell.publish(self.node.handle(decoded(reply), 0))
+        self._shell.take_replies(ch.READINGS, wanted.robot, replies, m.Reading)
 
     def _leave_last(self) -> None:
         """Robots and world leave at the final map; whoever missed it may still ask for it."""

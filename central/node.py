@@ -6,9 +6,13 @@ liveliness, and to nothing that holds the fused map.
 
 from collections.abc import Iterable, Sequence
 
+import msgspec
+
 from central.config import CentralConfig
+from central.fused import fused_message
 from central.roll import Roll
-from central.rule import rule_of
+from central.rule import Refuses, rule_of
+from central.rules import NOTHING
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -25,6 +29,9 @@ class CentralNode:
         self._roll = Roll.of(robots)
         self._rule = rule_of(config, self._announcement.digest, sorted(robots))
         self._broadcasts = 0
+        self._newest: m.FusedMap | None = None
+        self._credit: list[Outgoing] | None = None
+        self._concluding = False
         self.finished = False
         self.final: m.FusedMap | None = None
 
@@ -44,21 +51,53 @@ class CentralNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
+        self._credit = None
         self._roll.take(message)
-        last = self._rule.take(message, self._roll.now_ns)
-        return self._advance() + last  # the credit comes after the map that it gave
+        self._credit = self._rule.take(message, self._roll.now_ns)
+        return self._advance() + self._credit  # the credit comes after the map that it gave
+
+    def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
+        """Go on behind a message whose handling raised: who waits for its credit gets it.
+
+        One that the rule could not take counts as refused. Where the final map can not be computed,
+        the newest map that could is the final one, provisional and with the reason.
+        """
+        out, self._credit = self._credit, []
+        if out is None:
+            rule: object = self._rule
+            out = rule.refuse(message, why, self._roll.now_ns) if isinstance(rule, Refuses) else []
+        if self._concluding and not self.finished:
+            return out + self._conclude_anyway(why)
+        return out + (self._advance() if self._is_over else [])
 
     def _advance(self) -> list[Outgoing]:
         if self.finished:
             return []
         out = self._rule.advance(self._roll)
-        self._broadcasts += any(o.channel is ch.FUSED_MAP for o in out)
+        maps = [o.message for o in out if isinstance(o.message, m.FusedMap)]
+        self._broadcasts += bool(maps)
+        self._newest = maps[-1] if maps else self._newest
+        return out + self._conclude() if self._is_over else out
+
+    @property
+    def _is_over(self) -> bool:
+        """The streams have ended, and nobody and nothing of them is waited for."""
         end = self._roll.end
-        if end is not None and self._roll.concluded(self._rule.dealt) and self._rule.complete(end):
-            out += self._conclude()
-        return out
+        over = end is not None and self._roll.concluded(self._rule.dealt)
+        return over and end is not None and self._rule.complete(end)
+
+    def _conclude_anyway(self, why: str) -> list[Outgoing]:
+        newest = self._newest
+        if newest is None:
+            digest, now_ns = self._announcement.digest, self._roll.now_ns
+            newest = fused_message(self.config, digest, NOTHING, (), stamp_ns=now_ns, joint=False)
+        reasons = (*newest.reasons, f"not the final map, which raised: {why}")
+        final = msgspec.structs.replace(newest, final=True, provisional=True, reasons=reasons)
+        self.finished, self.final = True, final
+        return [Outgoing(ch.FINAL_MAP, "", final)]
 
     def _conclude(self) -> list[Outgoing]:
+        self._concluding = True
         out = self._rule.conclude(self._roll.now_ns)
         self.finished = True
         final = out[-1].message

@@ -58,6 +58,14 @@ class Rule(Protocol):
         """Readings that are missing and must be asked for at their source."""
 
 
+@runtime_checkable
+class Refuses(Protocol):
+    """A rule that acknowledges messages one by one, those too that it could not take."""
+
+    def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
+        """Count a message as refused; the credit that this gives."""
+
+
 def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> Rule:
     """The rule that the configuration names."""
     if config.fusion in FEEDBACK:

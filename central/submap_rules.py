@@ -74,6 +74,12 @@ class SubmapRule:
         self.joined.take_withdrawal(order)
         return [Outgoing(ch.WITHDRAWAL, order.robot, order)]
 
+    def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
+        """Nobody need wait for a submap, or a sighting from it, that raised."""
+        if not isinstance(message, m.Submap | m.SightingFactor):
+            return []
+        return _credit(message, self.joined.refuse(message, why), now_ns)
+
     def dealt(self, done: m.Done) -> bool:
         """Every submap that the robot has sent is in the fold's reach."""
         return self.joined.count((done.robot, done.epoch)) >= done.submaps

@@ -10,14 +10,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
-from team.wire.bus import Bus, Outgoing, Sample, opened
-from team.wire.channels import STATUS
-from team.wire.codec import WireError
-from team.wire.messages import Message, Status
+from team.containment import Boundary
+from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
+from team.wire.channels import FAULT, STATUS, Channel
+from team.wire.messages import Message, Status, tag_of
 
 STATUS_S = 0.5
 """Wall time between two statuses of a node."""
@@ -29,6 +29,7 @@ PARENT = "TEAMSLAM_PARENT"
 """Environment variable: the process without which this one must not live."""
 LAST_S = 20
 """A process that was told to stop is ended by SIGALRM after this many seconds."""
+T = TypeVar("T")
 _LOG = logging.getLogger("teamslam")
 _PR_SET_PDEATHSIG = 1
 
@@ -49,10 +50,15 @@ class Node(Protocol):
         """What the node is doing, for people."""
 
 
+class FaultyRunError(RuntimeError):
+    """A process did its work, but set messages aside that it could not handle: which, and where."""
+
+
 class Shell:
     """Runs one node on one bus.
 
-    What fails at the door is counted, logged with its reason, and dropped.
+    What fails at the door is counted, logged with its reason, and dropped; what raises behind it is
+    set aside (`team.containment`), and the node goes on.
     """
 
     def __init__(self, bus: Bus, node: Node, name: str, stop: threading.Event) -> None:
@@ -62,7 +68,7 @@ class Shell:
         self._stop = stop
         self._status_due = 0.0
         self._remind_due = time.monotonic() + REMIND_S
-        self._refused = 0
+        self.boundary = Boundary(name)
         self._messages = 0
         self._bytes = 0
         self._since = time.monotonic()
@@ -79,21 +85,62 @@ class Shell:
         return not (self.node.finished or self._stop.is_set())
 
     def publish(self, out: Iterable[Outgoing]) -> None:
-        """Publish what a node returned, in its order."""
+        """Publish what a node returned, in its order; what can not be published is a fault."""
         for outgoing in out:
-            self._bytes += self.bus.publish(outgoing)
-            self._messages += 1
+            try:
+                self._bytes += self.bus.publish(outgoing)
+                self._messages += 1
+            except Exception as error:
+                sample = Sample(outgoing.key, b"", outgoing.message.stamp_ns, 0, -1)
+                fault = self.boundary.note(error, sample, tag_of(type(outgoing.message)))
+                if outgoing.channel is not FAULT:
+                    self.publish([fault])
 
     def take(self, samples: Iterable[Sample]) -> None:
         """Decode at the door, hand to the node, publish its answer."""
         for sample in samples:
+            self.publish(self.boundary.take(self.node, sample))
+
+    def take_replies(
+        self, channel: Channel, name: str, replies: Iterable[bytes], expected: type[Message]
+    ) -> None:
+        """As `take`, of the replies to a question, each of which must be of the expected kind."""
+        for reply in replies:
+            key = channel.key(name)
+            self.publish(self.boundary.take_reply(self.node, key, reply, expected))
+
+    def answer(self, channel: Channel, name: str, answer: Answer) -> None:
+        """Answer queries; an answer that raises is a fault, of which the asker is told."""
+
+        def contained(request: bytes) -> list[bytes]:
             try:
-                _, _, message = opened(sample)
-            except WireError as error:
-                self._refused += 1
-                _LOG.warning("%s: dropped %s: %s", self._name, sample.key, error)
-                continue
-            self.publish(self.node.handle(message, sample.stamp_ns))
+                return list(answer(request))
+            except ValueError:
+                raise  # an unsound request: the asker's
+            except Exception as error:
+                sample = Sample(channel.key(name), request, 0, 0, -1)
+                self.publish([self.boundary.note(error, sample, tag_of(channel.message))])
+                raise ValueError(f"the answer failed: {type(error).__name__}") from error
+
+        self.bus.answer(channel, name, contained)
+
+    def contained(self, what: str, duty: Callable[[], T]) -> T | None:
+        """Do what no message asked for; None, and a fault, if it raises.
+
+        BusError passes: without a bus there is nothing to go on with.
+        """
+        try:
+            return duty()
+        except BusError:
+            raise
+        except Exception as error:
+            self.publish([self.boundary.note(error, Sample(what, b"", 0, 0, -1), "")])
+        return None
+
+    def end(self) -> None:
+        """Raise FaultyRunError if any message was set aside."""
+        if self.boundary.faults:
+            raise FaultyRunError("; ".join(self.boundary.warnings))
 
     def report(self, *, last: bool = False) -> None:
         """Publish the node's status, at most every STATUS_S; the last one in any case."""
@@ -103,7 +150,9 @@ class Shell:
             self._publish_status()
 
     def _publish_status(self) -> None:
-        status = self.node.status()
+        status = self.contained("status", self.node.status)
+        if status is None:
+            status = Status(0, self._name, "unknown", {}, ("it can not say how it is",))
         now = time.monotonic()
         elapsed = max(now - self._since, 1e-3)
         rates = {"messages_per_s": self._messages / elapsed, "bytes_per_s": self._bytes / elapsed}
@@ -115,8 +164,9 @@ class Shell:
         elif now >= self._remind_due:
             self._remind_due = now + REMIND_S
             _LOG.info("%s", "; ".join(warnings) or "waiting")
-        if self._refused:
-            warnings = (*warnings, f"{self._refused} messages were dropped at the door")
+        warnings = (*warnings, *self.boundary.warnings)
+        if self.boundary.faults:
+            rates["faults"] = float(self.boundary.faults)
         status = msgspec.structs.replace(status, figures=status.figures | rates, warnings=warnings)
         self.bus.publish(Outgoing(STATUS, self._name, status))
 
@@ -125,7 +175,7 @@ class Shell:
         self.begin()
         while self.going:
             self.take(self.bus.receive(WAIT_S))
-            duty()
+            self.contained("duty", duty)
             self.report()
         self.report(last=True)
 

@@ -165,6 +165,10 @@ def examples() -> Iterator[m.Message]:
     yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposed("in a submap", 200),), 7)
     yield m.End(9_000, (m.StreamEnd("alpha", 1, 200),), ("gap of 3 s",))
     yield m.Status(9_000, "recorder", "recording", {"messages": 12.0}, ("slow disk",))
+    yield m.Fault(
+        9_000, "central", "robot/alpha/submap", 7, "submap/1", "ValueError", "no frame",
+        "central.node:CentralNode.handle:58", b"\x01\x02\x03\x04\x05\x06\x07\x08",
+    )  # fmt: skip
     yield m.Liveliness(0, "robot/alpha", True)
     yield m.ReadingsWanted(0, "alpha", 1, 5, -1)
     yield m.SubmapsWanted(0, "alpha")

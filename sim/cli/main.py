@@ -50,6 +50,7 @@ def main() -> None:
     from sim.scenario.checks import ScenarioError
     from team.recording.reader import LogError
     from team.recording.recorder import RecorderError
+    from team.shell import FaultyRunError
     from team.wire.bus import BusError
 
     try:
@@ -61,6 +62,6 @@ def main() -> None:
         text = f"error: {error.filename}: {error.strerror}; give another path"
         typer.secho(text, fg="red", err=True)
         sys.exit(WRONG_USE)
-    except (LaunchError, RecorderError, OSError) as error:
+    except (LaunchError, RecorderError, FaultyRunError, OSError) as error:
         typer.secho(f"error: {error}", fg="red", err=True)
         sys.exit(FAILED)

@@ -5,7 +5,7 @@ radians; NEES is per degree of freedom, 1 where the covariance is right.
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -104,7 +104,8 @@ class RobotResult:
 class Evaluation:
     """A run: its scenario (None: the log does not say), its map, its robots and its traffic.
 
-    true_landmarks: all of them, seen or not. notes: what the world had to say of its data.
+    true_landmarks: all of them, seen or not. notes: what the world had to say of its data, and what
+    each node set aside. faults: how many messages were.
     unsound: samples that are no sound message.
     """
 
@@ -116,6 +117,7 @@ class Evaluation:
     notes: tuple[str, ...]
     unsound: int
     cost_by_robot: Mapping[str, float]
+    faults: int = 0
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
@@ -141,16 +143,30 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         for robot in log.robots
     }
     end = log.sound(log.last(ch.END))
+    faults = log.faults()
     return Evaluation(
         scenario,
         fused,
         robots,
         positions,
         {key: log.traffic[key] for key in sorted(log.traffic)},
-        end.notes if isinstance(end, m.End) else (),
+        (*(end.notes if isinstance(end, m.End) else ()), *_set_aside(faults)),
         log.unsound,
         _cost_by_robot(log),
+        len(faults),
     )
+
+
+def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
+    """What each node set aside, and the first that raised, in words."""
+    by_node: dict[str, list[m.Fault]] = {}
+    for fault in faults:
+        by_node.setdefault(fault.node, []).append(fault)
+    return [
+        f"{node} set {len(found)} messages aside; the first, {found[0].key}, raised "
+        f"{found[0].error} at {found[0].place}: {found[0].text}"
+        for node, found in sorted(by_node.items())
+    ]
 
 
 def _cost_by_robot(log: Collected) -> dict[str, float]:
@@ -198,6 +214,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         },
         "unsound_messages": evaluation.unsound,
         "notes": list(evaluation.notes),
+        "faults": evaluation.faults,
     }
     return figures | dict(extra or {})
 

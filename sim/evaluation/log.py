@@ -24,6 +24,7 @@ _LATEST = frozenset(channel.name for channel in _NEWEST)
 _KEPT = frozenset(
     channel.name
     for channel in (
+        ch.FAULT,
         ch.TRUTH,
         ch.TRAJECTORY,
         ch.OWN_POSE,
@@ -108,6 +109,12 @@ class Collected:
             if message is not None:
                 found.append(message)
         return found
+
+    def faults(self) -> list[m.Fault]:
+        """What any node set aside, in the order of the nodes."""
+        keys = sorted(key for key in self.kept if ch.FAULT.owner(key) is not None)
+        found = (self.sound(sample) for key in keys for sample in self.kept[key])
+        return [fault for fault in found if isinstance(fault, m.Fault)]
 
     def sound(self, sample: Sample | None) -> m.Message | None:
         """The sample's message; None, and counted, if it is not sound."""

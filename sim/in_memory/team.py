@@ -13,6 +13,7 @@ from sim.world.streams import WorldStreams
 from sim.world_node.node import WorldNode, expected_nodes
 from team import translate
 from team.config import Exchange, RobotConfig
+from team.containment import Boundary
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -48,6 +49,7 @@ class _Seat:
     node: World | RobotNode | CentralNode
     bus: MemoryBus
     link: Link
+    boundary: Boundary
 
     def send(self, out: list[Outgoing]) -> None:
         for outgoing in out:
@@ -56,8 +58,7 @@ class _Seat:
     def take(self, now_ns: int) -> bool:
         samples = self.link.arrived(self.bus.receive(0.0), now_ns)
         for sample in samples:
-            _, _, message = opened(sample)
-            self.send(self.node.handle(message, sample.stamp_ns))
+            self.send(self.boundary.take(self.node, sample))
         return bool(samples)
 
 
@@ -93,7 +94,7 @@ def run_nodes(
             recorder.subscribe(channel, "**")
     recorder.watch_alive()
     names = [config.id for config in scenario.robots]
-    source = _Seat(world, MemoryBus(network), Link())
+    source = _Seat(world, MemoryBus(network), Link(), Boundary("world"))
     for channel in world.listens:
         source.bus.subscribe(channel)
     source.bus.watch_alive()
@@ -147,7 +148,7 @@ def _centre(
     for channel in node.listens:
         bus.subscribe(channel)
     bus.watch_alive()
-    return _Seat(node, bus, conditions.to_centre(names))
+    return _Seat(node, bus, conditions.to_centre(names), Boundary("central"))
 
 
 def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _Seat:
@@ -157,7 +158,8 @@ def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _
     for channel in node.overhears:
         bus.subscribe(channel)
     bus.watch_alive("central")
-    return _Seat(node, bus, conditions.to_robot(node.robot))
+    boundary = Boundary(ch.robot_node(node.robot))
+    return _Seat(node, bus, conditions.to_robot(node.robot), boundary)
 
 
 def final_map(samples: list[Sample]) -> m.FusedMap:

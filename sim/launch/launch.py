@@ -69,7 +69,16 @@ class Watch:
                 self.statuses[message.node] = message
             elif isinstance(message, m.FusedMap):
                 self.fused = message
+            elif isinstance(message, m.Fault):
+                self._take_fault(message)
             self.errors.take(channel, message)
+
+    def _take_fault(self, fault: m.Fault) -> None:
+        """The first of a node is a failure by name; its status counts the rest."""
+        named = f"{fault.node} set aside "
+        if not any(failure.startswith(named) for failure in self.failures):
+            what = f"{fault.key}: {fault.error} at {fault.place}: {fault.text}"
+            self.failures.append(f"{named}{what}")
 
 
 @dataclass(frozen=True)
@@ -104,6 +113,7 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
             bus.subscribe(ch.STATUS)
             bus.subscribe(ch.FUSED_MAP)
             bus.subscribe(ch.FINAL_MAP)
+            bus.subscribe(ch.FAULT)
             for channel in watch.errors.listens:
                 bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):

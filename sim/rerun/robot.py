@@ -8,6 +8,7 @@ import msgspec
 
 from sim.rerun.log import Identity, Recorded, identity
 from team.config import RobotConfig
+from team.containment import Boundary
 from team.pairs import FEEDBACK
 from team.robot.node import RobotNode
 from team.stream.pose_grid import NO_NODE
@@ -28,6 +29,7 @@ class RetoldRobot(RobotNode):
 
     def __init__(self, config: RobotConfig, digest: bytes, said: PosesSaid) -> None:
         super().__init__(config)
+        self._boundary = Boundary(ch.robot_node(config.id))
         self._announcement = msgspec.structs.replace(self._announcement, digest=digest)
         self._said = said
 
@@ -40,10 +42,14 @@ class RetoldRobot(RobotNode):
             out += super()._poses(stamp_ns)
         return out
 
+    def given(self, message: m.Message) -> list[Outgoing]:
+        """Handle a message as the shell did: one that raises is set aside."""
+        return self._boundary.give(self, message)
+
     def took(self, message: m.Message) -> Counter[str]:
         """Take a reading or the end; the dispositions that it gave, how many of each."""
         before = Counter[str]() if isinstance(message, m.Start) else Counter(self._ledger)
-        self.handle(message, 0)
+        self.given(message)
         return self._ledger - before
 
 
@@ -58,7 +64,7 @@ def retold_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
     def born() -> RetoldRobot:
         node = RetoldRobot(config, digest, said)
         if log.known_map is not None:
-            node.handle(log.known_map, 0)
+            node.given(log.known_map)
         return node
 
     lives = _in_lockstep if config.fusion in FEEDBACK else _alone
@@ -139,11 +145,11 @@ def _life(
             node.resume(start, [s for s in chain if s.last_reading < first])
         counter = first
         while counter < last and counter in readings:
-            yield from node.handle(readings[counter], 0)
+            yield from node.given(readings[counter])
             counter += 1
         if counter == last and until is not None:
             end = m.StreamEnd(start.robot, start.epoch, until)
-            yield from node.handle(m.End(0, (end,)), 0)
+            yield from node.given(m.End(0, (end,)))
         behind = (s.last_reading + 1 for s in chain if counter <= s.last_reading < last)
         following = next((b for b in behind if b in readings), None)
         if counter >= last or following is None:
@@ -169,7 +175,7 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
         inputs.append(m.End(0, (end,)))
     inputs.reverse()
     while inputs:
-        out = node.handle(inputs.pop(), 0)
+        out = node.given(inputs.pop())
         yield from out
         for each in out:
             if isinstance(each.message, m.MapEstimate):
@@ -186,8 +192,8 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     config, digest = log.robot_config(robot)
     node = RetoldRobot(config, digest, {})
     if log.known_map is not None:
-        node.handle(log.known_map, 0)
-    node.handle(m.Liveliness(0, "central", False), 0)
+        node.given(log.known_map)
+    node.given(m.Liveliness(0, "central", False))
     readings = log.readings.get((robot, epoch), {})
     done = max((d.readings for d in _dones(log, robot, epoch)), default=None)
     said: dict[int, str] = {}

@@ -47,7 +47,7 @@ def run_world(
         bus.subscribe(channel)
     bus.watch_alive()
     for robot in robots:
-        bus.answer(ch.READINGS, robot, node.readings)
+        shell.answer(ch.READINGS, robot, node.readings)
     shell.begin()
     said: set[str] = set()
     while shell.going:
@@ -61,6 +61,7 @@ def run_world(
         shell.report()
     shell.report(last=True)
     _LOG.info("published %d readings", int(node.status().figures["readings"]))
+    shell.end()
 
 
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:

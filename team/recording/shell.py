@@ -21,7 +21,7 @@ from team.wire.channels import (
     STATUS,
     channel_of,
 )
-from team.wire.codec import decoded, encoded
+from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import Liveliness, Message, Progress, Status
 
 NODE = "recorder"
@@ -109,7 +109,11 @@ class RecordLoop:
         return sample
 
     def _noted_alive(self, sample: Sample, node: str) -> Sample:
-        came = _is_alive(sample.payload)
+        try:
+            came = _is_alive(sample.payload)
+        except WireError as error:  # a name that no node has: recorded as it came
+            _LOG.warning("%.80s: %s", sample.key, error)
+            return replace(sample, stamp_ns=self._newest_ns)
         (self._alive.add if came else self._alive.discard)(node)
         self._missing.discard(node)
         message = Liveliness(self._newest_ns, node, came)

@@ -5,12 +5,12 @@ import threading
 import time
 
 from team.config import Exchange, RobotConfig
+from team.containment import reply_of
 from team.robot.node import RobotNode
 from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, BusError
-from team.wire.codec import decoded
+from team.wire.bus import Bus, BusError, Sample
 
 GAP_PATIENCE_S = 0.5
 """A reading that is missing for so long is asked for at its source."""
@@ -24,7 +24,8 @@ _LOG = logging.getLogger("teamslam")
 class RobotShell:
     """A robot's process: subscribe, resume an earlier life if there was one, run.
 
-    `run` raises BusError when another process is this robot, and stays it for `patience_s`.
+    `run` raises BusError when another process is this robot, and stays it for `patience_s`;
+    FaultyRunError, at its end, when messages were set aside.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class RobotShell:
         self._bus = bus
         self._stop = stop
         self._patience_s = patience_s
+        self._config, self._exchange = config, exchange
         self.node = RobotNode(config, exchange)
         self._shell = Shell(bus, self.node, ch.robot_node(config.id), stop)
         self._gap_since: float | None = None
@@ -55,6 +57,7 @@ class RobotShell:
             self._catch_up()
         self._shell.run(self._mend)
         _LOG.info("%d submaps from %d readings", self.node.submaps, self.node.next_reading)
+        self._shell.end()
 
     def _be_the_only_one(self) -> None:
         """Return when no other process is this robot."""
@@ -73,9 +76,15 @@ class RobotShell:
         replies = self._bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
         if not replies:
             return False
-        start = decoded(replies[0], m.Start)
-        submaps = [decoded(reply, m.Submap) for reply in replies[1:]]
-        self.node.resume(start, submaps)
+        try:
+            start = reply_of(replies[0], m.Start)
+            submaps = [reply_of(reply, m.Submap) for reply in replies[1:]]
+            self.node.resume(start, submaps)
+        except Exception as error:
+            sample = Sample(ch.SUBMAPS.key(), replies[0], 0, 0, -1)
+            self._shell.publish([self._shell.boundary.note(error, sample, "")])
+            self.node = self._shell.node = RobotNode(self._config, self._exchange)
+            return False
         _LOG.info("resumed after submap %d of epoch %d", submaps[-1].sequence, start.epoch)
         return True
 
@@ -106,6 +115,5 @@ class RobotShell:
         except BusError as error:
             _LOG.warning("%s", error)
             return 0
-        for reply in replies:
-            self._shell.publish(self.node.handle(decoded(reply), 0))
+        self._shell.take_replies(ch.READINGS, wanted.robot, replies, m.Reading)
         return len(replies)

@@ -31,6 +31,10 @@ from team.wire.bus import Outgoing
 
 IN_SIGHTING = "in a sighting factor"
 """The disposition of a reading of teammates that was used."""
+SET_ASIDE = "rejected: its handling raised"
+"""The disposition of a reading that was set aside."""
+MOST_SET_ASIDE = 8
+"""Readings of one window after which the estimator is not put back behind them any more."""
 
 
 class RobotNode:
@@ -74,6 +78,13 @@ class RobotNode:
         self._now_ns = 0
         self._passed_ns = 0
         self._done = False
+        self._start: m.Start | None = None
+        self._closed: list[ClosedWindow] = []
+        self._window: list[m.Reading] = []
+        self._taking: m.Reading | None = None
+        self._aside = 0
+        self._pending: list[Outgoing] = []
+        self._said_done = False
         self.steps = 0
         self.finished = False
         self.warnings: list[str] = []
@@ -119,16 +130,16 @@ class RobotNode:
         for submap in submaps:
             local = translate.local_map_of(submap)
             self._locals.append(local)
-            self._member.resume(
-                ClosedWindow(
-                    submap.sequence,
-                    submap.first_reading,
-                    submap.last_reading,
-                    submap.start_ns,
-                    submap.stamp_ns,
-                    local,
-                )
+            closed = ClosedWindow(
+                submap.sequence,
+                submap.first_reading,
+                submap.last_reading,
+                submap.start_ns,
+                submap.stamp_ns,
+                local,
             )
+            self._closed.append(closed)
+            self._member.resume(closed)
         last = submaps[-1]
         self._ledger["in a submap"] = self._consumed = last.last_reading + 1
         self._pace.acknowledged = len(submaps)
@@ -186,22 +197,60 @@ class RobotNode:
         warnings = (*waiting, *self.warnings[-3:])
         return m.Status(self._now_ns, node, state, figures, warnings)
 
+    def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
+        """Go on behind a reading whose handling raised, as if it had never been there.
+
+        An estimator of submaps is put back: to its last submap, and the window's other readings.
+        One that raises as it closes its last window says `Done` without it.
+        """
+        if self._taking is not None:
+            self._taking = None
+            self._ledger[SET_ASIDE] += 1
+            self._aside += 1
+            if self._consumer == "submap" and self._start and self._aside <= MOST_SET_ASIDE:
+                self._put_back(self._start)
+        if self._done and not self._said_done:
+            self._pending += self._last_words()
+        return self._go_on()
+
+    def _put_back(self, start: m.Start) -> None:
+        self._member = member_of(self.config, start.epoch, self._known or NOTHING_KNOWN)
+        self._member.start(*translate.pose_of(start))
+        self._member.consumed(start.reading)
+        for closed in self._closed:
+            self._member.resume(closed)
+        for reading in self._window:
+            self._member.consumed(reading.reading)
+            match reading:
+                case m.Odometry() if reading.duration_ns:
+                    motion = translate.motion_of(reading, self.config.clock_offset_s)
+                    self._member.drive(*motion)
+                case m.Observations():
+                    self._member.observe(reading.stamp_ns, translate.scan_of(reading))
+                case m.Sightings():
+                    looks = translate.looks_of(reading)
+                    self._member.sight(reading.stamp_ns, reading.reading, looks)
+                case _:
+                    pass
+
     # The stream.
 
     _pose_sigma = 0.0
     _gated = 0
 
     def _go_on(self) -> list[Outgoing]:
-        out: list[Outgoing] = []
+        """Take the readings whose turn has come; what there is to say is kept until it is said."""
         readings = self._inbox.taken()
         while not self._blocked:
             reading = next(readings, None)
             if reading is None:
                 break
-            out += self._take(reading)
+            self._pending += self._take(reading)
         if not self._done and not self._blocked and self._complete:
-            out += self._finish()
-        return out + self._credit()
+            self._pending += self._finish()
+        self._pending += self._credit()
+        out, self._pending = self._pending, []
+        return out
 
     @property
     def _blocked(self) -> bool:
@@ -224,6 +273,7 @@ class RobotNode:
         if isinstance(reading, m.Start):
             out += self._leave_epoch()
             self._begin_epoch(reading)
+        self._taking = reading
         self._consumed = reading.reading + 1
         stamp_ns = self._team_time(reading)
         self._now_ns = max(self._now_ns, stamp_ns)
@@ -239,9 +289,17 @@ class RobotNode:
                 self._observe(reading)
             case m.Sightings():
                 out += self._sight(reading)
+        if self._taking is not None:
+            self._taken(reading)
         if self._pace.counted():
             out.append(self._progress())
         return out
+
+    def _taken(self, reading: m.Reading) -> None:
+        """The open window has the reading."""
+        self._taking = None
+        if self._consumer == "submap":
+            self._window.append(reading)
 
     def _team_time(self, reading: m.Reading) -> int:
         """The reading's stamp; the odometry's put right."""
@@ -255,6 +313,7 @@ class RobotNode:
         self._member.start(pose, covariance)
         self._member.consumed(start.reading)
         self._locals = []
+        self._start, self._closed, self._window, self._aside = start, [], [], 0
         self._last_map = -1
         self._ledger = Counter()
         self._epoch, self._consumed, self._steps = start.epoch, 0, 0
@@ -284,15 +343,21 @@ class RobotNode:
         if reading.duration_ns == 0:
             self._ledger["rejected: odometry over no time"] += 1
             return []
-        self._ledger[self._member.used] += 1
         motion = translate.motion_of(reading, self.config.clock_offset_s)
-        return self._told(self._member.drive(*motion))
+        driven = self._member.drive(*motion)
+        if driven.closed is None:
+            self._used(reading)
+        return self._told(driven)
 
     # What goes out.
 
     @property
     def _speaker(self) -> Speaker:
         return Speaker(self.robot, self._epoch, self._announcement.digest)
+
+    def _used(self, reading: m.Reading) -> None:
+        self._ledger[self._member.used] += 1
+        self._taken(reading)
 
     def _told(self, driven: Driven) -> list[Outgoing]:
         """What there is to say of what the estimator has given."""
@@ -308,9 +373,25 @@ class RobotNode:
         return out + self._mapped(driven.map_ns)
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
+        """Send a submap; it is among what is to be said before anything else of it can raise."""
+        said = [self._speaker.sighting(closed, each) for each in closed.sightings]
+        said.append(self._speaker.submap(closed))
+        if self._taking is not None:
+            self._used(self._taking)
+        self._sighted_in(closed)
         self._locals.append(closed.local)
-        out = self._held.put([*self._sightings(closed), self._speaker.submap(closed)])
-        out += self._speaker.cloud(closed.end_ns, closed.cloud)
+        plain = ClosedWindow(
+            closed.sequence,
+            closed.first_reading,
+            closed.last_reading,
+            closed.start_ns,
+            closed.end_ns,
+            closed.local,
+        )
+        self._closed.append(plain)
+        self._window, self._aside = [], 0
+        self._pending += self._held.put(said)
+        out = self._speaker.cloud(closed.end_ns, closed.cloud)
         out.append(self._speaker.innovation(closed.end_ns, closed.sequence, closed.innovation))
         self._gated += closed.gated
         out += self._poses(closed.end_ns)
@@ -340,18 +421,16 @@ class RobotNode:
         out = [Outgoing(ch.RENDEZVOUS, self.robot, told), *self._held.released()]
         return [*out, self._progress()]
 
-    def _sightings(self, closed: ClosedWindow | None) -> list[Outgoing]:
-        """The sightings of a window that ends, and what becomes of those that reached no node."""
-        out, used = [], set[int]()
+    def _sighted_in(self, closed: ClosedWindow | None) -> None:
+        """What becomes of the sightings of a window that ends and that reached no node."""
+        used = set[int]()
         if closed is not None:
-            out = [self._speaker.sighting(closed, each) for each in closed.sightings]
             used = used.union(*(each.readings for each in closed.sightings))
         lost = len(self._sighted - used)
         if lost:
             self._ledger[IN_SIGHTING] -= lost
             self._ledger[f"rejected: {NO_NODE}"] += lost
         self._sighted.clear()
-        return out
 
     def _mapped(self, stamp_ns: int) -> list[Outgoing]:
         """A new running map: for viewers, or what the rule consumes, when an exchange is due."""
@@ -446,7 +525,7 @@ class RobotNode:
         driven, uncovered = self._member.finish()
         out = self._told(driven)
         if driven.closed is None:
-            out += self._sightings(None)
+            self._sighted_in(None)
         if uncovered:
             self._ledger[self._member.used] -= uncovered
             self._ledger["rejected: no odometry covers it"] += uncovered
@@ -470,8 +549,12 @@ class RobotNode:
         exchanged = self._consumer != "own/map" or self._map_ns == self._exchange_ns
         if self._map_ns is not None and not exchanged:
             out += self._exchange_map(self._map_ns)
-        out += self._release(())
+        return out + self._last_words()
+
+    def _last_words(self) -> list[Outgoing]:
+        out = self._release(())
         dones = [self._epoch_done(), *self._ended]
+        self._said_done = True
         return [*out, self._progress(), *(Outgoing(ch.ROBOT_DONE, self.robot, d) for d in dones)]
 
     def _epoch_done(self) -> m.Done:

@@ -132,6 +132,8 @@ RECORDER_PROGRESS = Channel("recorder_progress", "recorder/progress/{robot}", m.
                             "credit for the world")  # fmt: skip
 STATUS = Channel("status", "{node}/status", m.Status, "1 Hz", "latest", True, False,
                  "what a node is doing, for people")  # fmt: skip
+FAULT = Channel("fault", "{node}/fault", m.Fault, "when a handling raises", "all", True, False,
+                "a message that a node could not handle and set aside")  # fmt: skip
 ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", True, False,
                 "liveliness token; its changes are logged as messages")  # fmt: skip
 

@@ -503,6 +503,25 @@ class Status(Message, frozen=True, array_like=True, gc=False, tag="status/1"):
     warnings: tuple[Text, ...] = ()
 
 
+class Fault(Message, frozen=True, array_like=True, gc=False, tag="fault/1"):
+    """A node could not handle a message and set it aside; stamp_ns is the message's.
+
+    key: where it came from, the query's for a reply, the duty's name if there was no message.
+    counter: its publisher's count of the key; -1: none. message: its tag; empty where it raised
+    before it was one. error, text: the exception's class and words. place: module:function:line.
+    digest: 8 bytes, the payload's BLAKE2b.
+    """
+
+    node: Text
+    key: Text
+    counter: Annotated[int, Meta(ge=-1, le=2**63 - 1)]
+    message: Text
+    error: Text
+    text: Text
+    place: Text
+    digest: Digest
+
+
 class Liveliness(Message, frozen=True, array_like=True, gc=False, tag="liveliness/1"):
     """A node's liveliness token appeared or went; a recorded input of whoever reacted to it."""
 

@@ -1,0 +1,159 @@
+"""The one boundary around the handling of a message: what raises there is set aside and named.
+
+Every shell, a team in memory and a rerun hand messages to their nodes through it, so what a node
+makes of a log does not depend on who runs it. A message that raised is recorded as `Fault`,
+counted, and not handled again when it is delivered once more; the node goes on with what its
+`set_aside` says. What is not an `Exception` (an interrupt, an exit) ends the process as ever.
+"""
+
+import hashlib
+import logging
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Protocol, TypeVar, runtime_checkable
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample, opened
+from team.wire.codec import WireError, decoded, encoded
+
+M = TypeVar("M", bound=m.Message)
+MOST_ANSWERS = 1000
+"""Attempts of a node to go on behind one message, when it raises at that again and again."""
+KEPT_TEXT = 1000
+"""Characters of an exception's text, or of a key, that are kept."""
+_OURS = ("team.", "central.", "sim.")
+_LOG = logging.getLogger("teamslam")
+
+
+@runtime_checkable
+class Handler(Protocol):
+    """What a message is handed to."""
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Take one message."""
+
+
+@runtime_checkable
+class Recovers(Protocol):
+    """A handler that says how it goes on behind a message that raised."""
+
+    def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
+        """What it says in place of its answer: what others wait for, and what was said before."""
+
+
+@dataclass
+class Boundary:
+    """Hands messages to one node and keeps what was refused at the door and what raised.
+
+    name: the node. faults: handlings that raised. refused: messages that were no sound ones.
+    last: the newest fault, in words. aside: what is not handled again, by key and payload.
+    """
+
+    name: str
+    faults: int = 0
+    refused: int = 0
+    last: str = ""
+    aside: set[tuple[str, bytes]] = field(default_factory=set)
+
+    def take(self, node: Handler, sample: Sample) -> list[Outgoing]:
+        """Decode a sample at the door and hand it to the node; its answer."""
+        message = self.let_in(sample, lambda: opened(sample)[2])
+        return message if isinstance(message, list) else self.hand(node, message, sample)
+
+    def take_reply(
+        self, node: Handler, key: str, payload: bytes, expected: type[m.Message]
+    ) -> list[Outgoing]:
+        """As `take`, of a reply to a question on `key`, which must be of the expected kind."""
+        sample = reply_sample(key, payload)
+        message = self.let_in(sample, lambda: reply_of(payload, expected))
+        return message if isinstance(message, list) else self.hand(node, message, sample)
+
+    def give(self, node: Handler, message: m.Message) -> list[Outgoing]:
+        """As `take`, of a message that came in before: a log's."""
+        return self.hand(node, message, reply_sample(m.tag_of(type(message)), encoded(message)))
+
+    def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
+        """The sound message of a sample, else what there is to say: nothing, or a fault."""
+        try:
+            return open_()
+        except WireError as error:
+            self.refused += 1
+            _LOG.warning("%s: dropped %s: %s", self.name, _cut(sample.key, 80), error)
+        except Exception as error:
+            return [self.note(error, sample, "")]
+        return []
+
+    def hand(self, node: Handler, message: m.Message, sample: Sample) -> list[Outgoing]:
+        """Hand a message to the node; its answer, or the fault and how the node goes on."""
+        if self.aside and _name(sample) in self.aside:
+            return []
+        tag = m.tag_of(type(message))
+        try:
+            return node.handle(message, sample.stamp_ns)
+        except Exception as error:
+            out = [self.note(error, sample, tag)]
+        self.aside.add(_name(sample))
+        for _ in range(MOST_ANSWERS if isinstance(node, Recovers) else 0):
+            try:
+                return [*out, *node.set_aside(message, self.last)]  # type: ignore[attr-defined]
+            except Exception as error:
+                out.append(self.note(error, sample, tag))
+        return out
+
+    def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
+        """Count and log a fault; its message."""
+        self.faults += 1
+        place = place_of(error.__traceback__)
+        text = _cut(str(error), KEPT_TEXT)
+        key = _cut(sample.key, KEPT_TEXT)
+        what = f"{tag} " if tag else ""
+        self.last = f"{what}{_cut(key, 80)}: {type(error).__name__} at {place}: {_cut(text, 200)}"
+        _LOG.error("set aside: %s", self.last)
+        _LOG.debug("%s", "".join(traceback.format_exception(error)))
+        digest = _name(sample)[1]
+        stamp_ns = min(max(sample.stamp_ns, -(2**62)), 2**62 - 1)
+        name = type(error).__name__
+        counter = max(sample.counter, -1)
+        fault = m.Fault(stamp_ns, self.name, key, counter, tag, name, text, place, digest)
+        return Outgoing(ch.FAULT, self.name, fault)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was dropped and set aside, in words, for a status."""
+        dropped = f"{self.refused} messages were dropped at the door"
+        raised = f"{self.faults} set aside after a fault, the last: {self.last}"
+        return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
+
+
+def reply_sample(key: str, payload: bytes) -> Sample:
+    """A reply as a sample: it has neither stamp nor counter."""
+    return Sample(key, payload, 0, 0, -1)
+
+
+def reply_of(payload: bytes, expected: type[M]) -> M:
+    """The message of a reply; WireError if it is no sound one, or of another kind."""
+    message: m.Message = decoded(payload)
+    if not isinstance(message, expected):
+        wanted = expected.__name__
+        raise WireError("wrong tag", f"a reply is {type(message).__name__}, no {wanted}")
+    return message
+
+
+def place_of(trace: TracebackType | None) -> str:
+    """module:function:line of the innermost frame of this program; of all frames if none is."""
+    frames = [(f.f_globals.get("__name__", "?"), f.f_code.co_qualname, line)
+              for f, line in traceback.walk_tb(trace)]  # fmt: skip
+    ours = [frame for frame in frames if f"{frame[0]}.".startswith(_OURS)]
+    module, function, line = (ours or [("?", "?", 0), *frames])[-1]
+    return _cut(f"{module}:{function}:{line}", KEPT_TEXT)
+
+
+def _cut(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[: length - 1]}…"
+
+
+def _name(sample: Sample) -> tuple[str, bytes]:
+    return sample.key, hashlib.blake2b(sample.payload, digest_size=8).digest()

@@ -1,0 +1,267 @@
+"""What raises is set aside and named, whoever runs the node; the rest of the team ends its map."""
+
+import re
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from central.join_rule import JoinRule
+from central.main import CentralShell
+from central.node import CentralNode
+from sim.evaluation.evaluation import evaluate
+from sim.in_memory.team import final_map
+from sim.rerun.verification import verify
+from team.containment import Boundary
+from team.recording.recorder import Recorder
+from team.recording.shell import RecordLoop
+from team.robot.main import RobotShell
+from team.robot.member import HybridMember
+from team.robot.node import SET_ASIDE, RobotNode
+from team.shell import FaultyRunError, Shell
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from team.wire.codec import encoded
+from tests.sim.reruns import messages, team_samples, thesis, written
+from tests.support import submap
+from tests.teams import config, published, stream
+from tests.test_laws import CENTRE, assert_each_reading_once
+
+BROKEN_NS = 17_000_000_000
+"""r1's and r2's odometry that ends here, in their second window, can not be handled."""
+
+
+@pytest.fixture
+def brittle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An estimator that raises at one odometry, in the middle of what it changes."""
+    whole = HybridMember.drive
+
+    def drive(self, stamp_ns, duration_ns, forward, yaw_rate):  # type: ignore[no-untyped-def]
+        if stamp_ns == BROKEN_NS:
+            self.sequence += 7
+            self._segmenter = None
+            raise ZeroDivisionError("no way")
+        return whole(self, stamp_ns, duration_ns, forward, yaw_rate)
+
+    monkeypatch.setattr(HybridMember, "drive", drive)
+
+
+def faults(samples: list[Sample]) -> list[m.Fault]:
+    found = [opened(s)[2] for s in samples if s.key.endswith("/fault")]
+    return [message for message in found if isinstance(message, m.Fault)]
+
+
+@pytest.mark.usefixtures("brittle")
+def test_a_reading_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_been_there(
+    tmp_path: Path,
+) -> None:
+    samples = list(team_samples(thesis(45)))
+    told = faults(samples)
+    assert [(f.node, f.key, f.message) for f in told] == [
+        (f"robot/{r}", ch.ODOMETRY.key(r), "odometry/1") for r in ("r1", "r2")
+    ]
+    assert {(f.error, f.text, f.stamp_ns) for f in told} == {
+        ("ZeroDivisionError", "no way", BROKEN_NS)
+    }
+    for fault in told:
+        assert re.fullmatch(r"team\.robot\.node:RobotNode\._drive:\d+", fault.place)
+    assert_each_reading_once(samples)
+    for robot in ("r1", "r2"):
+        (done,) = messages(samples, ch.ROBOT_DONE, robot)
+        assert isinstance(done, m.Done)
+        assert {d.disposition: d.readings for d in done.ledger}[SET_ASIDE] == 1
+    assert {x.robot for x in final_map(samples).members} == {"r1", "r2"}
+    (r1, r2), evaluation = told, evaluate(samples)
+    assert evaluation.faults == 2
+    assert [note.partition(",")[0] for note in evaluation.notes] == [
+        f"{f.node} set 1 messages aside; the first" for f in (r1, r2)
+    ]
+    result = verify(written(tmp_path / "log.mcap", samples))
+    assert result.first is None, str(result.first)
+
+
+@pytest.mark.usefixtures("brittle")
+def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_reading() -> None:
+    readings = published(stream("r1", 30))
+    broken = next(r for r in readings if isinstance(r, m.Odometry) and r.stamp_ns == BROKEN_NS)
+    node, without = RobotNode(config()), RobotNode(config())
+    boundary = Boundary("robot/r1")
+    said: list[list[m.Message]] = [[], []]
+    for reading in readings:
+        said[0] += submaps(boundary.give(node, reading))
+        if reading is broken:
+            without._inbox.next_reading += 1
+        else:
+            said[1] += submaps(without.handle(reading, 0))
+    assert boundary.faults == 1
+    assert said[0] == said[1]
+    assert len(said[0]) > 5
+
+
+def submaps(out: list[Outgoing]) -> list[m.Message]:
+    return [o.message for o in out if o.channel is ch.SUBMAP]
+
+
+def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_in_the_map(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = JoinRule.take_submap
+
+    def take(self: JoinRule, of: m.Submap) -> int:
+        if (of.robot, of.sequence) == ("r1", 1):
+            raise np.linalg.LinAlgError("singular")
+        return whole(self, of)
+
+    monkeypatch.setattr(JoinRule, "take_submap", take)
+    samples = list(team_samples(thesis(90)))
+    (fault,) = faults(samples)
+    assert (fault.node, fault.message, fault.error) == ("central", "submap/1", "LinAlgError")
+    (done,) = messages(samples, ch.ROBOT_DONE, "r1")
+    assert isinstance(done, m.Done)
+    credit = messages(samples, ch.CENTRAL_PROGRESS, "r1")
+    assert isinstance(credit[-1], m.Progress)
+    assert credit[-1].submaps == done.submaps > 5, "nobody waits for what was set aside"
+    final = final_map(samples)
+    assert {x.robot: x.sequence for x in final.members}["r1"] == 0
+    assert m.Member("r1", done.epoch, 1) in final.missing
+
+
+def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def conclude(self: JoinRule, now_ns: int) -> list[Outgoing]:
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr(JoinRule, "conclude", conclude)
+    samples = list(team_samples(thesis(45)))
+    final = final_map(samples)
+    assert final.provisional
+    assert "not the final map, which raised" in final.reasons[-1]
+    assert len(faults(samples)) == 1
+
+
+class Brittle:
+    """A node that raises wherever it is asked."""
+
+    finished = False
+
+    def begin(self) -> list[Outgoing]:
+        return []
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        raise KeyError(message.stamp_ns)
+
+    def status(self) -> m.Status:
+        raise RuntimeError("no word")
+
+
+@pytest.fixture
+def heard() -> tuple[Shell, MemoryBus]:
+    network = MemoryNetwork()
+    sink = MemoryBus(network)
+    for channel in (ch.FAULT, ch.STATUS):
+        sink.subscribe(channel)
+    return Shell(MemoryBus(network), Brittle(), "central", threading.Event()), sink
+
+
+def sampled(message: m.Message, key: str, counter: int = 0) -> Sample:
+    return Sample(key, encoded(message), message.stamp_ns, 0, counter)
+
+
+def test_a_message_that_raised_is_not_handled_again_when_it_comes_again(
+    heard: tuple[Shell, MemoryBus],
+) -> None:
+    shell, sink = heard
+    one, two = (sampled(submap(k), "robot/alpha/submap", k) for k in range(2))
+    shell.take([one, two, one, two])
+    assert [f.counter for f in faults(sink.receive())] == [0, 1]
+    assert shell.boundary.faults == 2
+    with pytest.raises(FaultyRunError, match=r"2 set aside after a fault, the last: submap/1"):
+        shell.end()
+
+
+def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
+    heard: tuple[Shell, MemoryBus],
+) -> None:
+    shell, sink = heard
+    shell.report(last=True)
+    fault, status = (opened(s)[2] for s in sink.receive())
+    assert isinstance(fault, m.Fault)
+    assert (fault.key, fault.text) == ("status", "no word")
+    assert isinstance(status, m.Status)
+    assert status.figures["faults"] == 1.0
+    assert "status: RuntimeError at team.shell:Shell.contained:" in status.warnings[-1]
+
+
+def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew() -> None:
+    network = MemoryNetwork()
+    centre, viewer = MemoryBus(network), MemoryBus(network)
+    start = m.Start(0, "r1", 1, 0, b"", b"")
+    # a submap that is sound, but not of the robot's stream: it can not be resumed from
+    centre.answer(ch.SUBMAPS, "", lambda _: [encoded(start), encoded(start)])
+    centre.answer(ch.READINGS, "r1", lambda _: [encoded(submap(0))])
+    for channel in (ch.FAULT, ch.ROBOT_CONFIG):
+        viewer.subscribe(channel)
+    stop = threading.Event()
+    stop.set()
+    robot = RobotShell(MemoryBus(network), config("r1"), stop, patience_s=0.0)
+    with pytest.raises(FaultyRunError, match="a reply is Start, no Submap"):
+        robot.run()
+    assert robot.node.next_reading == 0
+    assert len(faults([s for s in viewer.receive() if s.key.endswith("fault")])) == 1
+
+
+def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(
+    tmp_path: Path,
+) -> None:
+    network = MemoryNetwork()
+    stranger = MemoryBus(network)
+    stranger.declare_alive("robot/" + "a" * 25_000)
+    shell = CentralShell(MemoryBus(network), CENTRE, ["r1"], threading.Event())
+    token = Sample(
+        ch.ALIVE.key("robot/" + "a" * 25_000),
+        encoded(m.Liveliness(0, "robot/" + "a" * 25_000, True)),
+        0, 0, 0,
+    )  # fmt: skip
+    shell._shell.take(shell._patient([token]))
+    assert shell._shell.boundary.refused == 1
+    with Recorder(tmp_path / "log.mcap", "t", {}) as recorder:
+        loop = RecordLoop(MemoryBus(network), recorder, [])
+        loop.take([token])
+        assert loop.written == 1
+
+
+def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody() -> None:
+    network = MemoryNetwork()
+    shell = Shell(MemoryBus(network), CentralNode(CENTRE, ["r1"]), "central", threading.Event())
+
+    def answer(request: bytes) -> list[bytes]:
+        raise IndexError("beyond")
+
+    shell.answer(ch.SUBMAPS, "", answer)
+    asker = MemoryBus(network)
+    with pytest.raises(RuntimeError, match="the answer failed: IndexError"):
+        asker.ask(ch.SUBMAPS, "", m.SubmapsWanted(0, "r1"), 1.0)
+    assert shell.boundary.faults == 1
+
+
+def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network = MemoryNetwork()
+    bus, sink = MemoryBus(network), MemoryBus(network)
+    sink.subscribe(ch.SUBMAP)
+    sink.subscribe(ch.FAULT)
+    whole = bus.publish_raw
+
+    def publish_raw(sample: Sample) -> None:
+        if sample.key.endswith("submap") and sample.counter == 0:
+            raise OSError("too large")
+        whole(sample)
+
+    monkeypatch.setattr(bus, "publish_raw", publish_raw)
+    shell = Shell(bus, CentralNode(CENTRE, ["r1"]), "robot/alpha", threading.Event())
+    shell.publish(Outgoing(ch.SUBMAP, "alpha", submap(k)) for k in range(2))
+    assert [s.key for s in sink.receive()] == ["robot/alpha/fault", "robot/alpha/submap"]
