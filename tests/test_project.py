@@ -1,5 +1,6 @@
 """The project around the code: what is shipped, under which licences, what the texts promise."""
 
+import ast
 import re
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
+TESTS = ROOT / "tests"
 PACKAGES = ("team", "central", "sim")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
@@ -223,6 +225,44 @@ def test_every_command_that_the_readme_names_exists() -> None:
             capture_output=True, text=True, check=False, timeout=60,
         )  # fmt: skip
         assert result.returncode == 0, f"teamslam {command}: {result.stderr}"
+
+
+def always_true(node: ast.AST) -> bool:
+    """`x is not y` where y is not None (np.True_ is not True), or an assert of what is no value."""
+    if isinstance(node, ast.Assert):
+        return isinstance(node.test, ast.GeneratorExp | ast.Lambda | ast.Tuple | ast.JoinedStr)
+    return isinstance(node, ast.Compare) and any(
+        isinstance(operator, ast.IsNot) and not (isinstance(y, ast.Constant) and y.value is None)
+        for operator, y in zip(node.ops, node.comparators, strict=True)
+    )
+
+
+def test_no_test_asks_what_holds_for_ever() -> None:
+    pages = [file for file in tracked() if file.suffix == ".py" and file.is_relative_to(TESTS)]
+    assert len(pages) > 100
+    found = [
+        f"{page.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}"
+        for page in pages
+        for node in ast.walk(ast.parse(page.read_text()))
+        if isinstance(node, ast.Compare | ast.Assert) and always_true(node)
+    ]
+    assert found == [], "a truth value is compared by ==, not by identity"
+
+
+@pytest.mark.parametrize(
+    ("line", "never_false"),
+    [
+        ("assert inside is not twice", True),
+        ("assert not (1 < x) is not True", True),
+        ("assert (x > 0 for x in y)", True),
+        ("assert (x, y)", True),
+        ("assert inside == (not twice)", False),
+        ("assert found is not None", False),
+        ("assert all(x is not None for x in y)", False),
+    ],
+)
+def test_what_holds_for_ever_is_found(line: str, never_false: bool) -> None:
+    assert any(map(always_true, ast.walk(ast.parse(line)))) == never_false
 
 
 def test_ci_checks_and_tests() -> None:

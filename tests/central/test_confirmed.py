@@ -63,7 +63,7 @@ def test_what_one_submap_alone_has_stands_in_the_map_only_if_one_is_enough(
     least: int, stands: bool
 ) -> None:
     fused = final(rule({("r1", 3)}, landmark_submaps=least))
-    assert (FALSE in ids(fused.ids, "ids")) is stands
+    assert (FALSE in ids(fused.ids, "ids")) == stands
     assert len(left_out(fused)) == (not stands)
     assert all(f"of 6 landmarks ({FALSE})" in text for text in left_out(fused))
 
@@ -80,7 +80,7 @@ def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
 ) -> None:
     """Without a robust loss nobody is doubted: the centre has been told to expect no garbage."""
     fused = final(rule(set(APART), landmark_submaps=2, robust_c=robust_c))
-    assert (FALSE in ids(fused.ids, "ids")) is stands
+    assert (FALSE in ids(fused.ids, "ids")) == stands
 
 
 def test_running_maps_and_priors_have_the_same_landmarks() -> None:

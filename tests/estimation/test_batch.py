@@ -283,7 +283,7 @@ def test_a_robust_batch_leaves_garbage_out(robust):
     assert found.converged(1e-6)
     off = (batch.landmark_gaussian(found).means - clean.means).ravel()
     sigmas = float(np.abs(off / np.sqrt(np.diag(clean.covariance))).max())
-    assert (sigmas < 1.0) is robust, sigmas
+    assert (sigmas < 1.0) == robust, sigmas
 
 
 def told_twice(turn):
@@ -305,7 +305,7 @@ def test_it_is_consistent_and_a_reading_used_twice_is_found(twice):
         total += nees(state_error(mean, truth["r2"]), P)
         dof += 2 * len(ids) + 3
     low, high = chi2_interval(dof, 0.999, 1)
-    assert (low <= total / dof <= high) is not twice, total / dof
+    assert (low <= total / dof <= high) == (not twice), total / dof
 
 
 def test_the_same_readings_give_the_same_bits():

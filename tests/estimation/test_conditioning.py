@@ -169,6 +169,20 @@ def test_the_team_pose_is_consistent_and_counting_a_submap_twice_is_not():
     assert twice > high
 
 
+def test_a_submap_is_taken_with_the_variance_of_each_shared_error_that_it_knows():
+    local = team(3, submaps=1).submaps[0].local
+    n, rng = len(local.mean), np.random.default_rng(1)
+    columns = rng.normal(size=(2, n))
+    local = replace(local, biases=("bearing", "range_scale"), sensitivity=columns)
+    shared = Shared(1.5, (("range_scale", 0.2, 0.3), ("bearing", -0.1, 0.05), ("clock", 7.0, 7.0)))
+    taken = shared.taken(local)
+    S, B = columns, np.diag(np.square([0.05, 0.3]))
+    np.testing.assert_allclose(taken.mean, local.mean + S.T @ [-0.1, 0.2])
+    np.testing.assert_allclose(taken.covariance, 1.5 * local.covariance + S.T @ B @ S)
+    np.testing.assert_array_equal(taken.ids, local.ids)
+    assert Shared().taken(local).covariance.tobytes() == local.covariance.tobytes()
+
+
 FACTOR, SIGMA = 2.5, 0.3
 SHARED = JoinSettings(covariance_factor=FACTOR, bias_sigma={"range_scale": SIGMA})
 

@@ -283,6 +283,22 @@ def test_the_redundancies_of_submaps_and_priors_add_up_to_the_joint_degrees_of_f
     assert [each.sequence for each in agreement.submaps] == [c.sequence for c in world.submaps]
 
 
+@pytest.mark.parametrize("gate", [13.8, np.inf], ids=["landmarks by themselves", "as a whole"])
+def test_with_a_robust_loss_the_redundancies_add_up_too_since_each_counts_with_its_weight(gate):
+    """Σ (dim − w tr(JᵀP⁻¹J Σ)) = Σ dim − unknowns: Σ is the inverse of Σ w JᵀP⁻¹J."""
+    world = team(11, robots=2, submaps=10)
+    options = JoinSettings(robust_c=1.0, landmark_gate=gate, step_tolerance=1e-9)
+    fold = converged(joined(with_outlier(world, 15), world.starts, options), options)
+    costs, graph = joint_cost(fold).submaps, fold.main.graph
+    assert min(each.weight for each in costs) < 0.3
+    redundancy = sum(each.dof for each in costs)
+    assert redundancy == pytest.approx(graph.dimensions.sum() - graph.unknowns)
+    unweighted = sum(
+        (size - each.dof) / each.weight for each, size in zip(costs, graph.dimensions, strict=True)
+    )
+    assert unweighted > graph.unknowns + 1.0, "the mutant, which takes all as believed"
+
+
 # --- marginals ---
 
 

@@ -107,6 +107,34 @@ def test_a_discounted_landmark_counts_as_if_its_own_error_were_larger():
         np.testing.assert_allclose(found @ P, np.eye(len(P)), atol=1e-8)
 
 
+def test_a_factor_on_all_covariances_is_the_same_as_covariances_that_are_so_much_larger():
+    """Gates, weights, cost and redundancy too: the mutant's gate knows nothing of the factor."""
+    world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
+    submaps = mistaken(world, 4)
+    larger = [
+        replace(each, local=replace(each.local, covariance=6.0 * each.local.covariance))
+        for each in submaps
+    ]
+    exactly = replace(ROBUST, step_tolerance=1e-11)
+    told = fold_of(world, submaps, replace(exactly, covariance_factor=6.0))
+    meant = fold_of(world, larger, exactly)
+    weight = meant.main.landmark_weight
+    assert (weight < 0.5).any()
+    np.testing.assert_allclose(told.main.landmark_weight, weight, rtol=1e-6)
+    unscaled = replace(told.main, settings=exactly).landmark_weight
+    assert (unscaled[weight < 0.5] < 0.3 * weight[weight < 0.5]).all(), "the factor matters"
+    np.testing.assert_allclose(told.main.state, meant.main.state, atol=1e-6)
+    for name in ("dimensions", "chi2", "whole_chi2", "counted_chi2", "weight", "cost"):
+        np.testing.assert_allclose(
+            getattr(told.main, name), getattr(meant.main, name), rtol=1e-5, atol=1e-9, err_msg=name
+        )
+    found, expected = landmark_map(told), landmark_map(meant)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-5, atol=1e-9)
+    one, other = joint_cost(told), joint_cost(meant)
+    assert one.dof == pytest.approx(other.dof, rel=1e-6)
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-5)
+
+
 def test_the_cost_of_an_iteration_falls_with_the_robust_cost():
     world = team(5, robots=2, submaps=12, landmarks=10)
     island = fold_of(world, mistaken(world, 5), ROBUST).main

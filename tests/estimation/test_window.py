@@ -319,6 +319,39 @@ def test_a_landmark_seen_once_from_the_start_is_its_reading_and_its_noise():
     np.testing.assert_allclose(np.diag(local.covariance)[:3], windows.POSE_JITTER)
 
 
+def test_the_information_of_few_particles_is_right_on_average_and_that_of_their_scatter_is_not():
+    """E[P⁻¹] = Q⁻¹ over many windows; of the bare scatter it is N/(N − 5) = 4/3 of it."""
+    count, runs, sigmas = 20, 600, np.array([0.1, 0.05, 1e-3])
+    motion = Increment(np.array([1.0, 0.0, 0.0]), np.diag(np.square(sigmas)))
+    empty = windows.opened(FrontEnd(particles=count), ACCURATE)
+    information = {"window": 0.0, "scatter": 0.0}
+    for seed in range(runs):
+        window = windows.moved(empty, motion, generator(seed, "a", 0, 0))
+        P = windows.gaussian(window).covariance - np.diag(windows.POSE_JITTER)
+        scatter = np.cov((window.particles.poses / sigmas).T, bias=True)
+        np.testing.assert_allclose(P / np.outer(sigmas, sigmas), 4.0 / 3.0 * scatter, rtol=1e-6)
+        for name, each in (("window", P / np.outer(sigmas, sigmas)), ("scatter", scatter)):
+            information[name] += np.trace(np.linalg.inv(each)) / 3 / runs
+    # The mean of 600 has a sigma of 1.5 %.
+    assert 0.95 < information["window"] < 1.05
+    assert information["scatter"] > 1.25
+
+
+@pytest.mark.parametrize(
+    ("weights", "factor"),
+    [
+        ([0.05] * 20, 20 / 15),
+        ([0.1, 0.1] + [0.05] * 16, 1.0 / (1.0 - 5.0 * 0.06)),
+        ([0.1] * 10, 2.0),
+        ([0.5, 0.5], 2.0),
+        ([1.0], 2.0),
+    ],
+    ids=["twenty equal", "unequal ones count for fewer", "ten", "two", "one"],
+)
+def test_the_scatter_of_particles_is_taken_times_its_sample_factor(weights, factor):
+    assert windows.sample_factor(np.array(weights)) == pytest.approx(factor)
+
+
 def test_headings_about_half_a_turn_have_their_mean_there():
     back = Increment(np.array([0.0, 0.0, np.pi]), np.diag([0.0, 0.0, 0.01]))
     window = windows.moved(

@@ -49,7 +49,7 @@ def changed(samples: Sequence[Sample], channel: ch.Channel, change: Change) -> l
     out = []
     for sample in samples:
         found, _, message = opened(sample)
-        if found is not channel:
+        if found != channel:
             out.append(sample)
         elif (other := change(message)) is not None:
             out.append(replace(sample, payload=encoded(other)))

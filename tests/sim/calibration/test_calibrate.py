@@ -394,7 +394,7 @@ def test_odometry_that_does_not_fit_is_learnt_and_told_with_and_without_truth(
     told: list[str] = []
     world = world if by_truth else replace(world, landmarks=None)
     found = calibrated([("a log", world)], team, told.append)
-    assert found.by_truth is by_truth
+    assert found.by_truth == by_truth
     assert told
     motion = by_name(found.motion)
     assert motion["forward_scale"].value == pytest.approx(1.1, abs=0.015)

@@ -102,4 +102,4 @@ def test_the_alarm_is_of_the_mean_beyond_its_level_and_its_uncertainty(
     scales: tuple[float, ...], sigma: float, told: bool
 ) -> None:
     biases = [BiasEstimate((f"r{i}", 1), "range_scale", v, sigma) for i, v in enumerate(scales)]
-    assert bool(miscalibrations(biases)) is told
+    assert bool(miscalibrations(biases)) == told

@@ -253,7 +253,7 @@ def test_a_reading_that_is_used_twice_is_found(first: int, counted: int, once: b
     said = [submap(0, 0, 20), submap(1, first, 40), done(41, (("in a submap", counted),))]
     robot = evaluate(world_log(scenario()) + samples(said)).robots["r1"]
     assert robot.consumption.consumed == 41
-    assert robot.consumption.each_once is once
+    assert robot.consumption.each_once == once
 
 
 def test_a_log_without_truth_has_no_errors_but_the_rest() -> None:

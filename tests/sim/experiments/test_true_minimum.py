@@ -70,7 +70,7 @@ def test_the_other_one_of_two_places_is_wrong(bearing_sigma: float, lower: bool)
     assert not judged(minimum(island).island, {}, paths).wrong
     found = judged(minimum(across).island, {}, paths)
     assert found.elsewhere
-    assert (found.lower > 1.0) is lower
+    assert (found.lower > 1.0) == lower
 
 
 def test_submaps_that_deny_the_truth_are_found() -> None:

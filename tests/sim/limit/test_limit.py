@@ -124,7 +124,7 @@ def test_the_map_is_consistent_and_a_reading_used_twice_is_found(twice: bool) ->
     dof = sum(2 * e.count for e in errors)
     total = sum(e.nees_per_dof * 2 * e.count for e in errors)
     inside = chi2.ppf(0.0005, dof) <= total <= chi2.ppf(0.9995, dof)
-    assert inside is not twice, f"NEES/dof {total / dof:.3f} over {dof}"
+    assert inside == (not twice), f"NEES/dof {total / dof:.3f} over {dof}"
 
 
 def test_a_robot_that_the_join_left_out_is_named() -> None:

@@ -101,7 +101,7 @@ def test_the_error_states_eliminated_are_the_processes_covariance(mutant: bool) 
     same = held_cost(standing(LASTING)) == pytest.approx(
         marginal_cost(standing(LASTING), shares), rel=1e-4
     )
-    assert same is not mutant
+    assert same == (not mutant)
 
 
 def test_the_derivatives_are_those_of_the_residuals() -> None:
@@ -165,8 +165,8 @@ def test_the_map_is_consistent_where_errors_last_and_not_if_they_are_taken_as_wh
     errors = [run.errors for run in runs if run.errors is not None]
     dof = sum(2 * e.count for e in errors)
     total = sum(e.nees_per_dof * 2 * e.count for e in errors)
-    inside = bool(chi2.ppf(0.0005, dof) <= total <= chi2.ppf(0.9995, dof))
-    assert inside is (kind == "profile"), f"NEES/dof {total / dof:.3f} over {dof}"
+    inside = chi2.ppf(0.0005, dof) <= total <= chi2.ppf(0.9995, dof)
+    assert inside == (kind == "profile"), f"NEES/dof {total / dof:.3f} over {dof}"
 
 
 def test_the_figures_name_the_noise_and_stand_beside_the_teams() -> None:
