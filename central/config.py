@@ -33,6 +33,9 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     1 where readings may have nothing to do with what is there.
     covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors
     are independent from reading to reading.
+    normal_scale: what the covariance scale of the monitor is where the covariances are right. 1
+    where the errors of windows are independent; less where part of them lasts for longer than a
+    window, since what two windows have in common does not set them apart.
     particles: of `joint-fastslam`.
     bias_sigma: of the errors that robots send their submaps' sensitivities for.
     withdraw_above: a robot of whose submaps the half and more cost above this per degree of freedom
@@ -45,6 +48,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_c: Positive | None = None
     landmark_submaps: Annotated[int, Meta(ge=1, le=100)] = 1
     covariance_factor: Annotated[float, Meta(ge=1.0)] = 1.0
+    normal_scale: Positive = 1.0
     gauss_newton_per_tick: Annotated[int, Meta(ge=1, le=50)] = 2
     bias_sigma: BiasSigmas = BiasSigmas()
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 1000

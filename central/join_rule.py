@@ -212,10 +212,11 @@ class JoinRule:
 
     def _fused(self, fold: Fold, tail: Tail, digest: bytes) -> m.FusedMap:
         chi2 = dof = 0.0
+        self.finding = NOTHING
         if fold.contributions:
             agreement = self._agreement(fold)
             chi2, dof = agreement.chi2, agreement.dof
-            self.finding = finding(agreement)
+            self.finding = finding(agreement, self._config.normal_scale)
         joint = False
         shown = self._shown(fold)
         if not fold.contributions:
@@ -258,6 +259,7 @@ class JoinRule:
             tuple(m.BiasEstimate(*b.stream, b.bias, b.value, b.sigma) for b in biases),
             tuple(fold.joined[k] for k in sorted(fold.joined)),
             self._ticks.withdrawn,
+            self.finding.figures.get("covariance_scale", 0.0),
         )
 
     def _shown(self, fold: Fold) -> list[int]:

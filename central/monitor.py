@@ -1,11 +1,16 @@
-"""The consistency monitor: what the joint cost says of the robots' covariances, without any truth.
+"""The consistency monitor: what the submaps say of the robots' covariances, without any truth.
 
-χ² per degree of freedom is 1 when every covariance is true. Measured: 1.00-1.04 where the map's
-NEES is 1, 1.10-1.18 where it is 1.4-2, 54 where it is 514. With few degrees of freedom it scatters,
-so a level counts only beyond the 99.9 % quantile of χ² as well.
+Two figures, both 1 where every covariance is true. The joint cost per degree of freedom is what is
+minimised; it is sharp (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but a
+robust loss bounds it, since it takes whatever is large for an outlier. The covariance scale is what
+the submaps' unweighted χ² says by its median: no loss bounds it, the outliers of a minority do not
+move it, and it tells covariances that are too large as well. docs/decisions/0033 has how it is
+distributed. With few degrees of freedom both scatter, so a level counts only where chance would
+not reach it once in a thousand as well.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -13,14 +18,18 @@ import numpy as np
 from scipy.stats import chi2 as chi_squared
 
 from team.config import Bias
-from team.estimation.marginals import Agreement, BiasEstimate
+from team.estimation.consistency import Scale, covariance_scale
+from team.estimation.marginals import Agreement, BiasEstimate, SubmapCost
 
 WARN = 1.1
 FAIL = 1.3
+SCALE_WARN = math.sqrt(2.0)
+"""Beyond this, and below its inverse, the covariance scale is told: half way to a factor of 2."""
 QUANTILE = 0.999
 MISCALIBRATED = 0.015
 """A mean of the robots' scales beyond this is an error of the models, not of single robots."""
 SIGMAS = 3.0
+SCALE_SIGMAS = 3.3
 NAMED = 3
 """Submaps that are named at the most, the worst first."""
 
@@ -79,8 +88,11 @@ def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
     return mean if abs(mean) > max(MISCALIBRATED, SIGMAS * sigma) else None
 
 
-def finding(agreement: Agreement) -> Finding:
-    """The team's and every robot's cost per degree of freedom, and who is out of bounds."""
+def finding(agreement: Agreement, normal: float = 1.0) -> Finding:
+    """The team's and every robot's figures, and who is out of bounds.
+
+    normal: what the covariance scale is where the covariances are right; it is told in units of it.
+    """
     figures = {}
     warnings = []
     if agreement.dof >= 1.0:
@@ -92,7 +104,44 @@ def finding(agreement: Agreement) -> Finding:
         level = _level(chi2, dof)
         if level is not None:
             warnings.append(f"{robot}: joint cost {chi2 / dof:.2f} per degree of freedom, {level}")
-    return Finding(figures, (*warnings, *_worst(agreement)))
+    scales = _scales(agreement.submaps, normal)
+    for who, scale in scales.items():
+        figures[f"covariance_scale.{who}" if who else "covariance_scale"] = scale.value
+    return Finding(figures, (*warnings, *_misscaled(scales), *_worst(agreement)))
+
+
+def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
+    """The covariance scale of the team (the empty name) and of each robot, where there is one."""
+    chi2, dof = np.array([(each.chi2, each.dof) for each in submaps]).reshape(-1, 2).T
+    robots = np.array([each.stream[0] for each in submaps])
+    chosen = {"": np.ones(len(submaps), dtype=np.bool_)}
+    chosen |= {str(robot): robots == robot for robot in np.unique(robots)}
+    found = {who: covariance_scale(chi2[own], dof[own]) for who, own in chosen.items()}
+    return {
+        who: Scale(each.value / normal, each.log_sigma)
+        for who, each in found.items()
+        if each is not None
+    }
+
+
+def _misscaled(scales: Mapping[str, Scale]) -> list[str]:
+    """Whose covariances are far too small or too large, in words: the team's, or single robots'."""
+    said = {who: words for who, each in scales.items() if (words := _misscale(each)) is not None}
+    robots = said.keys() - {""}
+    if "" in said and (not robots or len(robots) == len(scales) - 1):
+        return [f"the team's {said['']}"]
+    return [f"{robot}: {said[robot]}" for robot in sorted(robots)]
+
+
+def _misscale(scale: Scale) -> str | None:
+    value = scale.value
+    if value <= 0.0:
+        return None
+    if abs(math.log(value)) <= max(math.log(SCALE_WARN), SCALE_SIGMAS * scale.log_sigma):
+        return None
+    if value > 1.0:
+        return f"covariances ought to be {value:.1f} times as large: their map claims too much"
+    return f"covariances ought to be {value:.2f} times as large: their map claims too little"
 
 
 def _level(chi2: float, dof: float) -> str | None:

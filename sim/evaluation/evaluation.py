@@ -6,7 +6,7 @@ radians; NEES is per degree of freedom, 1 where the covariance is right.
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ class MapResult:
 
     truth: the true positions, rows without truth zero; known: which rows have it. errors: of those.
     payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
+    covariance_scale: how many times the submaps' covariances ought to be taken; None: not known.
     withdrawn: the robots that the map goes without.
     """
 
@@ -66,6 +67,7 @@ class MapResult:
     reasons: tuple[str, ...]
     joined: tuple[str, ...] = ()
     withdrawn: tuple[str, ...] = ()
+    covariance_scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ class Evaluation:
     unsound: int
     cost_by_robot: Mapping[str, float]
     faults: int = 0
+    scale_by_robot: Mapping[str, float] = field(default_factory=dict)
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
@@ -152,8 +155,9 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         {key: log.traffic[key] for key in sorted(log.traffic)},
         (*(end.notes if isinstance(end, m.End) else ()), *_set_aside(faults)),
         log.unsound,
-        _cost_by_robot(log),
+        _by_robot(log, "joint_cost_per_dof."),
         len(faults),
+        _by_robot(log, "covariance_scale."),
     )
 
 
@@ -169,12 +173,11 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
     ]
 
 
-def _cost_by_robot(log: Collected) -> dict[str, float]:
-    """The centre's last word on each robot's joint cost per degree of freedom."""
+def _by_robot(log: Collected, name: str) -> dict[str, float]:
+    """The centre's last word on each robot's figure of this name."""
     status = log.sound(log.latest.get(ch.STATUS.key("central")))
     if not isinstance(status, m.Status):
         return {}
-    name = "joint_cost_per_dof."
     return {k.removeprefix(name): v for k, v in status.figures.items() if k.startswith(name)}
 
 
@@ -201,6 +204,8 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "map_covariance": None if fused is None else "joint" if fused.joint else "blocks",
         "joint_cost_per_dof": None if fused is None else fused.cost_per_dof,
         "joint_cost_per_dof_by_robot": dict(evaluation.cost_by_robot),
+        "covariance_scale": None if fused is None else fused.covariance_scale,
+        "covariance_scale_by_robot": dict(evaluation.scale_by_robot),
         "final_map_digest": None if fused is None else fused.digest,
         "final_map_sha256": None if fused is None else fused.payload_sha256,
         "final_map_frame": None if fused is None else fused.frame,
@@ -295,6 +300,7 @@ def _map_result(
         reasons=message.reasons,
         joined=message.joined,
         withdrawn=message.withdrawn,
+        covariance_scale=message.covariance_scale or None,
     )
 
 

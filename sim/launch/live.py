@@ -208,8 +208,15 @@ def _map_lines(watch: Watch) -> list[str]:
 def _honesty(watch: Watch) -> str:
     """The consistency monitor; against the truth NEES and coverage of the map's landmarks."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
-    cost = None if central is None else central.figures.get("joint_cost_per_dof")
-    parts = [] if cost is None else [f"joint cost per dof {cost:.2f}"]
+    figures = {} if central is None else central.figures
+    parts = [
+        f"{words} {figures[name]:.2f}"
+        for name, words in (
+            ("joint_cost_per_dof", "joint cost per dof"),
+            ("covariance_scale", "covariance scale"),
+        )
+        if name in figures
+    ]
     if landmarks.count:
         parts.append(f"map NEES per dof {landmarks.mean:.2f}")
         parts.append(f"{landmarks.coverage:.0%} of landmarks within 95 %")

@@ -150,6 +150,7 @@ def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
 def _honesty(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     """Whether the covariances are true: with truth NEES and coverage, without it NIS and cost."""
     innovations, cost = run.history.innovations, run.evaluation.cost_by_robot
+    scale = run.evaluation.scale_by_robot
     rows = []
     for name in sorted(run.evaluation.robots.keys() | innovations.keys() | cost.keys()):
         robot, of = run.evaluation.robots.get(name), innovations.get(name)
@@ -160,6 +161,7 @@ def _honesty(run: Run, pictures: Mapping[str, Path]) -> list[str]:
                 shown(None if of is None else of.per_dof, ".3f", ""),
                 "–" if of is None else f"{int(of.dof.sum()):,}",
                 shown(cost.get(name), ".3f", ""),
+                shown(scale.get(name), ".2f", ""),
                 shown(None if online is None else online.nees_per_dof, ".3g", ""),
                 shown(None if online is None else online.coverage, ".0%", ""),
             )
@@ -172,6 +174,7 @@ def _honesty(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "NIS\n/dof",
         "its\ndof",
         "joint cost\n/dof",
+        "covariance\nscale",
         "online\nNEES/dof",
         "in\n95 %",
     )

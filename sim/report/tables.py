@@ -80,6 +80,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("shape NEES/landmark", nees))
         rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
     rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
+    rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += [("joined", words) for words in fused.joined]
     rows += [("note", words) for words in fused.reasons]
     meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]

@@ -22,6 +22,9 @@ def layout(team: str, robots: Sequence[str]) -> str:
             "per degree of freedom (1 is right)",
             [
                 _line(f"{prefix}/{views.TEAM.key()}.status.joint_cost_per_dof", "joint cost", None),
+                _line(
+                    f"{prefix}/{views.TEAM.key()}.status.covariance_scale", "covariance scale", None
+                ),
                 _line(f"{prefix}/{views.TEAM.key()}.map_nees_per_dof", "map NEES", None),
             ],
         ),

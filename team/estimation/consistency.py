@@ -3,12 +3,18 @@
 Bar-Shalom, Li and Kirubarajan 2001, section 5.4.
 """
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from team.estimation.gaussian import cholesky_factor
+
+MEDIAN_PRICE = 1.3
+"""The median of χ² of a few degrees of freedom scatters so many times as much as their mean."""
 
 
 def state_error(
@@ -45,3 +51,35 @@ def coverage(
 ) -> float:
     """The share of runs whose NEES lies in the ellipsoid that should hold `probability` of them."""
     return float(np.mean(nees_values <= chi2.ppf(probability, dof)))
+
+
+class Scale(NamedTuple):
+    """How many times the covariances have to be taken to be those of the errors that are seen.
+
+    value: 1 is right, 2: they claim half of what they ought to. log_sigma: about one standard
+    deviation of its logarithm.
+    """
+
+    value: float
+    log_sigma: float
+
+
+def covariance_scale(
+    squared: Float[np.ndarray, " K"], dof: Float[np.ndarray, " K"]
+) -> Scale | None:
+    """The scale s where half of the terms, by degrees of freedom, lie below s times their median.
+
+    Each term is s χ² with dof degrees of freedom, so median_k(squared_k / median χ²(dof_k)) is s.
+    It moves with all covariances alike and not with the few terms that are outliers, whatever their
+    size. None without a term of one degree of freedom or more; others do not count.
+    """
+    judged = dof >= 1.0
+    if not judged.any():
+        return None
+    squared, dof = squared[judged], dof[judged]
+    ratio = squared / chi2.median(dof)
+    order = np.argsort(ratio, kind="stable")
+    middle = np.cumsum(dof[order]) - 0.5 * dof[order]
+    total = float(dof.sum())
+    value = float(np.interp(0.5 * total, middle, ratio[order]))
+    return Scale(value, MEDIAN_PRICE * math.sqrt(2.0 / total))

@@ -354,7 +354,8 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     speaks for another minimum of the final map, and that models do not fit the data. biases: by
     robot, epoch and name, where submaps have sensitivities. joined: how robots with an unknown
     start were joined, and how sure that is. withdrawn: the robots that the team goes on without,
-    ascending.
+    ascending. covariance_scale: how many times the submaps' covariances ought to be taken, by how
+    well they agree; 1 is right, 0: not known.
     """
 
     rule: Text
@@ -375,6 +376,7 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     biases: tuple[BiasEstimate, ...] = ()
     joined: tuple[Text, ...] = ()
     withdrawn: tuple[Name, ...] = ()
+    covariance_scale: Annotated[float, Meta(ge=0.0, le=1e300)] = 0.0
 
     def check(self) -> None:  # noqa: D102
         if any(a >= b for a, b in pairwise(self.withdrawn)):

@@ -2,8 +2,12 @@
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 from central.monitor import finding
 from team.estimation import marginals
+from team.estimation.consistency import covariance_scale
 from team.estimation.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -15,16 +19,18 @@ from team.estimation.joining import (
 from tests.estimation.submap_world import team
 
 SETTINGS = JoinSettings()
+ROBUST = JoinSettings(robust_c=1.0)
 
 
-def watched(seed, claim=None):
+def watched(seed, claim=None, settings=SETTINGS, normal=1.0):
     """The finding of a joined team; `claim` changes a contribution before it is joined."""
     world = team(seed, robots=3, submaps=30, landmarks=8)
     fold = EMPTY_FOLD
     for start in world.starts:
         fold = started(fold, start)
     submaps = [claim(s) if claim else s for s in world.submaps]
-    return finding(marginals.joint_cost(converged(folded(fold, submaps, SETTINGS), SETTINGS)))
+    solved = converged(folded(fold, submaps, settings), settings)
+    return finding(marginals.joint_cost(solved), normal)
 
 
 def with_covariance_times(factor, of):
@@ -65,3 +71,58 @@ def test_one_submap_that_the_rest_contradicts_is_named():
 
     named = [w for w in watched(3, shifted).warnings if "disagrees" in w]
     assert named[0].startswith("r2: submap 12 disagrees")
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, ROBUST, JoinSettings(robust_c=2.0)])
+def test_a_factor_of_two_in_all_covariances_is_told_and_none_is_not(settings):
+    """Whatever the loss; the factors 25 are what the bounded cost takes for nearly right."""
+    for seed in range(4):
+        for factor, words in ((1.0, None), (0.5, "too much"), (2.0, "too little")):
+            found = watched(seed, with_covariance_times(factor, lambda _: True), settings)
+            assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.25)
+            said = [w for w in found.warnings if "ought to be" in w]
+            assert bool(said) == (words is not None), (seed, factor, found)
+            assert all(words in w and w.startswith("the team's") for w in said)
+
+
+@pytest.mark.parametrize("factor", [1.0 / 25.0, 25.0])
+def test_no_loss_bounds_the_covariance_scale(factor):
+    found = watched(0, with_covariance_times(factor, lambda _: True), ROBUST)
+    assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.4)
+    assert any("ought to be" in w for w in found.warnings)
+
+
+def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
+    def shifted(c):
+        if c.sequence % 5:
+            return c
+        mean = c.local.mean.copy()
+        mean[3:] += 10.0
+        return Contribution(c.robot, c.epoch, c.sequence, c.end_ns, replace(c.local, mean=mean))
+
+    clean, spoilt = watched(3, settings=ROBUST), watched(3, shifted, ROBUST)
+    of = "covariance_scale"
+    assert spoilt.figures[of] == pytest.approx(clean.figures[of], rel=0.35)
+    assert not [w for w in spoilt.warnings if "ought to be" in w]
+
+
+def test_a_profile_says_which_scale_is_normal():
+    small = with_covariance_times(2.0, lambda _: True)
+    found = watched(0, small, normal=0.5)
+    assert found.figures["covariance_scale"] == pytest.approx(1.0, rel=0.25)
+    assert not [w for w in found.warnings if "ought to be" in w]
+
+
+@pytest.mark.parametrize(("dof", "scale"), [(1.0, 3.0), (2.5, 0.1), (8.0, 1.0), (40.0, 25.0)])
+def test_the_covariance_scale_of_drawn_terms_is_theirs(dof, scale):
+    """Against draws: its mean and its scatter are what it says of itself."""
+    rng = np.random.default_rng(0)
+    draws = scale * rng.chisquare(dof, (400, 60))
+    found = [covariance_scale(terms, np.full(60, dof)) for terms in draws]
+    logs = np.log([each.value for each in found])
+    assert np.mean(logs) == pytest.approx(np.log(scale), abs=0.04)
+    assert 0.7 < np.std(logs) / found[0].log_sigma < 1.3
+
+
+def test_terms_without_freedom_say_nothing_of_the_scale():
+    assert covariance_scale(np.array([0.1, 7.0]), np.array([0.2, 0.9])) is None

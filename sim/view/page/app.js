@@ -5,6 +5,7 @@ import { Plot, colour } from './plots.js';
 import { Store, upTo } from './store.js';
 
 const WARN = 1.1, FAIL = 1.3;  // of the joint cost per degree of freedom, as the centre's monitor
+const SCALE_WARN = Math.SQRT2; // of the covariance scale, and its inverse
 const TEXT_MS = 160;           // between two looks of tables
 const TRAFFIC_ROWS = 40;
 const $ = (id) => document.getElementById(id);
@@ -181,6 +182,15 @@ function lookAtMap() {
   const cost = figures && figures.joint_cost_per_dof;
   $('cost-box').hidden = !store.figures.has('central');
   put('cost', cost ? cost.toFixed(2) : '–', cost ? levelOf(cost) : '');
+  const scale = figures && figures.covariance_scale;
+  $('scale-box').hidden = !scale;
+  put('scale', scale ? scale.toFixed(2) : '–', scale && scaleSays(scale) ? 'warn' : '');
+}
+
+/** What is wrong with covariances of this scale; empty where nothing is. */
+function scaleSays(scale) {
+  if (scale > SCALE_WARN) return `covariances ought to be ${scale.toFixed(1)} times as large`;
+  return scale < 1 / SCALE_WARN ? `covariances ought to be ${scale.toFixed(2)} times as large` : '';
 }
 
 function metresText(v) { return v < 0.995 ? `${(100 * v).toFixed(v < 0.0995 ? 1 : 0)} cm` : `${v.toFixed(2)} m`; }
@@ -373,7 +383,10 @@ function drawConsistency() {
     const kept = found.t.map((t, i) => [t, costs[i]]).filter(([, v]) => v !== undefined);
     line(kept.map((k) => k[0]), kept.map((k) => k[1]), { colour: colour('text'), width: 1.8 });
     if (kept.length) legend.push(['text', 'joint cost of the team, of each robot']);
-    for (const [, v] of kept) high = Math.max(high, Math.min(1.15 * v, 5));
+    const scales = found.t.map((t, i) => [t, found.f[i].covariance_scale]).filter(([, v]) => v !== undefined);
+    line(scales.map((k) => k[0]), scales.map((k) => k[1]), { colour: colour('warn'), width: 1.5 });
+    if (scales.length) legend.push(['warn', 'covariance scale of the team']);
+    for (const [, v] of [...kept, ...scales]) high = Math.max(high, Math.min(1.15 * v, 5));
   }
   const fits = store.maps.filter((m) => m.nees !== null);
   if (fits.length) {
@@ -384,7 +397,9 @@ function drawConsistency() {
   drawInnovations();
   const i = found ? upTo(found.t, state.time) - 1 : -1;
   const cost = i < 0 ? undefined : costs[i];
-  $('consistency-says').textContent = cost === undefined ? 'per degree of freedom; 1 is right'
+  const scale = i < 0 ? undefined : found.f[i].covariance_scale;
+  $('consistency-says').textContent = scale && scaleSays(scale) ? scaleSays(scale)
+    : cost === undefined ? 'per degree of freedom; 1 is right'
     : cost > FAIL ? `${cost.toFixed(2)}: its covariances are not to be trusted` : cost > WARN ? `${cost.toFixed(2)}: its covariances are too small` : `${cost.toFixed(2)} per degree of freedom; 1 is right`;
   const key = `${found ? found.t.length : 0}|${store.maps.length}|${store.robots.size}`;
   plots[3].draw({
