@@ -129,14 +129,15 @@ class JoinRule:
         """How many submaps of a stream are in the fold's reach, or will never be."""
         return self._dealt_with(stream, self._entered.get(stream, 0))
 
-    def submaps(self, robot: str) -> list[m.Submap]:
-        """What is in the set of the latest epoch of one robot."""
-        epochs = [epoch for name, epoch in self._set.streams if name == robot]
-        return self._set.chain((robot, max(epochs))) if epochs else []
-
-    def start(self, robot: str, epoch: int) -> m.Start | None:
-        """The start of a stream, if it has come."""
-        return self._starts.get((robot, epoch))
+    def kept(self, robot: str) -> list[m.Message]:
+        """Of each epoch of one robot, the latest first: start, submaps without a gap, sightings."""
+        found: list[m.Message] = []
+        for stream in sorted((s for s in self._set.streams if s[0] == robot), reverse=True):
+            chain, start = self._set.chain(stream), self._starts.get(stream)
+            if chain and start is not None:
+                found += [start, *chain]
+                found += [each for submap in chain for each in self._set.sightings(submap)]
+        return found
 
     def advance(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
         """Fold what the watermark allows; a broadcast when one is due."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from central.config import CentralConfig
 from central.node import CentralNode
 from team.shell import WAIT_S, Shell
+from team.stream.patience import Patience
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids
@@ -43,6 +44,8 @@ class CentralShell:
         self._alive: set[str] = set()
         self._stop = stop
         self._gap_since: float | None = None
+        self._patience: Patience[tuple[str, int]] = Patience()
+        self._greeted: set[str] = set()
 
     def run(self) -> None:
         """Until the final map is out and the others have gone."""
@@ -55,6 +58,7 @@ class CentralShell:
             self._shell.take(self._patient(self._bus.receive(WAIT_S)))
             self._shell.take(self._given_up())
             self._shell.contained("wanted", self._mend)
+            self._shell.contained("wanted", self._gather)
             self._shell.report()
         self._shell.report(last=True)
         final = self.node.final
@@ -104,6 +108,23 @@ class CentralShell:
             self._gap_since = now
             for each in wanted:
                 self._ask(each)
+
+    def _gather(self) -> None:
+        """Ask robots for what they have sent and the centre lacks; those that appear, for all.
+
+        What a resumed robot took over from an earlier life is in no publisher's cache.
+        """
+        robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
+        for robot in sorted(robots - self._greeted):
+            self._bus.request(ch.SENT, robot, m.SubmapsWanted(0, robot))
+        self._greeted |= robots
+        wanted = {(each.robot, each.epoch): each for each in self.node.lacking()}
+        firsts = {stream: each.first for stream, each in wanted.items()}
+        for stream in self._patience.due(firsts, time.monotonic()):
+            _LOG.warning(
+                "submaps of %s from %d on are missing: asked for", stream[0], wanted[stream].first
+            )
+            self._bus.request(ch.SENT, stream[0], wanted[stream])
 
     def _ask(self, wanted: m.ReadingsWanted) -> None:
         named = f"readings {wanted.first} to {wanted.last} of {wanted.robot}"

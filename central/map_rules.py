@@ -29,9 +29,9 @@ class _MapRule:
         """Only robots are waited for."""
         return True
 
-    def chain(self, robot: str) -> tuple[m.Start, Sequence[m.Submap]] | None:
+    def kept(self, robot: str) -> Sequence[m.Message]:
         """It keeps no submaps: a robot that was started again takes its stream from the start."""
-        return None
+        return ()
 
     def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
         """It takes no readings."""
@@ -82,12 +82,12 @@ class ExchangeRule(_MapRule):
         """The last round's map."""
         return self._rule.conclude(now_ns)
 
-    def chain(self, robot: str) -> tuple[m.Start, Sequence[m.Submap]] | None:
-        """The submaps of the robot's latest epoch, without a gap."""
+    def kept(self, robot: str) -> Sequence[m.Message]:
+        """The start of the robot's latest epoch and its submaps without a gap."""
         epochs = [epoch for name, epoch in self._set.streams if name == robot]
         submaps = self._set.chain((robot, max(epochs))) if epochs else []
         start = self._starts.get((robot, submaps[0].epoch)) if submaps else None
-        return None if start is None else (start, submaps)
+        return () if start is None else (start, *submaps)
 
 
 class LatestRule(_MapRule):

@@ -13,6 +13,7 @@ from central.fused import fused_message
 from central.roll import Roll
 from central.rule import Refuses, rule_of
 from central.rules import NOTHING
+from central.submap_rules import SubmapRule
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -110,9 +111,15 @@ class CentralNode:
         return [] if self.finished else self._rule.wanted(self._roll.now_ns)
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:
-        """The answer to `SubmapsWanted`: the start of the latest epoch, then its submaps."""
-        chain = self._rule.chain(decoded(request, m.SubmapsWanted).robot)
-        return [] if chain is None else [encoded(chain[0]), *(encoded(s) for s in chain[1])]
+        """The answer to `SubmapsWanted`: what is here of the robot, its latest epoch first."""
+        kept = self._rule.kept(decoded(request, m.SubmapsWanted).robot)
+        return [encoded(message) for message in kept]
+
+    def lacking(self) -> list[m.SubmapsWanted]:
+        """What robots have sent by their own word and is not here: to be asked of them."""
+        if self.finished or not isinstance(self._rule, SubmapRule):
+            return []
+        return self._rule.lacking(self._roll)
 
     def status(self) -> m.Status:
         """What the centre is doing, for people."""

@@ -125,9 +125,9 @@ class ReadingRule(ABC):
         """The map after the last step."""
         return self._said(final=True)
 
-    def chain(self, robot: str) -> tuple[m.Start, Sequence[m.Submap]] | None:
+    def kept(self, robot: str) -> Sequence[m.Message]:
         """It keeps no submaps: a robot that was started again takes its stream from the start."""
-        return None
+        return ()
 
     def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
         """Readings that the link has lost."""

@@ -51,8 +51,10 @@ class Rule(Protocol):
     def conclude(self, now_ns: int) -> list[Outgoing]:
         """The last messages, the final map behind all others."""
 
-    def chain(self, robot: str) -> tuple[m.Start, Sequence[m.Submap]] | None:
-        """The latest epoch of a robot as far as the centre keeps it, for its next life."""
+    def kept(self, robot: str) -> Sequence[m.Message]:
+        """What the robot's next life takes over: of each epoch, the latest first, its start, the
+        submaps without a gap, the sightings from them.
+        """
 
     def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
         """Readings that are missing and must be asked for at their source."""

@@ -6,6 +6,7 @@ from central.config import CentralConfig
 from central.hearsay import Hearsay
 from central.join_rule import JoinRule
 from central.roll import Roll
+from central.submap_set import Stream
 from central.svd_rule import SvdJoinRule
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -97,11 +98,24 @@ class SubmapRule:
         """The final map of everything that is here."""
         return self.joined.conclude(now_ns)
 
-    def chain(self, robot: str) -> tuple[m.Start, Sequence[m.Submap]] | None:
-        """The submaps of the robot's latest epoch, without a gap."""
-        submaps = self.joined.submaps(robot)
-        start = self.joined.start(robot, submaps[0].epoch) if submaps else None
-        return None if start is None else (start, submaps)
+    def kept(self, robot: str) -> Sequence[m.Message]:
+        """The robot's starts, submaps and sightings, its latest epoch first."""
+        return self.joined.kept(robot)
+
+    def lacking(self, roll: Roll) -> list[m.SubmapsWanted]:
+        """What robots say that they have sent, and what is not in the fold's reach."""
+        said = (s for robot in roll.robots.values() for s in (robot.progress, robot.done))
+        sent: dict[Stream, int] = {}
+        for each in said:
+            if each is not None:
+                stream = (each.robot, each.epoch)
+                sent[stream] = max(sent.get(stream, 0), each.submaps)
+        here = {stream: self.joined.count(stream) for stream in sent}
+        return [
+            m.SubmapsWanted(roll.now_ns, *stream, here[stream])
+            for stream in sorted(sent)
+            if here[stream] < sent[stream]
+        ]
 
     def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
         """It takes no readings."""

@@ -205,7 +205,7 @@ class Team:
         request = encoded(m.SubmapsWanted(0, robot.id))
         kept = [decoded(reply) for reply in self.centre.answer_submaps(request)]
         if kept:
-            node.resume(kept[0], kept[1:])
+            node.take_over(kept)
         self.queues[(name, "central/alive")] = deque([m.Liveliness(0, "central", True)])
         latest = [
             self.sent[c.key()][-1:] for c in (ch.KNOWN_MAP, ch.END, ch.FUSED_MAP, ch.FINAL_MAP)

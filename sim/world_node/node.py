@@ -271,12 +271,15 @@ class WorldNode:
         source = self._sources.get(wanted.robot)
         if source is None or wanted.epoch not in (0, source.epoch):
             return []
-        if self.cache is not None and wanted.first < source.counter - self.cache:
-            self._begin_epoch(source)
-            return []
+        first = wanted.first
+        if self.cache is not None and first < source.counter - self.cache:
+            if not wanted.only:
+                self._begin_epoch(source)
+                return []
+            first = source.counter - self.cache
         last = source.counter - 1 if wanted.last < 0 else min(wanted.last, source.counter - 1)
-        last = min(last, wanted.first + ANSWER - 1)
-        return [encoded(source.message(source.base + i)) for i in range(wanted.first, last + 1)]
+        last = min(last, first + ANSWER - 1)
+        return [encoded(source.message(source.base + i)) for i in range(first, last + 1)]
 
     def _begin_epoch(self, source: _Source) -> None:
         """The stream can not be continued where the robot is: it begins anew at a free pose."""

@@ -53,6 +53,7 @@ class RobotShell:
         for channel in self.node.overhears:
             self._bus.subscribe(channel)
         self._bus.watch_alive("central")
+        self._shell.answer(ch.SENT, name, lambda request: self.node.answer_submaps(request))
         if self._resume():
             self._catch_up()
         self._shell.run(self._mend)
@@ -78,14 +79,13 @@ class RobotShell:
             return False
         try:
             start = reply_of(replies[0], m.Start)
-            submaps = [reply_of(reply, m.Submap) for reply in replies[1:]]
-            self.node.resume(start, submaps)
+            self.node.take_over([start, *(reply_of(reply, m.Message) for reply in replies[1:])])
         except Exception as error:
             sample = Sample(ch.SUBMAPS.key(), replies[0], 0, 0, -1)
             self._shell.publish([self._shell.boundary.note(error, sample, "")])
             self.node = self._shell.node = RobotNode(self._config, self._exchange)
             return False
-        _LOG.info("resumed after submap %d of epoch %d", submaps[-1].sequence, start.epoch)
+        _LOG.info("resumed after submap %d of epoch %d", self.node.submaps - 1, self.node.epoch)
         return True
 
     def _catch_up(self) -> None:

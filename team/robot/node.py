@@ -21,6 +21,7 @@ from team.robot.member import ClosedWindow, Driven
 from team.robot.members import Member, member_of
 from team.robot.pace import Pace
 from team.robot.rendezvous import Held
+from team.robot.sent import Sent
 from team.robot.statements import Speaker
 from team.robot.team_map import TeamMap
 from team.stream.inbox import Inbox
@@ -28,6 +29,7 @@ from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
 
 IN_SIGHTING = "in a sighting factor"
 """The disposition of a reading of teammates that was used."""
@@ -63,6 +65,7 @@ class RobotNode:
         self._locals: list[LocalMap] = []
         self._prior: m.Prior | None = None
         self._team_map = TeamMap()
+        self._sent = Sent()
         self._epoch = 0
         self._consumed = 0
         self._steps = 0
@@ -120,6 +123,25 @@ class RobotNode:
     def begin(self) -> list[Outgoing]:
         """What the node says first: its configuration."""
         return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
+
+    def take_over(self, kept: Sequence[m.Message]) -> None:
+        """Go on where the centre's set of this robot ends: the latest incarnation comes first.
+
+        What an earlier life has sent can be asked of this one, too.
+        """
+        start = kept[0]
+        assert isinstance(start, m.Start)
+        of_it = (s for s in kept if isinstance(s, m.Submap) and s.epoch == start.epoch)
+        self.resume(start, list(of_it))
+        for message in kept:
+            self._sent.take(message)
+
+    def answer_submaps(self, request: bytes) -> list[bytes]:
+        """The answer to `SubmapsWanted`: all that was sent, of an earlier life too."""
+        wanted = decoded(request, m.SubmapsWanted)
+        if wanted.robot != self.robot:
+            return []
+        return [encoded(message) for message in self._sent.wanted(wanted)]
 
     def resume(self, start: m.Start, submaps: Sequence[m.Submap]) -> None:
         """Go on after the last of this robot's own submaps, as an earlier life sent them.
@@ -312,6 +334,7 @@ class RobotNode:
         self._member = member_of(self.config, start.epoch, self._known or NOTHING_KNOWN)
         self._member.start(pose, covariance)
         self._member.consumed(start.reading)
+        self._sent.take(start)
         self._locals = []
         self._start, self._closed, self._window, self._aside = start, [], [], 0
         self._last_map = -1
@@ -390,7 +413,9 @@ class RobotNode:
         )
         self._closed.append(plain)
         self._window, self._aside = [], 0
-        self._pending += self._held.put(said)
+        released = self._held.put(said)
+        self._sent.note(released)
+        self._pending += released
         out = self._speaker.cloud(closed.end_ns, closed.cloud)
         out.append(self._speaker.innovation(closed.end_ns, closed.sequence, closed.innovation))
         self._gated += closed.gated
@@ -419,6 +444,7 @@ class RobotNode:
         self._held.greeted.update(seen)
         told = m.Rendezvous(self._now_ns, self.robot, self._epoch, seen, submaps, waited_s)
         out = [Outgoing(ch.RENDEZVOUS, self.robot, told), *self._held.released()]
+        self._sent.note(out)
         return [*out, self._progress()]
 
     def _sighted_in(self, closed: ClosedWindow | None) -> None:

@@ -7,10 +7,11 @@ shell takes samples from it, decodes them at the door, and publishes what the no
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from team.wire.channels import ALIVE, Channel, channel_of
+from team.wire.channels import ALIVE, REPLIES, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
     FusedMap,
@@ -79,6 +80,13 @@ class Bus(Protocol):
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
         """The replies' payloads, in order; empty when nobody answers, `BusError` on an error."""
 
+    def request(self, channel: Channel, name: str, request: Message) -> None:
+        """Ask without waiting: the replies come out of `receive`, as samples of their channels.
+
+        While the same is being asked nothing happens. A reply has no counter of its own: its
+        number (reading or sequence) stands in its place, and the wall clock of its arrival.
+        """
+
     def declare_alive(self, node: str) -> None:
         """Hold a liveliness token until the bus is closed."""
 
@@ -106,6 +114,21 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     if "{robot}" in channel.template and robot != name:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
     return channel, name, message
+
+
+def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
+    """A reply to a query as a sample of the channel that its message belongs to.
+
+    Raises `WireError` where it is no message that answers this query, or one of another robot.
+    """
+    message: Message = decoded(payload)
+    of = next((c for c in REPLIES[channel] if isinstance(message, c.message)), None)
+    robot = getattr(message, "robot", "")
+    if of is None or ("{robot}" in channel.template and robot != name):
+        text = f"{type(message).__name__} of {robot!r} is no reply to {channel.key(name)!r}"
+        raise WireError("wrong field", text)
+    number = getattr(message, "reading", getattr(message, "sequence", 0))
+    return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, number)
 
 
 LATEST_KEPT = 8_192
@@ -214,6 +237,12 @@ class MemoryBus:
                 except ValueError as error:
                     raise BusError(f"{channel.key(name)}: {error}") from error
         return []
+
+    def request(self, channel: Channel, name: str, request: Message) -> None:
+        """The answers, with the next samples."""
+        for payload in self.ask(channel, name, request, 0.0):
+            with suppress(WireError):  # what is no reply to this question is dropped
+                self._arrived.append(replied(channel, name, payload, 0))
 
     def declare_alive(self, node: str) -> None:
         """Hold a token."""

@@ -140,13 +140,21 @@ ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", Tr
 READINGS = Channel("readings", "source/{robot}/readings", m.ReadingsWanted, "query", "stream", False,
                    False, "a query; the replies are the readings")  # fmt: skip
 SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "stream", False, False,
-                  "a query; the replies are the submaps in the centre's set")  # fmt: skip
+                  "a query; the replies are the starts, submaps and sightings in the centre's set")  # fmt: skip
+SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsWanted, "query", "stream", False, False,
+               "a query; the replies are the starts, submaps and sightings that the robot has sent")  # fmt: skip
 
 VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "stream", True, False,
                "what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
-QUERIES = (READINGS, SUBMAPS)
+QUERIES = (READINGS, SUBMAPS, SENT)
+REPLIES = {
+    READINGS: SENSORS,
+    SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
+    SENT: (START, SUBMAP, SIGHTING_FACTOR),
+}
+"""The channels whose messages answer a query."""
 UNOPENED = (*QUERIES, VIEW)
 """Rows whose traffic is not opened: queries have no samples, a view is no message of ours."""
 EVERYTHING = "**"

@@ -532,18 +532,27 @@ class Liveliness(Message, frozen=True, array_like=True, gc=False, tag="livelines
 
 
 class ReadingsWanted(Message, frozen=True, array_like=True, gc=False, tag="readings_wanted/1"):
-    """A query to a source: readings first … last of (robot, epoch); last −1: all there are."""
+    """A query to a source: readings first … last of (robot, epoch); last −1: all there are.
+
+    only: the source gives what it has, and does not begin the stream anew for what it has not.
+    """
 
     robot: Name
     epoch: Count
     first: Count
     last: int
+    only: bool = False
 
 
 class SubmapsWanted(Message, frozen=True, array_like=True, gc=False, tag="submaps_wanted/1"):
-    """A query to the centre: the submaps of one robot that are in its set."""
+    """A query for the submaps of one robot: to the centre for those in its set, or to the robot.
+
+    epoch: whose alone; 0: of every incarnation. first: of that epoch, those from this sequence on.
+    """
 
     robot: Name
+    epoch: Count = 0
+    first: Count = 0
 
 
 def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: bool) -> None:

@@ -37,9 +37,9 @@ from zenoh import ext
 from zenoh.handlers import Callback
 
 from team.wire.arrivals import Arrivals
-from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of
+from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of, replied
 from team.wire.channels import ALIVE, Channel, channel_of
-from team.wire.codec import LARGEST_PAYLOAD, encoded
+from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.messages import Liveliness, Message
 
 _ATTACHMENT = struct.Struct("<qqq")
@@ -90,7 +90,17 @@ class _Cached:
     failed: bool = False
 
 
-_Item = zenoh.Sample | _Token | _Question | _Heartbeat | _Cached | None
+@dataclass(frozen=True)
+class _Reply:
+    """A reply to a request; without a payload: that was all, or why there is none."""
+
+    channel: Channel
+    name: str
+    payload: bytes | None
+    wrong: str = ""
+
+
+_Item = _Reply | zenoh.Sample | _Token | _Question | _Heartbeat | _Cached | None
 """What the receiving thread hands over; None wakes a receiver when the bus closes."""
 
 
@@ -108,6 +118,7 @@ class ZenohBus:
         self._counters: dict[str, int] = {}
         self._wanted: set[tuple[str, str]] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._requests: set[tuple[str, str]] = set()
         self._whole: set[str] = set()
         self._beats: dict[str, bytes] = {}
         self._arrivals: dict[tuple[str, str], Arrivals[Sample]] = {}
@@ -266,6 +277,8 @@ class ZenohBus:
                 if item.repeated and not item.failed and item.newest >= 0:
                     arrivals = self._arrivals_of(item.key, item.publisher, item.newest)
                     samples += arrivals.answered(item.first, item.newest)
+            case _Reply():
+                self._take_reply(item, samples)
             case zenoh.Sample():
                 self._take_sample(item, samples)
 
@@ -377,6 +390,46 @@ class ZenohBus:
                 raise BusError(f"{key}: {text} (waited at most {timeout_s} s)")
             payloads.append(reply.ok.payload.to_bytes())
         return payloads
+
+    def request(self, channel: Channel, name: str, request: Message) -> None:
+        """Ask without waiting: the replies come out of `receive`, as samples of their channels.
+
+        While the same is being asked nothing happens.
+        """
+        self._check_open()
+        if (channel.name, name) in self._requests:
+            return
+        self._requests.add((channel.name, name))
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._queue.put(_Reply(channel, name, reply.ok.payload.to_bytes()))
+            elif reply.err is not None:
+                told = reply.err.payload.to_bytes().decode("utf-8", "replace")
+                self._queue.put(_Reply(channel, name, None, told or "no answer"))
+
+        self._session.get(
+            self._prefix + channel.key(name),
+            Callback(
+                take, drop=lambda: self._queue.put(_Reply(channel, name, None)), indirect=False
+            ),
+            payload=encoded(request),
+            timeout=_ANSWER_S,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=_BLOCK,
+        )
+
+    def _take_reply(self, reply: _Reply, samples: list[Sample]) -> None:
+        key = reply.channel.key(reply.name)
+        if reply.payload is None:
+            self._requests.discard((reply.channel.name, reply.name))
+            if reply.wrong:
+                _LOG.warning("%s: %s (waited at most %s s)", key, reply.wrong, _ANSWER_S)
+            return
+        try:
+            samples.append(replied(reply.channel, reply.name, reply.payload, time.time_ns()))
+        except WireError as error:
+            _LOG.warning("%s: dropped a reply: %s", key, error)
 
     def declare_alive(self, node: str) -> None:
         """Hold a liveliness token until the bus is closed or its process dies."""

@@ -249,3 +249,24 @@ def test_under_feedback_all_open_rounds_are_fused_before_the_end():
     centre.hears(done("r2", 0))
     assert exchanges(centre) == [1, 2]
     assert centre.final.exchange == 2
+
+
+def test_what_a_robot_has_sent_by_its_word_and_is_not_here_is_wanted():
+    centre = joined()
+    centre.hears(SUBMAPS["r1"][0], progress("r1", 9.0, 3), progress("r2", 3.0, 0))
+    (wanted,) = centre.node.lacking()
+    assert (wanted.robot, wanted.epoch, wanted.first) == ("r1", 1, 1)
+    centre.hears(SUBMAPS["r1"][1], SUBMAPS["r1"][2])
+    assert centre.node.lacking() == []
+    centre.hears(done("r2", 4))
+    (wanted,) = centre.node.lacking()
+    assert (wanted.robot, wanted.epoch, wanted.first) == ("r2", 1, 0)
+
+
+def test_submaps_without_their_start_are_wanted_with_it():
+    centre = Centre()
+    centre.hears(alive("r1"), *SUBMAPS["r1"], progress("r1", 12.0, 4))
+    (wanted,) = centre.node.lacking()
+    assert (wanted.robot, wanted.first) == ("r1", 0)
+    centre.hears(STARTS["r1"])
+    assert centre.node.lacking() == []

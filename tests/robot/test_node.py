@@ -377,3 +377,30 @@ def test_an_order_to_withdraw_a_robot_is_repeated_once_for_a_centre_that_comes_l
         [heard[0]], [heard[1]], [],
     ]  # fmt: skip
     assert not node.warnings
+
+
+def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
+    first, sent = RobotNode(config()), []
+    for reading in READINGS[: len(READINGS) // 2]:
+        sent += first.handle(reading, 0)
+    kept = [READINGS[0], *of(sent, ch.SUBMAP)]
+    node = RobotNode(config())
+    node.take_over(kept)
+    for reading in READINGS[node.next_reading :]:
+        sent += node.handle(reading, 0)
+
+    def answer(**wanted):
+        request = encoded(m.SubmapsWanted(0, "r1", **wanted))
+        return [decoded(reply) for reply in node.answer_submaps(request)]
+
+    assert answer() == [READINGS[0], *of(sent, ch.SUBMAP)]
+    assert answer(epoch=1, first=2) == [READINGS[0], *of(sent, ch.SUBMAP)[2:]]
+    assert answer(epoch=2) == []
+    assert node.answer_submaps(encoded(m.SubmapsWanted(0, "r2"))) == []
+
+
+def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
+    node = RobotNode(config(), "rendezvous")
+    for reading in READINGS:
+        node.handle(reading, 0)
+    assert node.answer_submaps(encoded(m.SubmapsWanted(0, "r1"))) == [encoded(READINGS[0])]

@@ -130,3 +130,25 @@ async def test_an_order_to_withdraw_a_robot_outlives_the_centre_that_heard_it(
     assert {member.robot for member in fused.members} == {"r1"}
     verified = await team.start("rerun", found.log, "--verify", name="verified")
     assert await verified.ended() == 0, verified.said()
+
+
+async def test_a_centre_that_is_started_again_gets_what_a_resumed_robot_sent_in_its_earlier_life(
+    team: Processes,
+) -> None:
+    found = await assembled(team, "10")
+    there = ["--connect", found.endpoint]
+    first = await robot(team, found, found.endpoint, "r1")
+    with Observer(found.endpoint, [ch.SUBMAP]) as seen:
+        await seen.sees(2, ch.SUBMAP, "r1")
+        first.signal(signal.SIGKILL)
+        await first.ended()
+        found.robots["r1"] = await robot(team, found, found.endpoint, "r1-again")
+        await seen.sees(3, ch.SUBMAP, "r1")
+        centre = found.others.pop(1)
+        centre.signal(signal.SIGKILL)
+        await centre.ended()
+    again = await team.start("central", found.scenario, *there, "--patience", PATIENCE_S)
+    found.others.append(again)
+    await found.ends_well()
+    assert "resumed after submap" in found.robots["r1"].said()
+    assert found.final_map() == map_in_memory(found.scenario)

@@ -9,8 +9,17 @@ import pytest
 
 from team.wire import channels as c
 from team.wire import messages as m
-from team.wire.bus import Bus, BusError, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from team.wire.codec import decoded, encoded
+from team.wire.bus import (
+    Bus,
+    BusError,
+    MemoryBus,
+    MemoryNetwork,
+    Outgoing,
+    Sample,
+    opened,
+    replied,
+)
+from team.wire.codec import WireError, decoded, encoded
 from team.wire.zenoh_bus import ZenohBus, router
 from tests.support import odometry, received, submap, wait_until
 
@@ -232,3 +241,28 @@ def test_who_holds_a_token_can_be_asked_for(joined: Joined) -> None:
     assert not asker.is_alive("robot/alph")
     robot.close()
     wait_until(lambda: not asker.is_alive("robot/alpha"))
+
+
+def test_replies_to_a_request_come_with_what_arrives(joined: Joined) -> None:
+    centre, robot = joined(), joined()
+    answered = [encoded(submap(i)) for i in range(30)]
+    robot.answer(c.SENT, "alpha", lambda request: answered)
+    arrived: list[Sample] = []
+
+    def all_here() -> bool:
+        if not arrived:  # the answerer's declaration may still be on its way
+            centre.request(c.SENT, "alpha", m.SubmapsWanted(0, "alpha"))
+        robot.receive(0.02)
+        arrived.extend(centre.receive(0.02))
+        return len(arrived) >= 30
+
+    wait_until(all_here)
+    assert [(s.key, s.payload, s.counter) for s in arrived] == [
+        ("robot/alpha/submap", encoded(submap(i)), i) for i in range(30)
+    ]
+
+
+@pytest.mark.parametrize("reply", [encoded(submap(0, "bravo")), encoded(odometry(0)), b"\xc1"])
+def test_what_is_no_reply_to_the_question_is_dropped(reply: bytes) -> None:
+    with pytest.raises(WireError):
+        replied(c.SENT, "alpha", reply, 0)

@@ -1,0 +1,49 @@
+"""What a robot has sent for fusion, in this life or an earlier one: whoever lacks it may ask."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+
+@dataclass
+class Sent:
+    """Initial poses, submaps and inter-robot factors by incarnation.
+
+    A resumed robot's publisher has only what this process published; this has what it took over,
+    too, so that a centre that is started again can be given everything.
+    """
+
+    starts: dict[int, m.Start] = field(default_factory=dict)
+    submaps: dict[int, dict[int, m.Submap]] = field(default_factory=dict)
+    factors: dict[int, dict[tuple[int, int, str], m.SightingFactor]] = field(default_factory=dict)
+
+    def note(self, out: Iterable[Outgoing]) -> None:
+        """What is being published."""
+        for each in out:
+            self.take(each.message)
+
+    def take(self, message: m.Message) -> None:
+        """Keep what is for fusion."""
+        match message:
+            case m.Start():
+                self.starts[message.epoch] = message
+            case m.Submap():
+                self.submaps.setdefault(message.epoch, {})[message.sequence] = message
+            case m.SightingFactor():
+                name = (message.sequence, message.stamp_ns, message.teammate)
+                self.factors.setdefault(message.epoch, {})[name] = message
+            case _:
+                pass
+
+    def wanted(self, wanted: m.SubmapsWanted) -> Iterator[m.Message]:
+        """The answer: of each incarnation its start, then factors and submaps by sequence."""
+        for epoch in sorted(self.starts) if wanted.epoch == 0 else [wanted.epoch]:
+            first = wanted.first if wanted.epoch else 0
+            if epoch in self.starts:
+                yield self.starts[epoch]
+            factors = self.factors.get(epoch, {})
+            yield from (factors[name] for name in sorted(factors) if name[0] >= first)
+            submaps = self.submaps.get(epoch, {})
+            yield from (submaps[k] for k in sorted(submaps) if k >= first)

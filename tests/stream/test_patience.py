@@ -1,0 +1,29 @@
+"""What is missing is asked for after a while, and not again and again."""
+
+import itertools
+
+from team.stream.patience import LONGEST_S, PATIENCE_S, Patience
+
+
+def asked(gap_of, seconds=40.0):
+    patience = Patience()
+    times = [0.1 * tick for tick in range(round(10 * seconds))]
+    return [now for now in times if patience.due({"r1": gap_of(now)}, now)]
+
+
+def test_a_gap_that_stands_is_asked_for_with_longer_and_longer_pauses():
+    times = asked(lambda now: 3)
+    assert PATIENCE_S <= times[0] < PATIENCE_S + 0.11
+    pauses = [after - before for before, after in itertools.pairwise(times)]
+    assert pauses == sorted(pauses)
+    assert LONGEST_S <= pauses[-1] < LONGEST_S + 0.11
+
+
+def test_a_gap_that_changes_has_new_patience():
+    assert asked(lambda now: now // 0.4) == []
+
+
+def test_a_gap_that_was_closed_and_opens_again_has_new_patience():
+    patience = Patience()
+    assert patience.due({"r1": 3}, 0.0) == patience.due({}, 1.0) == patience.due({"r1": 3}, 2.0)
+    assert patience.due({"r1": 3}, 2.0 + PATIENCE_S) == ["r1"]
