@@ -57,7 +57,7 @@ def test_every_service_runs_the_command_that_its_name_says(compose: Any) -> None
     commands = {name: service["command"] for name, service in compose["services"].items()}
     reach = ["--connect", "tcp/router:7447"]
     assert commands == {
-        "router": ["router", "--listen", "tcp/0.0.0.0:7447"],
+        "router": ["router", "--listen", "tcp/0.0.0.0:7447", "--insecure"],
         "world": ["world", "waypoints", *reach],
         "r1": ["robot", "waypoints", "r1", *reach],
         "r2": ["robot", "waypoints", "r2", *reach],

@@ -12,17 +12,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sim.cli.options import (
+    ANY_PORT,
     FAILED,
     WRONG_USE,
     Dataset,
     EstimatorOption,
     FusionOption,
+    Keys,
     Robots,
     Seed,
     SpeedText,
     counted,
     fail,
+    over_tls,
     parsed_speed,
+    refuse_open_door,
     scenario_of,
 )
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
@@ -62,7 +66,11 @@ def launch(
     ] = None,
     listen: Annotated[
         str, typer.Option(help="Where the router listens; port 0: any free one.")
-    ] = "tcp/127.0.0.1:0",
+    ] = ANY_PORT,
+    keys: Keys = None,
+    insecure: Annotated[
+        bool, typer.Option(help="Without keys, let in whoever reaches the router.")
+    ] = False,
     report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
     views: Annotated[
         bool, typer.Option(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
@@ -84,6 +92,7 @@ def launch(
     from sim.scenario.source import with_present_robots
 
     pace = parsed_speed(speed)
+    refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     name = scenario or ("utias" if dataset is not None else "thesis")
     resolved = with_options(
         scenario_of(name),
@@ -104,7 +113,10 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     _prepare(resolved)
-    plan = Plan(resolved, folder, log, pace, listen, views)
+    door = listen if keys is None else over_tls(listen)
+    plan = Plan(
+        resolved, folder, log, pace, door, views, keys=keys and keys.resolve(), insecure=insecure
+    )
     page = (
         shown_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
         if view

@@ -8,14 +8,18 @@ import typer
 
 from sim.cli.options import (
     FAILED,
+    LOOPBACK,
     WRONG_USE,
+    Keys,
     Robots,
     ScenarioArgument,
     Seed,
     SpeedText,
+    connected,
     fail,
     parsed_speed,
     refuse_existing,
+    refuse_open_door,
     scenario_of,
 )
 from sim.scenario.scenario import with_options
@@ -41,7 +45,11 @@ def replay(
     ] = None,
     listen: Annotated[
         str, typer.Option(help="Where our own router listens; port 0: any free one.")
-    ] = "tcp/127.0.0.1:7447",
+    ] = LOOPBACK,
+    keys: Keys = None,
+    insecure: Annotated[
+        bool, typer.Option(help="Without keys, let in whoever reaches our own router.")
+    ] = False,
     wait: Annotated[
         float, typer.Option(help="Seconds between the router's start and the first message.")
     ] = 1.0,
@@ -52,12 +60,20 @@ def replay(
     from team.recording.reader import open_log
     from team.recording.shell import replay as replay_samples
     from team.shell import process
-    from team.wire.zenoh_bus import ZenohBus, router
+    from team.wire.zenoh_bus import router
 
     pace = parsed_speed(speed)
+    if connect is None:
+        if keys is not None:
+            fail("--keys is for a router that is there: give --connect", WRONG_USE)
+        refuse_open_door(listen, keys=False, insecure=insecure)
     opened = open_log(log)
     hub = router(listen) if connect is None else nullcontext(connect)
-    with process("replay") as stop, hub as endpoint, ZenohBus(opened.team, endpoint) as bus:
+    with (
+        process("replay") as stop,
+        hub as endpoint,
+        connected(opened.team, endpoint, keys, "replay") as bus,
+    ):
         if connect is None:
             typer.echo(f"listening at {endpoint}", err=True)
             stop.wait(wait)

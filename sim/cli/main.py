@@ -11,6 +11,7 @@ import typer  # noqa: E402 - the threads of BLAS are set before anything imports
 
 from sim.cli.calibrate import app as calibrate_commands  # noqa: E402
 from sim.cli.experiment import app as experiment_commands  # noqa: E402
+from sim.cli.keys import app as key_commands  # noqa: E402
 from sim.cli.launch import app as launch_commands  # noqa: E402
 from sim.cli.log import app as log_tools  # noqa: E402
 from sim.cli.logs import app as log_commands  # noqa: E402
@@ -27,7 +28,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 for _part in (
-    launch_commands, node_commands, log_commands, rerun_commands, view_commands, calibrate_commands,
+    launch_commands, node_commands, key_commands, log_commands, rerun_commands, view_commands,
+    calibrate_commands,
 ):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)
@@ -48,6 +50,7 @@ def main() -> None:
     from sim.datasets.tables import DatasetError
     from sim.launch.launch import LaunchError
     from sim.scenario.checks import ScenarioError
+    from team.keys.roster import KeysError
     from team.recording.reader import LogError
     from team.recording.recorder import RecorderError
     from team.shell import FaultyRunError
@@ -55,7 +58,7 @@ def main() -> None:
 
     try:
         app()
-    except (ScenarioError, DatasetError, LogError, BusError) as error:
+    except (ScenarioError, DatasetError, LogError, BusError, KeysError) as error:
         typer.secho(f"error: {error}", fg="red", err=True)
         sys.exit(WRONG_USE)
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:

@@ -9,24 +9,29 @@ import typer
 
 from sim.cli.options import (
     FAILED,
+    LOOPBACK,
     WRONG_USE,
     Connect,
     Dataset,
     EstimatorOption,
     FusionOption,
+    Keys,
     Robots,
     ScenarioArgument,
     Seed,
     SpeedText,
+    connected,
     fail,
+    over_tls,
+    own_keys,
     parsed_speed,
     refuse_existing,
+    refuse_open_door,
     scenario_of,
 )
 from sim.scenario.scenario import Scenario, doubts, with_options
 from team.wire.arrays import ids
 
-LOOPBACK = "tcp/127.0.0.1:7447"
 _LOG = logging.getLogger("teamslam")
 
 app = typer.Typer()
@@ -39,12 +44,23 @@ def _connected(scenario: Scenario, connect: str) -> None:
 @app.command()
 def router(
     listen: Annotated[str, typer.Option(help="Where to listen; port 0: any free one.")] = LOOPBACK,
+    keys: Keys = None,
+    insecure: Annotated[
+        bool, typer.Option(help="Without keys, let in whoever reaches it, not this machine alone.")
+    ] = False,
 ) -> None:
-    """The team's Zenoh router: every other process is its client. Runs until it is stopped."""
+    """The team's Zenoh router: every other process is its client. Runs until it is stopped.
+
+    With --keys it lets in who has a certificate, and each may say only what is its own.
+    """
+    from team.keys.roster import load_roster
     from team.shell import process
     from team.wire.zenoh_bus import router as zenoh_router
 
-    with process("router", endless=True) as stop, zenoh_router(listen) as endpoint:
+    refuse_open_door(listen, keys=keys is not None, insecure=insecure)
+    own = None if keys is None else (own_keys(keys, "router"), load_roster(keys))
+    at = over_tls(listen) if keys else listen
+    with process("router", endless=True) as stop, zenoh_router(at, own) as endpoint:
         typer.echo(f"listening at {endpoint}")
         stop.wait()
 
@@ -53,6 +69,7 @@ def router(
 def world(
     scenario: ScenarioArgument,
     connect: Connect = LOOPBACK,
+    keys: Keys = None,
     speed: SpeedText = "1",
     recorder: Annotated[
         bool, typer.Option(help="Wait for a recorder before the first reading.")
@@ -69,12 +86,11 @@ def world(
     from sim.scenario.source import streams_of
     from sim.world_node.main import run_world
     from team.shell import process
-    from team.wire.zenoh_bus import ZenohBus
 
     pace = parsed_speed(speed)
     resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, dataset=dataset)
     streams = streams_of(resolved)
-    with process("world") as stop, ZenohBus(resolved.team, connect) as bus:
+    with process("world") as stop, connected(resolved.team, connect, keys, "world") as bus:
         _connected(resolved, connect)
         for text in doubts(resolved):
             _LOG.warning("%s", text)
@@ -86,6 +102,7 @@ def robot(
     scenario: ScenarioArgument,
     name: Annotated[str, typer.Argument(help="The robot's name in the scenario, as r1.")],
     connect: Connect = LOOPBACK,
+    keys: Keys = None,
     robots: Robots = None,
     seed: Seed = None,
     estimator: EstimatorOption = None,
@@ -97,7 +114,6 @@ def robot(
     """
     from team.robot.main import RobotShell
     from team.shell import process
-    from team.wire.zenoh_bus import ZenohBus
 
     resolved = with_options(
         scenario_of(scenario), robots=robots, seed=seed, estimator=estimator, fusion=fusion
@@ -108,7 +124,10 @@ def robot(
             f"{scenario} has no robot {name!r}; its robots: {', '.join(configs)}",
             WRONG_USE,
         )
-    with process(f"robot-{name}") as stop, ZenohBus(resolved.team, connect) as bus:
+    with (
+        process(f"robot-{name}") as stop,
+        connected(resolved.team, connect, keys, f"robot-{name}") as bus,
+    ):
         _connected(resolved, connect)
         RobotShell(bus, configs[name], stop, exchange=resolved.exchange).run()
 
@@ -117,6 +136,7 @@ def robot(
 def central(
     scenario: ScenarioArgument,
     connect: Connect = LOOPBACK,
+    keys: Keys = None,
     patience: Annotated[
         float, typer.Option(help="Seconds that a lost robot has to come back.", min=0.0)
     ] = 3.0,
@@ -128,13 +148,12 @@ def central(
     """The central computer: fuses the robots' maps and broadcasts the fused map back."""
     from central.main import CentralShell
     from team.shell import process
-    from team.wire.zenoh_bus import ZenohBus
 
     resolved = with_options(
         scenario_of(scenario), robots=robots, seed=seed, estimator=estimator, fusion=fusion
     )
     names = [config.id for config in resolved.robots]
-    with process("central") as stop, ZenohBus(resolved.team, connect) as bus:
+    with process("central") as stop, connected(resolved.team, connect, keys, "central") as bus:
         _connected(resolved, connect)
         CentralShell(bus, resolved.central, names, stop, patience).run()
 
@@ -144,6 +163,7 @@ def record(
     scenario: ScenarioArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="The MCAP file to write.")],
     connect: Connect = LOOPBACK,
+    keys: Keys = None,
 ) -> None:
     """The recorder: every message of the team to one MCAP file, until the team has left."""
     from sim.scenario.scenario import dumps
@@ -152,7 +172,6 @@ def record(
     from team.recording.shell import record as record_until_end
     from team.shell import process
     from team.wire.channels import robot_node
-    from team.wire.zenoh_bus import ZenohBus
 
     resolved = scenario_of(scenario)
     refuse_existing(output)
@@ -163,7 +182,10 @@ def record(
         "scenario": dumps(resolved),
     }
     expected = ["world", "central", *(robot_node(r.id) for r in resolved.robots)]
-    with process("recorder", endless=True) as stop, ZenohBus(resolved.team, connect) as bus:
+    with (
+        process("recorder", endless=True) as stop,
+        connected(resolved.team, connect, keys, "recorder") as bus,
+    ):
         recorder = Recorder(output, resolved.team, metadata)
         _connected(resolved, connect)
         written = record_until_end(bus, recorder, expected, stop=stop)
@@ -175,6 +197,7 @@ def withdraw(
     robot: Annotated[str, typer.Argument(help="The robot's name, as r3.")],
     team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
     connect: Connect = LOOPBACK,
+    keys: Keys = None,
     reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
     patience: Annotated[
         float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
@@ -186,13 +209,12 @@ def withdraw(
     """
     from sim.launch.withdraw import WithdrawError
     from sim.launch.withdraw import withdraw as order
-    from team.wire.zenoh_bus import ZenohBus
 
     if not re.fullmatch("[a-z][a-z0-9_]{0,31}", robot):
         fail(f"{robot!r} is no robot's name", WRONG_USE)
     if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
         fail(f"{team!r} is no team's name", WRONG_USE)
-    with ZenohBus(team, connect) as bus:
+    with connected(team, connect, keys, "operator") as bus:
         try:
             fused = order(bus, robot, reason, patience)
         except WithdrawError as error:

@@ -1,14 +1,21 @@
 """What the commands have in common: options, their parsing, and errors with their exit status."""
 
+import logging
 import math
+import re
+from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, NoReturn, get_args
+from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
 import typer
 
 from sim.scenario.checks import ScenarioError
 from sim.scenario.scenario import Scenario, load, loads
 from team.config import Estimator, FusionRule
+
+if TYPE_CHECKING:
+    from team.keys.credentials import Credentials
+    from team.wire.zenoh_bus import ZenohBus
 
 WRONG_USE = 2
 FAILED = 1
@@ -26,6 +33,15 @@ ScenarioArgument = Annotated[
 Connect = Annotated[
     str, typer.Option(help="The router's endpoint, as tcp/HOST:PORT.", metavar="ENDPOINT")
 ]
+Keys = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder with the certificate of this process, as `teamslam keys` makes them.",
+        metavar="DIR",
+    ),
+]
+LOOPBACK = "tcp/127.0.0.1:7447"
+ANY_PORT = "tcp/127.0.0.1:0"
 Seed = Annotated[
     int | None, typer.Option(help="Seed of the world and of every estimator.", min=0, metavar="N")
 ]
@@ -40,6 +56,51 @@ SpeedText = Annotated[
     str,
     typer.Option(help="Multiple of real time, or max: as fast as everyone keeps up.", metavar="X"),
 ]
+
+
+def connected(team: str, connect: str, keys: Path | None, node: str) -> "ZenohBus":
+    """A bus of the team at the router's endpoint; with keys over TLS, by the node's certificate."""
+    from team.wire.zenoh_bus import ZenohBus
+
+    own = None if keys is None else own_keys(keys, node, team)
+    return ZenohBus(team, over_tls(connect) if keys else connect, keys=own)
+
+
+def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
+    """The node's certificate and key, checked; what will soon be wrong with them is logged."""
+    from team.keys.credentials import credentials_of
+
+    own = credentials_of(folder, node, team)
+    for warning in own.warnings():
+        logging.getLogger("teamslam").warning("%s", warning)
+    return own
+
+
+def over_tls(endpoint: str) -> str:
+    """The same place by TLS, where none was chosen."""
+    return endpoint.replace("tcp/", "tls/", 1) if endpoint in (LOOPBACK, ANY_PORT) else endpoint
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether only this machine can reach an endpoint, as far as its address tells."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol.startswith("unix"):
+        return True
+    host = re.sub(r":\d+([?#].*)?$", "", address).strip("[]")
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
+    """End with an error where strangers could reach a router that lets everyone in."""
+    if not (keys or insecure or is_loopback(listen)):
+        fail(
+            f"--listen {listen}: whoever reaches it could end the run or forge its map: give "
+            "--keys DIR (see `teamslam keys`), or --insecure where nobody else can reach it",
+            WRONG_USE,
+        )
 
 
 def fail(message: str, status: int) -> NoReturn:

@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.nodes import LOOPBACK
-from sim.cli.options import WRONG_USE, Connect, ScenarioArgument, fail, refuse_existing, scenario_of
+from sim.cli.options import (
+    LOOPBACK,
+    WRONG_USE,
+    Connect,
+    Keys,
+    ScenarioArgument,
+    connected,
+    fail,
+    refuse_existing,
+    scenario_of,
+)
 
 if TYPE_CHECKING:
     from sim.view.session import Shown
@@ -32,17 +41,19 @@ app = typer.Typer()
 
 
 @app.command()
-def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK) -> None:
+def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
     """Publish what Foxglove, Lichtblick and Rerun draw, once a second of team time.
 
     The recorder stores it beside the team's own messages. Ends after the final map.
     """
     from sim.view.viewer import run_viewer
     from team.shell import process
-    from team.wire.zenoh_bus import ZenohBus
 
     resolved = scenario_of(scenario)
-    with process("viewer", endless=True) as stop, ZenohBus(resolved.team, connect) as bus:
+    with (
+        process("viewer", endless=True) as stop,
+        connected(resolved.team, connect, keys, "viewer") as bus,
+    ):
         _LOG.info("connected to team %s at %s", resolved.team, connect)
         _LOG.info("published %d views", run_viewer(bus, stop))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from sim.launch.supervisor import Child, Ended, end_all
 from sim.launch.truth import LiveErrors
 from sim.scenario.scenario import Scenario, dumps
+from team.keys.credentials import credentials_of
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, BusError, opened
@@ -91,6 +92,13 @@ class Plan:
     speed: float
     listen: str
     views: bool = True
+    keys: Path | None = None
+    insecure: bool = False
+
+    @property
+    def door(self) -> list[str]:
+        """How every process gets in: the option, or nothing where the door is open."""
+        return [] if self.keys is None else ["--keys", str(self.keys)]
 
 
 def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
@@ -107,9 +115,12 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     resolved.write_text(dumps(plan.scenario))
     watch = Watch(began=began, robots=len(plan.scenario.robots))
     with _interruptible(), _children() as children:
+        team = plan.scenario.team
+        own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
+        door = "".join(f" {word}" for word in plan.door)
         endpoint = _start_router(plan, children)
-        watch.place = f"--team {plan.scenario.team} --connect {endpoint}"
-        with ZenohBus(plan.scenario.team, endpoint) as bus:
+        watch.place = f"--team {team} --connect {endpoint}{door}"
+        with ZenohBus(team, endpoint, keys=own) as bus:
             bus.subscribe(ch.STATUS)
             bus.subscribe(ch.FUSED_MAP)
             bus.subscribe(ch.FINAL_MAP)
@@ -119,7 +130,7 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
             for name, arguments in _commands(plan, resolved, endpoint):
                 children.append(Child(name, arguments, plan.folder))
             again = {
-                f"robot-{r.id}": f"teamslam robot {resolved} {r.id} --connect {endpoint}"
+                f"robot-{r.id}": f"teamslam robot {resolved} {r.id} --connect {endpoint}{door}"
                 for r in plan.scenario.robots
             }
             _supervise(children, bus, watch, show, again)
@@ -154,7 +165,8 @@ def _children() -> Iterator[list[Child]]:
 
 
 def _start_router(plan: Plan, children: list[Child]) -> str:
-    router = Child("router", ["router", "--listen", plan.listen], plan.folder)
+    door = [*plan.door, *(["--insecure"] if plan.insecure else [])]
+    router = Child("router", ["router", "--listen", plan.listen, *door], plan.folder)
     children.append(router)
     deadline = time.monotonic() + ROUTER_PATIENCE_S
     while time.monotonic() < deadline:
@@ -170,7 +182,7 @@ def _start_router(plan: Plan, children: list[Child]) -> str:
 
 
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
-    common = [str(resolved), "--connect", endpoint]
+    common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
     robots = [(f"robot-{r.id}", ["robot", *common, r.id]) for r in plan.scenario.robots]
     return [

@@ -36,10 +36,14 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
+from team.keys.credentials import Credentials
+from team.keys.roster import Roster
+from team.wire.access import access_control
 from team.wire.arrivals import Arrivals
 from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of, replied
 from team.wire.channels import ALIVE, Channel, channel_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
+from team.wire.handshake import why_refused
 from team.wire.messages import Liveliness, Message
 
 _ATTACHMENT = struct.Struct("<qqq")
@@ -47,6 +51,10 @@ _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process i
 _BLOCK_US = 10_000_000  # that a full queue may stop a publisher before its link is closed
 _HEARTBEAT_S = 0.25
 _ALIVE_TIMEOUT_S = 5.0
+FIRST_LOOK_S = 3.0
+"""A client that has not come in for so long looks why."""
+REFUSALS = "error,zenoh_link_tls=warn"
+"""What of Zenoh's log a router with keys shows: whom it refuses, and why."""
 _ADVANCED = "/@adv/pub/"  # in the key of what an advanced publisher says beside its publications
 _BEAT = struct.Struct("<I")  # a heartbeat's payload: the number of the last publication
 _LOOK_S = 0.1  # between two looks at what is missing
@@ -107,11 +115,18 @@ _Item = _Reply | zenoh.Sample | _Token | _Question | _Heartbeat | _Cached | None
 class ZenohBus:
     """A bus over one Zenoh session: a client of the router at `connect`.
 
-    Raises `BusError` when no router answers there within `patience_s`. One thread publishes and
-    receives; `close` may come from any.
+    keys: what this node shows the router, over TLS; None: nothing, over TCP. Raises `BusError` when
+    no router answers there within `patience_s`, or one that refuses us or that we refuse. One
+    thread publishes and receives; `close` may come from any.
     """
 
-    def __init__(self, team: str, connect: str, patience_s: float = 10.0) -> None:
+    def __init__(
+        self,
+        team: str,
+        connect: str,
+        patience_s: float = 10.0,
+        keys: Credentials | None = None,
+    ) -> None:
         self._prefix = f"team/{team}/"
         self._queue: SimpleQueue[_Item] = SimpleQueue()
         self._publishers: dict[str, _Publisher] = {}
@@ -125,7 +140,8 @@ class ZenohBus:
         self._incomplete: set[tuple[str, str]] = set()
         self._look_due = 0.0
         self._closed = threading.Event()
-        self._session = _client(connect, patience_s)
+        self._keys = keys
+        self._session = _client(connect, patience_s, keys)
 
     def __enter__(self) -> Self:
         return self
@@ -459,6 +475,12 @@ class ZenohBus:
     def _check_open(self) -> None:
         if self._closed.is_set():
             raise BusError("the bus is closed")
+        if self._keys is not None and time.time() > self._keys.ends.timestamp():
+            raise BusError(
+                f"{self._keys.certificate} has expired, so the router has closed the link: renew "
+                f"it by `teamslam keys {self._keys.team} -o DIR --renew {self._keys.node}`, copy "
+                "it, and start this process again"
+            )
 
 
 def _every(channel: Channel, name: str) -> str:
@@ -506,37 +528,87 @@ def _session(settings: dict[str, object]) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def _client(connect: str, patience_s: float) -> zenoh.Session:
-    try:
-        return _session(
-            {
-                "mode": "client",
-                "connect/endpoints": [connect],
-                "connect/timeout_ms": round(1e3 * patience_s),
-                "connect/retry": {
-                    "period_init_ms": 100,
-                    "period_max_ms": 200,
-                    "period_increase_factor": 1.5,
-                },
-            }
-        )
-    except zenoh.ZError as error:
-        raise BusError(
-            f"no router answers at {connect} ({patience_s:g} s): start `teamslam router`, "
-            f"or give its endpoint, as tcp/HOST:PORT"
-        ) from error
+def _client(connect: str, patience_s: float, keys: Credentials | None) -> zenoh.Session:
+    settings: dict[str, object] = {
+        "mode": "client",
+        "connect/endpoints": [connect],
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 200,
+            "period_increase_factor": 1.5,
+        },
+    }
+    if keys is not None:
+        if not connect.startswith("tls/"):
+            raise BusError(f"{connect}: with keys a router is reached by tls/HOST:PORT")
+        settings |= _client_tls(keys)
+    deadline = time.monotonic() + patience_s
+    wait_s = min(FIRST_LOOK_S, patience_s)
+    while True:
+        try:
+            return _session(settings | {"connect/timeout_ms": max(1, round(1e3 * wait_s))})
+        except zenoh.ZError as error:
+            refused = why_refused(connect, keys)
+            if refused is not None:
+                raise BusError(refused) from error
+            wait_s = deadline - time.monotonic()
+            if wait_s <= 0.0:
+                example = "tls/HOST:PORT" if keys is not None else "tcp/HOST:PORT"
+                raise BusError(
+                    f"no router answers at {connect} ({patience_s:g} s): start `teamslam router`, "
+                    f"or give its endpoint, as {example}"
+                ) from error
+
+
+def _client_tls(keys: Credentials) -> dict[str, object]:
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(keys.authority),
+            "enable_mtls": True,
+            "connect_certificate": str(keys.certificate),
+            "connect_private_key": str(keys.key),
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        },
+    }
+
+
+def _router_tls(keys: Credentials, roster: Roster) -> dict[str, object]:
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(keys.authority),
+            "enable_mtls": True,
+            "listen_certificate": str(keys.certificate),
+            "listen_private_key": str(keys.key),
+            "close_link_on_expiration": True,
+        },
+        "access_control": access_control(roster),
+    }
 
 
 @contextmanager
-def router(listen: str = "tcp/127.0.0.1:0") -> Iterator[str]:
+def router(
+    listen: str = "tcp/127.0.0.1:0", keys: tuple[Credentials, Roster] | None = None
+) -> Iterator[str]:
     """A router in this process; yields the endpoint that it is bound to.
 
-    Raises `BusError` when it can not listen there.
+    keys: the router's own, and whom it lets in: then it speaks TLS alone, and says on stderr or
+    stdout why it refuses whom. Raises `BusError` when it can not listen there.
     """
+    settings: dict[str, object] = {
+        "mode": "router",
+        "listen/endpoints": [listen],
+        "adminspace/enabled": True,
+    }
+    if keys is not None:
+        if not listen.startswith("tls/"):
+            raise BusError(f"{listen}: with keys a router listens at tls/HOST:PORT")
+        zenoh.init_log_from_env_or(REFUSALS)
+        settings |= _router_tls(*keys)
     try:
-        session = _session(
-            {"mode": "router", "listen/endpoints": [listen], "adminspace/enabled": True}
-        )
+        session = _session(settings)
     except zenoh.ZError as error:
         raise BusError(
             f"can not listen at {listen}: the port is taken or the address is not this machine's; "

@@ -1,0 +1,227 @@
+"""A team's authority: its certificate and key, and the certificates that it gives.
+
+Keys are on the curve P-256. A certificate names its node (CN) and its team (O); the router's also
+the hosts by which it is reached. A node's certificate is for clients alone, so that no robot can
+pass for the router. It is valid from an hour before it was made, since robots' clocks differ.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from team.keys.credentials import CA
+from team.keys.roster import (
+    ROSTER,
+    KeysError,
+    Roster,
+    chosen,
+    common_name,
+    load_roster,
+    roster_bytes,
+)
+
+CA_KEY = "ca.key"
+AUTHORITY_DAYS = 3650
+SKEW = timedelta(hours=1)
+LOCAL = ("localhost", "127.0.0.1", "::1")
+"""Hosts that every router's certificate is good for."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What was done: nodes with new certificates, those left as they were, and those revoked."""
+
+    roster: Roster
+    made: tuple[str, ...]
+    kept: tuple[str, ...]
+    revoked: tuple[str, ...]
+    ends: datetime
+
+
+def make_keys(
+    folder: Path,
+    team: str,
+    nodes: Iterable[str],
+    *,
+    hosts: Sequence[str] = (),
+    days: float = 90.0,
+    renew: Sequence[str] = (),
+    revoke: Sequence[str] = (),
+    now: datetime | None = None,
+) -> Made:
+    """Make an authority in the folder if there is none, and the certificates that are missing.
+
+    nodes: who is to be in the team. renew: nodes that get a new key and certificate under the same
+    name. revoke: nodes whose name the router is to forget; one that is made again later has another
+    name, so that the old certificate stays worthless. Raises KeysError.
+    """
+    now = now or datetime.now(UTC)
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    roster = load_roster(folder) if (folder / ROSTER).exists() else Roster(team, {})
+    if roster.team != team:
+        raise KeysError(f"{folder} holds the keys of the team {roster.team!r}, not of {team!r}")
+    authority = _authority(folder, team, now)
+    gone = chosen(revoke, roster)
+    if "router" in gone:
+        raise KeysError("the router is not in its own roster of clients: renew it instead")
+    renewed = [node for node in chosen(renew, roster) if node not in gone]
+    every_host = tuple(dict.fromkeys((*roster.hosts, *hosts)))
+    if every_host != roster.hosts and "router" in roster.nodes and "router" not in renewed:
+        renewed.append("router")  # its certificate names the hosts
+    generations = {n: g for n, g in roster.nodes.items() if n not in gone}
+    revoked = roster.revoked | {node: roster.nodes[node] for node in gone}
+    missing = [node for node in nodes if node not in generations and node not in gone]
+    generations |= {node: revoked.get(node, 0) + 1 for node in missing}
+    roster = Roster(team, generations, every_host, revoked)
+    ends = now + timedelta(days=days)
+    for node in (*missing, *renewed):
+        name = common_name(node, generations[node])
+        _write_pair(folder, node, *_issued(authority, team, name, node, every_host, now, ends))
+    for node in gone:
+        for suffix in ("pem", "key"):
+            (folder / f"{node}.{suffix}").unlink(missing_ok=True)
+    _write(folder / ROSTER, roster_bytes(roster))
+    new = (*missing, *renewed)
+    kept = tuple(sorted(node for node in generations if node not in new))
+    return Made(roster, tuple(sorted(new)), kept, tuple(sorted(gone)), ends)
+
+
+_Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
+
+
+def _authority(folder: Path, team: str, now: datetime) -> _Authority:
+    """The folder's own, or a new one where there is none."""
+    paths = folder / CA, folder / CA_KEY
+    if all(path.exists() for path in paths):
+        certificate = x509.load_pem_x509_certificate(paths[0].read_bytes())
+        key = serialization.load_pem_private_key(paths[1].read_bytes(), password=None)
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise KeysError(f"{paths[1]}: not a key that `teamslam keys` made")
+        return certificate, key
+    if any(path.exists() for path in paths) or (folder / ROSTER).exists():
+        raise KeysError(
+            f"{folder} has keys but not both {CA} and {CA_KEY}: certificates are made where the "
+            "authority is; for a new authority choose an empty folder"
+        )
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(team, f"authority of team {team}"[:64])
+    certificate = (
+        _builder(name, name, key.public_key(), now, now + timedelta(days=AUTHORITY_DAYS))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(certificates=True), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    _write_pair(folder, "ca", certificate, key)
+    return certificate, key
+
+
+def _issued(
+    authority: _Authority,
+    team: str,
+    name: str,
+    node: str,
+    hosts: Sequence[str],
+    now: datetime,
+    ends: datetime,
+) -> _Authority:
+    key = ec.generate_private_key(ec.SECP256R1())
+    issuer, issuer_key = authority
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    builder = _builder(_name(team, name), issuer.subject, key.public_key(), now, ends)
+    if node == "router":
+        usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
+        names = [_host(host) for host in dict.fromkeys((*LOCAL, *hosts))]
+        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    certificate = (
+        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()),
+            critical=False,
+        )
+        .sign(issuer_key, hashes.SHA256())
+    )
+    return certificate, key
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePublicKey,
+    now: datetime,
+    ends: datetime,
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, ends) - SKEW)
+        .not_valid_after(ends)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _usage(*, certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=certificates,
+        crl_sign=certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _name(team: str, common: str) -> x509.Name:
+    return x509.Name(
+        [
+            x509.NameAttribute(NameOID.ORGANIZATION_NAME, team),
+            x509.NameAttribute(NameOID.COMMON_NAME, common),
+        ]
+    )
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ip_address(host.strip("[]")))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(host)
+    except ValueError:
+        raise KeysError(f"{host!r} is no name or address of a host") from None
+
+
+def _write_pair(
+    folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey
+) -> None:
+    private = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    _write(folder / f"{name}.key", private)
+    _write(folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM))
+
+
+def _write(path: Path, content: bytes) -> None:
+    """In one step, and for the owner's eyes only."""
+    new = path.with_name(f".{path.name}.new")
+    new.unlink(missing_ok=True)
+    with os.fdopen(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file:
+        file.write(content)
+    new.replace(path)

@@ -1,0 +1,96 @@
+"""The roster of a team: which nodes have a certificate, and by which common name.
+
+A node is one voice: `robot-<name>`, `source-<name>` (the driver of a robot's sensors), `central`,
+`world`, `recorder`, `viewer`, `operator` (the commands of a person: `launch`, `withdraw`),
+`router`, and `replay`, which may say everything and is made only if asked for.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+ROSTER = "roster.json"
+STANDING = ("central", "operator", "recorder", "router", "viewer", "world")
+"""The nodes that every team has."""
+REPLAY = "replay"
+TEAM = re.compile("[A-Za-z0-9._-]{1,64}")
+ROBOT = re.compile("[a-z][a-z0-9_]{0,31}")
+
+
+class KeysError(RuntimeError):
+    """Keys that are missing, do not fit, or can not be made: which, and what to do."""
+
+
+class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """nodes: the generation of each node's certificate. hosts: by which the router is reached.
+    revoked: the last generation of each node that was revoked; a later one has another name.
+    """
+
+    team: str
+    nodes: dict[str, int]
+    hosts: tuple[str, ...] = ()
+    revoked: dict[str, int] = msgspec.field(default_factory=dict)
+
+    def common_name(self, node: str) -> str:
+        """By what the router knows the node: its name; after a revocation with a number."""
+        return common_name(node, self.nodes[node])
+
+    @property
+    def robots(self) -> list[str]:
+        """The names of the robots, in order."""
+        return sorted(n.removeprefix("robot-") for n in self.nodes if n.startswith("robot-"))
+
+
+def common_name(node: str, generation: int) -> str:
+    """`robot-r1`; its second generation is `robot-r1.2`."""
+    return node if generation == 1 else f"{node}.{generation}"
+
+
+def nodes_of(robots: Iterable[str]) -> list[str]:
+    """Every node of a team with these robots."""
+    names = list(robots)
+    return [*STANDING, *(f"{kind}-{name}" for name in names for kind in ("robot", "source"))]
+
+
+def is_node(text: str) -> bool:
+    """Whether a node can have this name."""
+    kind, dash, name = text.partition("-")
+    if not dash:
+        return text in (*STANDING, REPLAY)
+    return kind in ("robot", "source") and ROBOT.fullmatch(name) is not None
+
+
+def load_roster(folder: Path) -> Roster:
+    """The roster in a folder of keys; raises KeysError."""
+    path = folder / ROSTER
+    try:
+        roster = msgspec.json.decode(path.read_bytes(), type=Roster)
+    except OSError as error:
+        raise KeysError(
+            f"{path}: {error.strerror or error}; the router needs the roster: "
+            f"copy it from where `teamslam keys` made it"
+        ) from None
+    except msgspec.DecodeError as error:
+        raise KeysError(f"{path}: not a roster: {error}") from None
+    wrong = [node for node in roster.nodes if not is_node(node)]
+    if wrong or not TEAM.fullmatch(roster.team):
+        raise KeysError(f"{path}: {(wrong or [roster.team])[0]!r} is no name of a node or a team")
+    return roster
+
+
+def roster_bytes(roster: Roster) -> bytes:
+    """As the file has it."""
+    return msgspec.json.format(msgspec.json.encode(roster, order="deterministic"), indent=2) + b"\n"
+
+
+def chosen(nodes: Sequence[str], roster: Roster) -> list[str]:
+    """The named nodes, `all` for every one; raises KeysError for one that has no certificate."""
+    if "all" in nodes:
+        return sorted(roster.nodes)
+    for node in nodes:
+        if node not in roster.nodes:
+            known = ", ".join(sorted(roster.nodes))
+            raise KeysError(f"no certificate of {node!r}; there are: {known}")
+    return list(nodes)

@@ -1,0 +1,82 @@
+"""Why a link to a router does not come up: Zenoh says only that the time is over.
+
+One TLS handshake by the standard library, beside Zenoh, tells the cases apart: nobody listens; the
+router refuses our certificate, or we its; one side speaks TLS and the other does not.
+"""
+
+import re
+import socket
+import ssl
+
+from team.keys.credentials import Credentials
+
+TIMEOUT_S = 1.0
+"""For each step; a router on a busy machine that takes longer is asked again."""
+_ENDPOINT = re.compile(r"(?P<protocol>\w+)/(?P<host>\[[^]]+\]|[^:/?#]+):(?P<port>\d+)")
+_ALERTS = {
+    "UNKNOWN_CA": "it is of another authority than the router's: copy ca.pem and both files of "
+    "this node from one folder",
+    "CERTIFICATE_EXPIRED": "it has expired by the router's clock: renew it, or put the clock right",
+    "CERTIFICATE_REQUIRED": "it wants one: give --keys DIR",
+    "CERTIFICATE_UNKNOWN": "it does not take it for one of its team",
+    "BAD_CERTIFICATE": "it does not take it for one of its team",
+    "DECRYPT_ERROR": "it is of another authority than the router's, of the same name",
+}
+
+
+def why_refused(connect: str, keys: Credentials | None) -> str | None:
+    """In words, with the remedy; None: nobody listens there, or TLS is not what stands between."""
+    at = _ENDPOINT.match(connect)
+    if at is None:
+        return None
+    host, port = at["host"].strip("[]"), int(at["port"])
+    try:
+        link = socket.create_connection((host, port), TIMEOUT_S)
+    except OSError:
+        return None
+    with link:
+        return _without_keys(link, connect) if keys is None else _with(link, host, connect, keys)
+
+
+def _with(link: socket.socket, host: str, connect: str, keys: Credentials) -> str | None:
+    try:
+        tls = keys.context().wrap_socket(link, server_hostname=host)
+    except ssl.SSLCertVerificationError as error:
+        return (
+            f"{connect}: the router's certificate is not good: {error.verify_message}. If the host "
+            "is not in it: `teamslam keys TEAM -o DIR --router HOST`; if it is of another "
+            f"authority than {keys.authority}: copy both from one folder"
+        )
+    except ssl.SSLError as error:
+        return _alerted(error, connect, keys)
+    except OSError as error:
+        return f"{connect}: what listens there speaks no TLS ({error}): a router without --keys?"
+    with tls:
+        try:  # TLS 1.3: what the router says of our certificate comes after the handshake
+            tls.recv(1)
+        except ssl.SSLError as error:
+            return _alerted(error, connect, keys)
+        except OSError:
+            return None
+    return None
+
+
+def _alerted(error: ssl.SSLError, connect: str, keys: Credentials) -> str:
+    reason = error.reason or str(error)
+    for alert, meaning in _ALERTS.items():
+        if alert in reason:
+            return f"{connect}: the router refuses {keys.certificate}: {meaning}"
+    return f"{connect}: what listens there speaks no TLS ({reason}): a router without --keys?"
+
+
+def _without_keys(link: socket.socket, connect: str) -> str | None:
+    """Whether it is a router with keys, which answers a greeting in TLS."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    try:
+        with context.wrap_socket(link):
+            pass
+    except OSError:
+        return None
+    return f"{connect}: the router there has keys and refuses whoever has none: give --keys DIR"

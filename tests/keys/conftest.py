@@ -1,0 +1,22 @@
+"""One set of certificates for all tests here: they are cheap, but not free."""
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from team.keys.authority import make_keys
+from team.keys.roster import nodes_of
+from tests.keys.certificates import TEAM, Folders
+
+
+@pytest.fixture(scope="session")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Folders:
+    folders = Folders(*(tmp_path_factory.mktemp(name) for name in ("own", "strange", "ended")))
+    nodes = [*nodes_of(["r1", "r2"])]
+    make_keys(folders.own, TEAM, nodes)
+    make_keys(folders.strange, TEAM, nodes)
+    past = datetime.now(UTC) - timedelta(days=3)
+    for path in folders.own.iterdir():
+        (folders.ended / path.name).write_bytes(path.read_bytes())
+    make_keys(folders.ended, TEAM, [], renew=["robot-r1"], days=1.0, now=past)
+    return folders

@@ -1,0 +1,236 @@
+"""What a stranger and a robot that was taken over can say at a router with keys: nothing of others.
+
+Each attack is made twice: at a router with keys nothing arrives, at an open one it does.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from team.keys.credentials import credentials_of
+from team.keys.roster import load_roster
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire import zenoh_bus
+from team.wire.bus import BusError, Outgoing, Sample
+from team.wire.codec import encoded
+from team.wire.zenoh_bus import ZenohBus, router
+from tests.keys.certificates import TEAM, Folders
+from tests.support import examples, odometry, submap, wait_until
+
+HUGE = 2**62
+FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
+ATTACKS = {
+    "ends the run": (ch.END, "", m.End(0, ())),
+    "forges the final map": (ch.FINAL_MAP, "", FINAL),
+    "begins a life that nobody reaches": (ch.START, "r1", m.Start(0, "r1", HUGE, 0, b"", b"")),
+    "says that another is done": (ch.ROBOT_DONE, "r1", m.Done(0, "r1", HUGE, 0, 0, 0, ())),
+    "frees another's credit": (
+        ch.ROBOT_PROGRESS, "r1", m.Progress(0, "robot/r1", "r1", 1, HUGE, HUGE),
+    ),
+    "orders a withdrawal": (ch.ORDER, "r1", m.Withdrawal(0, "r1", "operator", "so")),
+    "tells that the centre withdrew": (ch.WITHDRAWAL, "r1", m.Withdrawal(0, "r1", "central", "so")),
+    "lets another repeat it": (
+        ch.WITHDRAWALS_HEARD, "r1", m.WithdrawalHeard(0, "r1", "r1", "operator", "so"),
+    ),
+    "brings a robot of its own": (ch.SUBMAP, "r9", submap(0, "r9")),
+    "replaces a measurement": (ch.ODOMETRY, "r1", odometry(0, "r1")),
+    "replaces a teammate's submap": (ch.SUBMAP, "r1", submap(0, "r1")),
+    "takes the recorder's place": (
+        ch.RECORDER_PROGRESS, "r1", m.Progress(0, "recorder", "r1", 1, HUGE, HUGE),
+    ),
+    "gives the truth": (ch.TRUTH, "r1", next(e for e in examples() if isinstance(e, m.Truth))),
+}  # fmt: skip
+"""What r2 says that is not its own to say."""
+OWN = Outgoing(ch.ROBOT_PROGRESS, "r2", m.Progress(7, "robot/r2", "r2", 1, 1, 1))
+
+
+@contextmanager
+def door(keys: Folders | None) -> Iterator[Callable[[str], ZenohBus]]:
+    """A router, and a function that brings a node in."""
+    opened: list[ZenohBus] = []
+    folder = None if keys is None else keys.own
+    own = folder and (credentials_of(folder, "router"), load_roster(folder))
+    with router("tls/127.0.0.1:0" if folder else "tcp/127.0.0.1:0", own or None) as endpoint:
+
+        def enter(node: str) -> ZenohBus:
+            shown = credentials_of(folder, node, TEAM) if folder else None
+            opened.append(ZenohBus(TEAM, endpoint, keys=shown))
+            return opened[-1]
+
+        try:
+            yield enter
+        finally:
+            for bus in opened:
+                bus.close()
+
+
+def arriving(bus: ZenohBus, last: str) -> list[str]:
+    """The keys that arrive until this one does."""
+    found: list[str] = []
+
+    def look() -> bool:
+        found.extend(sample.key for sample in bus.receive(0.05))
+        return last in found
+
+    wait_until(look, what=last)
+    return [key for key in found if key != last]
+
+
+@pytest.mark.parametrize("locked", [True, False], ids=["keys", "open"])
+def test_a_robot_that_was_taken_over_says_nothing_for_others(
+    keys: Folders, *, locked: bool
+) -> None:
+    with door(keys if locked else None) as enter:
+        victim, robot = enter("recorder"), enter("robot-r2")
+        for channel in {channel for channel, _, _ in ATTACKS.values()} | {ch.ROBOT_PROGRESS}:
+            victim.subscribe(channel)
+        probe = Outgoing(ch.STATUS, "robot/r2", m.Status(0, "robot/r2", "mapping", {}))
+        victim.subscribe(ch.STATUS)
+
+        def there() -> bool:
+            robot.publish(probe)
+            return bool(victim.receive(0.02))
+
+        wait_until(there, what="the link")
+        said = [Outgoing(*attack) for attack in ATTACKS.values()]
+        for out in said:
+            robot.publish(out)
+        robot.publish(OWN)
+        heard = {key for key in arriving(victim, OWN.key) if not key.endswith("/status")}
+        assert heard == (set() if locked else {out.key for out in said})
+
+
+def answers(asker: ZenohBus, channel: ch.Channel, name: str, request: m.Message) -> list[bytes]:
+    with suppress(BusError):
+        return asker.ask(channel, name, request, 2.0)
+    return []
+
+
+@pytest.mark.parametrize("locked", [True, False], ids=["keys", "open"])
+def test_a_robot_that_was_taken_over_answers_no_query_of_another(
+    keys: Folders, *, locked: bool
+) -> None:
+    forged = [encoded(odometry(5, "r1"))]
+    wanted = m.ReadingsWanted(0, "r1", 1, 0, -1)
+    with door(keys if locked else None) as enter:
+        robot, attacker = enter("robot-r1"), enter("robot-r2")
+        attacker.answer(ch.READINGS, "r1", lambda _: forged)
+        attacker.answer(ch.SUBMAPS, "", lambda _: forged)
+        attacker.declare_alive("robot/r1")
+        attacker.declare_alive("robot/r2")
+        wait_until(lambda: robot.is_alive("robot/r2"), what="the attacker")
+        assert robot.is_alive("robot/r1") is not locked
+        over = threading.Event()
+        serving = threading.Thread(
+            target=lambda: [attacker.receive(0.02) for _ in iter(over.is_set, True)]
+        )
+        serving.start()
+        try:
+            found = answers(robot, ch.READINGS, "r1", wanted)
+            found += answers(robot, ch.SUBMAPS, "", m.SubmapsWanted(0, "r1"))
+        finally:
+            over.set()
+            serving.join()
+        assert found == ([] if locked else forged * 2)
+
+
+def test_a_team_works_with_keys_late_joiners_caches_tokens_and_queries(keys: Folders) -> None:
+    with door(keys) as enter:
+        robot, source = enter("robot-r1"), enter("source-r1")
+        for k in range(5):
+            robot.publish(Outgoing(ch.SUBMAP, "r1", submap(k, "r1")))
+        robot.declare_alive("robot/r1")
+        centre = enter("central")
+        centre.watch_alive()
+        centre.subscribe(ch.SUBMAP)
+        found: list[Sample] = []
+
+        def look() -> int:
+            found.extend(centre.receive(0.05))
+            return len(found)
+
+        wait_until(lambda: look() == 6, what="history and a token")
+        assert {sample.key for sample in found} == {"robot/r1/submap", "robot/r1/alive"}
+        robot.publish(Outgoing(ch.SUBMAP, "r1", submap(5, "r1")))
+        wait_until(lambda: look() == 7, what="a live one")
+        robot.subscribe(ch.ODOMETRY, "r1")
+
+        def driven() -> bool:
+            source.publish(Outgoing(ch.ODOMETRY, "r1", odometry(0, "r1")))
+            return bool(robot.receive(0.05))
+
+        wait_until(driven, what="a measurement")
+
+
+def test_no_estimator_hears_the_truth(keys: Folders) -> None:
+    truth = Outgoing(ch.TRUTH, "r1", next(e for e in examples() if isinstance(e, m.Truth)))
+    with door(keys) as enter:
+        world, robot, recorder = enter("world"), enter("robot-r1"), enter("recorder")
+        for bus in (robot, recorder):
+            bus.subscribe(ch.TRUTH)
+            bus.subscribe(ch.END)
+        world.publish(truth)
+        wait_until(lambda: recorder.receive(0.05), what="the truth at the recorder")
+        world.publish(Outgoing(ch.END, "", m.End(0, ())))
+        assert arriving(robot, "world/end") == []
+
+
+def test_a_token_with_an_endless_name_is_nobodys(keys: Folders) -> None:
+    """Its own prefix lets a robot hold it; nobody takes it for a node's."""
+    with door(keys) as enter:
+        robot, centre = enter("robot-r2"), enter("central")
+        centre.watch_alive()
+        robot.declare_alive("robot/r2/" + "x" * 25_000)
+        robot.declare_alive("robot/r2")
+        found: list[Sample] = []
+        wait_until(lambda: found.extend(centre.receive(0.05)) or found, what="its own token")
+        assert [sample.key for sample in found] == ["robot/r2/alive"]
+
+
+def refusal(endpoint: str, node: Path | None, **changed: object) -> tuple[str, float]:
+    began = time.monotonic()
+    shown = node and replace(credentials_of(node, "robot-r1"), **changed)  # type: ignore[type-var]
+    with pytest.raises(BusError) as caught:
+        ZenohBus(TEAM, endpoint, 4.0, shown or None)
+    return str(caught.value), time.monotonic() - began
+
+
+def test_each_side_names_a_certificate_that_it_refuses(
+    keys: Folders,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(zenoh_bus, "FIRST_LOOK_S", 0.3)
+    own = credentials_of(keys.own, "router"), load_roster(keys.own)
+    with router("tls/127.0.0.1:0", own) as endpoint:
+        told, took = refusal(endpoint, keys.strange)
+        assert "the router's certificate is not good" in told
+        assert took < 10.0
+        told, took = refusal(endpoint, keys.strange, authority=keys.own / "ca.pem")
+        assert "the router refuses" in told
+        assert "of another authority" in told
+        told, _ = refusal(endpoint, None)
+        assert "give --keys DIR" in told
+        pair = {"certificate": keys.ended / "robot-r1.pem", "key": keys.ended / "robot-r1.key"}
+        told, _ = refusal(endpoint, keys.own, **pair)
+        assert "it has expired by the router's clock" in told
+        said = ""
+
+        def logged(*reasons: str) -> bool:
+            nonlocal said
+            said += "".join(capfd.readouterr())
+            return all(reason in said for reason in reasons)
+
+        reasons = "UnknownCA", "BadSignature", "sent no certificates", "certificate expired"
+        wait_until(lambda: logged(*reasons), what="the router's own words")
+    told, _ = refusal(endpoint, keys.own)
+    assert f"no router answers at {endpoint} (4 s)" in told
+    with router() as plain:
+        told, _ = refusal(plain.replace("tcp/", "tls/"), keys.own)
+        assert "speaks no TLS" in told
