@@ -125,7 +125,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
         attacker.declare_alive("robot/r1")
         attacker.declare_alive("robot/r2")
         wait_until(lambda: robot.is_alive("robot/r2"), what="the attacker")
-        assert robot.is_alive("robot/r1") is not locked
+        assert robot.is_alive("robot/r1") != locked
         over = threading.Event()
         serving = threading.Thread(
             target=lambda: [attacker.receive(0.02) for _ in iter(over.is_set, True)]
