@@ -3,11 +3,12 @@
 The truth is made with complex numbers (a position is x + iy), not with the estimator's geometry.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from team.estimation.contribution import Contribution, Start
+from team.estimation.gauss_newton import settled
 from team.estimation.submap import LocalMap
 
 
@@ -53,6 +54,12 @@ def drawn(truth, covariance, rng):
     mean = truth + np.linalg.cholesky(covariance) @ rng.normal(size=len(truth))
     mean[2] = wrap(mean[2])
     return mean
+
+
+def solved(fold, settings):
+    """The fold with the full solution of its main island; other minima are not searched for."""
+    island, _, _ = settled(replace(fold.main, settings=settings))
+    return replace(fold, islands={**fold.islands, fold.main_key: island})
 
 
 def team(seed, robots=2, submaps=8, landmarks=6, size=20.0, reach=12.0, sigmas=(0.1, 0.02, 0.2)):

@@ -31,7 +31,7 @@ from team.estimation.marginals import (
 )
 from team.estimation.submap import LocalMap
 from team.estimation.submap_factor import submap_normal
-from tests.estimation.submap_world import local_truth, team, wrap
+from tests.estimation.submap_world import local_truth, solved, team, wrap
 
 EXACTLY = JoinSettings(step_tolerance=1e-11)
 
@@ -251,7 +251,7 @@ def consistency(options):
     errors = cost = dof = joint = 0.0
     for seed in range(RUNS):
         world = team(seed, robots=2, submaps=5, landmarks=4)
-        fold = converged(joined(world.submaps, world.starts, options, tick=10), options)
+        fold = solved(joined(world.submaps, world.starts, options, tick=10), options)
         found = landmark_map(fold)
         truth = world.landmarks[found.ids]
         errors += nees((found.means - truth).ravel(), found.covariance)

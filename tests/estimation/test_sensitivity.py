@@ -23,7 +23,7 @@ from team.estimation.sensitivity import BIASES, carried_on, forward_column
 from team.estimation.submap_factor import biased_normal
 from team.robot.node import RobotNode
 from team.wire import channels as ch
-from tests.estimation.submap_world import local_truth, team, wrap
+from tests.estimation.submap_world import local_truth, solved, team, wrap
 from tests.teams import config, driven, of, published
 
 SIGMA = {"bearing": 0.01, "forward_scale": 0.05, "range_scale": 0.01}
@@ -175,13 +175,13 @@ def biased_team(seed):
     return world, submaps, errors
 
 
-def fold_of(world, submaps, options, tick=4):
+def fold_of(world, submaps, options, tick=4, full=converged):
     fold = joining.EMPTY_FOLD
     for start in world.starts:
         fold = started(fold, start)
     for begin in range(0, len(submaps), tick):
         fold = folded(fold, submaps[begin : begin + tick], options)
-    return converged(fold, options)
+    return full(fold, options)
 
 
 def without_columns(submaps):
@@ -196,7 +196,8 @@ def nees_of_map_and_biases(seeds, *, blind=False):
     for seed in seeds:
         world, submaps, errors = biased_team(seed)
         options = JoinSettings(bias_sigma=SIGMA)
-        fold = fold_of(world, without_columns(submaps) if blind else submaps, options)
+        taken = without_columns(submaps) if blind else submaps
+        fold = fold_of(world, taken, options, tick=12, full=solved)
         found = marginals.landmark_map(fold)
         of_map += nees((found.means - world.landmarks[found.ids]).ravel(), found.covariance)
         dof += found.means.size
@@ -206,7 +207,7 @@ def nees_of_map_and_biases(seeds, *, blind=False):
     return of_map / dof, of_biases
 
 
-SEEDS = range(100)
+SEEDS = range(200)
 
 
 def test_map_and_biases_are_as_sure_as_they_say_and_without_bias_states_they_are_not():

@@ -18,7 +18,7 @@ from team.estimation.sighting import Carried, carried_back, carried_on, point_se
 from team.estimation.sighting_kernel import sighting_residual
 from team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting
-from tests.estimation.submap_world import seen_from, wrap
+from tests.estimation.submap_world import seen_from, solved, wrap
 
 EXACTLY = JoinSettings(step_tolerance=1e-11)
 poses = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1)).map(np.array)
@@ -100,7 +100,7 @@ def consistency(change):
         world = meeting(seed, robots=2, submaps=3, landmarks=2, reach=7.0)
         sightings = [replace(each, covariance=change * each.covariance) for each in world.sightings]
         fold = joined_with(world.submaps, world.starts, sightings, JoinSettings(), 100)
-        fold = converged(fold, JoinSettings())
+        fold = solved(fold, JoinSettings())
         found = landmark_map(fold)
         truth = world.landmarks[found.ids]
         if len(found.ids):

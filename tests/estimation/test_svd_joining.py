@@ -122,11 +122,11 @@ def test_without_redundancy_the_identity_stands_as_it_is():
     np.testing.assert_allclose(svd_joining.pose_gaussian(state, "r0").mean, expected)
 
 
-def map_nees(weighting, honest):
+def map_nees(weighting, honest, runs=200):
     """NEES and dof of the map over many teams; spherical submaps are drawn as they are weighted."""
     values = []
-    for seed in range(60):
-        made = team(seed, robots=2, submaps=5, sigmas=(0.05, 0.05, 0.05))
+    for seed in range(runs):
+        made = team(seed, robots=2, submaps=3, sigmas=(0.05, 0.05, 0.05))
         rng = np.random.default_rng(seed)
         state = svd_joining.begun({start.robot: start.pose for start in made.starts}, weighting)
         for each in made.submaps:
@@ -150,7 +150,7 @@ def map_nees(weighting, honest):
 def test_where_errors_are_spherical_the_map_is_consistent_and_where_they_are_not_it_is_not():
     ratio, (low, high) = map_nees("spherical", honest=True)
     assert low < ratio < high
-    ratio, (low, high) = map_nees("spherical", honest=False)
+    ratio, (low, high) = map_nees("spherical", honest=False, runs=40)
     assert not low < ratio < high
 
 

@@ -153,7 +153,7 @@ def ratio(results):
 
 @pytest.mark.parametrize("sensor", [ACCURATE, COARSE], ids=["accurate", "coarse"])
 def test_the_submaps_of_many_particles_are_consistent(sensor):
-    results = submap_errors(sensor, particles=1000, runs=200)
+    results = submap_errors(sensor, particles=400, runs=200)
     low, high = chi2_interval(int(results[:, 1].sum()), 0.999, 1)
     assert low < ratio(results) < high
 

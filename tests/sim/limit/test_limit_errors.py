@@ -160,7 +160,7 @@ def test_the_map_is_consistent_where_errors_last_and_not_if_they_are_taken_as_wh
 ) -> None:
     runs = [
         batch_map(joined_log(lasting_scenario(seed), 0.02), kind)  # type: ignore[arg-type]
-        for seed in range(100, 120)
+        for seed in range(100, 300)
     ]
     errors = [run.errors for run in runs if run.errors is not None]
     dof = sum(2 * e.count for e in errors)
