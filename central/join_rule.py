@@ -1,6 +1,6 @@
 """The rule `join`: the team's map is a pure function of the set of submaps."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -9,11 +9,9 @@ from central.config import CentralConfig
 from central.monitor import NOTHING, finding, miscalibrations
 from central.submap_set import Stream, SubmapSet
 from central.tick_fold import TickFold
-from central.withdrawal import convicted, suspects
 from team import translate
 from team.estimation import marginals
-from team.estimation.joining import Fold, converged
-from team.estimation.marginals import Agreement
+from team.estimation.joining import Fold
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -45,8 +43,7 @@ class JoinRule:
         self._quiet_ns: int | None = None
         self.finding = NOTHING
         self.landmarks = 0
-        self._tried_at = 0
-        self._agreed: tuple[Fold, Agreement] | None = None
+        self._announced: dict[str, str] = {}
         self.warnings: list[str] = []
         self.reasons: tuple[str, ...] = ()
         self.refused = 0
@@ -76,9 +73,9 @@ class JoinRule:
 
     def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
         """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
-        robot = withdrawal.robot
-        if robot not in self.withdrawn:
-            self._ticks.withdraw(robot)
+        robot, known = withdrawal.robot, self.withdrawn
+        self._ticks.withdraw(robot)
+        if robot not in known:
             said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
             self.warnings.append(said)
 
@@ -142,10 +139,10 @@ class JoinRule:
     def advance(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
         """Fold what the watermark allows; a broadcast when one is due."""
         taken = self._ticks.take_until(watermark_ns)
+        said = self._withdrawals(newest_ns)
         since = None if self._broadcast_ns is None else newest_ns - self._broadcast_ns
         due = since is None or since >= self._config.broadcast_s * 1e9
-        if taken and due:
-            said = self._withdrawals(self._ticks.fold, newest_ns)
+        if said or (taken and due):
             return [*said, *self._broadcast(self._ticks.fold, "closed", newest_ns)]
         if not any(self._entered.values()):
             return []
@@ -158,47 +155,27 @@ class JoinRule:
 
     def conclude(self, newest_ns: int) -> list[Outgoing]:
         """The final map: everything folded, solved until it stands still, with what it says."""
-        fold = self._solved()
-        said = self._withdrawals(fold, newest_ns)
-        return [*said, *self._broadcast(self._solved() if said else fold, "final", newest_ns)]
+        fold = self._ticks.solved()
+        return [*self._withdrawals(newest_ns), *self._broadcast(fold, "final", newest_ns)]
 
-    def _solved(self) -> Fold:
-        self._ticks.take_until(float("inf"))
-        fold = self._ticks.fold
-        return converged(fold, self._ticks.settings) if fold.contributions else fold
-
-    def _withdrawals(self, fold: Fold, now_ns: int) -> list[Outgoing]:
-        """Who is wrong beyond doubt goes; looked at again when the set has grown by a quarter."""
-        limit, count = self._config.withdraw_above, len(fold.contributions)
-        if limit is None or not count or count < 1.25 * self._tried_at:
-            return []
-        agreement = self._agreement(fold)
-        if not suspects(agreement, limit):
-            return []
-        self._tried_at = count
-        found = convicted(agreement, limit, self._agreement_without)
-        if found is None:
-            return []
-        robot, reason = found
-        withdrawal = m.Withdrawal(now_ns, robot, "central", reason)
-        self.take_withdrawal(withdrawal)
-        self._tried_at = 0
-        return [Outgoing(ch.WITHDRAWAL, robot, withdrawal)]
-
-    def _agreement(self, fold: Fold) -> Agreement:
-        """The agreement of a fold; the last one's is kept, since a broadcast asks twice."""
-        if self._agreed is None or self._agreed[0] is not fold:
-            self._agreed = fold, marginals.joint_cost(fold)
-        return self._agreed[1]
-
-    def _agreement_without(self, robots: Collection[str]) -> Agreement | None:
-        fold = self._ticks.without(robots).fold
-        return marginals.joint_cost(converged(fold, self._ticks.settings)) if fold.home else None
+    def _withdrawals(self, now_ns: int) -> list[Outgoing]:
+        """Whom the fold has convicted since this was asked last; what came late may acquit."""
+        found = self._ticks.convicted
+        for robot in sorted(self._announced.keys() - found.keys()):
+            del self._announced[robot]
+            self.warnings.append(f"{robot} is withdrawn no more: what came late speaks for it")
+        new = [robot for robot in found if robot not in self._announced]
+        self._announced |= found
+        self.warnings += [f"{robot} withdrawn by central: {found[robot]}" for robot in new]
+        return [
+            Outgoing(ch.WITHDRAWAL, robot, m.Withdrawal(now_ns, robot, "central", found[robot]))
+            for robot in new
+        ]
 
     def retold(self, tail: Tail) -> list[Outgoing]:
         """What a map of everything that is here says, whatever the watermark: law 2, for reruns."""
         if tail == "final":
-            return self._broadcast(self._solved(), tail, 0)
+            return self._broadcast(self._ticks.solved(), tail, 0)
         self._ticks.take_until(float("inf"))
         return self._broadcast(self._ticks.fold, tail, 0)
 
@@ -215,7 +192,7 @@ class JoinRule:
         chi2 = dof = 0.0
         self.finding = NOTHING
         if fold.contributions:
-            agreement = self._agreement(fold)
+            agreement = self._ticks.agreement(fold)
             chi2, dof = agreement.chi2, agreement.dof
             self.finding = finding(agreement, self._config.normal_scale)
         joint = False

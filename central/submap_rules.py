@@ -69,11 +69,15 @@ class SubmapRule:
         return []
 
     def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
-        """Who joins later hears of every order from the centre: an operator does not stay."""
-        if order.robot in self.joined.withdrawn:
+        """Who joins later hears of every order from the centre: an operator does not stay.
+
+        What the centre itself has ordered, before it was started again, its fold finds again.
+        """
+        if order.by == "central":
             return []
+        known = self.joined.withdrawn
         self.joined.take_withdrawal(order)
-        return [Outgoing(ch.WITHDRAWAL, order.robot, order)]
+        return [] if order.robot in known else [Outgoing(ch.WITHDRAWAL, order.robot, order)]
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
         """Nobody need wait for a submap, or a sighting from it, that raised."""

@@ -2,28 +2,42 @@
 
 Tick b takes the submaps that end in (b·tick, (b + 1)·tick]. Behind the watermark every submap of a
 tick is there, so the fold is final; what comes late rolls it back to the checkpoint before.
+
+Who contradicts the rest beyond doubt is withdrawn by the fold itself: it is asked after the first
+tick of each broadcast's time and of the full solution, never when a broadcast happens to be due,
+and begins again without the robot. So who is withdrawn depends on the set alone, whenever and in
+whichever order it came.
 """
 
 import math
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 from central.config import CentralConfig
+from central.withdrawal import convicted, suspects
 from team import translate
+from team.estimation import marginals
 from team.estimation.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,
     JoinSettings,
     Sighting,
+    converged,
     folded,
     lean,
     started,
 )
 from team.estimation.joining import Start as StartValue
+from team.estimation.marginals import Agreement
 from team.wire.messages import SightingFactor, Submap
 
 Stream = tuple[str, int]
+Key = tuple[int, str, int, int]
+
+GROWTH = 1.25
+"""Suspects whom nothing convicted are tried again when there are so many times the submaps."""
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
@@ -40,19 +54,36 @@ def join_settings(config: CentralConfig) -> JoinSettings:
     )
 
 
+@dataclass
+class _Taken:
+    """The fold after a tick; tried: its submaps when suspects were last tried in vain."""
+
+    tick: int
+    fold: Fold
+    tried: int
+
+
 class TickFold:
-    """Holds the contributions by tick and the fold after each tick that has been taken."""
+    """Holds the contributions by tick and the fold after each tick that has been taken.
+
+    convicted: whom the fold found to be wrong, with the reason in words.
+    """
 
     def __init__(self, config: CentralConfig) -> None:
         self._config = config
         self.settings = join_settings(config)
-        self._withdrawn: set[str] = set()
+        self._limit = config.withdraw_above
+        self._ordered: set[str] = set()
+        self.convicted: dict[str, str] = {}
+        self._convicted_at = -math.inf
         self._tick_ns = round(config.tick_s * 1e9)
-        self._ticks: dict[int, dict[tuple[int, str, int, int], Contribution]] = defaultdict(dict)
-        self._sightings: dict[tuple[int, str, int, int], list[Sighting]] = {}
-        self._digests: dict[tuple[int, str, int, int], bytes] = {}
+        self._period = max(1, math.ceil(config.broadcast_s / config.tick_s))
+        self._ticks: dict[int, dict[Key, Contribution]] = defaultdict(dict)
+        self._sightings: dict[Key, list[Sighting]] = {}
+        self._digests: dict[Key, bytes] = {}
         self._starts: dict[Stream, StartValue] = {}
-        self._taken: list[tuple[int, Fold]] = []
+        self._taken: list[_Taken] = []
+        self._agreed: tuple[Fold, Agreement] | None = None
 
     def know_start(self, start: StartValue) -> None:
         """Where a stream starts; to be told before its first submap is added."""
@@ -63,65 +94,72 @@ class TickFold:
 
         The fold goes back to before that tick if it was taken.
         """
-        if submap.robot in self._withdrawn:
-            return
         contribution = translate.contribution_of(submap)
         tick = self._tick_of(submap.stamp_ns)
         self._ticks[tick][contribution.key] = contribution
-        self._sightings[contribution.key] = [
-            translate.sighting_of(each)
-            for each in sightings
-            if each.teammate not in self._withdrawn
-        ]
+        self._sightings[contribution.key] = [translate.sighting_of(each) for each in sightings]
         self._digests[contribution.key] = digest
-        self._roll_back(tick)
+        if submap.robot not in self._gone or tick <= self._convicted_at:
+            self._roll_back(tick)
 
     def withdraw(self, robot: str) -> None:
-        """Forget a robot's submaps, and the sightings by it or of it, now and in future.
+        """Leave out a robot's submaps, and the sightings by it or of it, now and in future.
 
         What is left is what there would be had the robot never been; the fold goes back to the
         checkpoint before it first said something, or was first seen, and takes the ticks again.
         """
-        if robot in self._withdrawn:
+        if robot in self._ordered:
             return
-        self._withdrawn.add(robot)
-        until_ns = (self._taken[-1][0] + 1) * self._tick_ns if self._taken else -math.inf
-        for tick in sorted(self._ticks):
-            touched = [key for key in [*self._ticks[tick]] if self._forget(tick, key, robot)]
-            if touched:
-                self._roll_back(tick)
-            if not self._ticks[tick]:
-                del self._ticks[tick]
+        until_ns = self._until_ns
+        touched = [tick for tick in sorted(self._ticks) if self._concerns(tick, robot)]
+        if touched:
+            self._roll_back(touched[0])
+        self._ordered.add(robot)
         self.take_until(until_ns)
 
-    def _forget(self, tick: int, key: tuple[int, str, int, int], robot: str) -> bool:
-        """Whether the robot had to do with this submap."""
-        if key[1] == robot:
-            del self._ticks[tick][key], self._sightings[key], self._digests[key]
-            return True
-        kept = [each for each in self._sightings[key] if each.teammate != robot]
-        touched = len(kept) < len(self._sightings[key])
-        self._sightings[key] = kept
-        return touched
+    def _concerns(self, tick: int, robot: str) -> bool:
+        """Whether a tick has something by a robot or of it."""
+        return any(
+            key[1] == robot or any(each.teammate == robot for each in self._sightings[key])
+            for key in self._ticks[tick]
+        )
 
     def without(self, robots: Collection[str]) -> "TickFold":
-        """Another one of the same submaps without some robots' that has taken the same ticks."""
+        """Another one of the same submaps without some robots' that has taken the same ticks.
+
+        It convicts nobody.
+        """
         other = TickFold(self._config)
+        other._limit = None
         other._ticks = defaultdict(dict, {t: dict(found) for t, found in self._ticks.items()})
         other._sightings, other._digests = dict(self._sightings), dict(self._digests)
-        other._starts, other._withdrawn = dict(self._starts), set(self._withdrawn)
-        for robot in robots:
-            other.withdraw(robot)
-        other.take_until((self._taken[-1][0] + 1) * self._tick_ns if self._taken else -math.inf)
+        other._starts, other._ordered = dict(self._starts), self._gone | set(robots)
+        other.take_until(self._until_ns)
         return other
+
+    @property
+    def _gone(self) -> set[str]:
+        return self._ordered | self.convicted.keys()
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
         """The robots that the team goes on without."""
-        return tuple(sorted(self._withdrawn))
+        return tuple(sorted(self._gone))
+
+    @property
+    def _until_ns(self) -> float:
+        """The end of the last tick that was taken."""
+        return (self._taken[-1].tick + 1) * self._tick_ns if self._taken else -math.inf
 
     def _roll_back(self, tick: int) -> None:
-        while self._taken and self._taken[-1][0] >= tick:
+        """Forget what was folded from a tick on, and with it who was convicted by it.
+
+        The robot was left out from the first tick on: there is no checkpoint that still has it.
+        """
+        if tick <= self._convicted_at:
+            self.convicted, self._convicted_at = {}, -math.inf
+            self._taken = []
+        while self._taken and self._taken[-1].tick >= tick:
             self._taken.pop()
 
     def _tick_of(self, end_ns: int) -> int:
@@ -130,20 +168,72 @@ class TickFold:
     @property
     def fold(self) -> Fold:
         """The fold over the ticks that have been taken."""
-        return self._taken[-1][1] if self._taken else EMPTY_FOLD
+        return self._taken[-1].fold if self._taken else EMPTY_FOLD
 
     def take_until(self, watermark_ns: float) -> bool:
         """Take every tick that ends at the watermark or before; True if there was one."""
-        taken = False
-        for tick in self._open_ticks():
-            if (tick + 1) * self._tick_ns > watermark_ns:
-                break
-            taken_fold = self._with_tick(self.fold, tick)
-            if self._taken:
-                self._taken[-1] = (self._taken[-1][0], lean(self._taken[-1][1]))
-            self._taken.append((tick, taken_fold))
-            taken = True
+        taken, again = False, True
+        while again:
+            again = False
+            for tick in self._open_ticks():
+                if (tick + 1) * self._tick_ns > watermark_ns:
+                    break
+                taken = True
+                self._take(tick)
+                again = not self._taken
+                if again:
+                    break
         return taken
+
+    def _take(self, tick: int) -> None:
+        """Take a tick; if it convicts a robot there is none that is taken any more."""
+        before = self._taken[-1] if self._taken else None
+        taken = _Taken(
+            tick, self._with_tick(self.fold, tick), 0 if before is None else before.tried
+        )
+        if before is not None:
+            before.fold = lean(before.fold)
+        self._taken.append(taken)
+        asked = before is None or before.tick // self._period < tick // self._period
+        if asked and len(taken.fold.contributions) >= GROWTH * taken.tried:
+            self._convict(taken.fold, tick)
+
+    def _convict(self, fold: Fold, at: float) -> bool:
+        """Whether somebody is wrong beyond doubt; he is left out from the first tick on."""
+        if self._limit is None or not fold.contributions:
+            return False
+        agreement = self.agreement(fold)
+        if not suspects(agreement, self._limit):
+            return False
+        self._taken[-1].tried = len(fold.contributions)
+        found = convicted(agreement, self._limit, self._agreement_without)
+        if found is None:
+            return False
+        robot, reason = found
+        self.convicted[robot] = reason
+        self._convicted_at = max(self._convicted_at, at)
+        self._taken = []
+        return True
+
+    def agreement(self, fold: Fold) -> Agreement:
+        """The agreement of a fold; the last one's is kept, since a broadcast asks again."""
+        if self._agreed is None or self._agreed[0] is not fold:
+            self._agreed = fold, marginals.joint_cost(fold)
+        return self._agreed[1]
+
+    def _agreement_without(self, robots: Collection[str]) -> Agreement | None:
+        fold = self.without(robots).fold
+        return marginals.joint_cost(converged(fold, self.settings)) if fold.home else None
+
+    def solved(self) -> Fold:
+        """The full solution of everything that is there, without whom it convicts."""
+        while True:
+            self.take_until(math.inf)
+            if not self.fold.contributions:
+                return self.fold
+            fold = converged(self.fold, self.settings)
+            if not self._convict(fold, math.inf):
+                return fold
 
     def provisional(self) -> Fold:
         """The fold over everything that is there, ahead of the watermark too."""
@@ -153,17 +243,24 @@ class TickFold:
         return fold
 
     def _open_ticks(self) -> list[int]:
-        last = self._taken[-1][0] if self._taken else None
-        return sorted(tick for tick in self._ticks if last is None or tick > last)
+        """The ticks that are not taken yet and have a submap of a robot that is not withdrawn."""
+        last, gone = self._taken[-1].tick if self._taken else -math.inf, self._gone
+        return sorted(
+            tick
+            for tick, members in self._ticks.items()
+            if tick > last and any(key[1] not in gone for key in members)
+        )
 
     def _with_tick(self, fold: Fold, tick: int) -> Fold:
-        members = self._ticks[tick]
+        gone = self._gone
+        members = {key: each for key, each in self._ticks[tick].items() if key[1] not in gone}
         for key in sorted(members):
             stream = members[key].stream
             if members[key].sequence == 0 and stream in self._starts:
                 fold = started(fold, self._starts[stream])
         order = sorted(members)
-        sightings = [each for key in order for each in self._sightings[key]]
+        seen = (each for key in order for each in self._sightings[key])
+        sightings = [each for each in seen if each.teammate not in gone]
         return folded(fold, [members[key] for key in order], self.settings, sightings)
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:

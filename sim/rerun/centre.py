@@ -38,8 +38,10 @@ def _joined(
 ) -> Iterator[Outgoing]:
     """Each map from its own version vector; a set that grows keeps the fold that there is.
 
-    Which submaps lie behind a gap is what the centre knew when it spoke: it says so in the map.
+    Which submaps lie behind a gap is what the centre knew when it spoke: it says so in the map. So
+    it does of who was withdrawn: nobody is judged again by a part of the set.
     """
+    config = msgspec.structs.replace(config, withdraw_above=None)
     starts = {s: r.get(0) for s, r in log.readings.items()}
     submaps, sightings = log.submaps(), log.sightings()
     rule = JoinRule(config, digest)

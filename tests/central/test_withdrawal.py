@@ -26,6 +26,7 @@ from team.estimation.joining import converged
 from team.estimation.marginals import Agreement, SubmapCost, joint_cost, landmark_map
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
+from team.wire.codec import encoded
 from tests.sim.reruns import written
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
@@ -171,6 +172,82 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong: str) ->
     found = landmark_map(converged(never.fold, never.settings))
     assert final.means == found.means.tobytes()
     assert final.covariance == translate.joint_bytes(found.covariance)
+
+
+@cache
+def one_closes_windows_often() -> tuple[Sample, ...]:
+    """r3's wheels are wrong, and it has many submaps before the others have enough to be judged."""
+    of = scenario()
+    front = msgspec.structs.replace(of.robots[2].front_end, window_s=2.0, node_s=2.0)
+    often = msgspec.structs.replace(of.robots[2], front_end=front)
+    of = msgspec.structs.replace(of, robots=(*of.robots[:2], often))
+    return tuple(run(msgspec.structs.replace(of, central=OPERATOR), "odometry"))
+
+
+OPERATOR = CentralConfig(tick_s=10.0, broadcast_s=10.0, withdraw_above=None)
+UNTIL_S = 40
+
+
+def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[JoinRule, bytes]:
+    """A rule that takes messages in an order, is told a watermark [s] after so many, and ends."""
+    rule = JoinRule(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8))
+    for start in messages(one_closes_windows_often(), m.Start):
+        rule.take_start(start)
+    out = []
+    for k, message in enumerate(order):
+        if isinstance(message, m.Submap):
+            rule.take_submap(message)
+        else:
+            rule.take_sighting(message)
+        if k in watermarks:
+            out += rule.advance(1e9 * watermarks[k], round(1e9 * watermarks[k]))
+    out += rule.conclude(10**12)
+    said = [each.message for each in out if isinstance(each.message, m.Withdrawal)]
+    assert {each.robot for each in said} <= set(rule.withdrawn) | {"r1", "r2"}
+    return rule, encoded(out[-1].message)
+
+
+def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent() -> None:
+    """At 35 s r3 is a suspect whom nobody can convict yet; five submaps later there are enough."""
+    everything = [
+        each
+        for each in (
+            *messages(one_closes_windows_often(), m.SightingFactor),
+            *messages(one_closes_windows_often(), m.Submap),
+        )
+        if each.stamp_ns <= UNTIL_S * 10**9
+    ]
+    by_time = sorted(everything, key=lambda each: (each.stamp_ns, isinstance(each, m.Submap)))
+    ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
+    at_once, expected = delivered(by_time, {})
+    assert at_once.withdrawn == ("r3",)
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        few = sorted(rng.choice(len(by_time), 6, replace=False).tolist())
+        assert delivered(by_time, {k: ends[k] for k in few})[1] == expected
+    last = {max(k for k, end in ends.items() if end <= 35.0): 35.0}
+    assert delivered(by_time, last)[1] == expected
+    # r2's submaps come long after the watermark: what was folded without them is folded again.
+    late = [each for each in by_time if each.robot == "r2"]
+    early = [each for each in by_time if each.robot != "r2"]
+    assert delivered([*early, *late], {len(early) - 1: 40.0})[1] == expected
+
+
+def test_who_was_convicted_without_what_comes_late_is_acquitted() -> None:
+    """Two that agree convict a third; a submap of it that came late takes the checkpoint away."""
+    samples = team_run("odometry")
+    ticks = of_set(samples)
+    ticks.take_until(math.inf)
+    assert list(ticks.convicted) == ["r3"]
+    again = next(each for each in messages(samples, m.Submap) if each.robot == "r3")
+    sightings = messages(samples, m.SightingFactor)
+    name = (again.robot, again.epoch, again.sequence)
+    own = [each for each in sightings if (each.robot, each.epoch, each.sequence) == name]
+    ticks.add(again, bytes(8), own)
+    assert (ticks.convicted, ticks.withdrawn) == ({}, ())
+    ticks.take_until(math.inf)
+    assert list(ticks.convicted) == ["r3"]
+    assert bits(ticks) == bits(of_set(samples, without="r3"))
 
 
 def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong() -> None:
