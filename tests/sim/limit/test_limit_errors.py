@@ -151,7 +151,8 @@ def lasting_scenario(seed: int) -> Scenario:
         bearing_correlation_s=10.0,
     )
     robots = tuple(msgspec.structs.replace(robot, sensor=sensor) for robot in of.robots)
-    return msgspec.structs.replace(of, robots=robots)
+    world = msgspec.structs.replace(of.world, steps=8)
+    return msgspec.structs.replace(of, robots=robots, world=world)
 
 
 @pytest.mark.parametrize("kind", ["profile", "white"], ids=["profile", "mutant: white"])
