@@ -1,6 +1,7 @@
 """EKF-SLAM against the textbook's dense formulas, its own symmetries, and the truth."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -215,6 +216,7 @@ def test_the_map_grows_to_a_thousand_landmarks():
     np.testing.assert_allclose([once, twice], [xx[3], 0.5 * xx[0]])
 
 
+@functools.cache
 def short_run(seed, repeat):
     """NEES, NIS and their dofs of ten steps among six landmarks, each reading `repeat` times."""
     rng = np.random.default_rng(seed)

@@ -1,6 +1,7 @@
 """Monte Carlo localisation against a grid, a Kalman filter, FastSLAM on known landmarks, truth."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -187,6 +188,7 @@ def test_without_readings_the_cloud_spreads_and_stays_equally_weighted():
     np.testing.assert_allclose(spread[2, 2], 4 * 0.05**2, rtol=0.15)
 
 
+@functools.cache
 def short_run(seed, repeat):
     """NEES of the pose after eight steps and their NIS, each reading told `repeat` times."""
     random, judged = np.random.default_rng(seed), innovations.NOTHING
