@@ -4,30 +4,37 @@ An ellipsoid is exceeded wherever the valley of the cost is curved, though the m
 one. So the final map's own cost is asked three things: whether a solution that starts at the truth
 ends lower, whether it ends in another place that is about as likely, and by how much the cost rises
 where the truth is held fixed (the likelihood ratio: χ² of the numbers held, however they are
-written down).
+written down). The cost and its minima are those of `plain_cost`, which shares nothing with the map
+joining that it judges: the map's state is taken as it is, and is wrong too where it has not come
+to rest.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtri
+from scipy.stats import chi2
 
 from central.tick_fold import TickFold
 from sim.evaluation.errors import Path, interpolated
 from sim.evaluation.evaluation import Evaluation
+from sim.experiments.plain_cost import PlainCost
 from sim.rerun.log import Recorded
 from team import translate
 from team.estimation.gauss_newton import Island
 from team.estimation.joining import Fold, converged
-from team.estimation.minima import LIKELY, elsewhere, likely_rise, minimum, searched
 from team.wire import messages as m
 from team.wire.bus import Sample
 
 LOWER = 1.0
 """A cost that is lower by more than this belongs to another minimum."""
+LIKELY = 0.999
+"""Quantile of χ² beyond which a place, or the truth, is excluded."""
+NEARBY = 3
+"""Starts about the truth, beside the truth itself."""
+NEARBY_RAD = 0.1
+"""… whose headings are off by about so much."""
 Values = Float[np.ndarray, " _"]
 
 
@@ -52,7 +59,7 @@ class TrueMinimum(NamedTuple):
     @property
     def excluded(self) -> bool:
         """Whether the submaps exclude the truth with 99.9 %."""
-        return self.rise > float(chdtri(self.dof, 1.0 - LIKELY))
+        return self.rise > float(chi2.ppf(LIKELY, self.dof))
 
 
 def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | None:
@@ -89,25 +96,38 @@ def judged(
     landmarks: Mapping[int, Float[np.ndarray, "2"]],
     paths: Mapping[str, Path],
 ) -> TrueMinimum:
-    """Of an island in the frame of the truth, solved."""
-    graph = island.graph
+    """Of an island in the frame of the truth, as it is; plain squares without biases."""
+    graph, settings = island.graph, island.settings
+    if settings.robust_c is not None:
+        raise NotImplementedError("the judge has plain squares: central.robust_c must be left out")
+    fixed = np.repeat(graph.fixed, np.diff(graph.offset))
+    cost = PlainCost(graph, settings.covariance_factor, fixed)
+    ours = cost.of(island.state)
     truth, known = _at_truth(island, landmarks, paths)
-    ours = minimum(island)
-    ends = minimum(replace(island, state=truth))
-    lowest = min(ends.cost, searched([replace(island, state=truth)]).best.cost)
-    other = elsewhere(ends, ours) and ends.cost - ours.cost < likely_rise()
+    headings = graph.headings[~fixed[graph.headings]]
+    rng = np.random.default_rng(0)
+    found = [cost.solved(truth)]
+    for _ in range(NEARBY):
+        near = truth.copy()
+        near[headings] += NEARBY_RAD * rng.normal(size=len(headings))
+        found.append(cost.solved(near))
+    ends = found[0]
+    away = ends.state - island.state
+    away[graph.headings] = np.angle(np.exp(1j * away[graph.headings]))
+    whitened = cost.jacobian(island.state) @ away[cost.free]
+    place = float(chi2.ppf(LIKELY, 3))
+    other = ends.at_rest and whitened @ whitened > place and ends.cost - ours < place
     firsts = {nodes[1] for nodes in graph.streams.values()}
     held = sorted(({*graph.landmarks.values()} | firsts) & known)
-    fixed = graph.fixed.copy()
-    fixed[held] = True
-    pinned = replace(graph, fixed=fixed)
-    begins = [truth, island.state.copy()]
-    for node in held:
-        span = slice(graph.offset[node], graph.offset[node + 1])
-        begins[1][span] = truth[span]
-    rise = min(minimum(replace(island, graph=pinned, state=s)).cost for s in begins) - ours.cost
-    dof = graph.unknowns - pinned.unknowns
-    return TrueMinimum(ours.cost - lowest, bool(other), rise, dof)
+    spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in held]
+    pinned = fixed.copy()
+    pinned[np.concatenate([np.zeros(0, np.int64), *spans])] = True
+    given = PlainCost(graph, settings.covariance_factor, pinned)
+    from_ours = np.where(pinned, truth, island.state)
+    rise = min(given.solved(state).cost for state in (truth, from_ours)) - ours
+    dof = len(cost.free) - len(given.free)
+    lower = ours - min(each.cost for each in found)
+    return TrueMinimum(lower, bool(other), rise, dof)
 
 
 def _at_truth(

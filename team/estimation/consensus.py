@@ -85,12 +85,14 @@ def confirmed(
     """As `agreeing`, then by a smoother over the whole window until no reading changes sides.
 
     The poses and landmarks of least squares over the odometry and the taken readings are found, and
-    every reading is judged by what the others predict of it.
+    every reading is judged by what the others predict of it. Where the smoother's equations have no
+    solution in these numbers (odometry and readings of scales too far apart) it judges nothing.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
     window = _Readings(motions, epochs, ids, readings, sensor, garbage)
-    taken, placed_by = _agreeing(window)
+    agreed, placed_by = _agreeing(window)
+    taken = agreed
     path = np.zeros((len(window.means), 3))
     for k in range(1, len(path)):
         path[k] = compose(path[k - 1], window.means[k])
@@ -99,7 +101,10 @@ def confirmed(
     ).reshape(-1, 2)
     metrics = np.linalg.inv(window.covariances + np.diag(MOTION_JITTER))
     for _ in range(ROUNDS):
-        path, landmarks, covariance = _smoothed(window, path, landmarks, metrics, taken)
+        smoothed = _smoothed(window, path, landmarks, metrics, taken)
+        if smoothed is None:
+            return agreed
+        path, landmarks, covariance = smoothed
         logs = kernel.left_out(
             path, landmarks, covariance, window.epochs, window.slots, readings, taken, window.sensor
         )
@@ -143,10 +148,11 @@ def _smoothed(
     landmarks: Float[np.ndarray, "L 2"],
     metrics: Float[np.ndarray, "K 3 3"],
     taken: Taken,
-) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "L 2"], Float[np.ndarray, "n n"]]:
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "L 2"], Float[np.ndarray, "n n"]] | None:
     """Two Gauss-Newton steps and the covariance; a landmark without a taken reading stays, unknown.
 
-    Such a landmark has a variance of the reach squared, about what is known of it.
+    Such a landmark has a variance of the reach squared, about what is known of it. None where the
+    normal equations are not positive definite.
     """
     unknown = np.bincount(window.slots[taken], minlength=window.landmarks) == 0
     free = 3 * (len(path) - 1) + np.flatnonzero(np.repeat(unknown, 2))
@@ -157,8 +163,12 @@ def _smoothed(
             taken, window.sensor,
         )  # fmt: skip
         H[free, free] = 1.0 / far
-        factor, _ = dpotrf(H, lower=1)
-        inverse, _ = dpotri(factor, lower=1)
+        factor, indefinite = dpotrf(H, lower=1)
+        if indefinite:
+            return None
+        inverse, singular = dpotri(factor, lower=1)
+        if singular or not np.isfinite(inverse).all():
+            return None
         covariance = np.tril(inverse) + np.tril(inverse, -1).T
         path, landmarks = kernel.stepped(path, landmarks, covariance @ g)
     return path, landmarks, covariance

@@ -26,23 +26,25 @@ def step(
     first: Bool[np.ndarray, " k"],
     readings: Float[np.ndarray, "k 2"],
     sensor: Triple,
-) -> None:
+) -> bool:
     """One step; before it only the pose and the first `known` landmarks are in mean and P.
 
     slots: the landmark of each reading in the state; first: whether it is a first sight. A further
-    reading of a landmark that is new in this step updates it after it was placed.
+    reading of a landmark that is new in this step updates it after it was placed. False where the
+    covariance of what is predicted is not positive definite; mean and P are then worth nothing.
     """
     size = 3 + 2 * known
     before, P_before = mean[:size], P[:size, :size]
     _move(before, P_before, motion, Q)
     places = 3 + 2 * slots
     old = slots < known
-    _condition(before, P_before, places[old], readings[old], sensor)
+    if not _condition(before, P_before, places[old], readings[old], sensor):
+        return False
     for k in range(len(slots)):
         if first[k]:
             _place(mean, P, places[k], readings[k], sensor)
     again = ~old & ~first
-    _condition(mean, P, places[again], readings[again], sensor)
+    return _condition(mean, P, places[again], readings[again], sensor)
 
 
 @compiled
@@ -135,14 +137,15 @@ def _condition(
     places: Int64[np.ndarray, " t"],
     readings: Float[np.ndarray, "t 2"],
     sensor: Triple,
-) -> None:
+) -> bool:
     """Readings of the landmarks at `places`, all linearised at the state before them.
 
     S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), and P by `_joseph`.
+    False where S is not positive definite.
     """
     m, n = 2 * len(places), len(mean)
     if m == 0:
-        return
+        return True
     sights, innovation, R = np.empty((len(places), 3)), np.empty(m), np.empty(m)
     pose = (mean[0], mean[1], mean[2])
     for i in range(len(places)):
@@ -160,11 +163,13 @@ def _condition(
         _all_applied(sights, places, HP[k], S[k])
         S[k, k] += R[k]
     gains = HP.copy()
-    _solve_in_place(S, gains)
+    if not _solve_in_place(S, gains):
+        return False
     for k in range(m):
         _subtract(mean, -innovation[k], gains[k])
     mean[2] = wrapped(mean[2])
     _joseph(P, HP, gains, sights, places, R)
+    return True
 
 
 @compiled
@@ -204,13 +209,18 @@ def _subtract(
 
 
 @compiled
-def _solve_in_place(S: Float[np.ndarray, "m m"], B: Float[np.ndarray, "m n"]) -> None:
-    """B ← S⁻¹ B by Cholesky, S = L Lᵀ; the lower triangle of S becomes L."""
+def _solve_in_place(S: Float[np.ndarray, "m m"], B: Float[np.ndarray, "m n"]) -> bool:
+    """B ← S⁻¹ B by Cholesky, S = L Lᵀ; the lower triangle of S becomes L.
+
+    False where S is not positive definite.
+    """
     m = len(S)
     for k in range(m):
         for j in range(k):
             for i in range(k, m):
                 S[i, k] -= S[i, j] * S[k, j]
+        if not S[k, k] > 0.0:
+            return False
         S[k, k] = math.sqrt(S[k, k])
         for i in range(k + 1, m):
             S[i, k] /= S[k, k]
@@ -222,3 +232,4 @@ def _solve_in_place(S: Float[np.ndarray, "m m"], B: Float[np.ndarray, "m n"]) ->
         for i in range(k + 1, m):
             _subtract(B[k], S[i, k], B[i])
         B[k] /= S[k, k]
+    return True

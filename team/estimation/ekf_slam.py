@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt32
 from team.config import Sensor
 from team.estimation import ekf_kernel
 from team.estimation.fastslam_kernel import slots_of
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
 from team.estimation.geometry import Pose
 from team.estimation.innovation import Innovation, joint_innovation
 from team.estimation.models import Increment, variances
@@ -49,7 +49,8 @@ def stepped(
     """Move, take all readings of known landmarks at once, then place the new ones.
 
     ranges [m] and bearings [rad] are corrected by the calibration. A further reading of a landmark
-    that is new in this epoch updates it after it was placed.
+    that is new in this epoch updates it after it was placed. Raises NotACovarianceError where the
+    state's covariance is none any more, so that the readings can not be predicted.
     """
     ids_after, slots, first = slots_of(state.ids, ids)
     n = 3 + 2 * len(ids_after)
@@ -57,7 +58,7 @@ def stepped(
     known = len(state.mean)
     mean[:known] = state.mean
     P[:known, :known] = state.covariance
-    ekf_kernel.step(
+    sound = ekf_kernel.step(
         mean,
         P,
         len(state.ids),
@@ -68,6 +69,8 @@ def stepped(
         np.column_stack((ranges, bearings)),
         variances(sensor),
     )
+    if not sound:
+        raise NotACovarianceError("the prediction of readings", "not positive definite")
     return EkfSlam(ids_after, mean, P)
 
 

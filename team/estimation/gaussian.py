@@ -54,7 +54,9 @@ def information(covariance: Matrix, what: str) -> Matrix:
     """P⁻¹ = L⁻ᵀL⁻¹ from the Cholesky factor of P, exactly symmetric."""
     if not len(covariance):
         return np.zeros((0, 0))
-    lower, _ = dpotri(cholesky_factor(covariance, what), lower=1)
+    lower, singular = dpotri(cholesky_factor(covariance, what), lower=1)
+    if singular:
+        raise NotACovarianceError(what, "not positive definite")
     triangle = np.tril(lower)
     return np.asarray(triangle + np.tril(triangle, -1).T)
 

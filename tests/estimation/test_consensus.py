@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg.lapack import dpotrf
 
 from sim.scenario.scenario import load
 from sim.scenario.source import streams_of
@@ -218,3 +219,30 @@ def test_names_alone_are_not_enough_against_wrong_names(monkeypatch: pytest.Monk
 
 def test_the_smoother_finds_what_the_odometry_alone_lets_pass() -> None:
     assert rates("thesis-b", "reading", agreeing)[1] > 2.0 * rates("thesis-b", "reading")[1]
+
+
+@pytest.mark.parametrize("exactly", [False, True])
+def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly, monkeypatch):
+    """A range of a picometre beside odometry of centimetres: no Cholesky factor in 53 bits."""
+    window, failures = drive(0), []
+    if exactly:
+        pose = np.zeros(3)
+        for k, motion in enumerate(window.motions):
+            pose = compose(pose, motion.mean)
+            for i in np.flatnonzero(window.epochs == k):
+                window.readings[i] = predicted(pose, PLACES[window.ids[i] - 1])
+
+    def factor(H, lower):
+        found = dpotrf(H, lower=lower)
+        failures.append(found[1])
+        return found
+
+    monkeypatch.setattr(consensus, "dpotrf", factor)
+    sensor = Sensor(
+        range_sigma=1e-10 if exactly else 1e-12, bearing_sigma=0.01 if exactly else 1e-3
+    )
+    readings = (window.motions, window.epochs, window.ids, window.readings, sensor, 0.3)
+    taken = confirmed(*readings)
+    assert failures[-1] != 0, "the equations have a solution here: nothing is tried"
+    assert len([each for each in failures if each]) == 1, "what has failed is not gone on with"
+    np.testing.assert_array_equal(taken, agreeing(*readings))

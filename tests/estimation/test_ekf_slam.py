@@ -13,7 +13,7 @@ from team.estimation import ekf_slam
 from team.estimation import innovation as innovations
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.ekf_slam import EkfSlam
-from team.estimation.gaussian import cholesky_factor
+from team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from team.estimation.geometry import compose, exponential, transformed
 from team.estimation.models import Increment
 from tests.estimation.estimator_runs import epochs_of, map_errors, run, world
@@ -285,3 +285,13 @@ def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
     for field, before in zip(dataclasses.fields(state), kept, strict=True):
         assert getattr(once, field.name).tobytes() == getattr(twice, field.name).tobytes()
         np.testing.assert_array_equal(getattr(state, field.name), before)
+
+
+def test_a_state_whose_covariance_is_none_any_more_is_named_not_carried_on():
+    """What rounding or a diverged filter leaves: the square root of a negative pivot is no gain."""
+    rng = np.random.default_rng(0)
+    state = some_state(rng)
+    broken = dataclasses.replace(state, covariance=state.covariance - np.eye(11))
+    readings = (state.ids[:1], np.array([9.0]), np.array([0.1]))
+    with pytest.raises(NotACovarianceError, match="prediction of readings"):
+        ekf_slam.stepped(broken, STANDING, SENSOR, *readings)

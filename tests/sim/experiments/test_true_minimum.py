@@ -8,12 +8,13 @@ import pytest
 
 from sim.evaluation.errors import Path
 from sim.evaluation.evaluation import evaluate
+from sim.experiments.plain_cost import PlainCost
 from sim.experiments.true_minimum import final_fold, judged, true_minimum
 from sim.in_memory.team import final_map, run_team
 from sim.scenario.source import streams_of
 from team.estimation.gauss_newton import Island, JoinSettings
 from team.estimation.minima import minimum, searched
-from tests.estimation.sighting_world import joined_with, mirrored
+from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import Team, team
 from tests.sim.experiments.test_experiment_runs import short
 
@@ -90,3 +91,54 @@ def test_a_run_is_asked_for_its_own_final_map() -> None:
     assert found is not None
     assert not found.wrong
     assert not found.excluded
+
+
+def test_the_judge_owes_nothing_to_what_it_judges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that finds nothing, a solver that goes nowhere, a cost that is always low."""
+    _, island, landmarks, paths = world(1)
+    _, wrong, _, _ = world(1)
+    sound = judged(island, landmarks, paths)
+    turned = wrong.state.copy()
+    first = wrong.graph.offset[wrong.graph.streams["r1", 0][1]]
+    turned[first + 2] += 0.2
+    wrong = replace(wrong, state=turned)
+    for place in ("gauss_newton.settled", "minima.settled"):
+        monkeypatch.setattr(f"team.estimation.{place}", lambda island: (island, 1, 0.0))
+    for place in ("gauss_newton.final_cost", "minima.final_cost"):
+        monkeypatch.setattr(f"team.estimation.{place}", lambda island: 0.0)
+    monkeypatch.setattr("team.estimation.minima.elsewhere", lambda one, best: False)
+    assert judged(island, landmarks, paths) == sound
+    assert judged(wrong, landmarks, paths).wrong
+
+
+def test_a_map_that_is_not_at_rest_is_wrong() -> None:
+    """As it is, not as the team's solver would mend it before it is judged."""
+    _, island, landmarks, paths = world(2)
+    off = island.state.copy()
+    at = island.graph.offset[next(iter(island.graph.landmarks.values()))]
+    step = 1e-4
+    while replace(island, state=off).cost < island.cost + 3.0:
+        off[at] += step
+    found = judged(replace(island, state=off), landmarks, paths)
+    assert found.wrong
+    assert found.lower == pytest.approx(3.0, abs=0.1)
+
+
+def test_the_judge_s_cost_is_the_map_joining_s() -> None:
+    """Two programs, one cost: with inter-robot measurements, pose nodes, an uncertain start."""
+    met = meeting(3)
+    starts = [replace(each, covariance=np.diag([0.04, 0.04, 0.01])) for each in met.starts]
+    island = joined_with(met.submaps, starts, met.sightings, OPTIONS).main
+    rng = np.random.default_rng(0)
+    fixed = np.zeros(len(island.state), dtype=np.bool_)
+    cost = PlainCost(island.graph, 1.0, fixed)
+    assert len(island.graph.sightings) > 4
+    for _ in range(3):
+        state = island.state + 0.3 * rng.normal(size=len(island.state))
+        assert cost.of(state) == pytest.approx(replace(island, state=state).cost, rel=1e-9)
+        J, h = cost.jacobian(state), 1e-6
+        gradient = 2.0 * J.T @ cost.residuals(state)
+        for k in rng.choice(len(state), 5, replace=False):
+            moved = h * np.eye(len(state))[k]
+            slope = (cost.of(state + moved) - cost.of(state - moved)) / (2.0 * h)
+            assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-3)
