@@ -12,11 +12,11 @@ from team.stream.patience import Patience
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids
-from team.wire.bus import Bus, BusError, Sample, opened
+from team.wire.bus import Bus, BusError, Outgoing, Sample, opened
 from team.wire.codec import WireError
 
-PATIENCE_S = 3.0
-"""A robot whose token went has this long to come back before the team goes on without it."""
+LOST_S = 3.0
+"""A robot whose token went for so long holds up no broadcast; the final map still waits for it."""
 GAP_PATIENCE_S = 0.5
 """A reading that is missing for so long is asked for at its source."""
 ASK_TIMEOUT_S = 10.0
@@ -26,7 +26,10 @@ _LOG = logging.getLogger("teamslam")
 
 
 class CentralShell:
-    """The centre's process: subscribe, answer for its set, run, leave last."""
+    """The centre's process: subscribe, answer for its set, run, leave last.
+
+    patience_s: a robot that is lost for so long is given up; None: nobody is, unless by an order.
+    """
 
     def __init__(
         self,
@@ -34,13 +37,15 @@ class CentralShell:
         config: CentralConfig,
         robots: Sequence[str],
         stop: threading.Event,
-        patience_s: float = PATIENCE_S,
+        patience_s: float | None = None,
     ) -> None:
         self._bus = bus
         self.node = CentralNode(config, robots)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
-        self._lost: dict[str, tuple[float, Sample]] = {}
+        self._shell.notes = self._awaited
+        self._lost: dict[str, Sample] = {}
+        self._since: dict[str, float] = {}
         self._alive: set[str] = set()
         self._stop = stop
         self._gap_since: float | None = None
@@ -53,10 +58,13 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
+        self._shell.look_for_the_end()
         self._shell.begin()
         while self._shell.going:
+            self._shell.look_for_the_end()
             self._shell.take(self._patient(self._bus.receive(WAIT_S)))
-            self._shell.take(self._given_up())
+            self._shell.take(self._long_lost())
+            self._give_up()
             self._shell.contained("wanted", self._mend)
             self._shell.contained("wanted", self._gather)
             self._shell.report()
@@ -68,10 +76,10 @@ class CentralShell:
             digest = final.digest.hex()
             _LOG.info("final map of %d landmarks, set %s", len(ids(final.ids, "ids")), digest)
         self._leave_last()
-        self._shell.end()
+        self._shell.end(final)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples, less the news of lost robots: they may come back."""
+        """The samples, less the news of lost robots: they may come back within LOST_S."""
         now = time.monotonic()
         passed = []
         for sample in samples:
@@ -84,18 +92,42 @@ class CentralShell:
                 assert isinstance(message, m.Liveliness)
                 (self._alive.add if message.alive else self._alive.discard)(node)
                 self._lost.pop(node, None)
+                self._since.pop(node, None)
                 left = node.startswith("robot/") and not message.alive
                 if left and not self.node.finished:
                     _LOG.warning("%s is lost", node)
-                    self._lost[node] = (now, sample)
+                    self._lost[node] = sample
+                    self._since[node] = now
                     continue
             passed.append(sample)
         return passed
 
-    def _given_up(self) -> list[Sample]:
+    def _long_lost(self) -> list[Sample]:
+        return [self._lost.pop(node) for node in self._away(LOST_S) if node in self._lost]
+
+    def _away(self, for_s: float) -> list[str]:
         now = time.monotonic()
-        gone = [n for n, (since, _) in self._lost.items() if now - since >= self._patience_s]
-        return [self._lost.pop(node)[1] for node in gone]
+        return [node for node, since in self._since.items() if now - since >= for_s]
+
+    def _give_up(self) -> None:
+        """Give up who has been lost for longer than an operator's patience, if there is one."""
+        for node in [] if self._patience_s is None else self._away(self._patience_s):
+            del self._since[node]
+            why = f"lost for {self._patience_s:g} s, the centre's --patience"
+            _LOG.warning("%s is given up: %s", node, why)
+            order = Outgoing(ch.GIVEN_UP, node, m.GivenUp(0, node, "central", why))
+            self._shell.take([self._shell.sample_of(order)])
+
+    def _awaited(self) -> tuple[str, ...]:
+        """Whom the final map waits for although they are not there, and what to do."""
+        now, awaited = time.monotonic(), self.node.awaited
+        gone = {n: since for n, since in self._since.items() if ch.robot_of(n) in awaited}
+        return tuple(
+            f"{ch.robot_of(node)} is lost for {now - since:.0f} s: start it again, or go on without"
+            f" it by `teamslam withdraw` or `teamslam end --without {ch.robot_of(node)}`"
+            for node, since in sorted(gone.items())
+            if now - since >= LOST_S
+        )
 
     def _mend(self) -> None:
         """Ask for readings that have been missing for GAP_PATIENCE_S (rules on raw readings)."""

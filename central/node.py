@@ -39,7 +39,7 @@ class CentralNode:
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
         """The channels to subscribe to."""
-        return (*self._rule.listens, ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END)
+        return (*self._rule.listens, ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.GIVEN_UP)
 
     @property
     def warnings(self) -> list[str]:
@@ -52,6 +52,8 @@ class CentralNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
+        if isinstance(message, m.FusedMap):
+            return self._take_final(message)
         self._credit = None
         self._roll.take(message)
         self._credit = self._rule.take(message, self._roll.now_ns)
@@ -71,9 +73,23 @@ class CentralNode:
             return out + self._conclude_anyway(why)
         return out + (self._advance() if self._is_over else [])
 
+    def _take_final(self, final: m.FusedMap) -> list[Outgoing]:
+        """An earlier life of this centre has concluded already."""
+        if final.final and not self.finished:
+            self.finished, self.final = True, final
+        return []
+
+    @property
+    def awaited(self) -> list[str]:
+        """The robots that are not there and that the final map waits for."""
+        return [] if self.finished else self._roll.awaited(self._rule.dealt)
+
     def _advance(self) -> list[Outgoing]:
         if self.finished:
             return []
+        rule: object = self._rule
+        if isinstance(rule, Refuses):
+            self._roll.withdrawn = frozenset(rule.withdrawn)
         out = self._rule.advance(self._roll)
         maps = [o.message for o in out if isinstance(o.message, m.FusedMap)]
         self._broadcasts += bool(maps)
@@ -93,7 +109,10 @@ class CentralNode:
             digest, now_ns = self._announcement.digest, self._roll.now_ns
             newest = fused_message(self.config, digest, NOTHING, (), stamp_ns=now_ns, joint=False)
         reasons = (*newest.reasons, f"not the final map, which raised: {why}")
-        final = msgspec.structs.replace(newest, final=True, provisional=True, reasons=reasons)
+        lost = tuple(self._roll.missing(self._rule.dealt))
+        final = msgspec.structs.replace(
+            newest, final=True, provisional=True, reasons=reasons, lost=lost
+        )
         self.finished, self.final = True, final
         return [Outgoing(ch.FINAL_MAP, "", final)]
 
@@ -103,8 +122,11 @@ class CentralNode:
         self.finished = True
         final = out[-1].message
         assert isinstance(final, m.FusedMap)
+        lost = tuple(self._roll.missing(self._rule.dealt))
+        if lost:
+            final = msgspec.structs.replace(final, provisional=True, lost=lost)
         self.final = final
-        return out
+        return [*out[:-1], Outgoing(ch.FINAL_MAP, "", final)]
 
     def wanted(self) -> list[m.ReadingsWanted]:
         """The readings that are missing and must be asked for at their source."""
@@ -131,6 +153,10 @@ class CentralNode:
             "refused": 0.0,
         }
         state = "done" if self.finished else "joining"
-        warnings = (*self._rule.findings, *self.warnings[-3:])
+        given_up = [
+            f"{robot} is given up: nobody waits for it, and the final map will be provisional"
+            for robot in self._roll.given_up
+        ]
+        warnings = (*given_up, *self._rule.findings, *self.warnings[-3:])
         now_ns = self._roll.now_ns
         return m.Status(now_ns, "central", state, figures | dict(self._rule.figures), warnings)

@@ -15,6 +15,7 @@ class Attendance:
 
     alive: bool = False
     seen: bool = False
+    given_up: bool = False
     progress: m.Progress | None = None
     done: m.Done | None = None
 
@@ -26,11 +27,15 @@ class Attendance:
 
 @dataclass
 class Roll:
-    """The team's robots by name; `now_ns` is the newest team time that anyone has spoken of."""
+    """The team's robots by name; `now_ns` is the newest team time that anyone has spoken of.
+
+    withdrawn: the robots that the team goes on without; nobody waits for one that has left.
+    """
 
     robots: dict[str, Attendance]
     end: m.End | None = None
     now_ns: int = 0
+    withdrawn: frozenset[str] = frozenset()
     _names: tuple[str, ...] = field(default=(), init=False)
 
     @classmethod
@@ -54,20 +59,47 @@ class Roll:
             case m.End():
                 self.end = message
             case m.Liveliness():
-                kind, _, name = message.node.partition("/")
-                found = self.robots.get(name) if kind == "robot" else None
+                found = self._named(message.node)
                 if found is not None:
                     found.alive = message.alive
                     found.seen = found.seen or message.alive
+            case m.GivenUp():
+                found = self._named(message.node)
+                if found is not None:
+                    found.given_up = True
             case _:
                 pass
 
+    def _named(self, node: str) -> Attendance | None:
+        kind, _, name = node.partition("/")
+        return self.robots.get(name) if kind == "robot" else None
+
+    def whole(self, name: str, dealt: Dealt) -> bool:
+        """The robot is done, and all of it is here."""
+        done = self.robots[name].done
+        return done is not None and self._is_last_epoch(name, done.epoch) and dealt(done)
+
     def settled(self, name: str, dealt: Dealt) -> bool:
-        """Nothing more comes of the robot: it is done and all of it is here, or it is lost."""
+        """Nobody waits for the robot: all of it is here, or it is given up or withdrawn and gone.
+
+        That it is lost is no reason: it may come back, and the map is not to depend on when.
+        """
         robot = self.robots[name]
-        if robot.done is not None and self._is_last_epoch(name, robot.done.epoch):
-            return dealt(robot.done) or robot.lost
-        return robot.lost
+        gone = name in self.withdrawn and not robot.alive
+        return robot.given_up or gone or self.whole(name, dealt)
+
+    @property
+    def given_up(self) -> list[str]:
+        """The robots that nobody waits for by an order."""
+        return [robot for robot, attendance in self.robots.items() if attendance.given_up]
+
+    def missing(self, dealt: Dealt) -> list[str]:
+        """The robots that the team was to have and whose streams are not wholly here."""
+        return [r for r in self.robots if r not in self.withdrawn and not self.whole(r, dealt)]
+
+    def awaited(self, dealt: Dealt) -> list[str]:
+        """The robots that are not there, were or not, and that are waited for."""
+        return [r for r, a in self.robots.items() if not (a.alive or self.settled(r, dealt))]
 
     def _is_last_epoch(self, name: str, epoch: int) -> bool:
         if self.end is None:
@@ -80,9 +112,9 @@ class Roll:
         return self.end is not None and all(self.settled(r, dealt) for r in self.robots)
 
     def takes_part(self, name: str) -> bool:
-        """Whether the robot may still send a map: it is there, or was never heard of."""
+        """Whether the robot may still send a map; one that is lost may come back."""
         robot = self.robots[name]
-        return robot.done is None and not robot.lost
+        return robot.done is None and not robot.given_up
 
     def watermark_ns(self, dealt: Dealt, count: Callable[[tuple[str, int]], int]) -> float:
         """The least progress of the live robots: no submap that ends before it can still come.
@@ -91,7 +123,7 @@ class Roll:
         """
         least = float("inf")
         for name, robot in self.robots.items():
-            if self.settled(name, dealt):
+            if robot.lost or self.settled(name, dealt):
                 continue
             progress = robot.progress
             if progress is None or count((name, progress.epoch)) < progress.submaps:

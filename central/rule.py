@@ -62,7 +62,13 @@ class Rule(Protocol):
 
 @runtime_checkable
 class Refuses(Protocol):
-    """A rule that acknowledges messages one by one, those too that it could not take."""
+    """A rule on submaps: it acknowledges them one by one, those too that it could not take.
+
+    withdrawn: the robots that the team goes on without.
+    """
+
+    @property
+    def withdrawn(self) -> tuple[str, ...]: ...  # noqa: D102
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
         """Count a message as refused; the credit that this gives."""

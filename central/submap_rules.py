@@ -79,6 +79,11 @@ class SubmapRule:
         self.joined.take_withdrawal(order)
         return [] if order.robot in known else [Outgoing(ch.WITHDRAWAL, order.robot, order)]
 
+    @property
+    def withdrawn(self) -> tuple[str, ...]:
+        """The robots that the team goes on without."""
+        return self.joined.withdrawn
+
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
         """Nobody need wait for a submap, or a sighting from it, that raised."""
         if not isinstance(message, m.Submap | m.SightingFactor):

@@ -15,9 +15,11 @@ from typing import Protocol, TypeVar, runtime_checkable
 import msgspec
 
 from team.containment import Boundary
+from team.the_end import TheEnd
 from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
 from team.wire.channels import FAULT, STATUS, Channel
-from team.wire.messages import Message, Status, tag_of
+from team.wire.codec import encoded
+from team.wire.messages import FusedMap, Message, Status, tag_of
 
 STATUS_S = 0.5
 """Wall time between two statuses of a node."""
@@ -51,7 +53,7 @@ class Node(Protocol):
 
 
 class FaultyRunError(RuntimeError):
-    """A process did its work, but set messages aside that it could not handle: which, and where."""
+    """A process did its work, but messages were set aside, or the final map lacks a robot."""
 
 
 class Shell:
@@ -69,6 +71,8 @@ class Shell:
         self._status_due = 0.0
         self._remind_due = time.monotonic() + REMIND_S
         self.boundary = Boundary(name)
+        self.notes: Callable[[], tuple[str, ...]] = tuple
+        self.the_end = TheEnd(bus)
         self._messages = 0
         self._bytes = 0
         self._since = time.monotonic()
@@ -137,10 +141,23 @@ class Shell:
             self.publish([self.boundary.note(error, Sample(what, b"", 0, 0, -1), "")])
         return None
 
-    def end(self) -> None:
-        """Raise FaultyRunError if any message was set aside."""
-        if self.boundary.faults:
-            raise FaultyRunError("; ".join(self.boundary.warnings))
+    def look_for_the_end(self) -> None:
+        """Ask the router now and then for a final map that this node has missed."""
+        self.take(self.the_end.missed())
+
+    def sample_of(self, out: Outgoing) -> Sample:
+        """A message to this node itself, as if it had come over the bus."""
+        return Sample(out.key, encoded(out.message), out.message.stamp_ns, time.time_ns(), 0)
+
+    def end(self, final: FusedMap | None) -> None:
+        """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
+        warnings = [*self.boundary.warnings] if self.boundary.faults else []
+        lost = () if final is None else final.lost
+        if lost:
+            names = ", ".join(lost)
+            warnings.append(f"the final map is provisional: {names} lost, and not wholly in it")
+        if warnings:
+            raise FaultyRunError("; ".join(warnings))
 
     def report(self, *, last: bool = False) -> None:
         """Publish the node's status, at most every STATUS_S; the last one in any case."""
@@ -158,7 +175,7 @@ class Shell:
         rates = {"messages_per_s": self._messages / elapsed, "bytes_per_s": self._bytes / elapsed}
         self._messages = self._bytes = 0
         self._since = now
-        warnings = status.warnings
+        warnings = (*self.notes(), *status.warnings)
         if status.state != "waiting":
             self._remind_due = now + REMIND_S
         elif now >= self._remind_due:
@@ -175,6 +192,7 @@ class Shell:
         self.begin()
         while self.going:
             self.take(self.bus.receive(WAIT_S))
+            self.look_for_the_end()
             self.contained("duty", duty)
             self.report()
         self.report(last=True)

@@ -32,7 +32,7 @@ def test_the_compose_file_is_valid_by_the_compose_specification() -> None:
 @pytest.mark.parametrize(
     ("right", "wrong", "named"),
     [
-        ("    init: true\n    command", "    innit: true\n    command", "innit"),
+        ("    init: true\n    # Open", "    innit: true\n    # Open", "innit"),
         ("condition: service_healthy", "condition: service_well", "service_well"),
         ("logs: {}", "logs: 3", "volumes.logs"),
     ],

@@ -75,6 +75,14 @@ def launch(
     views: Annotated[
         bool, typer.Option(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
     ] = True,
+    end_silent: Annotated[
+        float | None,
+        typer.Option(
+            help="End a process that has said nothing for so many seconds, so that it is started "
+            "again; default: name it only.",
+            min=10.0,
+        ),
+    ] = None,
     view: Annotated[
         bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
     ] = False,
@@ -115,7 +123,7 @@ def launch(
     _prepare(resolved)
     door = listen if keys is None else over_tls(listen)
     plan = Plan(
-        resolved, folder, log, pace, door, views, keys=keys and keys.resolve(), insecure=insecure
+        resolved, folder, log, pace, door, views, end_silent, keys and keys.resolve(), insecure
     )
     page = (
         shown_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
@@ -239,6 +247,8 @@ def _conclude(
     extra: dict[str, Any] = {
         "processes": {e.name: {"pid": e.pid, "exit": e.exit} for e in outcome.processes},
         "failures": outcome.failures,
+        "restarts": outcome.restarts,
+        "given_up": outcome.given_up,
         "log": str(outcome.log),
         "folder": str(outcome.folder),
         "wall_s": outcome.wall_s,
@@ -263,6 +273,9 @@ def _conclude(
                 console.print(f"wrote {path}", highlight=False, soft_wrap=True)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
+    for name, times in sorted(outcome.restarts.items()):
+        text = f"{name} was started again {times} time{'' if times == 1 else 's'}"
+        console.print(text, highlight=False)
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
     console.print(f"{outcome.wall_s:.1f} s of wall time", highlight=False)
     if json_file is not None:

@@ -138,8 +138,13 @@ def central(
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     patience: Annotated[
-        float, typer.Option(help="Seconds that a lost robot has to come back.", min=0.0)
-    ] = 3.0,
+        float | None,
+        typer.Option(
+            help="Give a robot up that is lost for so many seconds; default: wait for it, and say "
+            "so. A final map without it is provisional.",
+            min=0.0,
+        ),
+    ] = None,
     robots: Robots = None,
     seed: Seed = None,
     estimator: EstimatorOption = None,
@@ -221,3 +226,33 @@ def withdraw(
             fail(str(error), FAILED)
     landmarks = len(ids(fused.ids, "ids"))
     typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
+
+
+@app.command()
+def end(
+    without: Annotated[str, typer.Option(help="The robot that nobody is to wait for any more.")],
+    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    connect: Connect = LOOPBACK,
+    reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for the centre to follow.", min=0.0)
+    ] = 60.0,
+) -> None:
+    """Let a running team end without a robot that is lost: what has come of it stays in the map.
+
+    The final map names it as lost and is provisional, and every process ends with 1. A centre that
+    is started again later must be told again.
+    """
+    from sim.launch.withdraw import WithdrawError, give_up
+    from team.wire.zenoh_bus import ZenohBus
+
+    if not re.fullmatch("[a-z][a-z0-9_]{0,31}", without):
+        fail(f"{without!r} is no robot's name", WRONG_USE)
+    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
+        fail(f"{team!r} is no team's name", WRONG_USE)
+    with ZenohBus(team, connect) as bus:
+        try:
+            give_up(bus, without, reason, patience)
+        except WithdrawError as error:
+            fail(str(error), FAILED)
+    typer.echo(f"nobody waits for {without} any more")

@@ -2,27 +2,24 @@
 
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.launch.supervisor import Child, Ended, end_all
-from sim.launch.truth import LiveErrors
+from sim.launch.supervision import failure, supervise
+from sim.launch.supervisor import Ended, Supervised, end_all
+from sim.launch.watch import Watch
 from sim.scenario.scenario import Scenario, dumps
 from team.keys.credentials import credentials_of
 from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, BusError, opened
-from team.wire.codec import WireError
+from team.wire.bus import BusError
 from team.wire.zenoh_bus import ZenohBus
 
 ROUTER_PATIENCE_S = 20.0
 """The router must say where it listens within this time; a busy machine starts Python slowly."""
 REFUSED = 2
 """The exit status of a command that can not do what it was asked for."""
-TURN_S = 0.1
-_ESSENTIAL = ("router", "world", "central", "recorder")
 
 
 class LaunchError(RuntimeError):
@@ -31,55 +28,15 @@ class LaunchError(RuntimeError):
 
 @dataclass
 class Outcome:
-    """What a launch left behind."""
+    """What a launch left behind; restarts: how often each process was started again."""
 
     log: Path
     folder: Path
     wall_s: float
     processes: list[Ended]
     failures: list[str] = field(default_factory=list)
-
-
-@dataclass
-class Watch:
-    """What is known of the team while it runs: the last status of each node, and the last map.
-
-    robots: how many there are to be. errors: against the truth, where there is one. place: by what
-    other commands reach the team.
-    """
-
-    statuses: dict[str, m.Status] = field(default_factory=dict)
-    fused: m.FusedMap | None = None
-    failures: list[str] = field(default_factory=list)
-    began: float = field(default_factory=time.monotonic)
-    robots: int = 0
-    errors: LiveErrors = field(default_factory=LiveErrors)
-    place: str = ""
-
-    def take(self, bus: Bus) -> None:
-        """Take what has come since."""
-        for sample in bus.receive(TURN_S):
-            found = ch.channel_of(sample.key)
-            if found is None or not self.errors.wants(*found, sample):
-                continue
-            try:
-                channel, _, message = opened(sample)
-            except WireError:
-                continue
-            if isinstance(message, m.Status):
-                self.statuses[message.node] = message
-            elif isinstance(message, m.FusedMap):
-                self.fused = message
-            elif isinstance(message, m.Fault):
-                self._take_fault(message)
-            self.errors.take(channel, message)
-
-    def _take_fault(self, fault: m.Fault) -> None:
-        """The first of a node is a failure by name; its status counts the rest."""
-        named = f"{fault.node} set aside "
-        if not any(failure.startswith(named) for failure in self.failures):
-            what = f"{fault.key}: {fault.error} at {fault.place}: {fault.text}"
-            self.failures.append(f"{named}{what}")
+    restarts: dict[str, int] = field(default_factory=dict)
+    given_up: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -92,6 +49,7 @@ class Plan:
     speed: float
     listen: str
     views: bool = True
+    end_silent_s: float | None = None
     keys: Path | None = None
     insecure: bool = False
 
@@ -104,21 +62,22 @@ class Plan:
 def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     """Start router, recorder, world, centre and robots; return when all have ended.
 
-    `show` is called again and again with what is known. A robot that dies is named and the others
-    go on, unless the world still waits for it; when the router, the world, the centre or the
-    recorder dies, the run ends. Raises BusError when the router can not listen there, LaunchError
-    when it does not come up. SIGINT and SIGTERM end every process and raise KeyboardInterrupt.
+    `show` is called again and again with what is known. A process that dies is started again, or
+    given up (`sim.launch.supervision`). Raises BusError when the router can not listen there,
+    LaunchError when it does not come up. SIGINT and SIGTERM end every process and raise
+    KeyboardInterrupt.
     """
     began = time.monotonic()
     plan.folder.mkdir(parents=True, exist_ok=True)
     resolved = plan.folder / "scenario.json"
     resolved.write_text(dumps(plan.scenario))
     watch = Watch(began=began, robots=len(plan.scenario.robots))
-    with _interruptible(), _children() as children:
+    since_ns = time.time_ns()
+    with _interruptible(), _services() as services:
         team = plan.scenario.team
         own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
         door = "".join(f" {word}" for word in plan.door)
-        endpoint = _start_router(plan, children)
+        endpoint = _start_router(plan, services, since_ns)
         watch.place = f"--team {team} --connect {endpoint}{door}"
         with ZenohBus(team, endpoint, keys=own) as bus:
             bus.subscribe(ch.STATUS)
@@ -128,21 +87,21 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
             for channel in watch.errors.listens:
                 bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):
-                children.append(Child(name, arguments, plan.folder))
-            again = {
-                f"robot-{r.id}": f"teamslam robot {resolved} {r.id} --connect {endpoint}{door}"
-                for r in plan.scenario.robots
-            }
-            _supervise(children, bus, watch, show, again)
-        ended = end_all(children)
+                services.append(Supervised(name, arguments, plan.folder, since_ns))
+            supervise(services, bus, watch, show, plan.end_silent_s)
+        ended = end_all([service.child for service in services])
     failures = watch.failures + [
-        _failure(e)
+        failure(e)
         for e in ended
         if e.exit != 0
         and not e.asked
         and not any(f.startswith(f"{e.name} ") for f in watch.failures)
     ]
-    return Outcome(plan.log, plan.folder, time.monotonic() - began, ended, failures)
+    if watch.fused is not None and watch.fused.lost:
+        names = ", ".join(watch.fused.lost)
+        failures.append(f"the final map is provisional: {names} lost, and not wholly in it")
+    wall_s = time.monotonic() - began
+    return Outcome(plan.log, plan.folder, wall_s, ended, failures, watch.restarts, watch.given_up)
 
 
 @contextmanager
@@ -156,23 +115,28 @@ def _interruptible() -> Iterator[None]:
 
 
 @contextmanager
-def _children() -> Iterator[list[Child]]:
-    children: list[Child] = []
+def _services() -> Iterator[list[Supervised]]:
+    services: list[Supervised] = []
     try:
-        yield children
+        yield services
     finally:
-        end_all(children)
+        end_all([service.child for service in services])
 
 
-def _start_router(plan: Plan, children: list[Child]) -> str:
+def _start_router(plan: Plan, services: list[Supervised], since_ns: int) -> str:
+    """Start the router; where it listens. Started again it listens there, too."""
     door = [*plan.door, *(["--insecure"] if plan.insecure else [])]
-    router = Child("router", ["router", "--listen", plan.listen, *door], plan.folder)
-    children.append(router)
+    command = ["router", "--listen", plan.listen, *door]
+    service = Supervised("router", command, plan.folder, since_ns)
+    services.append(service)
+    router = service.child
     deadline = time.monotonic() + ROUTER_PATIENCE_S
     while time.monotonic() < deadline:
         for line in router.last_lines():
             if line.startswith("listening at "):
-                return line.removeprefix("listening at ").strip()
+                endpoint = line.removeprefix("listening at ").strip()
+                service.arguments[2] = endpoint
+                return endpoint
         if router.exit is not None:
             said = "\n".join(router.last_lines()).removeprefix("error: ")
             refused = BusError if router.exit == REFUSED else LaunchError
@@ -192,52 +156,3 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
         *([("viewer", ["viewer", *common])] if plan.views else []),
         ("world", ["world", *common, "--speed", speed]),
     ]
-
-
-def _supervise(
-    children: Sequence[Child],
-    bus: Bus,
-    watch: Watch,
-    show: Callable[[Watch], None],
-    again: Mapping[str, str],
-) -> None:
-    """Until every process but the router has ended, or an essential one has failed.
-
-    again: the commands that start those anew which a run can lose, by name.
-    """
-    named: dict[str, m.Status | None] = {}  # a process that died -> the world's status then
-    while True:
-        try:
-            watch.take(bus)
-        except BusError as error:
-            watch.failures.append(str(error))
-            return
-        for child in children:
-            if child.exit in (None, 0) or child.name in named:
-                continue
-            named[child.name] = watch.statuses.get("world")
-            watch.failures.append(_failure(child.ended(), again.get(child.name)))
-            if child.name in _ESSENTIAL:
-                return
-        if _waits_in_vain(watch.statuses.get("world"), named.values()):
-            return
-        if children[0].exit is not None:
-            watch.failures.append("router ended before the team did")
-            return
-        show(watch)
-        if all(child.exit is not None for child in children[1:]):
-            return
-
-
-def _waits_in_vain(world: m.Status | None, then: Iterable[m.Status | None]) -> bool:
-    """Whether the world says, after a death, that it still waits for everyone to be there."""
-    return world is not None and world.state == "waiting" and any(world is not s for s in then)
-
-
-def _failure(ended: Ended, again: str | None = None) -> str:
-    parts = [f"{ended.name} (pid {ended.pid}) {ended.how}"]
-    if again is not None:
-        parts.append(f"while the others go on, start it again by: {again}")
-    if ended.last_lines:
-        parts.append("its last lines:\n" + "\n".join(f"    {line}" for line in ended.last_lines))
-    return "; ".join(parts)

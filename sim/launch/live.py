@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from sim.evaluation.events import without_figures
-from sim.launch.launch import Watch
 from sim.launch.truth import LiveErrors
+from sim.launch.watch import Watch
 from team.wire import messages as m
 
 LINE_S = 5.0
@@ -49,11 +49,15 @@ class _Lines:
         self._said: set[str] = set()
         self._since: dict[str, float] = {}
         self._last: Watch | None = None
+        self._noted = 0
 
     def show(self, watch: Watch) -> None:
         if self._last is None and watch.place:
             self._print(watch, f"other commands reach the team by {watch.place}")
         self._last = watch
+        for note in watch.notes[self._noted :]:
+            self._print(watch, note)
+        self._noted = len(watch.notes)
         self._warn(watch, SETTLED_S)
         for words in () if watch.fused is None else watch.fused.joined:
             if words not in self._said:
@@ -149,6 +153,7 @@ def _view(title: str, watch: Watch) -> Group:
         parts.append(_robots(robots, watch.errors))
     parts += [Text(line) for line in _map_lines(watch)]
     parts += [Text(words) for words in (() if watch.fused is None else watch.fused.joined)]
+    parts += [Text(note) for note in watch.notes[-4:]]
     parts += [Text(w, style="yellow") for w in _warnings(watch)[-4:]]
     return Group(*parts)
 

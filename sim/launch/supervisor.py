@@ -1,4 +1,4 @@
-"""Child processes: started, watched, ended, and spoken of by name when they fail."""
+"""Child processes: started, started again, ended, and spoken of by name when they fail."""
 
 import os
 import signal
@@ -6,16 +6,23 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
 from team.shell import PARENT
+from team.the_end import SINCE
 
 LAST_LINES = 12
 """Lines of a failed process's output that are shown."""
 GRACE_S = 5.0
 """A process that was asked to stop has this long."""
+FRUITLESS = 5
+"""Deaths in a row, without progress between them, after which a process is given up."""
+FIRST_WAIT_S = 0.2
+LONGEST_WAIT_S = 5.0
+"""A process that dies waits from the first to the longest of these until it is started again."""
+_PROC = Path("/proc")
 _ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -52,19 +59,23 @@ class Ended:
 class Child:
     """One `teamslam …` process, its output in a file of its own."""
 
-    def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
+    def __init__(
+        self, name: str, arguments: Sequence[str], folder: Path, since_ns: int, life: int = 0
+    ) -> None:
         self.name = name
+        self.started = time.monotonic()
         self._asked = False
         self.output = folder / f"{name}.log"
         # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
         command = [sys.executable, "-P", "-m", "sim", *arguments]
-        self._file: IO[bytes] = self.output.open("wb")
+        self._file: IO[bytes] = self.output.open("ab" if life else "wb")
+        self._before = self.output.stat().st_size
         self._process = subprocess.Popen(  # noqa: S603 - our own program, no shell
             command,
             stdin=subprocess.DEVNULL,
             stdout=self._file,
             stderr=subprocess.STDOUT,
-            env=_environment(os.environ),
+            env=_environment(os.environ, since_ns),
             start_new_session=True,
         )
 
@@ -77,6 +88,19 @@ class Child:
     def exit(self) -> int | None:
         """The exit status; None while it runs."""
         return self._process.poll()
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether it is there but does not run (SIGSTOP), where the system tells."""
+        try:
+            state = (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
+        except (OSError, IndexError):
+            return False
+        return state in "Tt"
+
+    def kill(self) -> None:
+        """End it, stopped or not; nobody asked it before."""
+        self._process.kill()
 
     def stop(self) -> None:
         """Ask it to stop."""
@@ -103,13 +127,73 @@ class Child:
 
     def last_lines(self) -> tuple[str, ...]:
         """The end of what it printed."""
-        text = self.output.read_text("utf-8", "replace")
+        text = self.output.read_bytes()[self._before :].decode("utf-8", "replace")
         return tuple(text.splitlines()[-LAST_LINES:])
 
 
-def _environment(mine: Mapping[str, str]) -> dict[str, str]:
-    """A child's environment: one BLAS thread, tied to this process, unbuffered output."""
-    return {**mine, **_ONE_THREAD, PARENT: str(os.getpid()), "PYTHONUNBUFFERED": "1"}
+@dataclass
+class Supervised:
+    """A process that is started again by the same command when it dies, after longer and longer.
+
+    One that dies FRUITLESS times in a row without getting any further is given up. reached: how far
+    it had come at its last death, in whatever it counts.
+    """
+
+    name: str
+    arguments: list[str]
+    folder: Path
+    since_ns: int
+    restarts: int = 0
+    fruitless: int = 0
+    reached: float = -1.0
+    given_up: bool = False
+    over: bool = False
+    due: float | None = None
+    child: Child = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.child = Child(self.name, self.arguments, self.folder, self.since_ns)
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether it runs, or will again."""
+        return not (self.over or self.given_up)
+
+    def died(self, reached: float) -> None:
+        """Note a death; it will be started again, or is given up."""
+        self.fruitless = 1 if reached > self.reached else self.fruitless + 1
+        self.reached = max(self.reached, reached)
+        if self.fruitless >= FRUITLESS:
+            self.given_up = True
+            return
+        wait_s = min(FIRST_WAIT_S * 2.0 ** (self.fruitless - 1), LONGEST_WAIT_S)
+        self.due = time.monotonic() + wait_s
+
+    def start_again(self) -> None:
+        """Start it if it is time."""
+        if self.due is not None and time.monotonic() >= self.due:
+            self.due = None
+            self.restarts += 1
+            self.child.end(0.0)
+            if self.name == "recorder":
+                self.arguments[-1] = _next_part(self.arguments[-1], self.restarts)
+            self.child = Child(self.name, self.arguments, self.folder, self.since_ns, self.restarts)
+
+
+def _next_part(log: str, restarts: int) -> str:
+    """Where a recorder that was started again writes: a log is never overwritten."""
+    path = Path(log)
+    stem = path.stem.partition("-part")[0]
+    return str(path.with_name(f"{stem}-part{restarts + 1}{path.suffix}"))
+
+
+def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
+    """A child's environment: one BLAS thread, tied to this process, unbuffered output.
+
+    since_ns: when the run began, for a child that is started again after its end.
+    """
+    tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
+    return {**mine, **_ONE_THREAD, **tied}
 
 
 def end_all(children: Sequence[Child], *, last: str = "recorder") -> list[Ended]:

@@ -1,4 +1,4 @@
-"""An operator's order to a running team: go on without a robot."""
+"""An operator's orders to a running team: go on without a robot, or end without it."""
 
 import time
 
@@ -38,6 +38,29 @@ def withdraw(bus: Bus, robot: str, reason: str, patience_s: float) -> m.FusedMap
             if fused.final:
                 raise WithdrawError("the final map was out before the order; run the log again")
     raise WithdrawError(f"no map without {robot} within {patience_s:g} s; the order stands")
+
+
+def give_up(bus: Bus, robot: str, reason: str, patience_s: float) -> None:
+    """Order that nobody waits for a robot any more, and wait until the centre says that it follows.
+
+    Raises WithdrawError where there is no centre, no such robot, or no such word within the time.
+    """
+    for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP):
+        bus.subscribe(channel)
+    bus.watch_alive()
+    _await_team(bus, robot, set())
+    node = ch.robot_node(robot)
+    bus.publish(Outgoing(ch.GIVEN_UP, node, m.GivenUp(0, node, "operator", reason)))
+    until = time.monotonic() + patience_s
+    while time.monotonic() < until:
+        for sample in bus.receive(LOOK_S):
+            _, name, message = opened(sample)
+            if isinstance(message, m.FusedMap) and message.final:
+                return
+            said = message.warnings if isinstance(message, m.Status) and name == "central" else ()
+            if any(warning.startswith(f"{robot} is given up") for warning in said):
+                return
+    raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
 
 
 def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:

@@ -28,8 +28,12 @@ def retold_centre(log: Recorded) -> dict[Identity, m.Message]:
     config, digest = log.central_config()
     retell = _exchanged if config.fusion in FEEDBACK else _RETOLD[config.fusion]
     found: dict[Identity, m.Message] = {}
+    lost = finals[-1].lost if finals else ()
     for out in retell(log, config, digest, [*maps, *finals]):
-        found.setdefault(identity(out.key, out.message), out.message)
+        message = out.message
+        if lost and isinstance(message, m.FusedMap) and message.final:  # the set does not say it
+            message = msgspec.structs.replace(message, provisional=True, lost=lost)
+        found.setdefault(identity(out.key, message), message)
     return found
 
 

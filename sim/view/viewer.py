@@ -5,9 +5,11 @@ import time
 from dataclasses import replace
 
 from sim.view.export import Viewing, heard
-from team.shell import WAIT_S
+from team.shell import STATUS_S, WAIT_S
+from team.the_end import TheEnd
 from team.wire import channels as ch
-from team.wire.bus import Bus
+from team.wire.bus import Bus, Outgoing
+from team.wire.messages import Status
 
 NODE = "viewer"
 
@@ -20,8 +22,14 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     bus.watch_alive()
     bus.declare_alive(NODE)
     published = 0
+    end = TheEnd(bus)
+    due = 0.0
     while not (viewing.node.finished or stop.is_set()):
-        for sample in bus.receive(WAIT_S):
+        if time.monotonic() >= due:
+            due = time.monotonic() + STATUS_S
+            status = Status(0, NODE, "viewing", {"messages": float(published)})
+            bus.publish(Outgoing(ch.STATUS, NODE, status))
+        for sample in (*bus.receive(WAIT_S), *end.missed()):
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
             for shown in viewing.take(sample, heard(sample)):

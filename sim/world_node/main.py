@@ -48,7 +48,9 @@ def run_world(
     bus.watch_alive()
     for robot in robots:
         shell.answer(ch.READINGS, robot, node.readings)
-    shell.begin()
+    shell.look_for_the_end()
+    if shell.going:
+        shell.begin()
     said: set[str] = set()
     while shell.going:
         out = node.publish(time.monotonic())
@@ -58,10 +60,11 @@ def run_world(
             if mismatch not in said:
                 said.add(mismatch)
                 _LOG.warning("%s", mismatch)
+        shell.look_for_the_end()
         shell.report()
     shell.report(last=True)
     _LOG.info("published %d readings", int(node.status().figures["readings"]))
-    shell.end()
+    shell.end(node.final)
 
 
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:

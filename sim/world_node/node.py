@@ -29,6 +29,8 @@ BATCH = 256
 ANSWER = 8192
 """Readings in one answer to a query; who wants more asks again."""
 TRUTH_BATCH_NS = 1_000_000_000
+RESUME_S = 2.0
+"""A world that is started again waits so long for everyone to say how far he is."""
 FIRST_EPOCH = 1
 
 
@@ -118,6 +120,7 @@ class WorldNode:
     tells_map: bool = False
     ended: bool = field(default=False, init=False)
     finished: bool = field(default=False, init=False)
+    final: m.FusedMap | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._sources = {x.robot: _Source(x) for x in self.streams.streams}
@@ -130,15 +133,19 @@ class WorldNode:
         self._unrecorded = 0
         self._published = 0
         self._began_at: float | None = None
+        self._consumed: dict[tuple[str, int], int] = {}
+        self._passed_ns: dict[str, int] = {}
+        self._heard_at: float | None = None
         self._starts: list[Outgoing] = []
         first = [int(x.stamps_ns[0]) for x in self.streams.streams if len(x)]
         self._first_ns = min(first, default=0)
-        self.now_ns = self._first_ns
+        self.now_ns = self._paced_ns = self._first_ns
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
         ch.RECORDER_PROGRESS,
         ch.FINAL_MAP,
+        ch.GIVEN_UP,
     )
     announcements: ClassVar[tuple[ch.Channel, ...]] = (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
     """Listened to as well where configurations are compared."""
@@ -176,34 +183,92 @@ class WorldNode:
                 stream = (message.robot, message.epoch)
                 self._recorded[stream] = max(self._recorded.get(stream, 0), message.readings)
             case m.Progress():
+                if self._began_at is None and message.readings:
+                    self._note_consumed(message)
                 source = self._sources.get(message.robot)
                 if source is not None and message.epoch == source.epoch:
                     source.consumed = max(source.consumed, source.base + message.readings)
             case m.Configured():
                 self.configurations.take(message)
             case m.FusedMap() if message.final:
-                self.finished = True
+                self.finished, self.final = True, message
+            case m.GivenUp():
+                self.expected -= {message.node}
             case _:
                 pass
         return []
 
+    def _note_consumed(self, progress: m.Progress) -> None:
+        """What robots say before this world has begun is of an earlier life of it."""
+        stream = (progress.robot, progress.epoch)
+        if progress.robot in self._sources:
+            self._consumed[stream] = max(self._consumed.get(stream, 0), progress.readings)
+            self._passed_ns[progress.robot] = progress.stamp_ns
+
     def _take_liveliness(self, message: m.Liveliness) -> None:
         (self._alive.add if message.alive else self._alive.discard)(message.node)
-        if not self._recorder and "recorder" in self._alive:  # it counts from zero, from here on
+        came = not self._recorder and "recorder" in self._alive
+        if came and self._began_at is not None:  # it counts from zero, from here on
             self._recorded, self._unrecorded = {}, self._published
         self._recorder = "recorder" in self._alive
         for name, source in self._sources.items():
             source.alive = ch.robot_node(name) in self._alive
+
+    def _going_on(self, clock_s: float) -> bool:
+        """Whether an earlier life of this world had begun, and it is known how far everyone is.
+
+        Robots and recorder report their progress again to whoever comes; the streams are the same
+        for the same scenario, so this life goes on from the least that everybody has, in the same
+        epochs. What someone has already he drops, what he misses he asks for.
+        """
+        if not self._consumed:
+            return False
+        if self._heard_at is None:
+            self._heard_at = clock_s
+        robots = {ch.robot_node(name) for name in self._sources}
+        waiting = self.waiting_for and robots - {ch.robot_node(n) for n, _ in self._consumed}
+        return not waiting or clock_s - self._heard_at >= RESUME_S
+
+    def _skip(self) -> list[Outgoing]:
+        """Leave out what everybody has; the starts once more, for a centre that comes later."""
+        starts = []
+        for name, source in self._sources.items():
+            epoch = max((e for n, e in self._consumed if n == name), default=FIRST_EPOCH)
+            consumed = self._consumed.get((name, epoch), 0)
+            if epoch > FIRST_EPOCH:  # where it began is not known any more, but how far it came
+                at = int(np.searchsorted(source.stream.stamps_ns, self._passed_ns[name], "right"))
+                source.epoch, source.published = epoch, max(at, 1)
+                self._begin_epoch(source)
+                continue
+            if self._recorder:
+                consumed = min(consumed, self._recorded.get((name, epoch), 0))
+            source.published = min(consumed, len(source.stream))
+            if source.published:
+                starts.append(Outgoing(ch.START, name, source.message(0)))
+            if source.published and source.stream.truth_ns is not None:
+                at_ns = int(source.stream.stamps_ns[source.published - 1]) - TRUTH_BATCH_NS
+                source.truth_sent = int(np.searchsorted(source.stream.truth_ns, at_ns))
+        kept = [(r, i) for r, i in self._order if i >= self._sources[self._names[r]].published]
+        self._order = deque(kept)
+        self._published = sum(source.published for source in self._sources.values())
+        self._unrecorded = self._published - sum(self._recorded.values())
+        if kept:
+            robot, index = kept[0]
+            self._paced_ns = int(self._sources[self._names[robot]].stream.stamps_ns[index])
+        return starts
 
     def publish(self, clock_s: float) -> list[Outgoing]:
         """The next readings, at most BATCH: as many as pace and credit allow at `clock_s`."""
         if self.ended:  # a new epoch may begin after the end; it has its own last counters
             out, self._starts = self._starts, []
             return [*out, Outgoing(ch.END, "", self._end())] if out else []
-        if self._began_at is None and (self.waiting_for or self.configurations.mismatches):
-            return []
         if self._began_at is None:
+            if self.configurations.mismatches or not (
+                self._going_on(clock_s) if self._consumed else not self.waiting_for
+            ):
+                return []
             self._began_at = clock_s
+            self._starts += self._skip() if self._consumed else []
         horizon = self._horizon_ns(clock_s)
         out, self._starts = self._starts, []
         while self._order and len(out) < BATCH:
@@ -231,7 +296,7 @@ class WorldNode:
         assert self._began_at is not None
         if self.speed == float("inf"):
             return self.speed  # at the first look no time has passed: 0 · ∞ is not a number
-        return self._first_ns + (clock_s - self._began_at) * self.speed * 1e9
+        return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
     def _credit(self, source: _Source) -> bool:
         if source.alive and source.published - source.consumed >= CREDIT_READINGS:

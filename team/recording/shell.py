@@ -11,6 +11,7 @@ import msgpack
 
 from team.recording.recorder import Recorder
 from team.recording.replayer import schedule
+from team.the_end import TheEnd
 from team.wire.bus import Bus, Outgoing, Sample
 from team.wire.channels import (
     ALIVE,
@@ -119,6 +120,14 @@ class RecordLoop:
         message = Liveliness(self._newest_ns, node, came)
         return replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
+    def look(self, end: TheEnd) -> None:
+        """Take a final map that was missed, and see who has left while nobody said so."""
+        missed = end.missed()
+        if missed and not self._final:
+            self.take(missed)
+        if missed:
+            self._alive = {node for node in self._alive if self._bus.is_alive(node)}
+
     def status(self) -> Status:
         """Publish and log what the recorder is doing; returns it."""
         waiting = self._recorder.waiting()
@@ -149,8 +158,10 @@ def record(
         loop = RecordLoop(bus, recorder, expected)
         due = time.monotonic()
         remind_due = due + _REMIND_S
+        end = TheEnd(bus)
         while not (stop.is_set() or loop.finished):
             loop.take(bus.receive(_WAIT_S))
+            loop.look(end)
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATUS_S
                 status = loop.status()

@@ -54,11 +54,12 @@ class RobotShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive("central")
         self._shell.answer(ch.SENT, name, lambda request: self.node.answer_submaps(request))
-        if self._resume():
+        self._shell.look_for_the_end()
+        if not self.node.finished and self._resume():
             self._catch_up()
         self._shell.run(self._mend)
         _LOG.info("%d submaps from %d readings", self.node.submaps, self.node.next_reading)
-        self._shell.end()
+        self._shell.end(self.node.final)
 
     def _be_the_only_one(self) -> None:
         """Return when no other process is this robot."""

@@ -90,6 +90,7 @@ class RobotNode:
         self._said_done = False
         self.steps = 0
         self.finished = False
+        self.final: m.FusedMap | None = None
         self.warnings: list[str] = []
 
     # What the shell asks.
@@ -534,7 +535,7 @@ class RobotNode:
 
     def _take_fused(self, fused: m.FusedMap) -> list[Outgoing]:
         if fused.final:
-            self.finished = True
+            self.finished, self.final = True, fused
             return []
         if self._pace.answered(fused.exchange):
             ids, means = translate.landmarks_of(fused)

@@ -112,6 +112,8 @@ WITHDRAWAL = Channel("withdrawal", "central/withdrawal/{robot}", m.Withdrawal, "
 WITHDRAWALS_HEARD = Channel("withdrawals_heard", "robot/{robot}/withdrawals", m.WithdrawalHeard,
                             "once per order", "all", True, False,
                             "an order that the robot has heard, for a centre that is started again")  # fmt: skip
+GIVEN_UP = Channel("given_up", "operator/given_up/{node}", m.GivenUp, "once", "all", True, False,
+                   "an order: nobody waits for the node any more")  # fmt: skip
 FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
                     "the team's map with its joint covariance")  # fmt: skip
 TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per life of the stream",
@@ -144,11 +146,14 @@ SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "strea
 SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsWanted, "query", "stream", False, False,
                "a query; the replies are the starts, submaps and sightings that the robot has sent")  # fmt: skip
 
+FINAL_KEPT = Channel("final_kept", "router/final", m.FinalWanted, "query", "stream", False, False,
+                     "a query; the reply is the final map, when the centre has left, too")  # fmt: skip
+
 VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "stream", True, False,
                "what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
-QUERIES = (READINGS, SUBMAPS, SENT)
+QUERIES = (READINGS, SUBMAPS, SENT, FINAL_KEPT)
 REPLIES = {
     READINGS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
@@ -163,6 +168,12 @@ EVERYTHING = "**"
 def robot_node(robot: str) -> str:
     """The node name of a robot, as liveliness tokens and status carry it."""
     return f"robot/{robot}"
+
+
+def robot_of(node: str) -> str | None:
+    """The robot of a node's name; None if the node is none."""
+    kind, _, robot = node.partition("/")
+    return robot if kind == "robot" else None
 
 
 @lru_cache(maxsize=4096)

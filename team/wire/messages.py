@@ -254,6 +254,18 @@ class WithdrawalHeard(Message, frozen=True, array_like=True, gc=False, tag="with
     reason: Text
 
 
+class GivenUp(Message, frozen=True, array_like=True, gc=False, tag="given_up/1"):
+    """Nobody waits for a node any more: what has come of a robot is in the map, what has not is
+    missing, and the final map names it as lost.
+
+    by: "operator", "launch" or "central". reason: in words.
+    """
+
+    node: Text
+    by: Text
+    reason: Text
+
+
 class MapEstimate(Message, frozen=True, array_like=True, gc=False, tag="map/1"):
     """A robot's own running map in the team's frame: landmark means and covariances.
 
@@ -355,7 +367,8 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     robot, epoch and name, where submaps have sensitivities. joined: how robots with an unknown
     start were joined, and how sure that is. withdrawn: the robots that the team goes on without,
     ascending. covariance_scale: how many times the submaps' covariances ought to be taken, by how
-    well they agree; 1 is right, 0: not known.
+    well they agree; 1 is right, 0: not known. lost: of a final map, the robots whose streams are
+    not wholly in it, since nobody waited for them any more, ascending; such a map is provisional.
     """
 
     rule: Text
@@ -377,10 +390,12 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     joined: tuple[Text, ...] = ()
     withdrawn: tuple[Name, ...] = ()
     covariance_scale: Annotated[float, Meta(ge=0.0, le=1e300)] = 0.0
+    lost: tuple[Name, ...] = ()
 
     def check(self) -> None:  # noqa: D102
-        if any(a >= b for a, b in pairwise(self.withdrawn)):
-            raise ValueError("not ascending: withdrawn")
+        for name, robots in (("withdrawn", self.withdrawn), ("lost", self.lost)):
+            if any(a >= b for a, b in pairwise(robots)):
+                raise ValueError(f"not ascending: {name}")
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
 
 
@@ -553,6 +568,17 @@ class SubmapsWanted(Message, frozen=True, array_like=True, gc=False, tag="submap
     robot: Name
     epoch: Count = 0
     first: Count = 0
+
+
+class FinalWanted(Message, frozen=True, array_like=True, gc=False, tag="final_wanted/1"):
+    """A query to the router: the team's final map, if there is one already."""
+
+
+class FinalKept(Message, frozen=True, array_like=True, gc=False, tag="final_kept/1"):
+    """The router's answer: the payload of the newest final map, and how long ago it came [ns]."""
+
+    age_ns: Count
+    final: bytes
 
 
 def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: bool) -> None:

@@ -41,10 +41,10 @@ from team.keys.roster import Roster
 from team.wire.access import access_control
 from team.wire.arrivals import Arrivals
 from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of, replied
-from team.wire.channels import ALIVE, Channel, channel_of
+from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, Channel, channel_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.handshake import why_refused
-from team.wire.messages import Liveliness, Message
+from team.wire.messages import FinalKept, Liveliness, Message
 
 _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
@@ -615,8 +615,29 @@ def router(
             f"choose another, or port 0 for any free one"
         ) from error
     with session:
+        _keep_final_maps(session)
         replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
         locators = [json.loads(r.ok.payload.to_string())["locators"] for r in replies if r.ok]
         if not (locators and locators[0]):
             raise BusError(f"the router at {listen} does not tell its endpoint")
         yield str(locators[0][0])
+
+
+def _keep_final_maps(session: zenoh.Session) -> None:
+    """Keep each team's newest final map and answer for it: the centre leaves with its team."""
+    kept: dict[str, tuple[float, bytes]] = {}
+    ends = "/" + FINAL_MAP.key(), "/" + FINAL_KEPT.key()
+
+    def keep(sample: zenoh.Sample) -> None:
+        team = str(sample.key_expr).removesuffix(ends[0])
+        kept[team] = (time.monotonic(), sample.payload.to_bytes())
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            found = kept.get(str(query.key_expr).removesuffix(ends[1]))
+            if found is not None:
+                age_ns = round(1e9 * (time.monotonic() - found[0]))
+                query.reply(query.key_expr, encoded(FinalKept(0, age_ns, found[1])))
+
+    session.declare_subscriber(f"team/*{ends[0]}", Callback(keep, indirect=False))
+    session.declare_queryable(f"team/*{ends[1]}", Callback(answer, indirect=False))

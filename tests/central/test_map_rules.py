@@ -89,6 +89,9 @@ def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
     node, _ = heard(rule, messages)
     assert not node.finished
     node.handle(m.Liveliness(0, "robot/r2", False), 0)
+    assert not node.finished
+    node.handle(m.GivenUp(0, "robot/r2", "operator", "it fell into the water"), 0)
+    assert (node.final.lost, node.final.provisional) == (("r2",), True)
     assert node.final.members[1] == m.Member("r2", 1, 3)
 
 

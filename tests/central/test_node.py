@@ -149,20 +149,61 @@ def test_a_robot_that_was_never_there_is_waited_for():
     assert not centre.node.finished
 
 
-def test_a_robot_that_is_lost_at_the_end_leaves_what_it_has_sent():
+def given_up(robot):
+    return m.GivenUp(0, f"robot/{robot}", "operator", "it fell into the water")
+
+
+def test_a_robot_that_is_lost_at_the_end_is_waited_for_until_it_is_given_up():
     centre = joined()
-    centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"][:2], done("r1"), END)
+    centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"][:2], done("r1"), END, alive("r2", here=False))
     assert not centre.node.finished
-    centre.hears(alive("r2", here=False))
+    assert centre.node.awaited == ["r2"]
+    centre.hears(given_up("r2"))
     assert centre.final.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 1))
+    assert (centre.final.lost, centre.final.provisional) == (("r2",), True)
+    assert "r2 is given up" in centre.node.status().warnings[0]
 
 
-def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_does_not_hold_up_the_team():
+def test_a_robot_that_is_lost_and_comes_back_is_not_lost_and_the_map_is_that_of_all():
+    away, whole = joined(), joined()
+    away.hears(*SUBMAPS["r1"], *SUBMAPS["r2"][:2], done("r1"), END, alive("r2", here=False))
+    away.hears(alive("r2"), *SUBMAPS["r2"][2:], done("r2"))
+    whole.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), done("r2"), END)
+    assert away.final == whole.final
+    assert (away.final.lost, away.final.provisional) == ((), False)
+
+
+def test_a_robot_that_is_given_up_and_brings_all_before_the_end_is_not_lost():
+    centre = joined()
+    centre.hears(given_up("r2"), *SUBMAPS["r2"], done("r2"), *SUBMAPS["r1"], done("r1"), END)
+    assert (centre.final.lost, centre.final.provisional) == ((), False)
+
+
+def test_a_robot_that_was_withdrawn_and_has_left_is_not_waited_for_and_not_lost():
+    centre = joined()
+    centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"][:2], m.Withdrawal(0, "r2", "operator", "flat"))
+    centre.hears(done("r1"), END)
+    assert not centre.node.finished, "it is there, and may still say what it did"
+    centre.hears(alive("r2", here=False))
+    assert (centre.final.withdrawn, centre.final.lost) == (("r2",), ())
+    assert not centre.final.provisional
+
+
+def test_a_centre_that_finds_its_own_final_map_has_finished():
+    first, again = joined(), joined()
+    first.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), done("r2"), END)
+    out = again.hears(first.final)
+    assert (out, again.node.finished, again.node.final) == ([], True, first.final)
+
+
+def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_is_waited_for_too():
     centre = joined()
     centre.hears(*SUBMAPS["r1"], SUBMAPS["r2"][0], SUBMAPS["r2"][2], done("r1"), done("r2"), END)
-    assert not centre.node.finished
     centre.hears(alive("r2", here=False))
+    assert not centre.node.finished
+    centre.hears(given_up("r2"))
     assert centre.final.missing == (m.Member("r2", 1, 1),)
+    assert centre.final.lost == ("r2",)
 
 
 def test_a_refused_submap_does_not_hold_up_the_team():
@@ -231,8 +272,8 @@ def test_under_feedback_a_round_waits_for_every_live_robot():
     assert exchanges(centre) == [1]
 
 
-@pytest.mark.parametrize("news", [alive("r2", here=False), done("r2", 0)])
-def test_under_feedback_a_robot_that_dies_or_ends_early_is_waited_for_no_longer(news):
+@pytest.mark.parametrize("news", [given_up("r2"), done("r2", 0)])
+def test_under_feedback_a_robot_that_is_given_up_or_ends_early_is_waited_for_no_longer(news):
     centre = joined(config=FEEDBACK)
     centre.hears(estimate("r1", 1))
     centre.hears(news)

@@ -16,9 +16,6 @@ from tests.system.observer import Observer
 from tests.system.processes import Process, Processes
 from tests.system.scenarios import final_map, map_in_memory, short
 
-PATIENCE_S = "60"
-"""Of the centre with a robot that is away: longer than any of these tests."""
-
 
 @dataclass
 class Team:
@@ -49,7 +46,7 @@ async def assembled(team: Processes, speed: str, r1_connects: str = "") -> Team:
     log = team.folder / "log.mcap"
     others = [
         await team.start("record", scenario, *there, "--output", log, name="recorder"),
-        await team.start("central", scenario, *there, "--patience", PATIENCE_S),
+        await team.start("central", scenario, *there),
         await team.start("world", scenario, *there, "--speed", speed),
     ]
     robots = {"r2": await team.start("robot", scenario, "r2", *there, name="r2")}
@@ -122,7 +119,7 @@ async def test_an_order_to_withdraw_a_robot_outlives_the_centre_that_heard_it(
         centre = found.others.pop(1)
         centre.signal(signal.SIGKILL)
         await centre.ended()
-    again = await team.start("central", found.scenario, *there, "--patience", PATIENCE_S)
+    again = await team.start("central", found.scenario, *there)
     found.others.append(again)
     await found.ends_well()
     fused = decoded(found.final_map(), m.FusedMap)
@@ -147,7 +144,7 @@ async def test_a_centre_that_is_started_again_gets_what_a_resumed_robot_sent_in_
         centre = found.others.pop(1)
         centre.signal(signal.SIGKILL)
         await centre.ended()
-    again = await team.start("central", found.scenario, *there, "--patience", PATIENCE_S)
+    again = await team.start("central", found.scenario, *there)
     found.others.append(again)
     await found.ends_well()
     assert "resumed after submap" in found.robots["r1"].said()

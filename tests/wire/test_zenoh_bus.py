@@ -6,16 +6,21 @@ import threading
 import time
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 import zenoh
 
 from benchmarks.late_joins import storm
+from team import the_end
+from team.the_end import TheEnd
 from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import MAPS_KEPT, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from team.wire.zenoh_bus import ZenohBus, router
-from tests.support import ROOT, Link, odometry, received, submap, wait_until
+from tests.support import ROOT, Link, examples, odometry, received, submap, wait_until
+
+FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))
 
 
 @pytest.fixture
@@ -289,3 +294,23 @@ def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint
         sink.subscribe(c.ROBOT_PROGRESS, whole=True)
         assert counters(received(sink, 50), "robot/alpha/progress") == list(range(50))
         assert sink.lacking() == {}
+
+
+def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, final = (f for f in [FINAL, msgspec.structs.replace(FINAL, dof=99)])
+    with ZenohBus("t", endpoint) as centre, ZenohBus("other", endpoint) as stranger:
+        assert TheEnd(centre).missed() == []
+        centre.publish(Outgoing(c.FINAL_MAP, "", first))
+        centre.publish(Outgoing(c.FINAL_MAP, "", final))
+        wait_until(lambda: bool(TheEnd(centre).missed()))
+        assert TheEnd(stranger).missed() == []
+    with ZenohBus("t", endpoint) as straggler:
+        (sample,) = TheEnd(straggler).missed()
+        assert decoded(sample.payload, m.FusedMap) == final
+        assert (sample.key, sample.stamp_ns) == (c.FINAL_MAP.key(), final.stamp_ns)
+        monkeypatch.setattr(the_end, "_STARTED", time.monotonic())
+        assert TheEnd(straggler).missed() == [], "a process begins that knows nothing of that run"
+        monkeypatch.setenv(the_end.SINCE, str(time.time_ns() - 60 * 10**9))
+        assert TheEnd(straggler).missed(), "whoever started it says that it belongs to that run"

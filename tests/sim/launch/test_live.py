@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from sim.launch import live
-from sim.launch.launch import Watch
+from sim.launch.watch import Watch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sim.launch.launch import Watch
 from sim.launch.truth import EVERY_NS, LiveErrors
+from sim.launch.watch import Watch
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m

@@ -278,3 +278,67 @@ def test_it_is_finished_with_the_final_map():
     assert not node.finished
     node.handle(msgspec.structs.replace(fused, final=True), 0)
     assert node.finished
+
+
+def again(r1: int, r2: int, recorder=None, **options):
+    """A world that is started anew while its robots have so many readings."""
+    expected = expected_nodes(["r1", "r2"], recorder=recorder is not None)
+    node = world(expected=expected, **options)
+    for name in sorted(expected):
+        alive(node, name)
+    for robot, count in (("r1", r1), ("r2", r2)):
+        node.handle(progress(robot, count), 0)
+        if recorder is not None:
+            node.handle(progress(robot, recorder, node="recorder"), 0)
+    return node
+
+
+def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
+    before = readings(all_of(world()))
+    node = again(7, 5)
+    out = readings(all_of(node))
+    starts = [r for r in out if isinstance(r, m.Start)]
+    assert {(r.robot, r.reading, r.epoch) for r in starts} == {("r1", 0, 1), ("r2", 0, 1)}
+    least = {"r1": 7, "r2": 5}
+    assert out[len(starts) :] == [r for r in before if r.reading >= least[r.robot]]
+    assert node.status().figures["readings"] == len(before)
+    request = encoded(m.ReadingsWanted(0, "r1", 1, 0, -1))
+    assert [decoded(reply).reading for reply in node.readings(request)] == list(range(26))
+
+
+def test_a_world_that_is_started_again_gives_the_recorder_what_it_lacks():
+    out = readings(all_of(again(7, 5, recorder=3)))
+    assert min(r.reading for r in out if not isinstance(r, m.Start)) == 3
+
+
+def test_a_world_that_is_started_again_is_paced_from_where_it_goes_on():
+    node = again(12, 12, speed=2.0)
+    first = [r for r in readings(node.publish(100.0)) if not isinstance(r, m.Start)]
+    begins_ns = min(r.stamp_ns for r in first)
+    assert begins_ns > 4_000_000_000
+    later = readings(node.publish(101.0))
+    assert max(r.stamp_ns for r in later) == begins_ns + 2_000_000_000
+
+
+def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_ever():
+    node = world(expected=expected_nodes(["r1", "r2"], recorder=False))
+    node.handle(progress("r1", 7), 0)
+    assert node.publish(100.0) == []
+    assert readings(node.publish(100.0 + world_node.RESUME_S))
+
+
+def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot_is():
+    node = world()
+    node.handle(m.Progress(5_000_000_000, "robot/r1", "r1", 3, 4, 0), 0)
+    out = [r for r in readings(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
+    assert {r.epoch for r in out} == {4}
+    assert [r.reading for r in out] == list(range(len(out)))
+    assert min(r.stamp_ns for r in out) == 5_000_000_000
+
+
+def test_a_world_begins_without_a_node_that_is_given_up():
+    node = world(expected=frozenset({"robot/r1", "recorder"}))
+    alive(node, "robot/r1")
+    assert node.publish(0.0) == []
+    node.handle(m.GivenUp(0, "recorder", "launch", "it died 5 times"), 0)
+    assert readings(node.publish(0.0))

@@ -1,0 +1,237 @@
+"""Whole teams under `launch` whose processes are killed, or stopped for a while, at random.
+
+    python benchmarks/kills.py --runs 20 --kills 3 --load 4
+    python benchmarks/kills.py --runs 10 --stop 20 --what central,router
+
+Each run is a short world. The final map is compared, byte by byte, with that of the same team in
+memory, where nobody dies. A row per run, a summary, and with --json everything for machines. Ends
+with 1 unless every run ended with 0, with this map, and left no process and no unnamed hole.
+"""
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from sim.in_memory.team import run_team
+from sim.scenario.scenario import load
+from sim.scenario.source import streams_of
+from team.recording.reader import LogError, open_log
+from team.wire.channels import FINAL_MAP
+
+PROGRAM = (sys.executable, "-P", "-m", "sim")
+KINDS = ("robot", "central", "router", "record", "world", "viewer")
+PROC = Path("/proc")
+
+
+@dataclass
+class Run:
+    """What became of one run; hit: who was killed or stopped, and when [s after the launch]."""
+
+    number: int
+    hit: list[tuple[float, str]] = field(default_factory=list)
+    exit: int | None = None
+    wall_s: float = 0.0
+    equal: bool = False
+    left: int = 0
+    check: str = ""
+    restarts: dict[str, int] = field(default_factory=dict)
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def good(self) -> bool:
+        """As if nothing had happened."""
+        return self.exit == 0 and self.equal and not self.left and not self.check
+
+
+def children(launch: int, folder: Path) -> dict[int, list[str]]:
+    """The command lines of a run's processes but for `launch`, by pid."""
+    found = {}
+    for entry in PROC.iterdir():
+        if entry.name.isdigit() and int(entry.name) != launch:
+            with suppress(OSError):
+                if (entry / "cwd").readlink() == folder:
+                    line = (entry / "cmdline").read_bytes().decode().rstrip("\0").split("\0")
+                    if "sim" in line:
+                        found[int(entry.name)] = line[line.index("sim") + 1 :]
+    return found
+
+
+def final_in(folder: Path) -> bytes | None:
+    """The final map's bytes in the run's log, or in a part of it."""
+    for path in sorted((folder / "run").glob("log*.mcap")):
+        with suppress(LogError, OSError):
+            for sample in open_log(path).samples((FINAL_MAP,)):
+                return sample.payload
+    return None
+
+
+def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespace) -> Run:
+    """Launch, kill or stop, wait, compare."""
+    rng = random.Random(f"{options.seed} {number}")
+    run = Run(number)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name).resolve()
+        began = time.monotonic()
+        with (folder / "said").open("wb") as said:
+            launch = subprocess.Popen(
+                [*PROGRAM, "launch", scenario, "--speed", options.speed, "--no-report",
+                 "--output", "run", "--json", "result.json"],
+                cwd=folder, stdout=said, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            )  # fmt: skip
+        await_start(folder, launch)
+        awake: list[tuple[float, int]] = []
+        due = sorted(
+            time.monotonic() + rng.uniform(0.0, options.span) for _ in range(options.kills)
+        )
+        while launch.poll() is None and time.monotonic() - began < options.timeout:
+            now = time.monotonic()
+            while due and now >= due[0]:
+                due.pop(0)
+                hit(launch.pid, folder, rng, options, run, awake, now - began)
+            for at, pid in [a for a in awake if now >= a[0]]:
+                awake.remove((at, pid))
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGCONT)
+            time.sleep(0.02)
+        run.exit = launch.poll()
+        if run.exit is None:
+            launch.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                launch.wait(30.0)
+        time.sleep(0.2)
+        left = children(launch.pid, folder)
+        run.left = len(left)
+        for pid in left:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        if launch.poll() is None:
+            launch.kill()
+            launch.wait()
+        run.wall_s = time.monotonic() - began
+        final = final_in(folder)
+        run.equal = final == expected
+        with suppress(OSError, ValueError):
+            result = json.loads((folder / "result.json").read_text())
+            run.restarts, run.failures = result["restarts"], result["failures"]
+        checked = subprocess.run(
+            [*PROGRAM, "log", "check", "run/log.mcap"],
+            cwd=folder, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        run.check = "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
+        if not run.good and options.keep:
+            keep = Path(options.keep) / f"run{number}"
+            keep.parent.mkdir(parents=True, exist_ok=True)
+            subprocess.run(["cp", "-r", folder, keep], check=False)
+    return run
+
+
+def await_start(folder: Path, launch: subprocess.Popen[bytes]) -> None:
+    """Return when the world publishes."""
+    end = time.monotonic() + 120.0
+    said = folder / "run" / "central.log"
+    while time.monotonic() < end and launch.poll() is None:
+        if said.exists() and "connected" in said.read_text():
+            return
+        time.sleep(0.05)
+
+
+def hit(
+    launch: int, folder: Path, rng: random.Random, options: argparse.Namespace, run: Run,
+    awake: list[tuple[float, int]], at_s: float,
+) -> None:  # fmt: skip
+    """Kill one process of the wanted kinds, or stop it until later."""
+    stopped = {pid for _, pid in awake}
+    lines = children(launch, folder).items()
+    there = {p: li for p, li in lines if li[0] in options.what and p not in stopped}
+    kinds = sorted({line[0] for line in there.values()})
+    if not kinds:
+        return
+    kind = rng.choice(kinds)
+    pid = rng.choice(sorted(pid for pid, line in there.items() if line[0] == kind))
+    with suppress(ProcessLookupError):
+        if options.stop:
+            os.kill(pid, signal.SIGSTOP)
+            awake.append((time.monotonic() + options.stop, pid))
+        else:
+            os.kill(pid, signal.SIGKILL)
+        robots = [word for word in there[pid] if word in ("r1", "r2", "r3")]
+        run.hit.append((round(at_s, 2), "-".join([kind, *robots])))
+
+
+def main() -> int:
+    """Read the options, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--kills", type=int, default=3, help="in each run")
+    parser.add_argument("--span", type=float, default=10.0, help="seconds in which they fall")
+    parser.add_argument("--stop", type=float, default=0.0, help="stop for so long, do not kill")
+    parser.add_argument("--what", default="robot,central,router,record,world,viewer")
+    parser.add_argument("--load", type=int, default=0, help="busy loops beside the team")
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--speed", default="6")
+    parser.add_argument("--seed", default="1")
+    parser.add_argument("--timeout", type=float, default=240.0)
+    parser.add_argument("--keep", help="keep the folders of runs that went wrong here")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    options.what = options.what.split(",")
+    with tempfile.TemporaryDirectory() as name:
+        scenario = Path(name) / "short.toml"
+        scenario.write_text(f'base = "thesis"\n[world]\nsteps = {options.steps}\n')
+        resolved = load(scenario)
+        samples = run_team(resolved, streams_of(resolved))
+        (expected,) = [s.payload for s in samples if s.key == FINAL_MAP.key()]
+        busy = [
+            subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            for _ in range(options.load)
+        ]
+        runs = []
+        try:
+            for number in range(options.runs):
+                run = one(number, scenario, expected, options)
+                runs.append(run)
+                print(row(run), flush=True)
+        finally:
+            for process in busy:
+                process.kill()
+                process.wait()
+    good = sum(run.good for run in runs)
+    hits = sum(len(run.hit) for run in runs)
+    verb = "stopped" if options.stop else "killed"
+    print(
+        f"{good} of {len(runs)} runs good, {hits} processes {verb}; "
+        f"map equal in {sum(r.equal for r in runs)}, exit 0 in {sum(r.exit == 0 for r in runs)}, "
+        f"no process left in {sum(not r.left for r in runs)}, "
+        f"log whole in {sum(not r.check for r in runs)}"
+    )
+    if options.json:
+        options.json.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
+    return 0 if good == len(runs) else 1
+
+
+def row(run: Run) -> str:
+    """One line on a run."""
+    what = ", ".join(f"{who} at {at:.1f}" for at, who in run.hit)
+    exit_ = "–" if run.exit is None else run.exit
+    words = [
+        f"{run.number:3} {'good' if run.good else 'BAD '} exit {exit_} {run.wall_s:5.1f} s",
+        "map equal" if run.equal else "MAP DIFFERS",
+        f"hit {what or 'nobody'}",
+        *([f"{run.left} LEFT"] if run.left else []),
+        *([f"check: {run.check.splitlines()[0][:120]}"] if run.check else []),
+        *([f"failures: {run.failures[0][:160]!r}"] if run.failures else []),
+    ]
+    return "; ".join(words)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,147 @@
+"""The supervision of a team: who dies is started again, who makes no progress is given up by name.
+
+Recorder and viewer are not essential to the map: where they are given up the team goes on, and the
+run fails in the end. A robot that is given up is named as lost in the final map. Without router,
+world or centre there is no map: then the run ends.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+
+from sim.launch.supervisor import Ended, Supervised
+from sim.launch.watch import Watch
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Bus, BusError, Outgoing
+
+SILENT_S = 10.0
+"""A process that runs and has said nothing for so long is named."""
+STARTING_S = 60.0
+"""… one that starts and has not said anything yet, after so long: a busy machine is slow."""
+LEAVING_S = 60.0
+"""A process that is there so long after the final map is ended, and named."""
+_NODES = {"router": "router", "world": "world", "central": "central"}
+_WITHOUT_IT_NO_MAP = frozenset(_NODES)
+
+
+def node_of(name: str) -> str:
+    """The node that a process is: `robot-r1` is `robot/r1`."""
+    return f"robot/{name.removeprefix('robot-')}" if name.startswith("robot-") else name
+
+
+def supervise(
+    services: Sequence[Supervised],
+    bus: Bus,
+    watch: Watch,
+    show: Callable[[Watch], None],
+    end_silent_s: float | None,
+) -> None:
+    """Until every process but the router, the first, has ended or is given up.
+
+    end_silent_s: a process that has said nothing for so long is ended, so that it is started again.
+    """
+    silence = Silence(end_silent_s)
+    over_at: float | None = None
+    while True:
+        try:
+            watch.take(bus)
+        except BusError as error:
+            watch.failures.append(str(error))
+            return
+        is_final = watch.fused is not None and watch.fused.final
+        for service in services:
+            _look_after(service, bus, watch, is_final=is_final)
+        if any(s.given_up and s.name in _WITHOUT_IT_NO_MAP for s in services):
+            return
+        silence.look(services, watch)
+        show(watch)
+        if not any(service.is_watched for service in services[1:]):
+            return
+        over_at = over_at or (time.monotonic() if is_final else None)
+        if over_at is not None and time.monotonic() - over_at > LEAVING_S:
+            _end_who_stays(services[1:], watch)
+            return
+
+
+def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) -> None:
+    if not service.is_watched:
+        return
+    if service.due is not None:
+        service.start_again()
+        return
+    status = service.child.exit
+    if status is None:
+        return
+    failed_at_the_end = is_final and status > 0
+    if (status == 0 and service.name != "router") or failed_at_the_end:
+        service.over = True
+        if failed_at_the_end:
+            watch.failures.append(failure(service.child.ended()))
+        return
+    ended = service.child.ended()
+    service.died(watch.progress(node_of(service.name)))
+    if not service.given_up:
+        watch.restarts[service.name] = service.restarts + 1
+        watch.note(f"{ended.name} (pid {ended.pid}) {ended.how}: it is started again")
+        return
+    deaths = f"it died {service.fruitless} times without getting any further, and is given up"
+    watch.given_up.append(service.name)
+    watch.failures.append(f"{failure(ended)}; {deaths}")
+    node = node_of(service.name)
+    order = m.GivenUp(0, node, "launch", f"{ended.how}; {deaths}")
+    if service.name not in _WITHOUT_IT_NO_MAP:
+        bus.publish(Outgoing(ch.GIVEN_UP, node, order))
+
+
+def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
+    for service in services:
+        if service.is_watched:
+            service.child.kill()
+            name = f"{service.name} (pid {service.child.pid})"
+            stopped = ", since it was stopped" if service.child.is_stopped else ""
+            watch.failures.append(
+                f"{name} had not left {LEAVING_S:g} s after the final map{stopped}: it was ended"
+            )
+
+
+class Silence:
+    """Names who is there but says nothing."""
+
+    def __init__(self, end_s: float | None) -> None:
+        self._end_s = end_s
+        self._named: set[int] = set()
+
+    def look(self, services: Sequence[Supervised], watch: Watch) -> None:
+        """Name each process that has been silent for SILENT_S, once; end it if that is wished."""
+        now = time.monotonic()
+        for service in services:
+            child = service.child
+            if not service.is_watched or service.due is not None or child.exit is not None:
+                continue
+            heard = watch.heard.get(node_of(service.name), 0.0)
+            if service.name == "router":  # it says nothing itself: all others are silent with it
+                heard = max(watch.heard.values(), default=0.0)
+            silent_s = now - max(heard, child.started)
+            starts = heard < child.started and not child.is_stopped
+            if silent_s < (STARTING_S if starts else SILENT_S):
+                self._named.discard(child.pid)
+                continue
+            if child.pid not in self._named:
+                self._named.add(child.pid)
+                state = "is stopped (SIGSTOP?)" if child.is_stopped else "is there"
+                watch.note(
+                    f"{service.name} (pid {child.pid}) {state} and has said nothing for "
+                    f"{silent_s:.0f} s: the team may wait for it. To have it started again: "
+                    f"kill -9 {child.pid}"
+                )
+            if self._end_s is not None and silent_s >= self._end_s:
+                watch.note(f"{service.name} (pid {child.pid}) was silent {silent_s:.0f} s: ended")
+                child.kill()
+
+
+def failure(ended: Ended) -> str:
+    """How a process failed, and its last lines."""
+    parts = [f"{ended.name} (pid {ended.pid}) {ended.how}"]
+    if ended.last_lines:
+        parts.append("its last lines:\n" + "\n".join(f"    {line}" for line in ended.last_lines))
+    return "; ".join(parts)

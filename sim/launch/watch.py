@@ -1,0 +1,74 @@
+"""What is known of a running team: its nodes' last words, its map, and what became of processes."""
+
+import time
+from dataclasses import dataclass, field
+
+from sim.launch.truth import LiveErrors
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Bus, opened
+from team.wire.codec import WireError
+
+TURN_S = 0.1
+_PROGRESS = ("readings", "submaps", "messages")
+"""Figures of a status that grow as its node gets on."""
+
+
+@dataclass
+class Watch:
+    """What is known of the team while it runs: the last status of each node, and the last map.
+
+    robots: how many there are to be. errors: against the truth, where there is one. place: by what
+    other commands reach the team. notes: what became of processes, in words. restarts: how often
+    each was started again. given_up: those that were. heard: when each node's last status came.
+    """
+
+    statuses: dict[str, m.Status] = field(default_factory=dict)
+    fused: m.FusedMap | None = None
+    failures: list[str] = field(default_factory=list)
+    began: float = field(default_factory=time.monotonic)
+    robots: int = 0
+    errors: LiveErrors = field(default_factory=LiveErrors)
+    place: str = ""
+    notes: list[str] = field(default_factory=list)
+    restarts: dict[str, int] = field(default_factory=dict)
+    given_up: list[str] = field(default_factory=list)
+    heard: dict[str, float] = field(default_factory=dict)
+
+    def take(self, bus: Bus) -> None:
+        """Take what has come since."""
+        for sample in bus.receive(TURN_S):
+            found = ch.channel_of(sample.key)
+            if found is None or not self.errors.wants(*found, sample):
+                continue
+            try:
+                channel, _, message = opened(sample)
+            except WireError:
+                continue
+            if isinstance(message, m.Status):
+                self.statuses[message.node] = message
+                self.heard[message.node] = time.monotonic()
+            elif isinstance(message, m.FusedMap):
+                self.fused = message
+            elif isinstance(message, m.Fault):
+                self._take_fault(message)
+            self.errors.take(channel, message)
+
+    def _take_fault(self, fault: m.Fault) -> None:
+        """The first of a node is a failure by name; its status counts the rest."""
+        named = f"{fault.node} set aside "
+        if not any(failure.startswith(named) for failure in self.failures):
+            what = f"{fault.key}: {fault.error} at {fault.place}: {fault.text}"
+            self.failures.append(f"{named}{what}")
+
+    def note(self, text: str) -> None:
+        """Say what became of a process."""
+        elapsed = time.monotonic() - self.began
+        self.notes.append(f"at {elapsed:.1f} s {text}")
+
+    def progress(self, node: str) -> float:
+        """How far a node has got by its last status; the router is as far as the whole team."""
+        names = list(self.statuses) if node == "router" else [node]
+        statuses = [self.statuses[name] for name in names if name in self.statuses]
+        figures = [status.figures.get(name, 0.0) for status in statuses for name in _PROGRESS]
+        return sum(figures)

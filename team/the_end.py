@@ -1,0 +1,54 @@
+"""The end of a team as a fact: the router keeps the final map for whoever was away at the end."""
+
+import logging
+import os
+import time
+
+from team.wire.bus import Bus, BusError, Sample
+from team.wire.channels import FINAL_KEPT, FINAL_MAP
+from team.wire.codec import WireError, decoded
+from team.wire.messages import FinalKept, FinalWanted, FusedMap
+
+FINAL_S = 3.0
+"""The router is asked so often for a final map that was missed."""
+FINAL_ASK_S = 2.0
+SINCE = "TEAMSLAM_SINCE"
+"""Environment variable: when this process's run began [ns, wall clock], if not with itself."""
+_STARTED = time.monotonic()
+_LOG = logging.getLogger("teamslam")
+
+
+class TheEnd:
+    """Whether a team that this process knows has ended: the router keeps the final map.
+
+    A process that starts again, or that was stopped or cut off while the centre left, learns of it
+    so. A map that is older than the process is another run's, unless whoever started it says that
+    the run began earlier (SINCE).
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._due = 0.0
+        began = os.environ.get(SINCE)
+        self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
+        self._began = _STARTED
+
+    def missed(self) -> list[Sample]:
+        """The final map, if the router has it; it is asked at most every FINAL_S."""
+        now = time.monotonic()
+        if now < self._due:
+            return []
+        self._due = now + FINAL_S
+        try:
+            replies = self._bus.ask(FINAL_KEPT, "", FinalWanted(0), FINAL_ASK_S)
+            kept = [decoded(reply, FinalKept) for reply in replies]
+            life_s = time.monotonic() - self._began + max(self._before_s, 0.0)
+            return [_sample(k.final) for k in kept[:1] if 1e-9 * k.age_ns <= life_s]
+        except (BusError, WireError) as error:
+            _LOG.debug("%s", error)
+            return []
+
+
+def _sample(final: bytes) -> Sample:
+    stamp_ns = decoded(final, FusedMap).stamp_ns
+    return Sample(FINAL_MAP.key(), final, stamp_ns, time.time_ns(), 0)
