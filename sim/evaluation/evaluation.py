@@ -153,12 +153,19 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         robots,
         positions,
         {key: log.traffic[key] for key in sorted(log.traffic)},
-        (*(end.notes if isinstance(end, m.End) else ()), *_set_aside(faults)),
+        (*(end.notes if isinstance(end, m.End) else ()), *_lost(log), *_set_aside(faults)),
         log.unsound,
         _by_robot(log, "joint_cost_per_dof."),
         len(faults),
         _by_robot(log, "covariance_scale."),
     )
+
+
+def _lost(log: Collected) -> list[str]:
+    """Of whom the final map has not all that it was to have."""
+    final = log.sound(log.last(ch.FINAL_MAP))
+    lost = final.lost if isinstance(final, m.FusedMap) else ()
+    return [f"the final map is provisional: {robot} lost, and not wholly in it" for robot in lost]
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:

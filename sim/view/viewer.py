@@ -5,6 +5,7 @@ import time
 from dataclasses import replace
 
 from sim.view.export import Viewing, heard
+from team.containment import Boundary
 from team.shell import STATUS_S, WAIT_S
 from team.the_end import TheEnd
 from team.wire import channels as ch
@@ -23,6 +24,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     bus.declare_alive(NODE)
     published = 0
     end = TheEnd(bus)
+    boundary = Boundary(NODE)
     due = 0.0
     while not (viewing.node.finished or stop.is_set()):
         if time.monotonic() >= due:
@@ -32,7 +34,12 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
         for sample in (*bus.receive(WAIT_S), *end.missed()):
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
-            for shown in viewing.take(sample, heard(sample)):
+            try:
+                views = viewing.take(sample, heard(sample))
+            except Exception as error:  # what it can not draw it leaves out
+                bus.publish(boundary.note(error, sample, ""))
+                continue
+            for shown in views:
                 bus.publish_raw(replace(shown, wall_ns=time.time_ns()))
                 published += 1
     return published

@@ -29,6 +29,8 @@ BATCH = 256
 ANSWER = 8192
 """Readings in one answer to a query; who wants more asks again."""
 TRUTH_BATCH_NS = 1_000_000_000
+HELD_UP_S = 5.0
+"""A node without whose progress the world can not go on is named after so long."""
 RESUME_S = 2.0
 """A world that is started again waits so long for everyone to say how far he is."""
 FIRST_EPOCH = 1
@@ -136,6 +138,8 @@ class WorldNode:
         self._consumed: dict[tuple[str, int], int] = {}
         self._passed_ns: dict[str, int] = {}
         self._heard_at: float | None = None
+        self._held_up: tuple[str, float] | None = None
+        self._clock_s = 0.0
         self._starts: list[Outgoing] = []
         first = [int(x.stamps_ns[0]) for x in self.streams.streams if len(x)]
         self._first_ns = min(first, default=0)
@@ -275,8 +279,15 @@ class WorldNode:
             robot, index = self._order[0]
             source = self._sources[self._names[robot]]
             stamp_ns = int(source.stream.stamps_ns[index])
-            if stamp_ns > horizon or not self._credit(source):
+            if stamp_ns > horizon:
+                self._held_up = None
                 break
+            if (who := self._without_credit(source)) is not None:
+                before = self._held_up
+                self._held_up = before if before and before[0] == who else (who, clock_s)
+                self._clock_s = clock_s
+                break
+            self._held_up = None
             self._order.popleft()
             self.now_ns = max(self.now_ns, stamp_ns)
             kind = int(source.stream.kinds[index])
@@ -298,11 +309,12 @@ class WorldNode:
             return self.speed  # at the first look no time has passed: 0 · ∞ is not a number
         return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
-    def _credit(self, source: _Source) -> bool:
+    def _without_credit(self, source: _Source) -> str | None:
+        """Who has to get on before the next reading of this robot; None: nobody."""
         if source.alive and source.published - source.consumed >= CREDIT_READINGS:
-            return False
+            return ch.robot_node(source.stream.robot)
         ahead = self._published - self._unrecorded - sum(self._recorded.values())
-        return not self._recorder or ahead < CREDIT_RECORDER
+        return "recorder" if self._recorder and ahead >= CREDIT_RECORDER else None
 
     def _truth(self, source: _Source, stamp_ns: int, batch_ns: int) -> list[Outgoing]:
         stream = source.stream
@@ -365,6 +377,11 @@ class WorldNode:
         waiting = self.waiting_for
         state = "publishing" if self._began_at is not None else "waiting"
         warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
+        if self._held_up is not None and self._clock_s - self._held_up[1] >= HELD_UP_S:
+            who, since = self._held_up
+            warnings = (
+                f"{who} holds the team up: it has got no further for {self._clock_s - since:.0f} s",
+            )
         return m.Status(
             self.now_ns,
             "world",

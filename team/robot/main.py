@@ -75,7 +75,11 @@ class RobotShell:
     def _resume(self) -> bool:
         """Take over the submaps of an earlier life that the centre has; False if there are none."""
         wanted = m.SubmapsWanted(0, self.node.robot)
-        replies = self._bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
+        try:
+            replies = self._bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
+        except BusError as error:  # a centre that does not answer: the same submaps once more
+            _LOG.warning("%s", error)
+            return False
         if not replies:
             return False
         try:

@@ -157,6 +157,20 @@ def test_a_recorder_that_comes_late_or_again_is_credited_from_there(monkeypatch)
     assert readings(node.publish(0.0))
 
 
+def test_who_holds_the_team_up_is_named(monkeypatch):
+    monkeypatch.setattr(world_node, "CREDIT_READINGS", 5)
+    node = world()
+    alive(node, "robot/r1")
+    for clock in (0.0, 4.0):
+        node.publish(clock)
+        assert node.status().warnings == ()
+    node.publish(6.0)
+    assert node.status().warnings == ("robot/r1 holds the team up: it has got no further for 6 s",)
+    node.handle(progress("r1", 5), 0)
+    node.publish(7.0)
+    assert node.status().warnings == ()
+
+
 def test_at_a_given_speed_it_publishes_what_is_due():
     node = world(speed=2.0)
     last = [max((r.stamp_ns for r in readings(node.publish(100.0))), default=None)]
