@@ -78,7 +78,10 @@ class Mutation:
     ) -> dict[str, Any]:
         files = {str(ROOT / "tests" / name) for name in MODULES[module][1]}
         of_module = [each for each in items if str(each.path) in files]
-        of_module.sort(key=lambda each: self._seconds.get(each.nodeid, 0.3))
+        own = f"test_{Path(module).stem}"
+        of_module.sort(
+            key=lambda x: self._seconds.get(x.nodeid, 0.2 if x.path.stem == own else 1.0)
+        )
         said = {"module": module, "mutant": str(mutant), "where": mutant.where if mutant else ""}
         left = self._budget_s
         while True:
