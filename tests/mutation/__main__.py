@@ -22,7 +22,6 @@ from typing import Any
 
 import pytest
 from _pytest.runner import runtestprotocol
-from hypothesis import Phase, settings
 
 from tests.mutation.change import changed
 from tests.mutation.mutants import Mutant, mutants
@@ -55,6 +54,8 @@ class Mutation:
     @pytest.hookimpl(trylast=True)
     def pytest_collection(self) -> None:
         """Before the tests are imported: no example is written down, no failing one made small."""
+        from hypothesis import Phase, settings  # pytest's plugin comes first
+
         phases = (Phase.explicit, Phase.generate)
         settings.register_profile("mutation", derandomize=True, database=None, phases=phases)
         settings.load_profile("mutation")
