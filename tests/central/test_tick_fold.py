@@ -106,6 +106,30 @@ def test_the_provisional_fold_holds_everything_and_leaves_the_final_one_alone():
     assert bits(ticks.fold) == before
 
 
+@pytest.mark.parametrize("until_ns", [0.0, 8e9, float("inf")])
+def test_a_withdrawal_takes_the_ticks_again_that_were_taken_and_no_more(until_ns):
+    ticks, without = fresh(), fresh()
+    for each in ALL:
+        add(ticks, each)
+    for each in SUBMAPS["r1"]:
+        add(without, each)
+    taken = ticks.take_until(until_ns)
+    assert without.take_until(until_ns) == taken == (until_ns > 0.0)
+    ticks.withdraw("r2")
+    assert ticks.withdrawn == ("r2",)
+    assert [c.key for c in ticks.fold.contributions] == [c.key for c in without.fold.contributions]
+    if taken:
+        assert bits(ticks.fold) == bits(without.fold)
+    kept = ticks.fold
+    add(ticks, SUBMAPS["r2"][0])
+    assert ticks.fold is kept, "what it says later changes nothing"
+    ticks.withdraw("r2")
+    assert ticks.fold is kept, "once is enough"
+    ticks.take_until(float("inf"))
+    without.take_until(float("inf"))
+    assert bits(ticks.fold) == bits(without.fold)
+
+
 def test_the_fold_by_ticks_is_the_fold_of_the_joined_submaps():
     fold_by_hand = EMPTY_FOLD
     contributions = sorted((translate.contribution_of(x) for x in ALL), key=lambda c: c.key)
