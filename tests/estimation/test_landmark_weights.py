@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from team.estimation import joining, joining_kernel
+from team.estimation.gauss_newton import LEAST_WEIGHT
 from team.estimation.joining import JoinSettings, converged, folded, started
 from team.estimation.marginals import joint_cost, landmark_map
-from tests.estimation.submap_world import solved, team
+from tests.estimation.submap_world import seen_from, solved, team
 
 ROBUST = JoinSettings(robust_c=2.0)
 WHOLE = replace(ROBUST, landmark_gate=math.inf)
@@ -81,6 +82,26 @@ def test_only_what_was_mistaken_is_discounted():
         assert (weight[wrong] < 0.2).all()
         assert (weight[~wrong] > 0.5).all()
     assert (island.landmark_weight == 1.0).mean() > 0.85
+
+
+def test_beyond_its_gate_a_landmark_counts_by_the_gate_over_its_chi_square():
+    """w = min(1, g/rᵀP⁻¹r), r between what the submap says of it and where it is from there."""
+    world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
+    island = fold_of(world, mistaken(world, 4), ROBUST, solved).main
+    graph, state, expected = island.graph, island.state, []
+    for contribution, nodes in graph.submaps:
+        local = contribution.local
+        for k, id_ in enumerate(local.ids.tolist()):
+            at, start = graph.offset[graph.landmarks[id_]], graph.offset[nodes[0]]
+            place = seen_from(state[start : start + 3], state[at] + 1j * state[at + 1])
+            r = np.array([place.real, place.imag]) - local.landmarks[k]
+            block = local.covariance[3 + 2 * k : 5 + 2 * k, 3 + 2 * k : 5 + 2 * k]
+            expected.append(min(1.0, ROBUST.landmark_gate / (r @ np.linalg.solve(block, r))))
+    np.testing.assert_allclose(island.landmark_weight, expected, rtol=1e-6)
+    assert min(expected) < 0.2
+    far = state.copy()
+    far[graph.offset[min(graph.landmarks.values())]] += 1e6
+    assert replace(island, state=far).landmark_weight.min() == LEAST_WEIGHT
 
 
 def test_without_a_robust_loss_every_landmark_counts():
