@@ -15,6 +15,7 @@ from central.rule import Refuses, rule_of
 from central.rules import NOTHING
 from central.submap_rules import SubmapRule
 from team import translate
+from team.door import Door
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -27,6 +28,7 @@ class CentralNode:
     def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
         self.config = config
         self._announcement = translate.configured("central", 0, 0, config)
+        self._door = Door(robots)
         self._roll = Roll.of(robots)
         self._rule = rule_of(config, self._announcement.digest, sorted(robots))
         self._broadcasts = 0
@@ -49,6 +51,13 @@ class CentralNode:
     def begin(self) -> list[Outgoing]:
         """What the node says first: its configuration."""
         return [Outgoing(ch.CENTRAL_CONFIG, "", self._announcement)]
+
+    def refusal(self, message: m.Message) -> str | None:
+        """Why a message can not be true of this team: its robots, counters, stamps, or its end."""
+        refused = self._door.refusal(message)
+        if refused is None and isinstance(message, m.End):
+            return self._roll.contradicts(message)
+        return refused
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""

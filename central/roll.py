@@ -79,6 +79,19 @@ class Roll:
         done = self.robots[name].done
         return done is not None and self._is_last_epoch(name, done.epoch) and dealt(done)
 
+    def contradicts(self, end: m.End) -> str | None:
+        """Why this can not be the end of the team's streams, in words."""
+        ends = {(s.robot, s.epoch): s.readings for s in end.streams}
+        silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
+        if silent:
+            return f"an end that does not know of {', '.join(silent)}"
+        for name, robot in self.robots.items():
+            said = robot.progress
+            last = None if said is None else ends.get((name, said.epoch))
+            if said is not None and last is not None and last < said.readings:
+                return f"ends with reading {last} of {name}, which has consumed {said.readings}"
+        return None
+
     def settled(self, name: str, dealt: Dealt) -> bool:
         """Nobody waits for the robot: all of it is here, or it is given up or withdrawn and gone.
 

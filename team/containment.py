@@ -11,6 +11,7 @@ import logging
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from types import TracebackType
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -37,6 +38,14 @@ class Handler(Protocol):
 
 
 @runtime_checkable
+class Guarded(Protocol):
+    """A handler that knows what can not be true of its team."""
+
+    def refusal(self, message: m.Message) -> str | None:
+        """Why it does not take a message, in words; None: it takes it."""
+
+
+@runtime_checkable
 class Recovers(Protocol):
     """A handler that says how it goes on behind a message that raised."""
 
@@ -49,13 +58,15 @@ class Boundary:
     """Hands messages to one node and keeps what was refused at the door and what raised.
 
     name: the node. faults: handlings that raised. refused: messages that were no sound ones.
-    last: the newest fault, in words. aside: what is not handled again, by key and payload.
+    last, last_refused: the newest of each, in words. aside: what is not handled again, by key and
+    payload.
     """
 
     name: str
     faults: int = 0
     refused: int = 0
     last: str = ""
+    last_refused: str = ""
     aside: set[tuple[str, bytes]] = field(default_factory=set)
 
     def take(self, node: Handler, sample: Sample) -> list[Outgoing]:
@@ -80,8 +91,7 @@ class Boundary:
         try:
             return open_()
         except WireError as error:
-            self.refused += 1
-            _LOG.warning("%s: dropped %s: %s", self.name, _cut(sample.key, 80), error)
+            self._refuse(sample, str(error))
         except Exception as error:
             return [self.note(error, sample, "")]
         return []
@@ -92,6 +102,10 @@ class Boundary:
             return []
         tag = m.tag_of(type(message))
         try:
+            refused = node.refusal(message) if _guarded(type(node)) else None  # type: ignore[attr-defined]
+            if refused is not None:
+                self._refuse(sample, refused)
+                return []
             return node.handle(message, sample.stamp_ns)
         except Exception as error:
             out = [self.note(error, sample, tag)]
@@ -102,6 +116,11 @@ class Boundary:
             except Exception as error:
                 out.append(self.note(error, sample, tag))
         return out
+
+    def _refuse(self, sample: Sample, why: str) -> None:
+        self.refused += 1
+        self.last_refused = f"{_cut(sample.key, 80)}: {_cut(why, 200)}"
+        _LOG.warning("%s: dropped %s", self.name, self.last_refused)
 
     def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
         """Count and log a fault; its message."""
@@ -123,9 +142,14 @@ class Boundary:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What was dropped and set aside, in words, for a status."""
-        dropped = f"{self.refused} messages were dropped at the door"
+        dropped = f"{self.refused} dropped at the door, the last: {self.last_refused}"
         raised = f"{self.faults} set aside after a fault, the last: {self.last}"
         return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
+
+
+@cache
+def _guarded(kind: type) -> bool:
+    return issubclass(kind, Guarded)
 
 
 def reply_sample(key: str, payload: bytes) -> Sample:

@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Self
 
+import msgspec
 import numpy as np
 
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Bus, Sample
+from team.wire.channels import Channel
 
 ROOT = Path(__file__).parents[1]
 
@@ -119,6 +121,12 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
         from_floats(np.arange(n) / 8.0),
         packed(spd(n)),
     )
+
+
+def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
+    """The message as the node says it that publishes on the channel's key for this name."""
+    speaker = channel.speaker(name)
+    return msgspec.structs.replace(message, node=speaker) if hasattr(message, "node") else message
 
 
 def examples() -> Iterator[m.Message]:

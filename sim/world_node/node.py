@@ -178,6 +178,23 @@ class WorldNode:
                 out.append(Outgoing(ch.KNOWN_MAP, "", told))
         return out
 
+    def refusal(self, message: m.Message) -> str | None:
+        """Why a message can not be true: credit for what never was, a final map before the end."""
+        match message:
+            case m.Progress():
+                source = self._sources.get(message.robot)
+                if source is None:
+                    return f"of {message.robot}, not in this team"
+                if message.epoch > source.epoch:
+                    return f"of incarnation {message.epoch} of {message.robot}, {source.epoch} is"
+                if message.readings > len(source.stream):
+                    return f"consumed {message.readings} of {len(source.stream)} readings"
+            case m.FusedMap() if message.final and self._published and not self.ended:
+                return "a final map before the end of the streams"
+            case _:
+                pass
+        return None
+
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take progress, liveliness, configurations, the final map; the answer is always empty."""
         match message:

@@ -13,6 +13,7 @@ import numpy as np
 
 from team import translate
 from team.config import Exchange, RobotConfig
+from team.door import absurd
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
@@ -31,6 +32,8 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
 
+AHEAD = 64
+"""Submaps of an earlier life that the centre may have taken since it was asked for them."""
 IN_SIGHTING = "in a sighting factor"
 """The disposition of a reading of teammates that was used."""
 SET_ASIDE = "rejected: its handling raised"
@@ -168,6 +171,24 @@ class RobotNode:
         self._pace.acknowledged = len(submaps)
         self._now_ns = self._passed_ns = last.stamp_ns
         self._inbox.resume(last.epoch, last.last_reading + 1)
+
+    def refusal(self, message: m.Message) -> str | None:
+        """Why a message can not be true of this robot: another's, an absurd count, an early end."""
+        refused = absurd(message)
+        if refused is not None:
+            return refused
+        match message:
+            case m.Reading():
+                own = message.robot == self.robot
+                return self._inbox.refusal(message) if own else f"a reading of {message.robot}"
+            case m.Progress() if message.epoch == self._epoch:
+                if message.submaps > self.submaps + AHEAD:
+                    return f"acknowledges {message.submaps} submaps of {self.submaps}"
+            case m.End():
+                return self._inbox.contradicts(message, self.robot)
+            case _:
+                pass
+        return None
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""

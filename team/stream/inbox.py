@@ -2,7 +2,11 @@
 
 from collections.abc import Iterator
 
-from team.wire.messages import Reading, StreamEnd
+from team.door import another_time
+from team.wire.messages import End, Reading, Start, StreamEnd
+
+NEAR_LIVES = 16
+"""A stream begins a new life when it is asked for what it has lost: seldom, one by one."""
 
 
 class Inbox:
@@ -18,6 +22,7 @@ class Inbox:
         self._waiting: dict[int, Reading] = {}
         self._later: dict[int, dict[int, Reading]] = {}
         self._received = 0
+        self._began_ns: int | None = None
 
     def resume(self, epoch: int, next_reading: int) -> None:
         """Everything before `next_reading` of `epoch` has been consumed in an earlier life."""
@@ -34,12 +39,35 @@ class Inbox:
         elif reading.epoch == self.epoch and reading.reading >= self.next_reading:
             self._waiting[reading.reading] = reading
 
+    def refusal(self, reading: Reading) -> str | None:
+        """Why a reading can not be of this stream, in words; None: it can.
+
+        A stream's incarnations follow one another, and its stamps its initial pose's.
+        """
+        if self.next_reading and reading.epoch > self.epoch + NEAR_LIVES:
+            return f"of incarnation {reading.epoch}, while {self.epoch} is in progress"
+        if reading.epoch == self.epoch and self._began_ns is not None:
+            return another_time(reading.stamp_ns, self._began_ns)
+        return None
+
+    def contradicts(self, end: End, robot: str) -> str | None:
+        """Why this can not be the end of the robot's stream, in words."""
+        ends = {stream.epoch: stream.readings for stream in end.streams if stream.robot == robot}
+        if not ends and self.next_reading:
+            return f"an end that does not know of {robot}"
+        last = ends.get(self.epoch)
+        if last is not None and last < self.next_reading:
+            return f"ends with reading {last} of {robot}, which has consumed {self.next_reading}"
+        return None
+
     def taken(self) -> Iterator[Reading]:
         """The readings whose turn has come, one by one."""
         while True:
             reading = self._waiting.pop(self.next_reading, None)
             if reading is not None:
                 self.next_reading += 1
+                if isinstance(reading, Start):
+                    self._began_ns = reading.stamp_ns
                 yield reading
                 continue
             following = min((e for e, r in self._later.items() if 0 in r), default=None)

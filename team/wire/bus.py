@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from team.wire.channels import ALIVE, REPLIES, Channel, channel_of
+from team.wire.channels import ALIVE, ORDER, REPLIES, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
     FusedMap,
@@ -103,16 +103,20 @@ class Bus(Protocol):
 def opened(sample: Sample) -> tuple[Channel, str, Message]:
     """The message of a sample, checked against its key; raises `WireError`.
 
-    A robot's message on another robot's key is refused.
+    A robot's message on another robot's key is refused, and a node's on another node's.
     """
     found = channel_of(sample.key)
     if found is None:
-        raise WireError("wrong tag", f"no channel has the key {sample.key!r}")
+        raise WireError("wrong tag", f"no channel has the key {sample.key[:200]!r}")
     channel, name = found
     message = decoded(sample.payload, channel.message)
     robot = getattr(message, "robot", name)
     if "{robot}" in channel.template and robot != name:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
+    speaker = channel.speaker(name)
+    node = getattr(message, "by" if channel is ORDER else "node", speaker)
+    if node != speaker:
+        raise WireError("wrong field", f"a message of {node[:80]!r} on the key {sample.key!r}")
     return channel, name, message
 
 

@@ -48,6 +48,13 @@ class Channel:
         """The key for one robot or node."""
         return _PLACE.sub(name, self.template)
 
+    def speaker(self, name: str) -> str:
+        """The node that publishes the key for one robot or node."""
+        first, _, rest = self.template.partition("/")
+        if first == "{node}":
+            return name
+        return f"robot/{name}" if first == "robot" and rest.startswith("{robot}") else first
+
     def owner(self, key: str) -> str | None:
         """The robot or node that `key` belongs to on this channel; None when it is another's."""
         parts = _PLACE.split(self.template)

@@ -31,7 +31,7 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
 from tests.recording.test_log import chunks_of
-from tests.support import examples, odometry, submap
+from tests.support import examples, odometry, on_its_key, submap
 
 SECOND = 10**9
 
@@ -401,7 +401,7 @@ def test_numbers_read_back_from_csv_are_the_same(
 
 def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: Path) -> None:
     by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
-    kept = [message for message in examples() if type(message) in by_class]
+    kept = [on_its_key(by_class[type(x)], "alpha", x) for x in examples() if type(x) in by_class]
     samples = [
         sampled(by_class[type(x)], getattr(x, "robot", "alpha"), x, i) for i, x in enumerate(kept)
     ]

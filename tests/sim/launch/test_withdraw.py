@@ -12,10 +12,11 @@ from sim.launch.withdraw import WithdrawError, withdraw
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, opened
-from tests.support import examples, wait_until
+from tests.support import examples, on_its_key, wait_until
 
 FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
-CONFIG = next(e for e in examples() if isinstance(e, m.Configured))
+EXAMPLE = next(e for e in examples() if isinstance(e, m.Configured))
+CONFIG = on_its_key(ch.ROBOT_CONFIG, "r3", EXAMPLE)
 
 
 class Centre(threading.Thread):

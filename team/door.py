@@ -1,0 +1,109 @@
+"""What a node refuses of messages that are sound in themselves: what can not be true of this team.
+
+A stranger, or a robot that is broken, may name robots that nobody knows, lives and counters that
+nobody could have reached, stamps that are years away. A node says so by `refusal`, the boundary
+(`team.containment`) counts it and names the reason in the node's status; the recorder keeps it all.
+Every bound is far beyond what a team does, so that no order of arrival lets a true message fail.
+"""
+
+from collections.abc import Iterable, Iterator
+
+from team.wire import messages as m
+
+MOST_LIVES = 1_000
+"""Incarnations of a stream: each begins because its source has lost what it was asked for."""
+MOST_COUNT = 2**40
+"""Of anything that is counted one by one; at 100 Hz that takes 348 years."""
+EARLY_NS = 86_400 * 10**9
+LATE_NS = 400 * EARLY_NS
+"""A stream's messages lie within a day before and 400 days after its initial pose's stamp."""
+OF_ROBOTS = (
+    m.Reading, m.Submap, m.SightingFactor, m.MapEstimate, m.Progress, m.Done, m.Rendezvous,
+    m.Innovation,
+)  # fmt: skip
+"""Messages about a stream: they carry its robot and its incarnation."""
+
+
+class Door:
+    """Knows who is in the team, and when each stream began by its source's word."""
+
+    def __init__(self, robots: Iterable[str]) -> None:
+        self._robots = frozenset(robots)
+        self._began: dict[tuple[str, int], int] = {}
+
+    def refusal(self, message: m.Message) -> str | None:
+        """Why the message can not be true of this team, in words; None: it can."""
+        strangers = sorted(set(_robots(message)) - self._robots)
+        if strangers:
+            return f"of {', '.join(strangers)}, not in this team"
+        refused = absurd(message) or self._another_time(message)
+        if refused is None and isinstance(message, m.Start):
+            self._began.setdefault((message.robot, message.epoch), message.stamp_ns)
+        return refused
+
+    def _another_time(self, message: m.Message) -> str | None:
+        if not isinstance(message, OF_ROBOTS):
+            return None
+        began = self._began.get((message.robot, message.epoch))
+        return None if began is None else another_time(message.stamp_ns, began)
+
+
+def another_time(stamp_ns: int, began_ns: int) -> str | None:
+    """Why a stamp can not be of a stream that began then, in words."""
+    after_ns = stamp_ns - began_ns
+    if -EARLY_NS <= after_ns <= LATE_NS:
+        return None
+    return f"stamped {after_ns / EARLY_NS:.0f} days after its stream began"
+
+
+def absurd(message: m.Message) -> str | None:
+    """Why nobody could have counted so far, in words."""
+    for epoch in _lives(message):
+        if epoch > MOST_LIVES:
+            return f"of incarnation {epoch}; no stream has more than {MOST_LIVES}"
+    for count in _counts(message):
+        if count > MOST_COUNT:
+            return f"counts to {count}; nobody has come further than {MOST_COUNT}"
+    return None
+
+
+def _robots(message: m.Message) -> Iterator[str]:
+    """The robots that a message speaks of as of the team's."""
+    match message:
+        case m.SightingFactor():
+            yield from (message.robot, message.teammate)
+        case m.End():
+            yield from (stream.robot for stream in message.streams)
+        case m.WithdrawalHeard():
+            yield from (message.robot, message.withdrawn)
+        case m.Withdrawal():
+            yield message.robot
+        case _ if isinstance(message, OF_ROBOTS):
+            yield message.robot
+
+
+def _lives(message: m.Message) -> Iterator[int]:
+    if isinstance(message, m.End):
+        yield from (stream.epoch for stream in message.streams)
+    elif isinstance(message, OF_ROBOTS):
+        yield message.epoch
+
+
+def _counts(message: m.Message) -> Iterator[int]:
+    match message:
+        case m.Reading():
+            yield message.reading
+        case m.Submap():
+            yield from (message.sequence, message.last_reading, message.sightings)
+        case m.SightingFactor():
+            yield from (message.sequence, *message.readings)
+        case m.Progress():
+            yield from (message.readings, message.submaps)
+        case m.Done():
+            yield from (message.readings, message.submaps, message.steps)
+        case m.MapEstimate():
+            yield from (message.sequence, message.exchange)
+        case m.End():
+            yield from (stream.readings for stream in message.streams)
+        case _:
+            pass

@@ -1,0 +1,164 @@
+"""What can not be true of a team is refused by every node, counted, named, and changes nothing."""
+
+import msgspec
+import pytest
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from sim.world_node.node import WorldNode
+from team import translate
+from team.config import RobotConfig
+from team.containment import Boundary, Handler
+from team.door import LATE_NS, MOST_COUNT, MOST_LIVES, Door
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample
+from team.wire.codec import encoded
+from tests.support import examples
+from tests.teams import of, published, stream, submaps_of, world_of
+
+HUGE = 2**62
+STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
+READINGS = {name: published(each) for name, each in STREAMS.items()}
+SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+END = m.End(0, tuple(m.StreamEnd(n, 1, len(s)) for n, s in STREAMS.items()))
+FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
+
+
+def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
+    return Sample(channel.key(name), encoded(message), message.stamp_ns, 0, 0)
+
+
+def given(
+    boundary: Boundary, node: Handler, *said: tuple[ch.Channel, str, m.Message]
+) -> list[Outgoing]:
+    return [out for each in said for out in boundary.take(node, sample(*each))]
+
+
+def progress(robot: str, readings: int, submaps: int, stamp_s: float = 12.0) -> m.Progress:
+    return m.Progress(round(stamp_s * 1e9), f"robot/{robot}", robot, 1, readings, submaps)
+
+
+def run() -> list[tuple[ch.Channel, str, m.Message]]:
+    """All that a centre hears of a team, in one possible order."""
+    said: list[tuple[ch.Channel, str, m.Message]] = []
+    for name, submaps in SUBMAPS.items():
+        here = m.Liveliness(0, f"robot/{name}", True)
+        count = len(READINGS[name])
+        said += [(ch.ALIVE, f"robot/{name}", here), (ch.START, name, READINGS[name][0])]
+        said += [(ch.SUBMAP, name, submap) for submap in submaps]
+        said.append((ch.ROBOT_PROGRESS, name, progress(name, count, len(submaps))))
+    for name, submaps in SUBMAPS.items():
+        done = m.Done(12 * 10**9, name, 1, len(READINGS[name]), 12, len(submaps), ())
+        said.append((ch.ROBOT_DONE, name, done))
+    return [*said, (ch.END, "", END)]
+
+
+STRANGE = msgspec.structs.replace(SUBMAPS["r1"][0], robot="r9")
+ATTACKS = [
+    (ch.SUBMAP, "r9", STRANGE, "of r9, not in this team"),
+    (ch.START, "r1", m.Start(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
+    (ch.ROBOT_DONE, "r1", m.Done(0, "r1", HUGE, 0, 0, 0, ()), f"of incarnation {HUGE}"),
+    (ch.ROBOT_DONE, "r1", m.Done(0, "r1", 1, 5, 0, HUGE, ()), f"counts to {HUGE}"),
+    (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, HUGE), f"counts to {HUGE}"),
+    (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, 1, 4e9), "days after its stream began"),
+    (ch.ROBOT_PROGRESS, "r1", progress("r2", 5, 1), "a message of 'r2' on the key"),
+    (ch.ROBOT_PROGRESS, "r1", m.Progress(0, "central", "r1", 1, 5, 1), "a message of 'central'"),
+    (ch.END, "", m.End(0, ()), "an end that does not know of r1, r2"),
+    (ch.END, "", m.End(0, tuple(m.StreamEnd(n, 1, 3) for n in STREAMS)), "ends with reading 3 of"),
+    (ch.END, "", m.End(0, (*END.streams, m.StreamEnd("r9", 1, 3))), "of r9, not in this team"),
+    (ch.ORDER, "r1", m.Withdrawal(0, "r1", "central", "so"), "a message of 'central' on the key"),
+    (ch.ORDER, "r9", m.Withdrawal(0, "r9", "operator", "so"), "of r9, not in this team"),
+]  # fmt: skip
+
+
+def centre() -> tuple[Boundary, CentralNode]:
+    node = CentralNode(CentralConfig(tick_s=3.0, broadcast_s=3.0), ("r1", "r2"))
+    return Boundary("central"), node
+
+
+def test_a_centre_refuses_what_can_not_be_and_its_map_stays() -> None:
+    plain, node = centre()
+    (wanted,) = of(given(plain, node, *run()), ch.FINAL_MAP)
+    assert plain.refused == 0, plain.last_refused
+    boundary, node = centre()
+    said = run()
+    out = given(boundary, node, *said[:-1])
+    for count, (channel, name, message, why) in enumerate(ATTACKS, 1):
+        out += given(boundary, node, (channel, name, message))
+        assert boundary.refused == count, why
+        assert why in boundary.warnings[0]
+    assert (
+        f"{len(ATTACKS)} dropped at the door, the last: operator/withdrawal/r9: of r9"
+        in (boundary.warnings[0])
+    )
+    out += given(boundary, node, said[-1])
+    (final,) = of(out, ch.FINAL_MAP)
+    assert encoded(final) == encoded(wanted)
+
+
+def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submaps() -> None:
+    def robot() -> tuple[Boundary, RobotNode]:
+        return Boundary("robot/r1"), RobotNode(RobotConfig("r1"))
+
+    channel_of = {channel.message: channel for channel in ch.SENSORS}
+    readings = [(channel_of[type(each)], "r1", each) for each in READINGS["r1"]]
+    plain, node = robot()
+    wanted = given(plain, node, *readings, (ch.END, "", END))
+    assert plain.refused == 0, plain.last_refused
+    boundary, node = robot()
+    out = given(boundary, node, *readings[:8])
+    odometry = next(each for each in READINGS["r1"][8:] if isinstance(each, m.Odometry))
+    far = msgspec.structs.replace(odometry, stamp_ns=odometry.stamp_ns + 2 * LATE_NS)
+    acknowledged = m.Progress(0, "central", "r1", 1, 0, 10**6)
+    attacks = [
+        (ch.START, m.Start(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
+        (ch.START, m.Start(0, "r1", 100, 0, b"", b""), "of incarnation 100, while 1 is in"),
+        (ch.ODOMETRY, msgspec.structs.replace(odometry, reading=HUGE), f"counts to {HUGE}"),
+        (ch.ODOMETRY, far, "days after its stream began"),
+        (ch.CENTRAL_PROGRESS, acknowledged, "acknowledges 1000000 submaps of"),
+        (ch.END, m.End(0, ()), "an end that does not know of r1"),
+        (ch.END, m.End(0, (m.StreamEnd("r1", 1, 2),)), "ends with reading 2 of r1"),
+    ]
+    for count, (channel, message, why) in enumerate(attacks, 1):
+        out += given(boundary, node, (channel, "r1", message))
+        assert (boundary.refused, why in boundary.last_refused) == (count, True), why
+    reply = encoded(msgspec.structs.replace(odometry, robot="r2"))
+    out += boundary.take_reply(node, "source/r1/readings", reply, m.Reading)
+    assert "a reading of r2" in boundary.last_refused
+    out += given(boundary, node, *readings[8:], (ch.END, "", END))
+    assert [encoded(each) for each in of(out, ch.SUBMAP)] == [
+        encoded(each) for each in of(wanted, ch.SUBMAP)
+    ]
+    assert of(out, ch.ROBOT_DONE) == of(wanted, ch.ROBOT_DONE)
+
+
+def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own() -> None:
+    streams = world_of(*STREAMS.values())
+    announced = translate.configured("world", 0, 0, RobotConfig("r1"))
+    node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
+    assert node.publish(0.0)
+    node.ended = False
+    for channel, name, message, why in (
+        (ch.ROBOT_PROGRESS, "r1", progress("r1", 10**6, 1), "consumed 1000000 of"),
+        (ch.ROBOT_PROGRESS, "r9", progress("r9", 1, 1), "of r9, not in this team"),
+        (ch.RECORDER_PROGRESS, "r1", m.Progress(0, "recorder", "r1", 7, 1, 1), "incarnation 7"),
+        (ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, final=True), "before the end"),
+    ):
+        before = boundary.refused
+        assert given(boundary, node, (channel, name, message)) == []
+        assert (boundary.refused, why in boundary.last_refused) == (before + 1, True), why
+    assert not node.finished
+    node.ended = True
+    given(boundary, node, (ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, final=True)))
+    assert node.finished
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_a_team_can_say_is_refused_in_no_order(order: int) -> None:
+    door = Door(["r1", "r2"])
+    said = [message for _, _, message in run()]
+    assert [door.refusal(message) for message in said[::order]] == [None] * len(said)
+    assert door.refusal(m.Done(0, "r1", MOST_LIVES, MOST_COUNT, 0, 0, ())) is None
+    assert door.refusal(m.Done(0, "r1", MOST_LIVES + 1, 0, 0, 0, ())) is not None
