@@ -126,7 +126,8 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
 def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
     """The message as the node says it that publishes on the channel's key for this name."""
     speaker = channel.speaker(name)
-    return msgspec.structs.replace(message, node=speaker) if hasattr(message, "node") else message
+    says = m.Configured | m.Progress | m.Status | m.Liveliness | m.Fault
+    return msgspec.structs.replace(message, node=speaker) if isinstance(message, says) else message
 
 
 def examples() -> Iterator[m.Message]:

@@ -233,6 +233,7 @@ def end(
     without: Annotated[str, typer.Option(help="The robot that nobody is to wait for any more.")],
     team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
     connect: Connect = LOOPBACK,
+    keys: Keys = None,
     reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
     patience: Annotated[
         float, typer.Option(help="Seconds to wait for the centre to follow.", min=0.0)
@@ -244,13 +245,12 @@ def end(
     is started again later must be told again.
     """
     from sim.launch.withdraw import WithdrawError, give_up
-    from team.wire.zenoh_bus import ZenohBus
 
     if not re.fullmatch("[a-z][a-z0-9_]{0,31}", without):
         fail(f"{without!r} is no robot's name", WRONG_USE)
     if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
         fail(f"{team!r} is no team's name", WRONG_USE)
-    with ZenohBus(team, connect) as bus:
+    with connected(team, connect, keys, "operator") as bus:
         try:
             give_up(bus, without, reason, patience)
         except WithdrawError as error:

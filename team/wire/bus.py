@@ -14,12 +14,17 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from team.wire.channels import ALIVE, ORDER, REPLIES, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
+    Configured,
+    Fault,
     FusedMap,
     Liveliness,
     MapEstimate,
     Message,
     ParticleCloud,
     Prior,
+    Progress,
+    Status,
+    Withdrawal,
 )
 
 
@@ -113,11 +118,23 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     robot = getattr(message, "robot", name)
     if "{robot}" in channel.template and robot != name:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
-    speaker = channel.speaker(name)
-    node = getattr(message, "by" if channel is ORDER else "node", speaker)
-    if node != speaker:
-        raise WireError("wrong field", f"a message of {node[:80]!r} on the key {sample.key!r}")
+    said_by = _said_by(channel, message)
+    if said_by not in (None, channel.speaker(name)):
+        raise WireError(
+            "wrong field", f"a message of {str(said_by)[:80]!r} on the key {sample.key!r}"
+        )
     return channel, name, message
+
+
+def _said_by(channel: Channel, message: Message) -> str | None:
+    """The node that a message names as its own; None where it names none."""
+    match message:
+        case Configured() | Progress() | Status() | Liveliness() | Fault():
+            return message.node
+        case Withdrawal() if channel is ORDER:
+            return message.by
+        case _:
+            return None
 
 
 def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
