@@ -120,14 +120,20 @@ class CentralShell:
 
     def _awaited(self) -> tuple[str, ...]:
         """Whom the final map waits for although they are not there, and what to do."""
-        now, awaited = time.monotonic(), self.node.awaited
-        gone = {n: since for n, since in self._since.items() if ch.robot_of(n) in awaited}
-        return tuple(
-            f"{ch.robot_of(node)} is lost for {now - since:.0f} s: start it again, or go on without"
-            f" it by `teamslam withdraw` or `teamslam end --without {ch.robot_of(node)}`"
-            for node, since in sorted(gone.items())
-            if now - since >= LOST_S
-        )
+        now, said = time.monotonic(), []
+        for robot in self.node.awaited:
+            since = self._since.get(ch.robot_node(robot))
+            if since is None and self.node.ends:
+                state = "is not there, and the final map waits for it"
+            elif since is not None and now - since >= LOST_S:
+                state = f"is lost for {now - since:.0f} s"
+            else:
+                continue
+            said.append(
+                f"{robot} {state}: start it again, or go on without it by `teamslam withdraw` "
+                f"or `teamslam end --without {robot}`"
+            )
+        return tuple(said)
 
     def _mend(self) -> None:
         """Ask for readings that have been missing for GAP_PATIENCE_S (rules on raw readings)."""

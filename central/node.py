@@ -93,6 +93,11 @@ class CentralNode:
         """The robots that are not there and that the final map waits for."""
         return [] if self.finished else self._roll.awaited(self._rule.dealt)
 
+    @property
+    def ends(self) -> bool:
+        """Whether the world has said that it has published everything."""
+        return self._roll.end is not None
+
     def _advance(self) -> list[Outgoing]:
         if self.finished:
             return []

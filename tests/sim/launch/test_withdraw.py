@@ -1,4 +1,4 @@
-"""`teamslam withdraw`: an operator's order reaches the centre, and what comes of it is told."""
+"""`teamslam withdraw` and `end`: an operator's order reaches the centre, and what comes of it."""
 
 import threading
 
@@ -6,9 +6,11 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
+from central.config import CentralConfig
+from central.node import CentralNode
 from sim.cli.main import app
 from sim.launch import withdraw as orders
-from sim.launch.withdraw import WithdrawError, withdraw
+from sim.launch.withdraw import WithdrawError, give_up, withdraw
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, opened
@@ -95,3 +97,32 @@ def test_names_that_are_none_are_wrong_use(robot: str, team: str) -> None:
     refused = CliRunner().invoke(app, ["withdraw", robot, "--team", team])
     assert refused.exit_code == 2
     assert "is no" in refused.stderr
+
+
+def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network = MemoryNetwork()
+    bus = MemoryBus(network)
+    bus.declare_alive("central")
+    bus.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
+    bus.subscribe(ch.GIVEN_UP)
+    node, over = CentralNode(CentralConfig(), ["r1", "r3"]), threading.Event()
+
+    def centre() -> None:
+        while not over.wait(0.01):
+            for sample in bus.receive(0.0):
+                node.handle(opened(sample)[2], 0)
+            bus.publish(Outgoing(ch.STATUS, "central", node.status()))
+
+    thread = threading.Thread(target=centre, daemon=True)
+    thread.start()
+    try:
+        give_up(MemoryBus(network), "r3", "it fell into the water", 30.0)
+        monkeypatch.setattr(orders, "CENTRE_S", 0.2)
+        with pytest.raises(WithdrawError, match="the team has no robot r9; heard of: r3"):
+            give_up(MemoryBus(network), "r9", "", 1.0)
+    finally:
+        over.set()
+        thread.join()
+    assert "r3 is given up" in node.status().warnings[0]
