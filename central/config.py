@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.config import FusionRule, Positive
+from team.config import FusionRule, NonNegative, Positive
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -17,6 +17,17 @@ class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bearing: Positive = 0.01
     range_scale: Positive = 0.005
     forward_scale: Positive = 0.05
+
+
+class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How large the errors are that all robots share, beside each robot's own; 0: there are none.
+
+    What was calibrated for robots of a kind is off by one amount for all of them.
+    """
+
+    bearing: NonNegative = 0.0
+    range_scale: NonNegative = 0.0
+    forward_scale: NonNegative = 0.0
 
 
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,6 +49,10 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window, since what two windows have in common does not set them apart.
     particles: of `joint-fastslam`.
     bias_sigma: of the errors that robots send their submaps' sensitivities for.
+    common_bias_sigma: of what all robots have in common of them, in addition.
+    joined_ranges: the errors of ranges are proportional to the range, and a submap's landmarks count
+    with what they are at the range of the joined map: at the measured one, what came out short
+    weighs more and the map shrinks.
     withdraw_above: a robot of whose submaps the half and more cost above this per degree of freedom
     is withdrawn if the rest of the team agrees without it; absent: by an operator only.
     """
@@ -51,5 +66,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal_scale: Positive = 1.0
     gauss_newton_per_tick: Annotated[int, Meta(ge=1, le=50)] = 2
     bias_sigma: BiasSigmas = BiasSigmas()
+    common_bias_sigma: CommonBiasSigmas = CommonBiasSigmas()
+    joined_ranges: bool = False
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 1000
     withdraw_above: Annotated[float, Meta(ge=2.0)] | None = 4.0

@@ -31,6 +31,7 @@ from team.estimation.joining import (
 )
 from team.estimation.joining import Start as StartValue
 from team.estimation.marginals import Agreement
+from team.estimation.sensitivity import BIASES
 from team.wire.messages import SightingFactor, Submap
 
 Stream = tuple[str, int]
@@ -46,11 +47,13 @@ def join_settings(config: CentralConfig) -> JoinSettings:
         iterations_per_tick=config.gauss_newton_per_tick,
         robust_c=config.robust_c,
         covariance_factor=config.covariance_factor,
-        bias_sigma={
-            "bearing": config.bias_sigma.bearing,
-            "forward_scale": config.bias_sigma.forward_scale,
-            "range_scale": config.bias_sigma.range_scale,
+        bias_sigma={bias: getattr(config.bias_sigma, bias) for bias in BIASES},
+        common_bias_sigma={
+            bias: sigma
+            for bias in BIASES
+            if (sigma := getattr(config.common_bias_sigma, bias)) > 0.0
         },
+        joined_ranges=config.joined_ranges,
     )
 
 

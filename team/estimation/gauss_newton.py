@@ -55,6 +55,10 @@ class JoinSettings:
     alignment_confidence: quantile of the χ² test before a free island is merged.
     alignment_heading_sigma: the shape of the shared landmarks must give a heading this well [rad].
     bias_sigma: how large the errors are that a robot's submaps share, before they are estimated.
+    common_bias_sigma: the same of errors that all robots share, as of a calibration of their kind;
+        they add to each robot's own.
+    joined_ranges: errors of ranges are proportional to the range, and it is taken from the joined
+        map (`joining_kernel.with_joined_ranges`).
     """
 
     iterations_per_tick: int = 2
@@ -68,6 +72,8 @@ class JoinSettings:
     alignment_confidence: float = 0.999
     alignment_heading_sigma: float = 0.3
     bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
+    common_bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
+    joined_ranges: bool = False
 
 
 class NotDeterminedError(ValueError):
@@ -103,9 +109,17 @@ class Island:
         return _scale_at(self.sighting_age, self.settings)
 
     @cached_property
+    def _submaps(self) -> kernel.Factors:
+        """The submaps with the noise that they have at this state."""
+        factors = self.graph.factors
+        if not self.settings.joined_ranges:
+            return factors
+        return kernel.with_joined_ranges(self.state, self.graph.offset, factors)
+
+    @cached_property
     def _landmark_chi2_and_gate(self) -> tuple[Values, Values]:
         """χ² of each landmark of each submap by itself, and its gate."""
-        factors, settings = self.graph.factors, self.settings
+        factors, settings = self._submaps, self.settings
         if settings.robust_c is None:
             return np.zeros(len(factors.block)), np.ones(len(factors.block))
         chi2 = kernel.landmark_chi2(
@@ -128,7 +142,7 @@ class Island:
         return self._discounted(self.landmark_weight)
 
     def _discounted(self, weight: Values) -> kernel.Factors:
-        factors = self.graph.factors
+        factors = self._submaps
         if (weight == 1.0).all():
             return factors
         return factors._replace(information=kernel.discounted_information(factors, weight))
@@ -151,7 +165,7 @@ class Island:
     def whole_chi2(self) -> Float[np.ndarray, " F"]:
         """rᵀ(f P)⁻¹r of each submap, nothing discounted."""
         factor = self.settings.covariance_factor
-        return kernel.costs(self.state, self.graph.offset, self.graph.factors, factor)
+        return kernel.costs(self.state, self.graph.offset, self._submaps, factor)
 
     @cached_property
     def counted_chi2(self) -> Float[np.ndarray, " F"]:

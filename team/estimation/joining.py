@@ -167,7 +167,14 @@ def folded(
     islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
     for key, taken in news.items():
         island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
-        graph, state = extended(island.graph, island.state, taken, fold.starts, settings.bias_sigma)
+        graph, state = extended(
+            island.graph,
+            island.state,
+            taken,
+            fold.starts,
+            settings.bias_sigma,
+            settings.common_bias_sigma,
+        )
         age = np.concatenate([island.age, ages(len(taken))])
         island, waiting = sighted(replace(island, graph=graph, state=state, age=age), waiting)
         islands[key] = iterated(island)

@@ -16,6 +16,9 @@ from team.estimation.submap_factor import (
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
+LARGEST_RATIO = 1.25
+"""Of a landmark's distance in the joined map to the measured one, or its inverse: what differs by
+more is an outlier, whose covariance is not to grow with it."""
 
 
 class Factors(NamedTuple):
@@ -25,6 +28,8 @@ class Factors(NamedTuple):
     pose nodes by stamp, landmarks by id, biases. mean, information (P⁻¹, row-major) and sensitivity
     (a row per bias) lie likewise from mean_start, information_start and sensitivity_start on.
     block: each landmark's own covariance (xx, xy, yy), those of submap f from block_start[f] on.
+    of_range: of each row of the sensitivities, those of submap f from row_start[f] on, whether it
+    is by the scale of the ranges.
     """
 
     member: Indices
@@ -37,6 +42,8 @@ class Factors(NamedTuple):
     sensitivity_start: Indices
     block: Float[np.ndarray, "B 3"]
     block_start: Indices
+    of_range: Bool[np.ndarray, " R"]
+    row_start: Indices
 
 
 @compiled
@@ -113,6 +120,64 @@ def _places(offset: Indices, nodes: Indices) -> Indices:
     for k in range(len(nodes)):
         at[k] = offset[nodes[k]]
     return at
+
+
+@compiled
+def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Factors:
+    """The submaps as if their noise had been taken at the ranges of the joined map.
+
+    Where the error of a range is proportional to the range, q is the distance that the state gives
+    a landmark from where its submap saw it (the middle of the submap's poses), over the one that
+    the submap measured. Its errors are taken times q, P' = T P T with T = diag(1, …, q, q, …), and
+    so is its derivative by the scale of the ranges. At the measured distance d(1 + e) what came out
+    short weighs more, by (1 + e)⁻² (Peelle's puzzle), and in a scale b that is a state the noise e
+    meets itself: E[S e] = −d² σ². Both make maps smaller, the second by more the more submaps
+    there are.
+    """
+    information, block = factors.information.copy(), factors.block.copy()
+    columns = factors.sensitivity.copy()
+    for f in range(len(factors.member_start) - 1):
+        at = _places(offset, factors.member[factors.member_start[f] : factors.member_start[f + 1]])
+        begin, n = factors.mean_start[f], factors.mean_start[f + 1] - factors.mean_start[f]
+        mean = factors.mean[begin : begin + n]
+        landmarks = factors.block_start[f + 1] - factors.block_start[f]
+        poses = (n - 2 * landmarks) // 3
+        x, y = 0.0, 0.0
+        for k in range(poses):
+            x, y = x + mean[3 * k] / (poses + 1), y + mean[3 * k + 1] / (poses + 1)
+        c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+        x_map, y_map = state[at[0]] + c * x - s * y, state[at[0] + 1] + s * x + c * y
+        metric = information[factors.information_start[f] : factors.information_start[f] + n * n]
+        first = factors.row_start[f]
+        for landmark in range(landmarks):
+            row, node = 3 * poses + 2 * landmark, at[1 + poses + landmark]
+            own = math.hypot(mean[row] - x, mean[row + 1] - y)
+            joined = math.hypot(state[node] - x_map, state[node + 1] - y_map)
+            if not (own > 0.0 and joined > 0.0):
+                continue
+            q = min(max(joined / own, 1.0 / LARGEST_RATIO), LARGEST_RATIO)
+            block[factors.block_start[f] + landmark] *= q * q
+            for i in range(row, row + 2):
+                for j in range(n):
+                    metric[i * n + j] /= q
+                    metric[j * n + i] /= q
+                for b in range(factors.row_start[f + 1] - first):
+                    if factors.of_range[first + b]:
+                        columns[factors.sensitivity_start[f] + b * n + i] *= q
+    return Factors(
+        factors.member,
+        factors.member_start,
+        factors.mean,
+        factors.mean_start,
+        information,
+        factors.information_start,
+        columns,
+        factors.sensitivity_start,
+        block,
+        factors.block_start,
+        factors.of_range,
+        factors.row_start,
+    )
 
 
 @compiled

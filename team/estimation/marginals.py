@@ -84,16 +84,23 @@ class Agreement(NamedTuple):
 
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
-    """The errors that each stream's submaps share, in the island that the stream is in."""
+    """The errors that each stream's submaps share, in the island that the stream is in.
+
+    A robot's own and what the team has in common, together.
+    """
     return sorted(each for island in fold.islands.values() for each in _biases_in(island))
 
 
 def _biases_in(island: Island) -> list[BiasEstimate]:
     found = []
     for (stream, bias), node in sorted(island.graph.biases.items()):
-        mean, covariance = _own_marginal(island, node)
-        sigma = float(np.sqrt(covariance[0, 0]))
-        found.append(BiasEstimate(stream, bias, float(mean[0]), sigma))
+        common = island.graph.common
+        if bias in common:
+            mean, covariance = joint_marginal(island, [node, common[bias]])
+        else:
+            mean, covariance = _own_marginal(island, node)
+        sigma = float(np.sqrt(covariance.sum()))
+        found.append(BiasEstimate(stream, bias, float(mean.sum()), sigma))
     return found
 
 
@@ -106,7 +113,7 @@ def confirmed(fold: Fold, submaps: int) -> list[int]:
     island = fold.main
     if submaps <= 1:
         return sorted(island.graph.landmarks)
-    ids = np.concatenate([each.local.ids for each, _ in island.graph.submaps])
+    ids = np.concatenate([each.local.ids for each, *_ in island.graph.submaps])
     found, counts = np.unique(ids[island.landmark_weight >= BELIEVED], return_counts=True)
     return [int(id_) for id_ in found[counts >= submaps]]
 
@@ -212,7 +219,7 @@ def joint_cost(fold: Fold) -> Agreement:
     taken = weight * explained
     submaps = tuple(
         SubmapCost(of.stream, of.sequence, float(chi2), float(own), float(w))
-        for (of, _), chi2, own, w in zip(
+        for (of, *_), chi2, own, w in zip(
             graph.submaps, island.whole_chi2, graph.dimensions - taken, weight, strict=True
         )
     )
@@ -221,7 +228,7 @@ def joint_cost(fold: Fold) -> Agreement:
     )
     robots: dict[str, tuple[float, float]] = {}
     for robot, chi2, own in [
-        *((of.robot, float(chi2), float(own)) for (of, _), chi2, own in counted),
+        *((of.robot, float(chi2), float(own)) for (of, *_), chi2, own in counted),
         *_priors(island),
         *_sightings(island),
     ]:
@@ -265,9 +272,10 @@ def _sightings(island: Island) -> list[tuple[str, float, float]]:
 
 
 def _priors(island: Island) -> list[tuple[str, float, float]]:
-    """(robot, χ², dof) of the priors on starts and biases."""
+    """(robot, χ², dof) of the priors on starts and biases; the team's counts with its frame."""
     robots = {nodes[0]: stream[0] for stream, nodes in island.graph.streams.items()}
     robots |= {node: stream[0] for (stream, _), node in island.graph.biases.items()}
+    robots |= dict.fromkeys(island.graph.common.values(), min(island.graph.streams)[0])
     return [
         (
             robots[prior.node],

@@ -157,7 +157,7 @@ def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
     """The pairs of landmarks, as places in the state, that a stream sees one after the other."""
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
-    for contribution, _ in graph.submaps:
+    for contribution, *_ in graph.submaps:
         seen = {graph.landmarks[id_] for id_ in contribution.local.ids.tolist()}
         if contribution.stream != stream or not seen:
             continue

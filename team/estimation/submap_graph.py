@@ -5,8 +5,9 @@ value of a node that is added is found by composition from the nodes that are th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,9 @@ Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 
 
+NONE_IN_COMMON: Mapping[Bias, float] = MappingProxyType({})
+
+
 class Prior(NamedTuple):
     """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹), never down-weighted."""
 
@@ -34,10 +38,27 @@ class Prior(NamedTuple):
 
 
 class Joined(NamedTuple):
-    """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases."""
+    """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
+
+    common: those of its biases that have a node of the whole team too, which stand last.
+    """
 
     contribution: Contribution
     nodes: Indices
+    common: tuple[Bias, ...] = ()
+
+    @property
+    def biases(self) -> tuple[Bias, ...]:
+        """The bias of each row of `sensitivity`."""
+        return (*self.contribution.local.biases, *self.common)
+
+    @property
+    def sensitivity(self) -> Float[np.ndarray, "B _"]:
+        """∂mean/∂b, a row for each bias node: a robot's own error and the team's add."""
+        local = self.contribution.local
+        if not self.common:
+            return local.sensitivity
+        return local.sensitivity[[local.biases.index(bias) for bias in self.biases]]
 
 
 class Met(NamedTuple):
@@ -55,7 +76,8 @@ class Graph:
     streams:   nodes of each stream: its start, then the end pose of submap 0, 1, …
     landmarks: node of each landmark id.
     poses:     node of each further pose, by (stream, stamp).
-    biases:    node of each error that the submaps of a stream share: the only nodes of one number.
+    biases:    node of each error that the submaps of a stream share.
+    common:    node of each error that all streams share; with `biases` the only nodes of one number.
     offset:    first number of each node in the state; the last is the state's length.
     fixed:     nodes that are constants (exact starts, the gauge).
     submaps, sightings: in the order in which they were taken.
@@ -70,6 +92,7 @@ class Graph:
     submaps: tuple[Joined, ...]
     sightings: tuple[Met, ...]
     priors: tuple[Prior, ...]
+    common: Mapping[Bias, int] = field(default_factory=dict)
 
     @cached_property
     def factors(self) -> Factors:
@@ -82,10 +105,12 @@ class Graph:
             _starts([len(each.local.mean) for each in submaps]),
             np.concatenate([np.zeros(0), *(each.information.ravel() for each in submaps)]),
             _starts([each.information.size for each in submaps]),
-            np.concatenate([np.zeros(0), *(each.local.sensitivity.ravel() for each in submaps)]),
-            _starts([each.local.sensitivity.size for each in submaps]),
+            np.concatenate([np.zeros(0), *(each.sensitivity.ravel() for each in self.submaps)]),
+            _starts([each.sensitivity.size for each in self.submaps]),
             np.concatenate([np.zeros((0, 3)), *(_blocks(each.local) for each in submaps)]),
             _starts([len(each.local.ids) for each in submaps]),
+            np.array([b == "range_scale" for each in self.submaps for b in each.biases], np.bool_),
+            _starts([len(each.biases) for each in self.submaps]),
         )
 
     @cached_property
@@ -154,6 +179,9 @@ class Graph:
         for (stream, bias), at in self.biases.items():
             if node == at:
                 return f"the bias {bias} of {named(stream)}"
+        for bias, at in self.common.items():
+            if node == at:
+                return f"the bias {bias} of the team"
         ids = [id_ for id_, at in self.landmarks.items() if at == node]
         return f"landmark {ids[0]}"
 
@@ -182,6 +210,7 @@ class _Growth:
         self.landmarks = dict(graph.landmarks)
         self.poses = dict(graph.poses)
         self.biases = dict(graph.biases)
+        self.common = dict(graph.common)
         self.offset = graph.offset
         self.state = state
         self.count = len(graph.fixed)
@@ -207,12 +236,13 @@ def extended(
     contributions: Sequence[Contribution],
     starts: Mapping[Stream, Start],
     bias_sigma: Mapping[Bias, float],
+    common_bias_sigma: Mapping[Bias, float] = NONE_IN_COMMON,
 ) -> tuple[Graph, Values]:
     """The graph with more submaps, in the given order; a stream without a start begins at 0.
 
     A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
     first submap that sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of
-    its frame. A bias is N(0, bias_sigma²).
+    its frame. A bias is N(0, bias_sigma²), and what the team has in common N(0, common_bias_sigma²).
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -241,9 +271,16 @@ def extended(
                 growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
                 certainty = np.array([[bias_sigma[bias] ** -2]])
                 priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
+        common = tuple(bias for bias in local.biases if bias in common_bias_sigma)
+        for bias in common:
+            if bias not in growth.common:
+                growth.common[bias] = growth.add(np.zeros(1), fixed=False)
+                certainty = np.array([[common_bias_sigma[bias] ** -2]])
+                priors.append(Prior(growth.common[bias], np.zeros(1), certainty))
         errors = [growth.biases[stream, bias] for bias in local.biases]
+        errors += [growth.common[bias] for bias in common]
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
-        submaps.append(Joined(contribution, nodes))
+        submaps.append(Joined(contribution, nodes, common))
     grown = Graph(
         growth.streams,
         growth.landmarks,
@@ -254,6 +291,7 @@ def extended(
         tuple(submaps),
         graph.sightings,
         tuple(priors),
+        growth.common,
     )
     return grown, np.concatenate([state, *growth.values])
 
@@ -290,6 +328,7 @@ def merged(
     common = {
         node: main.landmarks[id_] for id_, node in other.landmarks.items() if id_ in main.landmarks
     }
+    common |= {node: main.common[bias] for bias, node in other.common.items() if bias in main.common}
     node_of = np.empty(len(other.fixed), dtype=np.int64)
     values: list[Values] = []
     for node in range(len(other.fixed)):
@@ -309,10 +348,11 @@ def merged(
         for each, observer, teammate in other.sightings
     )
     biases = {key: int(node_of[node]) for key, node in other.biases.items()}
+    of_team = {bias: int(node_of[node]) for bias, node in other.common.items()}
     priors = (
         prior._replace(node=int(node_of[prior.node]))
         for prior in other.priors
-        if len(prior.mean) == 1
+        if len(prior.mean) == 1 and prior.node not in common
     )
     graph = Graph(
         {**main.streams, **streams},
@@ -321,9 +361,10 @@ def merged(
         {**main.biases, **biases},
         _continued(main.offset, [len(value) for value in values]),
         np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
-        (*main.submaps, *(Joined(each, node_of[nodes]) for each, nodes in other.submaps)),
+        (*main.submaps, *(each._replace(nodes=node_of[each.nodes]) for each in other.submaps)),
         (*main.sightings, *sightings),
         (*main.priors, *priors),
+        {**of_team, **main.common},
     )
     return graph, np.concatenate([state, *values])
 

@@ -72,7 +72,7 @@ def test_the_utias_scenario_has_the_five_robots_of_the_rig() -> None:
     scenario = load("utias")
     assert [robot.id for robot in scenario.robots] == ["r1", "r2", "r3", "r4", "r5"]
     assert scenario.robots[4].motion.yaw_scale == 0.936
-    assert scenario.central.covariance_factor == 2.5
+    assert scenario.central.covariance_factor == 1.9
 
 
 def test_estimator_rule_and_seed_are_said_once_and_handed_to_all(tmp_path: Path) -> None:

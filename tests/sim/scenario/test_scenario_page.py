@@ -10,7 +10,7 @@ import pytest
 from msgspec import Meta
 from typer.testing import CliRunner
 
-from central.config import BiasSigmas, CentralConfig
+from central.config import BiasSigmas, CentralConfig, CommonBiasSigmas
 from sim.cli.main import app
 from sim.scenario.scenario import Scenario, load
 from sim.scenario.source import streams_of
@@ -21,7 +21,7 @@ from tests.support import ROOT
 PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
     Scenario, SimulatedWorld, UtiasWorld, RobotConfig, MotionModel, MotionNoise, Sensor, FrontEnd,
-    CentralConfig, BiasSigmas,
+    CentralConfig, BiasSigmas, CommonBiasSigmas,
 )  # fmt: skip
 
 
