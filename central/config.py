@@ -50,9 +50,9 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     particles: of `joint-fastslam`.
     bias_sigma: of the errors that robots send their submaps' sensitivities for.
     common_bias_sigma: of what all robots have in common of them, in addition.
-    joined_ranges: the errors of ranges are proportional to the range, and a submap's landmarks count
-    with what they are at the range of the joined map: at the measured one, what came out short
-    weighs more and the map shrinks.
+    joined_ranges: the errors of ranges are proportional to the range, and a submap's landmarks
+    count with what they are at the range of the joined map: at the measured one, what came out
+    short weighs more and the map shrinks.
     withdraw_above: a robot of whose submaps the half and more cost above this per degree of freedom
     is withdrawn if the rest of the team agrees without it; absent: by an operator only.
     """

@@ -49,7 +49,7 @@ class PlainCost:
         self._graph = graph
         self.free: Indices = np.flatnonzero(~fixed)
         self._of_submap = [
-            _whitening(covariance_factor * c.local.covariance) for c, _ in graph.submaps
+            _whitening(covariance_factor * c.local.covariance) for c, *_ in graph.submaps
         ]
         self._of_sighting = [_whitening(each.sighting.covariance) for each in graph.sightings]
         self._of_prior = [np.linalg.cholesky(each.information).T for each in graph.priors]
@@ -113,7 +113,7 @@ class PlainCost:
     def _terms(self, state: Values) -> Iterator[tuple[Rows, Values, Indices, Rows]]:
         """Term by term: what whitens it, its residual, and the Jacobian over these numbers."""
         offset = self._graph.offset
-        for W, (contribution, nodes) in zip(self._of_submap, self._graph.submaps, strict=True):
+        for W, (contribution, nodes, _) in zip(self._of_submap, self._graph.submaps, strict=True):
             poses = 1 + len(contribution.local.node_stamps)
             h, at, J = _submap(state, offset[nodes], poses)
             r = h - contribution.local.mean

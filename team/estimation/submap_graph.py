@@ -77,7 +77,7 @@ class Graph:
     landmarks: node of each landmark id.
     poses:     node of each further pose, by (stream, stamp).
     biases:    node of each error that the submaps of a stream share.
-    common:    node of each error that all streams share; with `biases` the only nodes of one number.
+    common:    node of each error that all streams share; these and `biases` have one number.
     offset:    first number of each node in the state; the last is the state's length.
     fixed:     nodes that are constants (exact starts, the gauge).
     submaps, sightings: in the order in which they were taken.
@@ -242,7 +242,7 @@ def extended(
 
     A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
     first submap that sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of
-    its frame. A bias is N(0, bias_sigma²), and what the team has in common N(0, common_bias_sigma²).
+    its frame. A bias is N(0, bias_sigma²), what the team has in common N(0, common_bias_sigma²).
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -328,7 +328,9 @@ def merged(
     common = {
         node: main.landmarks[id_] for id_, node in other.landmarks.items() if id_ in main.landmarks
     }
-    common |= {node: main.common[bias] for bias, node in other.common.items() if bias in main.common}
+    common |= {
+        node: main.common[bias] for bias, node in other.common.items() if bias in main.common
+    }
     node_of = np.empty(len(other.fixed), dtype=np.int64)
     values: list[Values] = []
     for node in range(len(other.fixed)):

@@ -122,8 +122,8 @@ def scale_errors(seeds, *, joined_ranges):
     for seed in seeds:
         submaps, starts, errors = carts(seed, robots=1, submaps=20)
         options = JoinSettings(bias_sigma=SIGMA, joined_ranges=joined_ranges)
-        for each in marginals.bias_estimates(fold_of(submaps, starts, options)):
-            found.append((each.value - errors[each.stream[0]]) / each.sigma)
+        estimates = marginals.bias_estimates(fold_of(submaps, starts, options))
+        found += [(each.value - errors[each.stream[0]]) / each.sigma for each in estimates]
     return np.array(found)
 
 
