@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from central.config import CentralConfig
 from central.node import CentralNode
 from team.shell import WAIT_S, Shell
-from team.stream.patience import Patience
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids
 from team.wire.bus import Bus, BusError, Outgoing, Sample, opened
 from team.wire.codec import WireError
+from team.wire.patience import Patience
 
 LOST_S = 3.0
 """A robot whose token went for so long holds up no broadcast; the final map still waits for it."""

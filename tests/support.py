@@ -182,5 +182,6 @@ def examples() -> Iterator[m.Message]:
         "central.node:CentralNode.handle:58", b"\x01\x02\x03\x04\x05\x06\x07\x08",
     )  # fmt: skip
     yield m.Liveliness(0, "robot/alpha", True)
+    yield m.Tally(9_000, "robot/alpha", 10**18, ("robot/alpha/submap",), (6,))
     yield m.ReadingsWanted(0, "alpha", 1, 5, -1)
     yield m.SubmapsWanted(0, "alpha")

@@ -236,7 +236,7 @@ def _conclude(
     """Evaluate the log, print the result, write the report; end with 1 if anything failed."""
     from rich.console import Console
 
-    from sim.evaluation.evaluation import evaluate, to_json
+    from sim.evaluation.evaluation import evaluate, to_json, with_holes
     from sim.evaluation.history import history
     from sim.report.page import write_report
     from sim.report.run import Run, nis_line, run_figures
@@ -255,7 +255,7 @@ def _conclude(
     }
     try:
         log = open_log(outcome.log)
-        evaluation = evaluate(log.samples())
+        evaluation = with_holes(evaluate(log.samples()), log)
     except (LogError, OSError) as error:
         outcome.failures.append(f"the log can not be evaluated: {error}")
         figures = extra

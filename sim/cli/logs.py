@@ -95,7 +95,7 @@ def report(
     """A page, pictures, tables and figures of a run, from its log alone."""
     from rich.console import Console
 
-    from sim.evaluation.evaluation import evaluate, to_json
+    from sim.evaluation.evaluation import evaluate, to_json, with_holes
     from sim.evaluation.history import history
     from sim.report.page import write_report
     from sim.report.run import Run, nis_line, run_figures
@@ -107,7 +107,7 @@ def report(
     if log.stat().st_size > LONG_BYTES:
         text = "this log is long: proving its ledger takes most of the time"
         typer.echo(f"{text}, --no-ledger leaves it out" if ledger else "this log is long", err=True)
-    evaluation = evaluate(opened.samples())
+    evaluation = with_holes(evaluate(opened.samples()), opened)
     found, why = _ledger(opened) if ledger else (None, Run.no_ledger)
     run = Run(evaluation, history(opened.samples()), opened.metadata, found, why)
     figures = to_json(

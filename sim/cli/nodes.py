@@ -25,7 +25,6 @@ from sim.cli.options import (
     over_tls,
     own_keys,
     parsed_speed,
-    refuse_existing,
     refuse_open_door,
     scenario_of,
 )
@@ -170,31 +169,58 @@ def record(
     connect: Connect = LOOPBACK,
     keys: Keys = None,
 ) -> None:
-    """The recorder: every message of the team to one MCAP file, until the team has left."""
+    """The recorder: every message of the team to one MCAP file, until the team has left.
+
+    Started again while the team still runs it goes on in a further part, and asks for what it has
+    missed; at the end the parts are joined.
+    """
     from sim.scenario.scenario import dumps
+    from team.recording.parts import check_continues, join, next_part
     from team.recording.provenance import provenance
-    from team.recording.recorder import Recorder
+    from team.recording.reader import LogError
     from team.recording.shell import record as record_until_end
     from team.shell import process
     from team.wire.channels import robot_node
 
     resolved = scenario_of(scenario)
-    refuse_existing(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     metadata = {
         **provenance(),
         "seed": str(resolved.seed),
         "scenario": dumps(resolved),
     }
+    again = output.exists()
+    try:
+        if again:
+            check_continues(output, resolved.team, metadata)
+    except LogError as error:
+        fail(str(error), WRONG_USE)
     expected = ["world", "central", *(robot_node(r.id) for r in resolved.robots)]
     with (
         process("recorder", endless=True) as stop,
         connected(resolved.team, connect, keys, "recorder") as bus,
     ):
-        recorder = Recorder(output, resolved.team, metadata)
+        recorder, inventory = next_part(output, resolved.team, metadata)
         _connected(resolved, connect)
-        written = record_until_end(bus, recorder, expected, stop=stop)
-        _LOG.info("wrote %s, %d messages", output, written)
+        if again:
+            _LOG.info("%s goes on in %s", output, recorder.path.name)
+        try:
+            written = record_until_end(
+                bus,
+                recorder,
+                expected,
+                inventory,
+                lambda: next_part(output, resolved.team, metadata),
+                stop=stop,
+            )
+            _LOG.info("wrote %s, %d messages", recorder.path, written)
+        finally:
+            parts = join(output)
+            if len(parts) > 1:
+                names = " ".join(str(part) for part in parts)
+                whole = output.with_stem(f"{output.stem}.whole")
+                command = f"teamslam log merge {names} --output {whole}"
+                _LOG.warning("no room to join the parts of the log; elsewhere: %s", command)
 
 
 @app.command()

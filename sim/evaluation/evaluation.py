@@ -6,7 +6,7 @@ radians; NEES is per degree of freedom, 1 where the covariance is right.
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ from sim.scenario.scenario import Scenario, loads
 from team import translate
 from team.estimation.gaussian import Matrix
 from team.pairs import PAIRS
+from team.recording.check import holes
+from team.recording.reader import Log
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
@@ -186,6 +188,12 @@ def _by_robot(log: Collected, name: str) -> dict[str, float]:
     if not isinstance(status, m.Status):
         return {}
     return {k.removeprefix(name): v for k, v in status.figures.items() if k.startswith(name)}
+
+
+def with_holes(evaluation: Evaluation, log: Log) -> Evaluation:
+    """The evaluation with a note for everything that its log lacks."""
+    lost = tuple(f"the log is not whole, {finding}" for finding in holes(log))
+    return replace(evaluation, notes=(*evaluation.notes, *lost))
 
 
 def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -229,8 +229,8 @@ class WorldNode:
     def _take_liveliness(self, message: m.Liveliness) -> None:
         (self._alive.add if message.alive else self._alive.discard)(message.node)
         came = not self._recorder and "recorder" in self._alive
-        if came and self._began_at is not None:  # it counts from zero, from here on
-            self._recorded, self._unrecorded = {}, self._published
+        if came and self._began_at is not None:  # it says what its log has
+            self._recorded, self._unrecorded = {}, self._out_of_reach
         self._recorder = "recorder" in self._alive
         for name, source in self._sources.items():
             source.alive = ch.robot_node(name) in self._alive
@@ -277,6 +277,20 @@ class WorldNode:
             robot, index = kept[0]
             self._paced_ns = int(self._sources[self._names[robot]].stream.stamps_ns[index])
         return starts
+
+    @property
+    def _out_of_reach(self) -> int:
+        """Readings that nobody can ask for any more: a recorder that comes late never has them."""
+        if self.cache is None:
+            return 0
+        return sum(max(0, x.published - self.cache) for x in self._sources.values())
+
+    @property
+    def unrecorded(self) -> int:
+        """Readings that a living recorder still lacks by its own word."""
+        if not self._recorder:
+            return 0
+        return self._published - self._unrecorded - sum(self._recorded.values())
 
     def publish(self, clock_s: float) -> list[Outgoing]:
         """The next readings, at most BATCH: as many as pace and credit allow at `clock_s`."""
@@ -330,8 +344,7 @@ class WorldNode:
         """Who has to get on before the next reading of this robot; None: nobody."""
         if source.alive and source.published - source.consumed >= CREDIT_READINGS:
             return ch.robot_node(source.stream.robot)
-        ahead = self._published - self._unrecorded - sum(self._recorded.values())
-        return "recorder" if self._recorder and ahead >= CREDIT_RECORDER else None
+        return "recorder" if self.unrecorded >= CREDIT_RECORDER else None
 
     def _truth(self, source: _Source, stamp_ns: int, batch_ns: int) -> list[Outgoing]:
         stream = source.stream

@@ -1,16 +1,19 @@
 """Check: whether a log is whole, complete and sound; every finding one line."""
 
 from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from team.recording.counters import Counters
+from team.recording.counters import Counters, Told
 from team.recording.cut import CUT
 from team.recording.declared import declared, misdeclared
-from team.recording.merge import MERGED
+from team.recording.inventory import Inventory
 from team.recording.reader import Log, LogError
 from team.recording.records import index_damage
 from team.recording.repair import salvaged
 from team.wire import channels as ch
+from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
@@ -31,11 +34,12 @@ class Finding(NamedTuple):
 def checked(log: Log) -> list[Finding]:
     """Everything that is wrong with a log: file, schemas, counters, messages; none if it is sound.
 
-    Liveliness and the recorder's own messages are not published on a counted key: their counters
-    are not looked at. Memory: 16 bytes a message, and one chunk.
+    What is missing is known by the measurements' and submaps' own numbers, the streams' ends, the
+    counters of each key, and what the processes said at their ends (`holes`). Memory: 16 bytes a
+    message, and one chunk.
     """
     found = _of_file(log)
-    counters: dict[str, Counters] = defaultdict(Counters)
+    evidence = _Evidence(part=_noted(log, CUT))
     unsound: dict[str, tuple[int, str]] = {}
     for chunk in salvaged(log):
         if isinstance(chunk, LogError):
@@ -46,22 +50,86 @@ def checked(log: Log) -> list[Finding]:
             if reason is not None:
                 count, first = unsound.get(sample.key, (0, reason))
                 unsound[sample.key] = (count + 1, first)
-            counters[sample.key].take(sample)
+            evidence.take(sample)
     declarations = declared(log)
     for key in sorted(declarations):
         wrong = misdeclared(declarations[key])
         if wrong is not None:
             found.append(Finding(key, wrong))
-    part = _noted(log, CUT)
-    merged = _noted(log, MERGED)
-    for key in sorted(counters):
-        if _is_counted(key):
-            lines = counters[key].findings(part=part, sorted_by_time=merged)
-            found += [Finding(key, line) for line in lines]
-        if key in unsound:
-            count, first = unsound[key]
-            found.append(Finding(key, f"{count} unsound, the first: {first}"))
+    found += evidence.findings()
+    for key, (count, first) in sorted(unsound.items()):
+        found.append(Finding(key, f"{count} unsound, the first: {first}"))
     return found
+
+
+def holes(log: Log) -> list[Finding]:
+    """What a log lacks, or has twice; nothing of one that has every message.
+
+    Liveliness and the recorder's own messages are not published on a counted key: their counters
+    are not looked at.
+    """
+    evidence = _Evidence(part=_noted(log, CUT))
+    damaged = []
+    for chunk in salvaged(log):
+        if isinstance(chunk, LogError):
+            damaged.append(Finding(FILE, chunk.what))
+            continue
+        for sample in chunk:
+            evidence.take(sample)
+    return [*damaged, *evidence.findings()]
+
+
+@dataclass
+class _Evidence:
+    """What the samples of a log say of those that are missing."""
+
+    part: bool
+    inventory: Inventory = field(default_factory=Inventory)
+    counters: dict[str, Counters] = field(default_factory=lambda: defaultdict(Counters))
+    tallies: dict[str, list[Told]] = field(default_factory=lambda: defaultdict(list))
+    last_word: tuple[str, ...] = ()
+
+    def take(self, sample: Sample) -> None:
+        self.counters[sample.key].take(sample)
+        self.inventory.take(sample)
+        row = ch.channel_of(sample.key)
+        if row is None or row[0] not in (ch.TALLY, ch.STATUS):
+            return
+        try:
+            message = opened(sample)[2]
+        except WireError:
+            return
+        if isinstance(message, m.Status) and row[1] == "recorder":
+            self.last_word = message.warnings
+        elif isinstance(message, m.Tally):
+            for key, count in zip(message.keys, message.counts, strict=True):
+                self.tallies[key].append(Told(message.since_ns, sample.wall_ns, count))
+
+    def findings(self) -> Iterator[Finding]:
+        """By key; of a part of a log only what is missing between two messages of a publisher."""
+        for key in sorted(self.counters.keys() | self.tallies.keys()):
+            row = ch.channel_of(key)
+            if row is not None and (row[0] is ch.ALIVE or row[1] == "recorder"):
+                continue
+            if row is not None and not row[0].recorded:
+                continue
+            numbered = not self.part and row is not None and row[0] in _NUMBERED
+            told = self.tallies.get(key, ())
+            for line in self.counters[key].findings(
+                part=self.part, numbered=numbered, tallies=told
+            ):
+                yield Finding(key, line)
+        if not self.part:
+            for key, line in self.inventory.findings():
+                yield Finding(key, line)
+        for said in self.last_word:
+            if said.startswith(MISSING):
+                yield Finding("recorder", said)
+
+
+_NUMBERED = (*ch.SENSORS, ch.SUBMAP)
+MISSING = "missing: "
+"""How the recorder's last word on what it lacks begins."""
 
 
 def _of_file(log: Log) -> list[Finding]:
@@ -87,8 +155,3 @@ def _unsound(sample: Sample) -> str | None:
 def _noted(log: Log, note: str) -> bool:
     """Whether the metadata has this note, of the log or of one that it was merged from."""
     return any(name.partition("@")[0] == note for name in log.metadata)
-
-
-def _is_counted(key: str) -> bool:
-    row = ch.channel_of(key)
-    return row is None or not (row[0] is ch.ALIVE or row[1] == "recorder")

@@ -6,14 +6,22 @@ publisher that was started again.
 """
 
 from array import array
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
 
-from team.wire.bus import Sample
+from team.recording.inventory import intervals
+from team.wire.bus import NO_COUNTER, Sample
 
-SHOWN = 3
-"""Gaps that a finding names; it counts the rest."""
+
+class Told(NamedTuple):
+    """A publisher's last word on a key: how many it published, between which wall clocks [ns]."""
+
+    since_ns: int
+    until_ns: int
+    published: int
 
 
 class Counters:
@@ -31,31 +39,34 @@ class Counters:
         self._counters.append(sample.counter)
         self._walls.append(min(sample.wall_ns, 2**63 - 1))
 
-    def findings(self, *, part: bool, sorted_by_time: bool) -> list[str]:
+    def findings(
+        self, *, part: bool, numbered: bool = False, tallies: Sequence[Told] = ()
+    ) -> list[str]:
         """What is wrong, one line each; nothing of a sound key.
 
-        part: the log is a cut, so that what a publisher said before it began is no loss.
-        sorted_by_time: the log is in the order of team time, so that order of arrival is not there.
+        part: the log is a cut, so that what a publisher said before it began is no loss. numbered:
+        the messages have numbers of their own, so that what is missing is known by these. tallies:
+        what its publishers said at their ends. Order is not looked at: what was asked for is late.
         """
         counters, walls = (np.frombuffer(each, np.int64) for each in (self._counters, self._walls))
         order = np.lexsort((counters, walls))
         found = []
-        again = np.append(False, (np.diff(counters[order]) == 0) & (np.diff(walls[order]) == 0))
+        again = np.zeros(len(order), np.bool_)
+        again[1:] = (np.diff(counters[order]) == 0) & (np.diff(walls[order]) == 0)
+        again &= counters[order] != NO_COUNTER
         if again.any():
             first = counters[order][again][0]
             found.append(f"{_messages(int(again.sum()))} twice, the first is {first}")
         order = order[~again]
         in_order = counters[order]
-        gaps = _gaps(in_order, part=part)
+        gaps = [] if numbered else _gaps(in_order[in_order != NO_COUNTER], part=part)
+        for told in () if part or numbered else tallies:
+            within = (walls >= told.since_ns) & (walls <= told.until_ns) & (counters != NO_COUNTER)
+            behind = int(counters[within].max(initial=-1)) + 1
+            gaps += [(behind, told.published - 1)] if behind < told.published else []
         if gaps:
             lost = sum(last - first + 1 for first, last in gaps)
-            named = ", ".join(_interval(*gap) for gap in gaps[:SHOWN])
-            more = f" and {len(gaps) - SHOWN} more gaps" if len(gaps) > SHOWN else ""
-            found.append(f"{_messages(lost)} missing: {named}{more}")
-        late = np.flatnonzero(np.diff(order) < 0)
-        if len(late) and not sorted_by_time:
-            first = in_order[late[0] + 1]
-            found.append(f"{_messages(len(late))} out of order, the first is {first}")
+            found.append(f"{_messages(lost)} missing: {intervals(gaps)}")
         return found
 
 
@@ -69,10 +80,6 @@ def _gaps(counters: Int64[np.ndarray, " n"], *, part: bool) -> list[tuple[int, i
     if part:
         missing &= ~begins
     return [(int(e), int(c) - 1) for e, c in zip(expected[missing], counters[missing], strict=True)]
-
-
-def _interval(first: int, last: int) -> str:
-    return str(first) if first == last else f"{first}–{last}"
 
 
 def _messages(count: int) -> str:

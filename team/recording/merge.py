@@ -8,7 +8,9 @@ from typing import NamedTuple
 from team.recording.reader import Log, LogError
 from team.recording.recorder import Recorder
 from team.wire.bus import Sample
+from team.wire.channels import SENSORS, SIGHTING_FACTOR, SUBMAP, channel_of
 
+_BY_CONTENT = (*SENSORS, SUBMAP, SIGHTING_FACTOR)
 MERGED = "merged"
 """The metadata that names what a log was merged from."""
 
@@ -25,9 +27,10 @@ def merge(logs: Sequence[Log], out: str | Path) -> Merged:
 
     Equal stamps stay in the order of the logs and of each file. Equal key, counter,
     wall clock and payload is one publication that several recorders took; a robot that was started
-    again announces the same configuration by another. All samples are in memory at once. Raises
-    `LogError` where the logs are of different teams or one is damaged, before `out` is made, and
-    `RecorderError` when `out` exists.
+    again announces the same configuration by another. A measurement, a submap and a sighting are
+    what they are by their content: one recorder may have had to ask for what another heard. All
+    samples are in memory at once. Raises `LogError` where the logs are of different teams or one is
+    damaged, before `out` is made, and `RecorderError` when `out` exists.
     """
     first = logs[0]
     for log in logs[1:]:
@@ -63,9 +66,12 @@ def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
 
 
 def _once(samples: Sequence[Sample]) -> Iterator[Sample]:
-    seen: set[tuple[str, int, int, bytes]] = set()
+    seen: set[tuple[object, ...]] = set()
     for sample in samples:
-        name = (sample.key, sample.counter, sample.wall_ns, sample.payload)
+        row = channel_of(sample.key)
+        by_content = row is not None and row[0] in _BY_CONTENT
+        published = () if by_content else (sample.counter, sample.wall_ns)
+        name = (sample.key, sample.payload, *published)
         if name not in seen:
             seen.add(name)
             yield sample

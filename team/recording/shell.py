@@ -4,12 +4,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable
+from contextlib import closing
 from dataclasses import replace
-from typing import NamedTuple
 
-import msgpack
-
-from team.recording.recorder import Recorder
+from team.recording.check import MISSING
+from team.recording.inventory import Inventory, Stream, intervals
+from team.recording.recorder import Recorder, RecorderError
 from team.recording.replayer import schedule
 from team.the_end import TheEnd
 from team.wire.bus import Bus, Outgoing, Sample
@@ -17,13 +17,24 @@ from team.wire.channels import (
     ALIVE,
     CHANNELS,
     FINAL_MAP,
+    READINGS,
     RECORDER_PROGRESS,
     SENSORS,
+    SENT,
     STATUS,
+    SUBMAP,
     channel_of,
 )
 from team.wire.codec import WireError, decoded, encoded
-from team.wire.messages import Liveliness, Message, Progress, Status
+from team.wire.messages import (
+    Liveliness,
+    Message,
+    Progress,
+    ReadingsWanted,
+    Status,
+    SubmapsWanted,
+)
+from team.wire.patience import Patience
 
 NODE = "recorder"
 PROGRESS_EVERY = 256
@@ -33,36 +44,47 @@ _WAIT_S = 0.05
 _QUIET_S = 0.5
 _STATUS_S = 1.0
 _REMIND_S = 10.0
+_RETRY_S = 5.0
 _LOG = logging.getLogger("teamslam")
-_HEAD = 128  # bytes of a reading: its tag, stamp, robot and epoch are within
 
 
-class _Taken(NamedTuple):
-    epoch: int
-    readings: int
-    reported: int
+More = Callable[[], tuple[Recorder, Inventory]]
+"""Opens a further part of a log; what the parts before it have. Raises `RecorderError`."""
 
 
 class RecordLoop:
-    """Takes samples from a bus, writes them, and says how far it is.
+    """Takes samples from a bus, writes each once, asks for what is missing, says how far it is.
 
     The log also gets what the recorder itself observes: `Liveliness` of the others, at the newest
-    team time seen, and its own status.
+    team time seen, and its own status. inventory: what earlier parts of the log have. more: opens
+    the next part of a log that could not be written on; without it that is raised.
     """
 
-    def __init__(self, bus: Bus, recorder: Recorder, expected: Collection[str]) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        recorder: Recorder,
+        expected: Collection[str],
+        inventory: Inventory | None = None,
+        more: More | None = None,
+    ) -> None:
         self._bus = bus
-        self._recorder = recorder
+        self._recorder: Recorder | None = recorder
+        self._more = more
+        self._failure: RecorderError | None = None
+        self._retry_s = 0.0
+        self._inventory = Inventory() if inventory is None else inventory
+        self._patience: Patience[Stream] = Patience()
+        self._reported: dict[Stream, int] = {}
         self._missing = set(expected)
         self._alive: set[str] = set()
-        self._taken: dict[str, _Taken] = {}
         self._newest_ns = 0
         self._final = False
         self._messages = 0
         self._statuses = 0
         for channel in CHANNELS:
             if channel.recorded and channel is not ALIVE:
-                bus.subscribe(channel)
+                bus.subscribe(channel, whole=True)
         bus.watch_alive()
         bus.declare_alive(NODE)
 
@@ -81,16 +103,84 @@ class RecordLoop:
 
         Progress is credit: while the writing thread is far behind, nothing is reported.
         """
-        noted = [self._noted(sample) for sample in samples]
-        self._recorder.write(noted)
-        self._messages += len(noted)
-        if self._recorder.waiting() > _FAR_BEHIND:
+        noted = [(sample, self._noted(sample)) for sample in samples]
+        self._write([said for sample, said in noted if self._inventory.news(sample)])
+        if self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND:
             return
-        for robot, (epoch, readings, reported) in self._taken.items():
-            if readings - reported >= (PROGRESS_EVERY if samples else 1):
-                progress = Progress(self._newest_ns, NODE, robot, epoch, readings, 0)
-                self._bus.publish(Outgoing(RECORDER_PROGRESS, robot, progress))
-                self._taken[robot] = _Taken(epoch, readings, readings)
+        for stream, found in self._inventory.streams.items():
+            new = found.count - self._reported.get(stream, 0)
+            if stream.kind == "measurements" and new >= (PROGRESS_EVERY if samples else 1):
+                said = (stream.robot, stream.epoch, found.count, 0)
+                progress = Progress(self._newest_ns, NODE, *said)
+                self._bus.publish(Outgoing(RECORDER_PROGRESS, stream.robot, progress))
+                self._reported[stream] = found.count
+
+    def _write(self, samples: list[Sample]) -> None:
+        """To the log, if it can be written: the run goes on without it."""
+        if self._recorder is None:
+            return
+        try:
+            self._recorder.write(samples)
+        except RecorderError as error:
+            if self._more is None:
+                raise
+            self._stopped(error)
+        else:
+            self._messages += len(samples)
+
+    def _stopped(self, error: RecorderError) -> None:
+        _LOG.error("nothing is recorded any more: %s; trying again every %g s", error, _RETRY_S)
+        self._recorder, self._failure = None, error
+        self._retry_s = time.monotonic() + _RETRY_S
+
+    def _go_on(self, now_s: float) -> None:
+        """Open a new part of a log that could not be written; what it missed is asked for."""
+        if self._recorder is not None or self._more is None or now_s < self._retry_s:
+            return
+        self._retry_s = now_s + _RETRY_S
+        try:
+            self._recorder, self._inventory = self._more()
+        except RecorderError as error:
+            self._failure = error
+            return
+        self._failure = None
+        self._reported.clear()
+        self._bus.again()
+        _LOG.warning("recording goes on in %s", self._recorder.path)
+
+    def close(self) -> None:
+        """Complete the log; raises `RecorderError` if it can not be written."""
+        try:
+            if self._recorder is not None:
+                self._recorder.close()
+        except RecorderError as error:
+            self._failure = error
+        if self._failure is not None:
+            raise self._failure
+
+    def mend(self, now_s: float) -> None:
+        """Ask sources and robots for what has been missing for a while, without waiting for it."""
+        self._go_on(now_s)
+        for stream in self._patience.due(self._inventory.gaps, now_s):
+            kind, robot, epoch = stream
+            first, last = self._inventory.span(stream)
+            _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
+            if kind == "measurements":
+                wanted = ReadingsWanted(self._newest_ns, robot, epoch, first, last, only=True)
+                self._bus.request(READINGS, robot, wanted)
+            else:
+                self._bus.request(SENT, robot, SubmapsWanted(self._newest_ns, robot, epoch, first))
+
+    @property
+    def lacking(self) -> list[str]:
+        """What the log lacks, in words."""
+        numbered = [f"{key}: {what}" for key, what in self._inventory.findings()]
+        others = [
+            f"{key}: {intervals(lost)}"
+            for key, lost in self._bus.lacking().items()
+            if (found := channel_of(key)) is None or found[0] not in (*SENSORS, SUBMAP)
+        ]
+        return [*numbered, *others]
 
     def _noted(self, sample: Sample) -> Sample:
         found = channel_of(sample.key)
@@ -101,12 +191,6 @@ class RecordLoop:
             return self._noted_alive(sample, name)
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         self._final = self._final or channel is FINAL_MAP
-        if channel in SENSORS:
-            epoch = _epoch_in(sample.payload)
-            before = self._taken.get(name)
-            if before is None or before.epoch != epoch:
-                before = _Taken(epoch, 0, 0)
-            self._taken[name] = before._replace(readings=before.readings + 1)
         return sample
 
     def _noted_alive(self, sample: Sample, node: str) -> Sample:
@@ -128,14 +212,17 @@ class RecordLoop:
         if missed:
             self._alive = {node for node in self._alive if self._bus.is_alive(node)}
 
-    def status(self) -> Status:
-        """Publish and log what the recorder is doing; returns it."""
-        waiting = self._recorder.waiting()
+    def status(self, *, last: bool = False) -> Status:
+        """Publish and log what the recorder is doing; returns it. The last one says what lacks."""
+        waiting = 0 if self._recorder is None else self._recorder.waiting()
         figures = {"messages": float(self._messages), "waiting": float(waiting)}
-        warnings = tuple(f"{node} has not appeared yet" for node in sorted(self._missing))
-        status = Status(self._newest_ns, NODE, "recording", figures, warnings)
+        failure = () if self._failure is None else (f"nothing is recorded: {self._failure}",)
+        absent = tuple(f"{node} has not appeared yet" for node in sorted(self._missing))
+        lacking = tuple(f"{MISSING}{what}" for what in self.lacking) if last else ()
+        state = "done" if last else "recording"
+        status = Status(self._newest_ns, NODE, state, figures, (*failure, *absent, *lacking))
         self._bus.publish(Outgoing(STATUS, NODE, status))
-        self._recorder.write([_own(STATUS.key(NODE), status, self._statuses)])
+        self._write([_own(STATUS.key(NODE), status, self._statuses)])
         self._statuses += 1
         return status
 
@@ -144,23 +231,32 @@ def record(
     bus: Bus,
     recorder: Recorder,
     expected: Collection[str] = (),
+    inventory: Inventory | None = None,
+    more: More | None = None,
     on_status: Callable[[Status], None] | None = None,
     stop: threading.Event | None = None,
 ) -> int:
     """Record until the final map is there and all other nodes have gone, or until `stop`; close.
 
     Returns how many messages were written.
-    `expected`: nodes whose absence is a warning in the status. Raises `RecorderError` when the log
-    can not be written.
+    `expected`: nodes whose absence is a warning in the status. `inventory`, `more`: what earlier
+    parts of the log have, and what opens the next one when this one can not be written. Raises
+    `RecorderError` when the log can not be written: at once without `more`, else at the end.
     """
     stop = threading.Event() if stop is None else stop
-    with recorder:
-        loop = RecordLoop(bus, recorder, expected)
+    loop = RecordLoop(bus, recorder, expected, inventory, more)
+    with closing(loop):
         due = time.monotonic()
         remind_due = due + _REMIND_S
         end = TheEnd(bus)
-        while not (stop.is_set() or loop.finished):
+        while not stop.is_set():
+            if loop.finished:
+                # A token goes with a higher priority than data: what it overtook is on its way.
+                if not (samples := bus.receive(_QUIET_S)):
+                    break
+                loop.take(samples)
             loop.take(bus.receive(_WAIT_S))
+            loop.mend(time.monotonic())
             loop.look(end)
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATUS_S
@@ -171,9 +267,8 @@ def record(
                     remind_due = time.monotonic() + _REMIND_S
                     _LOG.info("%s", "; ".join(status.warnings))
         loop.take(bus.receive(0.0))
-        # A token goes with a higher priority than data: what it overtook is still on its way.
-        while loop.finished and (samples := bus.receive(_QUIET_S)):
-            loop.take(samples)
+        for warning in loop.status(last=True).warnings:
+            _LOG.warning("%s", warning)
     return loop.written
 
 
@@ -197,21 +292,6 @@ def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Ev
 
 def _own(key: str, message: Message, counter: int) -> Sample:
     return Sample(key, encoded(message), message.stamp_ns, time.time_ns(), counter)
-
-
-def _epoch_in(payload: bytes) -> int:
-    """The epoch of a reading, [tag, stamp, robot, epoch, …]; 0 when it is no reading."""
-    unpacker = msgpack.Unpacker()
-    unpacker.feed(payload[:_HEAD])
-    try:
-        if unpacker.read_array_header() < 4:
-            return 0
-        for _ in range(3):
-            unpacker.skip()
-        epoch = unpacker.unpack()
-    except (ValueError, msgpack.UnpackException):
-        return 0  # unsound readings are recorded as they came; whoever opens them will say so
-    return epoch if isinstance(epoch, int) and epoch >= 0 else 0
 
 
 def _is_alive(payload: bytes) -> bool:

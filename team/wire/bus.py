@@ -88,9 +88,15 @@ class Bus(Protocol):
     def request(self, channel: Channel, name: str, request: Message) -> None:
         """Ask without waiting: the replies come out of `receive`, as samples of their channels.
 
-        While the same is being asked nothing happens. A reply has no counter of its own: its
-        number (reading or sequence) stands in its place, and the wall clock of its arrival.
+        While the same is being asked nothing happens. A reply has no counter of its own
+        (`NO_COUNTER`), and the wall clock of its arrival.
         """
+
+    def again(self) -> None:
+        """What was delivered of `all` and whole channels is asked for and delivered once more."""
+
+    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+        """What is known of and has not arrived: by key, intervals of a publisher's numbers."""
 
     def declare_alive(self, node: str) -> None:
         """Hold a liveliness token until the bus is closed."""
@@ -148,8 +154,11 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
     if of is None or ("{robot}" in channel.template and robot != name):
         text = f"{type(message).__name__} of {robot!r} is no reply to {channel.key(name)!r}"
         raise WireError("wrong field", text)
-    number = getattr(message, "reading", getattr(message, "sequence", 0))
-    return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, number)
+    return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, NO_COUNTER)
+
+
+NO_COUNTER = 2**32 - 1
+"""In the place of the counter of what was asked for: it was published at another time, or never."""
 
 
 LATEST_KEPT = 8_192
@@ -200,6 +209,7 @@ class MemoryBus:
         self._network = network
         self._arrived: deque[Sample] = deque()
         self._wanted: list[tuple[Channel, str]] = []
+        self._whole: set[str] = set()
         self._known: dict[str, bool] = {}
         self._counters: dict[str, int] = defaultdict(int)
         network.buses.append(self)
@@ -222,6 +232,8 @@ class MemoryBus:
             if _is_of(channel, name, key) and not self._subscribed(key):
                 wanted = list(kept) if whole or channel.delivery == "all" else [kept[-1]]
                 self._arrived.extend(sample for source, sample in wanted if source is not self)
+        if whole:
+            self._whole.add(channel.name)
         self._want(channel, name)
 
     def _want(self, channel: Channel, name: str) -> None:
@@ -264,6 +276,19 @@ class MemoryBus:
         for payload in self.ask(channel, name, request, 0.0):
             with suppress(WireError):  # what is no reply to this question is dropped
                 self._arrived.append(replied(channel, name, payload, 0))
+
+    def again(self) -> None:
+        """What is kept of the channels that were subscribed to as a whole, or are `all`, again."""
+        for key, kept in self._network.kept.items():
+            found = channel_of(key)
+            if found is None or not self._subscribed(key):
+                continue
+            if found[0].delivery == "all" or found[0].name in self._whole:
+                self._arrived.extend(sample for source, sample in kept if source is not self)
+
+    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+        """Nothing is lost in memory."""
+        return {}
 
     def declare_alive(self, node: str) -> None:
         """Hold a token."""

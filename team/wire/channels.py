@@ -146,6 +146,9 @@ FAULT = Channel("fault", "{node}/fault", m.Fault, "when a handling raises", "all
 ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", True, False,
                 "liveliness token; its changes are logged as messages")  # fmt: skip
 
+TALLY = Channel("tally", "{node}/tally", m.Tally, "once, at its end", "latest", True, False,
+                "how many messages the node's process has published on each key")  # fmt: skip
+
 READINGS = Channel("readings", "source/{robot}/readings", m.ReadingsWanted, "query", "stream", False,
                    False, "a query; the replies are the readings")  # fmt: skip
 SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "stream", False, False,

@@ -546,6 +546,22 @@ class Liveliness(Message, frozen=True, array_like=True, gc=False, tag="livelines
     alive: bool
 
 
+class Tally(Message, frozen=True, array_like=True, gc=False, tag="tally/1"):
+    """What a process has published of each key, said at its end: what is not in a log is missing.
+
+    since_ns: its wall clock at the beginning [ns since 1970]; what it published is not older.
+    """
+
+    node: Text
+    since_ns: StampNs
+    keys: tuple[Text, ...]
+    counts: tuple[Count, ...]
+
+    def check(self) -> None:  # noqa: D102
+        if len(self.keys) != len(self.counts):
+            raise ValueError(f"{len(self.counts)} counts of {len(self.keys)} keys")
+
+
 class ReadingsWanted(Message, frozen=True, array_like=True, gc=False, tag="readings_wanted/1"):
     """A query to a source: readings first … last of (robot, epoch); last −1: all there are.
 

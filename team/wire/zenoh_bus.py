@@ -41,10 +41,10 @@ from team.keys.roster import Roster
 from team.wire.access import access_control
 from team.wire.arrivals import Arrivals
 from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of, replied
-from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, Channel, channel_of
+from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, TALLY, Channel, channel_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.handshake import why_refused
-from team.wire.messages import FinalKept, Liveliness, Message
+from team.wire.messages import FinalKept, Liveliness, Message, Tally
 
 _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
@@ -139,6 +139,9 @@ class ZenohBus:
         self._arrivals: dict[tuple[str, str], Arrivals[Sample]] = {}
         self._incomplete: set[tuple[str, str]] = set()
         self._look_due = 0.0
+        self._published: dict[str, int] = {}
+        self._newest_ns = 0
+        self._since_ns = time.time_ns()
         self._closed = threading.Event()
         self._keys = keys
         self._session = _client(connect, patience_s, keys)
@@ -157,9 +160,20 @@ class ZenohBus:
     def close(self) -> None:
         """Leave: what was published is sent first, the tokens go, a waiting receiver returns."""
         if not self._closed.is_set():
+            with suppress(BusError):
+                self._tell_tally()
             self._closed.set()
             self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
             self._queue.put(None)
+
+    def _tell_tally(self) -> None:
+        """Whoever records is told how much there was of each key: a tail may have been lost."""
+        if self._tokens:
+            node = next(iter(self._tokens))
+            counts = dict(sorted(self._published.items()))
+            keys = tuple(counts)
+            tally = Tally(self._newest_ns, node, self._since_ns, keys, tuple(counts.values()))
+            self.publish(Outgoing(TALLY, node, tally))
 
     def publish(self, out: Outgoing) -> int:
         """Encode and publish, stamped with this machine's wall clock; the payload's bytes.
@@ -190,6 +204,10 @@ class ZenohBus:
             if publisher is None:
                 publisher = self._publishers[sample.key] = self._declared(sample.key)
             publisher.put(sample.payload, attachment=attachment)
+            self._published[sample.key] = max(
+                self._published.get(sample.key, 0), sample.counter + 1
+            )
+            self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         except zenoh.ZError as error:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
@@ -360,6 +378,12 @@ class ZenohBus:
             target=zenoh.QueryTarget.ALL,
             congestion_control=_BLOCK,
         )
+
+    def again(self) -> None:
+        """What was delivered of `all` and whole channels is asked for and delivered once more."""
+        self._arrivals.clear()
+        self._incomplete.clear()
+        self._beats.clear()  # so that the next heartbeats are news
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
         """What is known of and has not arrived: by key, intervals of a publisher's numbers.

@@ -1,0 +1,206 @@
+"""What a log has of each numbered stream, and what is known that it lacks.
+
+A robot's measurements are numbered by its source across all sensor channels, its submaps by itself;
+`world/end` says how many measurements there are, `progress` and `done` how many there are at least.
+So what is missing at the end or altogether is known, too.
+"""
+
+import zlib
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import msgpack
+import numpy as np
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import NO_COUNTER, Sample, opened
+from team.wire.codec import WireError
+
+FAR = 10_000_000
+"""A number that is so far behind the others is not believed: it would need memory."""
+_HEAD = 128  # bytes of a message: its tag, stamp, robot, epoch and number are within
+Kind = Literal["measurements", "submaps"]
+
+
+class Stream(NamedTuple):
+    """Measurements or submaps of one incarnation of a robot."""
+
+    kind: Kind
+    robot: str
+    epoch: int
+
+
+@dataclass
+class Numbered:
+    """Which numbers of a stream are there: of each a check sum of its payload, 4 bytes.
+
+    whole: all before it are there. newest: the last number that is known of.
+    """
+
+    whole: int = 0
+    newest: int = -1
+    count: int = 0
+    twice: int = 0
+    contradicted: int = 0
+    _sums: "array[int]" = field(default_factory=lambda: array("I"), init=False)
+
+    def take(self, number: int, payload: bytes) -> bool:
+        """Note a payload; False if it is there already, with the same content."""
+        if number >= len(self._sums) + FAR:
+            return True
+        if number >= len(self._sums):
+            self._sums.extend(bytes(number + 1 - len(self._sums)))
+        found = zlib.crc32(payload) or 1
+        if self._sums[number]:
+            same = self._sums[number] == found
+            self.twice += same
+            self.contradicted += not same
+            return not same
+        self._sums[number] = found
+        self.count += 1
+        self.know(number)
+        while self.whole < len(self._sums) and self._sums[self.whole]:
+            self.whole += 1
+        return True
+
+    def know(self, newest: int) -> None:
+        """Somebody has said that there is this number."""
+        if newest < len(self._sums) + FAR:
+            self.newest = max(self.newest, newest)
+
+    @property
+    def missing(self) -> list[tuple[int, int]]:
+        """The intervals that are known of and not there."""
+        if self.whole > self.newest:
+            return []
+        here = np.flatnonzero(np.frombuffer(self._sums, np.uint32)[self.whole :]) + self.whole
+        bounds = np.concatenate([[self.whole - 1], here[here <= self.newest], [self.newest + 1]])
+        gaps = np.flatnonzero(np.diff(bounds) > 1)
+        return [(int(bounds[k]) + 1, int(bounds[k + 1]) - 1) for k in gaps]
+
+
+@dataclass
+class Inventory:
+    """The numbered streams of a log, sample by sample.
+
+    parted: the log has earlier parts, whose messages may come again.
+    """
+
+    parted: bool = False
+    streams: dict[Stream, Numbered] = field(default_factory=dict)
+    _earlier: set[int] = field(default_factory=set, init=False)
+    _contents: set[int] = field(default_factory=set, init=False)
+
+    def remember(self, sample: Sample) -> None:
+        """Note a sample of an earlier part of the log: it may come again."""
+        self._earlier.add(_name(sample))
+        self.take(sample)
+
+    def news(self, sample: Sample) -> bool:
+        """Note a sample; False where it is in the log already, or in an earlier part of it."""
+        if self.parted:
+            name = _name(sample)
+            if name in self._earlier and sample.counter != NO_COUNTER:
+                return False
+            self._earlier.add(name)
+        return self.take(sample)
+
+    def take(self, sample: Sample) -> bool:
+        """Note a sample; False where it is one of a stream that is there already."""
+        found = ch.channel_of(sample.key)
+        if found is None:
+            return True
+        channel, robot = found
+        if channel in (ch.SIGHTING_FACTOR, ch.FINAL_MAP):  # come once more where they are asked for
+            name = hash((sample.key, sample.payload))
+            known = name in self._contents
+            self._contents.add(name)
+            return not known
+        if channel in ch.SENSORS or channel is ch.SUBMAP:
+            named = numbered_in(sample.payload)
+            if named is None:
+                return True
+            kind: Kind = "submaps" if channel is ch.SUBMAP else "measurements"
+            return self._of(kind, robot, named[0]).take(named[1], sample.payload)
+        if channel in (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END):
+            self._hear(sample)
+        return True
+
+    def _of(self, kind: Kind, robot: str, epoch: int) -> Numbered:
+        return self.streams.setdefault(Stream(kind, robot, epoch), Numbered())
+
+    def _hear(self, sample: Sample) -> None:
+        try:
+            message = opened(sample)[2]
+        except WireError:
+            return  # whoever opens it will say so
+        match message:
+            case m.Progress() | m.Done():
+                self._of("measurements", message.robot, message.epoch).know(message.readings - 1)
+                self._of("submaps", message.robot, message.epoch).know(message.submaps - 1)
+            case m.End():
+                for end in message.streams:
+                    self._of("measurements", end.robot, end.epoch).know(end.readings - 1)
+            case _:
+                pass
+
+    @property
+    def gaps(self) -> dict[Stream, int]:
+        """The first number that is missing of each stream that is not whole."""
+        return {
+            name: each.whole for name, each in self.streams.items() if each.newest >= each.whole
+        }
+
+    def span(self, stream: Stream) -> tuple[int, int]:
+        """The first and the last number that are missing of a stream that is not whole."""
+        missing = self.streams[stream].missing
+        return missing[0][0], missing[-1][1]
+
+    def findings(self) -> Iterator[tuple[str, str]]:
+        """What is missing, or there twice and not the same: a key, and what is wrong with it."""
+        for (kind, robot, epoch), found in sorted(self.streams.items()):
+            key = ch.SUBMAP.key(robot) if kind == "submaps" else f"source/{robot}"
+            of = f"of {epoch_named(epoch)}"
+            if missing := found.missing:
+                lost = sum(last - first + 1 for first, last in missing)
+                yield key, f"{lost} {kind} {of} missing: {intervals(missing)}"
+            if found.contradicted:
+                yield key, f"{found.contradicted} {kind} {of} there twice, and not the same"
+
+
+def _name(sample: Sample) -> int:
+    return hash((sample.key, sample.counter % 2**32, sample.wall_ns))
+
+
+def epoch_named(epoch: int) -> str:
+    """An incarnation in words."""
+    return f"life {epoch} of the stream"
+
+
+SHOWN = 3
+"""Intervals that a finding names; it counts the rest."""
+
+
+def intervals(of: list[tuple[int, int]]) -> str:
+    """Intervals of numbers in words."""
+    named = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in of[:SHOWN])
+    return named + (f" and {len(of) - SHOWN} more gaps" if len(of) > SHOWN else "")
+
+
+def numbered_in(payload: bytes) -> tuple[int, int] | None:
+    """Epoch and number of a message [tag, stamp, robot, epoch, number, …]; None: it is no such."""
+    unpacker = msgpack.Unpacker()
+    unpacker.feed(payload[:_HEAD])
+    try:
+        if unpacker.read_array_header() < 5:
+            return None
+        for _ in range(3):
+            unpacker.skip()
+        epoch, number = unpacker.unpack(), unpacker.unpack()
+    except (ValueError, msgpack.UnpackException):
+        return None  # unsound ones are recorded as they came; whoever opens them will say so
+    sound = all(isinstance(n, int) and n >= 0 for n in (epoch, number))
+    return (epoch, number) if sound else None

@@ -1,0 +1,187 @@
+"""A recorder that is started again, or had no room: the parts of its log are one in the end."""
+
+import resource
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from team.recording.check import holes
+from team.recording.inventory import Inventory
+from team.recording.parts import check_continues, join, next_part, part_of, parts_of
+from team.recording.reader import LogError, open_log
+from team.recording.recorder import Recorder, RecorderError
+from team.recording.shell import RecordLoop, record
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
+from team.wire.codec import decoded, encoded
+from team.wire.zenoh_bus import ZenohBus, router
+from tests.recording.test_shell import FINAL, POSE, Team, logged
+from tests.support import odometry, received, wait_until
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "log.mcap"
+
+
+def killed_part(path: Path, samples: list[Sample]) -> None:
+    """A log that its recorder did not finish."""
+    recorder = Recorder(path, "t", {"scenario": "s"})
+    recorder.write(samples)
+    wait_until(lambda: sum(n for n, _ in recorder.counts().values()) == len(samples))
+    wait_until(lambda: len(list(open_log(path).samples())) == len(samples))
+
+
+def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path: Path) -> None:
+    with router() as at, ZenohBus("t", at) as source:
+        team = Team(source)
+        source.declare_alive("robot/alpha")
+        source.watch_alive("recorder")
+        team.says(50)
+        first = ZenohBus("t", at)
+        killed = RecordLoop(first, Recorder(path, "t", {"scenario": "s"}), ())
+        received(source, 1)
+        wait_until(lambda: bool(killed.take(first.receive(0.02)) or logged(path, c.ODOMETRY) >= 0))
+        team.says(50)
+
+        def flushed() -> bool:
+            killed.take(first.receive(0.02))
+            return logged(path, c.ODOMETRY) == 50 and logged(path, c.OWN_POSE) == 10
+
+        wait_until(flushed)
+        first.close()  # and nothing is completed
+        team.says(60)
+        check_continues(path, "t", {"scenario": "s"})
+        recorder, inventory = next_part(path, "t", {"scenario": "s"})
+        second = ZenohBus("t", at)
+        thread = threading.Thread(target=record, args=(second, recorder, (), inventory))
+        thread.start()
+        part = part_of(path, 2)
+        team.says(10)
+        team.ends(lambda: logged(part, c.ODOMETRY) == 120 and logged(part, c.OWN_POSE) == 7)
+        thread.join(20.0)
+        second.close()
+    assert parts_of(path) == [path, part]
+    assert join(path) == [path]
+    log = open_log(path)
+    assert log.complete
+    readings = [decoded(s.payload, m.Odometry) for s in log.samples([c.ODOMETRY])]
+    assert sorted(readings, key=lambda x: x.reading) == team.published
+    assert sorted(s.counter for s in log.samples([c.OWN_POSE])) == list(range(17))
+    assert holes(log) == []
+
+
+def samples_of(count: int) -> list[Sample]:
+    return [
+        Sample(c.ODOMETRY.key("alpha"), encoded(odometry(i)), i, 10**18 + i, i)
+        for i in range(count)
+    ]
+
+
+def test_what_an_earlier_part_has_is_not_written_again(path: Path) -> None:
+    killed_part(path, samples_of(5))
+    recorder, inventory = next_part(path, "t", {"scenario": "s"})
+    network = MemoryNetwork()
+    bus, world = MemoryBus(network), MemoryBus(network)
+    with recorder:
+        loop = RecordLoop(bus, recorder, (), inventory)
+        for i in range(3, 8):
+            world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
+        loop.take(bus.receive())
+    assert logged(recorder.path, c.ODOMETRY) == 3
+    assert join(path) == [path]
+    assert logged(path, c.ODOMETRY) == 8
+    assert parts_of(path) == [path]
+
+
+@pytest.mark.parametrize("wrong", ["another scenario", "finished", "no log", "old"])
+def test_a_log_that_is_not_of_this_run_is_not_continued(
+    wrong: str, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if wrong == "no log":
+        path.write_bytes(b"my thesis")
+    elif wrong == "finished":
+        with Recorder(path, "t", {"scenario": "s"}) as recorder:
+            recorder.write([Sample("central/final", encoded(FINAL), 0, 0, 0)])
+    else:
+        killed_part(path, samples_of(1))
+    if wrong == "old":
+        monkeypatch.setattr("team.recording.parts.LONGEST_AWAY_S", -1.0)
+    scenario = "another" if wrong == "another scenario" else "s"
+    with pytest.raises(LogError, match=r"exists.*choose another name or remove it"):
+        check_continues(path, "t", {"scenario": scenario})
+
+
+@pytest.fixture
+def limit() -> Iterator[Callable[[int], None]]:
+    """Sets the largest size of a file that this process may write: a full disk without a disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (soft if size < 0 else size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
+    path: Path, limit: Callable[[int], None], monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("team.recording.shell._RETRY_S", 0.0)
+    network = MemoryNetwork()
+    bus, world = MemoryBus(network), MemoryBus(network)
+
+    def answer(request: bytes) -> list[bytes]:
+        wanted = decoded(request, m.ReadingsWanted)
+        return [encoded(odometry(i)) for i in range(wanted.first, wanted.last + 1)]
+
+    world.answer(c.READINGS, "alpha", answer)
+    recorder, inventory = next_part(path, "t", {})
+    room = False
+
+    def more() -> tuple[Recorder, Inventory]:
+        if not room:
+            raise RecorderError("the disk is full")
+        return next_part(path, "t", {})
+
+    loop = RecordLoop(bus, recorder, (), inventory, more)
+    limit(path.stat().st_size + 20_000)
+    said = 0
+
+    def stopped() -> bool:
+        nonlocal said
+        for _ in range(100):
+            world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(said)))
+            world.publish(Outgoing(c.OWN_POSE, "alpha", POSE))
+            said += 1
+        loop.take(bus.receive())
+        loop.mend(0.0)
+        return any("nothing is recorded" in each for each in loop.status().warnings)
+
+    wait_until(stopped)
+    assert "nothing is recorded any more" in caplog.text
+    limit(-1)
+    assert logged(path, c.OWN_POSE) < said, "what was written reads"
+    room = True
+    world.publish(Outgoing(c.END, "", m.End(0, (m.StreamEnd("alpha", 0, said),))))
+    for now_s in (1e9, 2e9, 3e9):
+        loop.mend(now_s)
+        loop.take(bus.receive())
+    loop.close()
+    assert join(path) == [path]
+    log = open_log(path)
+    assert logged(path, c.ODOMETRY) == logged(path, c.OWN_POSE) == said
+    assert holes(log) == []
+
+
+def test_a_disk_that_stays_full_is_an_error_at_the_end(path: Path) -> None:
+    network = MemoryNetwork()
+    stop = threading.Event()
+    recorder = Recorder(path, "t", {})
+    recorder._failure = OSError("No space left on device")
+
+    def more() -> tuple[Recorder, Inventory]:
+        raise RecorderError("the disk is full")
+
+    with pytest.raises(RecorderError, match="No space left"):
+        record(MemoryBus(network), recorder, (), None, more, lambda _: stop.set(), stop=stop)
