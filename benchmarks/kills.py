@@ -4,8 +4,9 @@
     python benchmarks/kills.py --runs 10 --stop 20 --what central,router
 
 Each run is a short world. The final map is compared, byte by byte, with that of the same team in
-memory, where nobody dies. A row per run, a summary, and with --json everything for machines. Ends
-with 1 unless every run ended with 0, with this map, and left no process and no unnamed hole.
+memory, where nobody dies, and the log's content with the streams' own last counts. A row per run, a
+summary, and with --json everything for machines. Ends with 1 unless every run ended with 0, with
+this map, left no process, and no hole in its log that `teamslam log check` does not name.
 """
 
 import argparse
@@ -25,7 +26,10 @@ from sim.in_memory.team import run_team
 from sim.scenario.scenario import load
 from sim.scenario.source import streams_of
 from team.recording.reader import LogError, open_log
+from team.wire import messages as m
+from team.wire.bus import opened
 from team.wire.channels import FINAL_MAP
+from team.wire.codec import WireError
 
 PROGRAM = (sys.executable, "-P", "-m", "sim")
 KINDS = ("robot", "central", "router", "record", "world", "viewer")
@@ -43,13 +47,15 @@ class Run:
     equal: bool = False
     left: int = 0
     check: str = ""
+    lacks: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
 
     @property
     def good(self) -> bool:
         """As if nothing had happened."""
-        return self.exit == 0 and self.equal and not self.left and not self.check
+        unnamed = bool(self.lacks) and not self.check
+        return self.exit == 0 and self.equal and not self.left and not unnamed
 
 
 def children(launch: int, folder: Path) -> dict[int, list[str]]:
@@ -63,6 +69,34 @@ def children(launch: int, folder: Path) -> dict[int, list[str]]:
                     if "sim" in line:
                         found[int(entry.name)] = line[line.index("sim") + 1 :]
     return found
+
+
+def lacking(folder: Path) -> list[str]:
+    """What of the streams and of the submaps is not in the log, by their own last counts."""
+    counted: dict[tuple[str, str, int], set[int]] = {}
+    said: dict[tuple[str, str, int], int] = {}
+    try:
+        for sample in open_log(folder / "run" / "log.mcap").samples():
+            with suppress(WireError):
+                message = opened(sample)[2]
+                match message:
+                    case m.Reading():
+                        stream = ("readings", message.robot, message.epoch)
+                        counted.setdefault(stream, set()).add(message.reading)
+                    case m.Submap():
+                        stream = ("submaps", message.robot, message.epoch)
+                        counted.setdefault(stream, set()).add(message.sequence)
+                    case m.End():
+                        said |= {
+                            ("readings", s.robot, s.epoch): s.readings for s in message.streams
+                        }
+                    case m.Done():
+                        said["submaps", message.robot, message.epoch] = message.submaps
+    except (LogError, OSError) as error:
+        return [str(error)]
+    gaps = {k: n - len(counted.get(k, set()) & set(range(n))) for k, n in said.items()}
+    none = [] if said else ["the log has no end"]
+    return none + [f"{n} {what} of {robot}" for (what, robot, _), n in gaps.items() if n]
 
 
 def final_in(folder: Path) -> bytes | None:
@@ -126,6 +160,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             [*PROGRAM, "log", "check", "run/log.mcap"],
             cwd=folder, capture_output=True, text=True, check=False,
         )  # fmt: skip
+        run.lacks = lacking(folder)
         run.check = "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
         if not run.good and options.keep:
             keep = Path(options.keep) / f"run{number}"
@@ -211,7 +246,8 @@ def main() -> int:
         f"{good} of {len(runs)} runs good, {hits} processes {verb}; "
         f"map equal in {sum(r.equal for r in runs)}, exit 0 in {sum(r.exit == 0 for r in runs)}, "
         f"no process left in {sum(not r.left for r in runs)}, "
-        f"log whole in {sum(not r.check for r in runs)}"
+        f"log whole in {sum(not r.lacks for r in runs)}, with an unnamed hole in "
+        f"{sum(bool(r.lacks) and not r.check for r in runs)}"
     )
     if options.json:
         options.json.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
@@ -227,6 +263,7 @@ def row(run: Run) -> str:
         "map equal" if run.equal else "MAP DIFFERS",
         f"hit {what or 'nobody'}",
         *([f"{run.left} LEFT"] if run.left else []),
+        *([f"log lacks {', '.join(run.lacks)}"] if run.lacks else []),
         *([f"check: {run.check.splitlines()[0][:120]}"] if run.check else []),
         *([f"failures: {run.failures[0][:160]!r}"] if run.failures else []),
     ]

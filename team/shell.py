@@ -56,6 +56,16 @@ class FaultyRunError(RuntimeError):
     """A process did its work, but messages were set aside, or the final map lacks a robot."""
 
 
+def judge(boundary: Boundary, final: FusedMap | None) -> None:
+    """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
+    warnings = [*boundary.warnings] if boundary.faults else []
+    if final is not None and final.lost:
+        names = ", ".join(final.lost)
+        warnings.append(f"the final map is provisional: {names} lost, and not wholly in it")
+    if warnings:
+        raise FaultyRunError("; ".join(warnings))
+
+
 class Shell:
     """Runs one node on one bus.
 
@@ -151,13 +161,7 @@ class Shell:
 
     def end(self, final: FusedMap | None) -> None:
         """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
-        warnings = [*self.boundary.warnings] if self.boundary.faults else []
-        lost = () if final is None else final.lost
-        if lost:
-            names = ", ".join(lost)
-            warnings.append(f"the final map is provisional: {names} lost, and not wholly in it")
-        if warnings:
-            raise FaultyRunError("; ".join(warnings))
+        judge(self.boundary, final)
 
     def report(self, *, last: bool = False) -> None:
         """Publish the node's status, at most every STATUS_S; the last one in any case."""

@@ -2,6 +2,7 @@
 
 import logging
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -221,6 +222,25 @@ def record(
                 whole = output.with_stem(f"{output.stem}.whole")
                 command = f"teamslam log merge {names} --output {whole}"
                 _LOG.warning("no room to join the parts of the log; elsewhere: %s", command)
+    lost = _lost_in(parts)
+    if lost:
+        fail(f"the final map is provisional: {', '.join(lost)} lost, and not wholly in it", FAILED)
+
+
+def _lost_in(parts: Sequence[Path]) -> tuple[str, ...]:
+    """The robots that the final map in a log lacks, if there is one."""
+    from team.recording.reader import LogError, open_log
+    from team.wire.channels import FINAL_MAP
+    from team.wire.codec import WireError, decoded
+    from team.wire.messages import FusedMap
+
+    for part in parts:
+        try:
+            for sample in open_log(part).samples([FINAL_MAP]):
+                return decoded(sample.payload, FusedMap).lost
+        except (LogError, WireError, OSError) as error:
+            _LOG.debug("%s", error)
+    return ()
 
 
 @app.command()

@@ -175,16 +175,7 @@ class Supervised:
             self.due = None
             self.restarts += 1
             self.child.end(0.0)
-            if self.name == "recorder":
-                self.arguments[-1] = _next_part(self.arguments[-1], self.restarts)
             self.child = Child(self.name, self.arguments, self.folder, self.since_ns, self.restarts)
-
-
-def _next_part(log: str, restarts: int) -> str:
-    """Where a recorder that was started again writes: a log is never overwritten."""
-    path = Path(log)
-    stem = path.stem.partition("-part")[0]
-    return str(path.with_name(f"{stem}-part{restarts + 1}{path.suffix}"))
 
 
 def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:

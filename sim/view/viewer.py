@@ -6,17 +6,20 @@ from dataclasses import replace
 
 from sim.view.export import Viewing, heard
 from team.containment import Boundary
-from team.shell import STATUS_S, WAIT_S
+from team.shell import STATUS_S, WAIT_S, judge
 from team.the_end import TheEnd
 from team.wire import channels as ch
 from team.wire.bus import Bus, Outgoing
-from team.wire.messages import Status
+from team.wire.messages import FusedMap, Status
 
 NODE = "viewer"
 
 
 def run_viewer(bus: Bus, stop: threading.Event) -> int:
-    """Publish the views of a team until its final map is shown, or until `stop`; how many."""
+    """Publish the views of a team until its final map is shown, or until `stop`; how many.
+
+    Raises FaultyRunError, at its end, where the map lacks a robot or something could not be drawn.
+    """
     viewing = Viewing()
     for channel in viewing.node.listens:
         bus.subscribe(channel)
@@ -26,6 +29,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     end = TheEnd(bus)
     boundary = Boundary(NODE)
     due = 0.0
+    final: FusedMap | None = None
     while not (viewing.node.finished or stop.is_set()):
         if time.monotonic() >= due:
             due = time.monotonic() + STATUS_S
@@ -35,11 +39,15 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
             try:
-                views = viewing.take(sample, heard(sample))
+                said = heard(sample)
+                views = viewing.take(sample, said)
             except Exception as error:  # what it can not draw it leaves out
                 bus.publish(boundary.note(error, sample, ""))
                 continue
+            if said is not None and isinstance(said[1], FusedMap) and said[1].final:
+                final = said[1]
             for shown in views:
                 bus.publish_raw(replace(shown, wall_ns=time.time_ns()))
                 published += 1
+    judge(boundary, final)
     return published

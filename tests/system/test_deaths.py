@@ -117,7 +117,7 @@ async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map
     assert "the final map is provisional: r1 lost, and not wholly in it" in texts
     exits = {name: process["exit"] for name, process in result["processes"].items()}
     assert exits == {
-        "router": 0, "recorder": 0, "central": 1, "robot-r1": -9, "robot-r2": 1, "viewer": 0,
+        "router": 0, "recorder": 1, "central": 1, "robot-r1": -9, "robot-r2": 1, "viewer": 1,
         "world": 1,
     }  # fmt: skip
     (final,) = [opened(s)[2] for s in open_log(folder / "log.mcap").samples([ch.FINAL_MAP])]
