@@ -21,6 +21,8 @@ from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures, Shown, cells_of, team_task
 from sim.scenario.scenario import load
 
+NORMAL_SCALE = (0.8, 1.25)
+"""What the monitor says without the truth, in units of the profile's `normal_scale`."""
 MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
 """By the data set's number; other sets have no goal of their own."""
 MOST_RAW_TRAJECTORY_M = {"1": 0.035, "2": 0.070, "6": 0.116}
@@ -30,6 +32,7 @@ SHOWN: Shown = (
     ("nees", "NEES/dof", "{:.3g}"),
     ("shape_nees", "shape", "{:.3g}"),
     ("coverage", "covered", "{:.0%}"),
+    ("covariance_scale", "scale", "{:.2f}"),
     ("trajectory_raw", "path [m]", "{:.3f}"),
     ("trajectory_aligned", "aligned [m]", "{:.3f}"),
     ("online_position_rmse", "online [m]", "{:.3f}"),
@@ -97,7 +100,8 @@ def outcome(options: Options, results: Results) -> Outcome:
                 _heads("set", SHOWN),
                 rows,
                 "landmarks aligned and raw, their NEES as they lie, and per landmark of the shape "
-                "(2 is right); paths raw and aligned; online poses",
+                "(2 is right); the monitor's covariance scale, 1 is right; paths raw and aligned; "
+                "online poses",
             ),
             Table("each robot", _heads("robot", ROBOT), robots),
         ),
@@ -136,6 +140,7 @@ def _goals(dataset: Dataset, figures: Mapping[str, Figures]) -> list[Goal]:
     goals = [
         Goal(f"{name}: shape_nees", of_set.get("shape_nees"), 1.0, 3.5),
         Goal(f"{name}: coverage", of_set.get("coverage"), 0.8, 1.0),
+        Goal(f"{name}: covariance_scale", of_set.get("covariance_scale"), *NORMAL_SCALE),
     ]
     for figure, most in (("aligned", MOST_ALIGNED_M), ("trajectory_raw", MOST_RAW_TRAJECTORY_M)):
         if number in most:

@@ -58,6 +58,7 @@ SHOWN: Shown = (
     ("nees", "NEES/dof", "{:.3g}"),
     ("nees_median", "median", "{:.3g}"),
     ("in_band", "in band", "{:.0%}"),
+    ("covariance_scale", "scale", "{:.2f}"),
     ("final_pose_nees", "final pose", "{:.3g}"),
     ("online_pose_nees", "online pose", "{:.3g}"),
     ("bytes_per_step", "B/step", "{:.0f}"),
