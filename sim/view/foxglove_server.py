@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from bisect import bisect_right
+from contextlib import ExitStack
 from typing import Self
 
 import foxglove
@@ -24,6 +25,7 @@ from foxglove.websocket import (
     WebSocketServer,
 )
 
+from sim.view.foxglove_door import door, hidden_host
 from sim.view.server import ServerError
 from team.recording.schemas import declaration_of
 from team.wire.bus import Sample
@@ -177,10 +179,10 @@ class FoxgloveFeed:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._server: WebSocketServer | None = None
+        self._door = ExitStack()
         self._port = port if port or live else _free_port(host)
         if live:
             self._server = self._started([Capability.Time], _Newest(self._views), None)
-            self._port = self._server.port
         else:
             _check_free(host, self._port)
 
@@ -196,6 +198,7 @@ class FoxgloveFeed:
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
+        self._door.close()
         if self._server is not None:
             self._server.stop()
 
@@ -241,18 +244,24 @@ class FoxgloveFeed:
         listener: Player | _Newest,
         span_ns: tuple[int, int] | None,
     ) -> WebSocketServer:
+        """The SDK's server where nobody looks, and the door to it where we said."""
+        hidden = hidden_host()
+        server = foxglove.start_server(
+            name="teamslam",
+            host=hidden,
+            port=0,
+            context=self._views.context,
+            capabilities=capabilities,
+            server_listener=listener,
+            playback_time_range=span_ns,
+        )
+        behind = f"ws://{hidden}:{server.port}"
         try:
-            return foxglove.start_server(
-                name="teamslam",
-                host=self._host,
-                port=self._port,
-                context=self._views.context,
-                capabilities=capabilities,
-                server_listener=listener,
-                playback_time_range=span_ns,
-            )
-        except Exception as error:  # the SDK tells a taken port by a class that it does not export
+            self._port = self._door.enter_context(door(self._host, self._port, behind))
+        except OSError as error:
+            server.stop()
             raise taken(self._host, self._port) from error
+        return server
 
 
 def taken(host: str, port: int) -> ServerError:

@@ -106,7 +106,6 @@ class Feed:
         if samples:
             self.frames += self._page.flush(self._viewing.node.now_ns)
         elif self.tail.ended or not growing:
-            self.ended = True
             try:
                 if self.audience is not None:
                     self.audience.end()
@@ -115,6 +114,7 @@ class Feed:
             ) as error:  # its port was taken meanwhile: the page is shown all the same
                 self.error = str(error)
             self.frames += self._page.end(self._wrong(), complete=True)
+            self.ended = True
         return bool(samples)
 
     def _wrong(self) -> list[str]:

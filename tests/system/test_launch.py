@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 import pytest_asyncio
 
+from team.keys.authority import make_keys
+from team.keys.roster import nodes_of
 from team.recording.reader import open_log
 from team.wire import channels as ch
 from team.wire.bus import opened
@@ -153,3 +155,13 @@ def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(
     launched: Launched, watched: Watched
 ) -> None:
     assert watched.result["final_map_sha256"] == launched.result["final_map_sha256"]
+
+
+async def test_a_launch_with_keys_sends_the_same_bytes_as_final_map(
+    team: Processes, launched: Launched
+) -> None:
+    make_keys(team.folder / "keys", "thesis", nodes_of(["r1", "r2"]))
+    result = await launch(team, launched.scenario, "--keys", "keys")
+    assert result["final_map_sha256"] == launched.result["final_map_sha256"]
+    said = (team.folder / "run" / "router.log").read_text()
+    assert "listening at tls/127.0.0.1:" in said

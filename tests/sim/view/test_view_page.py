@@ -18,6 +18,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from sim.view.export import with_views
+from sim.view.foxglove_door import refusal
 from sim.view.foxglove_server import Player, Views
 from sim.view.layout import layout
 from sim.view.server import Feed, ServerError, page_files, serving
@@ -176,8 +177,10 @@ def shown(log: Path) -> Iterator[Shown]:
         yield found
 
 
-def asked(shown: Shown, path: str, **headers: str) -> tuple[int, bytes, dict[str, str]]:
-    at = urlsplit(shown.url)
+def asked(
+    shown: Shown, path: str, at: str | None = None, **headers: str
+) -> tuple[int, bytes, dict[str, str]]:
+    at = urlsplit(at or shown.url)
     connection = HTTPConnection(at.hostname, at.port, timeout=20)
     try:
         connection.request("GET", path, headers=headers)
@@ -286,6 +289,34 @@ def test_of_a_growing_log_foxglove_gets_the_newest_view_at_once(log, tmp_path):
                 if isinstance(said, bytes) and b"landmarks" in said:
                     break
         assert json.loads(said[said.index(b"{") :])["landmarks"] == LANDMARKS
+
+
+def test_foxglove_is_for_viewers_of_this_machine(shown):
+    for origin in ("https://app.foxglove.dev", "http://localhost:8080", None):
+        with connect(shown.foxglove, origin=origin, subprotocols=["foxglove.sdk.v1"]) as socket:
+            assert "playbackControl" in json.loads(socket.recv(timeout=20))["capabilities"]
+    for origin in ("http://elsewhere.example", "https://app.foxglove.dev.example", "null"):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(shown.foxglove, origin=origin, subprotocols=["foxglove.sdk.v1"])
+    at = shown.foxglove.replace("ws:", "http:") + "/"
+    assert asked(shown, "/", at=at, Host="elsewhere.example")[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("at", "host", "origins", "let_in"),
+    [
+        ("127.0.0.1", "127.0.0.1:8765", [], True),
+        ("::1", "[::1]:8765", ["http://[::1]:80"], True),
+        ("127.0.0.1", "elsewhere.example:8765", [], False),
+        ("127.0.0.1", "", [], False),
+        ("0.0.0.0", "lab.example:8765", ["http://lab.example:8765"], True),
+        ("0.0.0.0", "lab.example:8765", ["http://elsewhere.example"], False),
+        ("0.0.0.0", "", ["null"], False),
+        ("127.0.0.1", "localhost:1", ["http://localhost", "http://elsewhere.example"], False),
+    ],
+)
+def test_foxgloves_door_looks_at_host_and_origin(at, host, origins, let_in):
+    assert (refusal(at, host, origins) is None) == let_in
 
 
 class Told(Views):
