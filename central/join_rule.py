@@ -1,6 +1,6 @@
 """The rule `join`: the team's map is a pure function of the set of submaps."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -41,6 +41,8 @@ class JoinRule:
         self._refusals: dict[Stream, set[int]] = {}
         self._broadcast_ns: int | None = None
         self._quiet_ns: int | None = None
+        self._published: Mapping[Stream, int] = {}
+        self._orders: set[str] = set()
         self.finding = NOTHING
         self.landmarks = 0
         self._announced: dict[str, str] = {}
@@ -75,6 +77,7 @@ class JoinRule:
         """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
         robot, known = withdrawal.robot, self.withdrawn
         self._ticks.withdraw(robot)
+        self._orders.add(robot)
         if robot not in known:
             said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
             self.warnings.append(said)
@@ -143,7 +146,9 @@ class JoinRule:
         since = None if self._broadcast_ns is None else newest_ns - self._broadcast_ns
         due = since is None or since >= self._config.broadcast_s * 1e9
         if said or (taken and due):
-            return [*said, *self._broadcast(self._ticks.fold, "closed", newest_ns)]
+            if self._has_all_that_was_published(self._ticks.fold):
+                return [*said, *self._broadcast(self._ticks.fold, "closed", newest_ns)]
+            return [*said, *self._broadcast(self._ticks.provisional(), "provisional", newest_ns)]
         if not any(self._entered.values()):
             return []
         if self._quiet_ns is None:
@@ -152,6 +157,24 @@ class JoinRule:
         if newest_ns - self._quiet_ns >= patience_s * 1e9:
             return self._broadcast(self._ticks.provisional(), "provisional", newest_ns)
         return []
+
+    @property
+    def _heard(self) -> int:
+        """Submaps that are in the fold's reach, and robots that were withdrawn by an order."""
+        return sum(self._entered.values()) + len(self._orders)
+
+    def _has_all_that_was_published(self, fold: Fold) -> bool:
+        """Whether a map of this fold holds every submap of the last one: none steps back.
+
+        What lies ahead of the watermark is in a provisional map and not yet in a closed one. A
+        robot that was withdrawn since is in neither.
+        """
+        members = self._ticks.members(fold)
+        return all(
+            members.get(stream, -1) >= sequence
+            for stream, sequence in self._published.items()
+            if stream[0] not in self._ticks.withdrawn
+        )
 
     def conclude(self, newest_ns: int) -> list[Outgoing]:
         """The final map: everything folded, solved until it stands still, with what it says."""
@@ -183,10 +206,11 @@ class JoinRule:
         self._broadcast_ns = self._quiet_ns = now_ns
         digest = self._ticks.digest(fold, self._digest, tail.encode())
         fused = self._fused(fold, tail, digest)
+        self._published = self._ticks.members(fold)
         if tail == "final":
             out = [Outgoing(ch.TRAJECTORY, stream[0], t) for stream, t in self._paths(fold, digest)]
             return [*out, Outgoing(ch.FINAL_MAP, "", fused)]
-        return [Outgoing(ch.FUSED_MAP, "", fused), *self._priors(fold, digest)]
+        return [Outgoing(ch.FUSED_MAP, "", fused), *self._priors(fold, digest, fused)]
 
     def _fused(self, fold: Fold, tail: Tail, digest: bytes) -> m.FusedMap:
         chi2 = dof = 0.0
@@ -238,6 +262,7 @@ class JoinRule:
             tuple(fold.joined[k] for k in sorted(fold.joined)),
             self._ticks.withdrawn,
             self.finding.figures.get("covariance_scale", 0.0),
+            heard=self._heard,
         )
 
     def _shown(self, fold: Fold) -> list[int]:
@@ -258,7 +283,7 @@ class JoinRule:
             f"{len(out)} of {len(known)} landmarks ({named})",
         )
 
-    def _priors(self, fold: Fold, digest: bytes) -> list[Outgoing]:
+    def _priors(self, fold: Fold, digest: bytes, fused: m.FusedMap) -> list[Outgoing]:
         """For the latest stream of every robot that is in the team's frame."""
         if not fold.contributions:
             return []
@@ -271,7 +296,9 @@ class JoinRule:
         out = []
         for stream, prior in priors.items():
             sequence = fold.next_sequence(stream) - 1
-            message = translate.prior_message(stamp_ns, *stream, sequence, digest, prior)
+            message = translate.prior_message(
+                stamp_ns, *stream, sequence, digest, prior, fused.members, fused.heard
+            )
             out.append(Outgoing(ch.PRIOR, stream[0], message))
         return out
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from team.wire import messages as m
+from team.wire.newer import further, later_end
 
 Dealt = Callable[[m.Done], bool]
 """Whether everything that a robot's last word speaks of has been dealt with."""
@@ -49,7 +50,8 @@ class Roll:
             case m.Submap() | m.MapEstimate():
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Progress() if message.robot in self.robots:
-                self.robots[message.robot].progress = message
+                robot = self.robots[message.robot]
+                robot.progress = further(message, robot.progress)
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Done() if message.robot in self.robots:
                 robot = self.robots[message.robot]
@@ -57,7 +59,7 @@ class Roll:
                 if robot.done is None or robot.done.epoch <= message.epoch:
                     robot.done = message
             case m.End():
-                self.end = message
+                self.end = later_end(message, self.end)
             case m.Liveliness():
                 found = self._named(message.node)
                 if found is not None:

@@ -1,6 +1,7 @@
 """Estimation values to messages and back: the one module that knows both."""
 
 import hashlib
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -246,9 +247,16 @@ def landmarks_of(
 
 
 def prior_message(
-    stamp_ns: int, robot: str, epoch: int, sequence: int, digest: bytes, prior: RobotPrior
+    stamp_ns: int,
+    robot: str,
+    epoch: int,
+    sequence: int,
+    digest: bytes,
+    prior: RobotPrior,
+    members: Sequence[m.Member] = (),
+    heard: int = 0,
 ) -> m.Prior:
-    """The joint marginal of a robot's last fused end pose and the landmarks."""
+    """The joint marginal of a robot's last fused end pose and the landmarks; of which set."""
     return m.Prior(
         stamp_ns,
         robot,
@@ -260,6 +268,8 @@ def prior_message(
         joint_bytes(prior.covariance),
         prior.shared.covariance_factor,
         tuple(m.BiasEstimate(robot, epoch, *each) for each in prior.shared.biases),
+        tuple(members),
+        heard,
     )
 
 

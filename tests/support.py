@@ -162,11 +162,11 @@ def examples() -> Iterator[m.Message]:
         9_000, "join", digest, "alpha/1", True, False, 0, (member,), (m.Member("bravo", 0, 2),),
         True, two, means, packed(spd(4)), 12.5, 14, ("bravo: 1 shared landmark, 2 needed",),
         (m.BiasEstimate("alpha", 1, "bearing", 0.25, 0.125),), ("charlie joined: 5 landmarks",),
-        ("charlie",), 1.25,
+        ("charlie",), 1.25, (), 9,
     )  # fmt: skip
     yield m.Prior(
         9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)),
-        2.5, (m.BiasEstimate("alpha", 1, "range_scale", 0.25, 0.125),),
+        2.5, (m.BiasEstimate("alpha", 1, "range_scale", 0.25, 0.125),), (member,), 9,
     )  # fmt: skip
     yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))
     yield m.Progress(9_000, "central", "alpha", 1, 128, 6)

@@ -8,6 +8,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, opened
 from team.wire.codec import WireError
+from team.wire.newer import is_newer_map
 
 TURN_S = 0.1
 _PROGRESS = ("readings", "submaps", "messages")
@@ -49,7 +50,7 @@ class Watch:
                 self.statuses[message.node] = message
                 self.heard[message.node] = time.monotonic()
             elif isinstance(message, m.FusedMap):
-                self.fused = message
+                self.fused = message if is_newer_map(message, self.fused) else self.fused
             elif isinstance(message, m.Fault):
                 self._take_fault(message)
             self.errors.take(channel, message)

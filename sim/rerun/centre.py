@@ -42,8 +42,9 @@ def _joined(
 ) -> Iterator[Outgoing]:
     """Each map from its own version vector; a set that grows keeps the fold that there is.
 
-    Which submaps lie behind a gap is what the centre knew when it spoke: it says so in the map. So
-    it does of who was withdrawn: nobody is judged again by a part of the set.
+    Which submaps lie behind a gap and how much it had heard is what the centre knew when it spoke:
+    it says so in the map. So it does of who was withdrawn: nobody is judged again by a part of the
+    set.
     """
     config = msgspec.structs.replace(config, withdraw_above=None)
     starts = {s: r.get(0) for s, r in log.readings.items()}
@@ -72,10 +73,16 @@ def _joined(
                 rule.take_submap(submaps[stream][k])
         inside = vector
         for out in rule.retold(_tail(fused)):
-            message = out.message
-            if isinstance(message, m.FusedMap):
-                message = msgspec.structs.replace(message, missing=fused.missing)
-            yield Outgoing(out.channel, out.name, message)
+            yield Outgoing(out.channel, out.name, _as_known(out.message, fused))
+
+
+def _as_known(message: m.Message, fused: m.FusedMap) -> m.Message:
+    """With what the centre knew of the rest of the set when it said `fused`."""
+    if isinstance(message, m.FusedMap):
+        return msgspec.structs.replace(message, missing=fused.missing, heard=fused.heard)
+    if isinstance(message, m.Prior):
+        return msgspec.structs.replace(message, heard=fused.heard)
+    return message
 
 
 def _tail(fused: m.FusedMap) -> Tail:

@@ -83,7 +83,7 @@ class Chronicle:
         ]
         events += [
             Event(now_ns, "withdrawn", f"robot/{robot}", f"{robot} was withdrawn from the map")
-            for robot in sorted(self._members - members - self._withdrawn)
+            for robot in sorted((self._members & {*fused.withdrawn}) - self._withdrawn)
         ]
         self._members = members
         events += [

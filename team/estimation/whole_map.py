@@ -81,8 +81,9 @@ def joined(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> WholeMap
     return _by_id(np.concatenate([whole.ids, local.ids[fresh]]), mean, covariance)
 
 
-def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> PoseGaussian:
-    """The pose of `joined`, without the landmarks."""
+def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> tuple[PoseGaussian, int]:
+    """The pose of `joined`, without the landmarks, and how many of them the gate left out."""
+    seen = len(local.ids)
     local, in_whole, in_local, tie = _agreeing(whole, local, gate)
     place, sights = _entries(in_whole), _sights(local, in_local)
     pose, covariance = tied_pose(
@@ -93,7 +94,7 @@ def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> PoseGa
         local.covariance[:3, :3],
         local.covariance[:3, sights],
     )
-    return PoseGaussian(pose, covariance)
+    return PoseGaussian(pose, covariance), seen - len(local.ids)
 
 
 def _agreeing(

@@ -179,7 +179,7 @@ class HybridMember:
 
     def own_pose(self, window: LocalMap | None) -> PoseGaussian:
         """The pose of the own whole map, times the open window."""
-        return pose_now(self.whole, window)
+        return pose_now(self.whole, window).pose
 
     def own_map(self) -> LandmarkGaussian:
         """The landmarks of the own whole map."""

@@ -14,6 +14,7 @@ import numpy as np
 from team import translate
 from team.config import Exchange, RobotConfig
 from team.door import absurd
+from team.estimation.gauss_newton import NotDeterminedError
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
@@ -31,6 +32,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
+from team.wire.newer import is_newer_prior, later_end
 
 AHEAD = 64
 """Submaps of an earlier life that the centre may have taken since it was asked for them."""
@@ -64,6 +66,7 @@ class RobotNode:
         self._consumer = PAIRS[config.estimator, config.fusion]
         self._pace = Pace(config.fusion in FEEDBACK, self._consumer == "submap")
         self._known = NOTHING_KNOWN if config.estimator not in NEEDS_MAP else None
+        self._known_ns: int | None = None
         self._member: Member = member_of(config, 0)
         self._locals: list[LocalMap] = []
         self._prior: m.Prior | None = None
@@ -78,6 +81,7 @@ class RobotNode:
         self._withdrawn: set[str] = set()
         self._ended: list[m.Done] = []
         self._end: m.StreamEnd | None = None
+        self._world_end: m.End | None = None
         self._exchange_ns: int | None = None
         self._map_ns: int | None = None
         self._pose_ns: int | None = None
@@ -196,9 +200,9 @@ class RobotNode:
             case m.Reading():
                 self._inbox.put(message)
             case m.Prior():
-                self._prior = message
+                self._take_prior(message)
             case m.KnownMap():
-                self._known = KnownMap(*translate.landmarks_of(message))
+                self._take_known(message)
             case m.FusedMap():
                 return self._take_fused(message) + self._go_on()
             case m.Progress():
@@ -233,12 +237,15 @@ class RobotNode:
             figures["held_submaps"] = float(self._held.submaps)
         if nis.per_dof is not None:
             figures |= {"nis_per_dof": nis.per_dof, "nis_dof": float(nis.dof)}
+        if self._prior is not None:
+            figures["landmarks_refused"] = float(self._team_map.refused)
         if self.config.front_end.garbage:
             figures["gated"] = float(self._gated)
         state = "done" if self._done else "mapping" if self._inbox.next_reading else "waiting"
         node = ch.robot_node(self.robot)
         waiting = ("no readings of this team yet",) if state == "waiting" else ()
-        warnings = (*waiting, *self.warnings[-3:])
+        doubt = (self._team_map.doubt,) if self._team_map.doubt else ()
+        warnings = (*waiting, *doubt, *self.warnings[-3:])
         return m.Status(self._now_ns, node, state, figures, warnings)
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
@@ -363,7 +370,8 @@ class RobotNode:
         self._ledger = Counter()
         self._epoch, self._consumed, self._steps = start.epoch, 0, 0
         self._pace.begin_epoch()
-        self._prior = None
+        if self._prior is not None and self._prior.epoch < start.epoch:
+            self._prior = None
         self._now_ns = max(self._now_ns, start.stamp_ns)
         self._passed_ns = start.stamp_ns - 1
 
@@ -521,8 +529,8 @@ class RobotNode:
         if prior is None or prior.epoch != self._epoch:
             return out
         try:
-            posed = self._team_map.pose(prior, self._locals, window)
-        except (NotACovarianceError, np.linalg.LinAlgError) as error:
+            posed = self._team_map.pose(prior, self._locals, window).pose
+        except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
             self.warnings.append(f"no team pose from the fused map: {error}")
             return out
         self._pose_sigma = float(np.sqrt(posed[1][0, 0] + posed[1][1, 1]))
@@ -563,9 +571,20 @@ class RobotNode:
             self._member.absorb(ids, means, translate.landmark_covariance_of(fused))
         return []
 
+    def _take_prior(self, prior: m.Prior) -> None:
+        if is_newer_prior(prior, self._prior):
+            self._prior = prior
+
+    def _take_known(self, told: m.KnownMap) -> None:
+        """The newer one by its stamp; an equal one again changes nothing."""
+        if self._known_ns is None or told.stamp_ns > self._known_ns:
+            self._known_ns = told.stamp_ns
+            self._known = KnownMap(*translate.landmarks_of(told))
+
     # The end.
 
     def _take_end(self, end: m.End) -> None:
+        self._world_end = end = later_end(end, self._world_end)
         mine = [s for s in end.streams if s.robot == self.robot]
         self._end = mine[0] if mine else m.StreamEnd(self.robot, self.epoch, 0)
 

@@ -3,36 +3,57 @@
 from collections.abc import Sequence
 
 from team import translate
-from team.estimation.conditioning import Shared, followed, pose_now
-from team.estimation.gaussian import PoseGaussian
+from team.estimation.conditioning import Followed, Posed, Shared, followed, mostly, pose_now
 from team.estimation.submap import LocalMap
-from team.estimation.whole_map import WholeMap
 from team.wire import messages as m
 
 
 class TeamMap:
-    """A pure function of the last prior and the robot's submaps, computed as far as it is new."""
+    """A pure function of the last prior and the robot's submaps, computed when they change.
+
+    known, refused: of the newest submap's and the open window's landmarks, how many the rest has,
+    and contradicts. doubt: what speaks against the last pose, in words; empty: nothing.
+    """
 
     def __init__(self) -> None:
         self._prior: m.Prior | None = None
         self._submaps = 0
-        self._whole: WholeMap | None = None
         self._shared = Shared()
+        self._followed: Followed | None = None
+        self.known = 0
+        self.refused = 0
+        self.doubt = ""
 
-    def pose(
-        self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None
-    ) -> PoseGaussian:
+    def pose(self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None) -> Posed:
         """The robot's pose in the team's frame; `window`: the one in progress, if it has begun."""
-        whole = self.given(prior, submaps)
-        return pose_now(whole, None if window is None else self._shared.taken(window))
+        given = self.given(prior, submaps)
+        posed = pose_now(given.whole, None if window is None else self._shared.taken(window))
+        self.known = posed.known + sum(given.known[-1:])
+        self.refused = posed.refused + sum(given.refused[-1:])
+        self.doubt = self._doubt(given)
+        return posed
 
-    def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> WholeMap:
-        """The prior times those of the epoch's submaps that are not in it."""
-        if self._whole is None or prior is not self._prior:
-            told, first = translate.prior_of(prior), prior.sequence + 1
-            self._prior, self._shared, self._whole = prior, told.shared, told.whole
-            self._submaps = first
-        pending = submaps[self._submaps :]
-        self._whole = followed(self._whole, (self._shared.taken(each) for each in pending))
-        self._submaps += len(pending)  # the prior may have more than a robot that has come back
-        return self._whole
+    def _doubt(self, given: Followed) -> str:
+        if mostly(self.refused, self.known):
+            return (
+                f"the pose in the team's map is in doubt: {self.refused} of {self.known} landmarks "
+                "that are seen contradict the rest"
+            )
+        if given.disputed:
+            return (
+                "the pose in the team's map is in doubt: the map and the robot's later submaps "
+                f"contradict each other, χ² {given.cost:.0f} in {given.dof} degrees of freedom"
+            )
+        return ""
+
+    def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
+        """The prior times those of the epoch's submaps that are not in it.
+
+        The prior may have more of them than a robot that has come back.
+        """
+        if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
+            told = translate.prior_of(prior)
+            pending = [told.shared.taken(each) for each in submaps[max(0, prior.sequence + 1) :]]
+            self._followed = followed(told.whole, pending)
+            self._prior, self._shared, self._submaps = prior, told.shared, len(submaps)
+        return self._followed

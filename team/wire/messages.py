@@ -369,6 +369,8 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     ascending. covariance_scale: how many times the submaps' covariances ought to be taken, by how
     well they agree; 1 is right, 0: not known. lost: of a final map, the robots whose streams are
     not wholly in it, since nobody waited for them any more, ascending; such a map is provisional.
+    heard: how many submaps and orders to withdraw a robot the centre had, in the map or not: of two
+    maps that with more is the newer one, and of equals that with more members.
     """
 
     rule: Text
@@ -391,6 +393,7 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     withdrawn: tuple[Name, ...] = ()
     covariance_scale: Annotated[float, Meta(ge=0.0, le=1e300)] = 0.0
     lost: tuple[Name, ...] = ()
+    heard: Count = 0
 
     def check(self) -> None:  # noqa: D102
         for name, robots in (("withdrawn", self.withdrawn), ("lost", self.lost)):
@@ -406,6 +409,7 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
     the start pose). mean: 3 + 2L floats; covariance: packed upper triangle. The robot is to take
     its submaps that are not in the set as the centre takes them: their covariances times
     covariance_factor, their means moved by the errors that the robot's submaps share (biases).
+    members, heard: as in FusedMap; by them a receiver knows the newer one of two.
     """
 
     robot: Name
@@ -417,6 +421,8 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
     covariance: Floats
     covariance_factor: Annotated[float, Meta(ge=1.0, le=1e9)] = 1.0
     biases: tuple[BiasEstimate, ...] = ()
+    members: tuple[Member, ...] = ()
+    heard: Count = 0
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")

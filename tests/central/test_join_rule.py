@@ -1,5 +1,7 @@
 """The rule `join`: when it broadcasts, what it says of its set, and what it refuses."""
 
+from itertools import pairwise
+
 import msgspec
 import numpy as np
 import pytest
@@ -75,6 +77,30 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
     assert [(p.robot, p.sequence) for p in priors[:2]] == [("r1", 0), ("r2", 0)]
     for each in [*maps, *priors]:
         assert decoded(encoded(each)) == each
+
+
+def test_no_map_has_less_than_the_one_before_it():
+    """r2 is slow: a map goes ahead of the watermark, then r2 comes, two windows behind r1."""
+    found, maps = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0)), []
+    for k in range(5):
+        found.take_submap(SUBMAPS["r1"][k])
+        maps += of(found.advance(0.0, SUBMAPS["r1"][k].stamp_ns), ch.FUSED_MAP)
+    assert [each.provisional for each in maps] == [True]
+    ahead = {each.robot: each.sequence for each in maps[-1].members}
+    for k in range(5):
+        found.take_submap(SUBMAPS["r2"][k])
+        end_ns = SUBMAPS["r2"][k].stamp_ns
+        maps += of(found.advance(end_ns, END_NS + end_ns), ch.FUSED_MAP)
+    assert ahead["r1"] > 0
+    assert len(maps) > 3
+    for before, after in pairwise(maps):
+        now = {(each.robot, each.epoch): each.sequence for each in after.members}
+        assert all(now[each.robot, each.epoch] >= each.sequence for each in before.members)
+    assert not maps[-1].provisional
+    withdrawal = m.Withdrawal(END_NS, "r1", "operator", "a test")
+    found.take_withdrawal(withdrawal)
+    (last,) = of(found.conclude(END_NS), ch.FINAL_MAP)
+    assert {each.robot for each in last.members} == {"r2"}
 
 
 def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_one():

@@ -91,6 +91,21 @@ def test_the_prior_does_change_the_team_pose():
     assert poses[0] != poses[1]
 
 
+def test_an_older_prior_does_not_replace_the_one_that_is_held():
+    """Closed and provisional broadcasts alternate: the closed one has fewer of everyone's."""
+    poses = []
+    newer = msgspec.structs.replace(prior(2, at=3.0), members=(m.Member("r1", 1, 2),))
+    older = msgspec.structs.replace(prior(1), members=(m.Member("r1", 1, 1),))
+    for after in ((), (older,), (newer,), (older, newer, older)):
+        node = RobotNode(config())
+        out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
+        for message in (newer, *after):
+            out += node.handle(message, 0)
+        out += [o for r in READINGS[10:] for o in node.handle(r, 0)]
+        poses.append(payloads(out, ch.TEAM_POSE))
+    assert poses[0] == poses[1] == poses[2] == poses[3]
+
+
 def test_a_prior_that_can_not_be_solved_is_a_warning_and_the_robot_goes_on():
     node = RobotNode(config())
     flat = msgspec.structs.replace(prior(), covariance=packed(-100.0 * np.eye(7)))

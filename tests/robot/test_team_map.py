@@ -21,7 +21,7 @@ def test_the_map_that_is_kept_is_the_one_that_is_made_anew() -> None:
     kept, told = TeamMap(), prior(1)
     for known in range(2, 7):
         again = TeamMap().given(told, LOCALS[:known])
-        assert kept.given(told, LOCALS[:known]).mean.tobytes() == again.mean.tobytes()
+        assert kept.given(told, LOCALS[:known]).whole.mean.tobytes() == again.whole.mean.tobytes()
 
 
 def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already() -> None:
@@ -29,6 +29,6 @@ def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already() 
     kept, told = TeamMap(), prior(4)
     alone = translate.prior_of(told).whole
     for known in (3, 4, 5):
-        assert kept.given(told, LOCALS[:known]).mean.tobytes() == alone.mean.tobytes()
-    expected = followed(alone, LOCALS[5:])
-    assert kept.given(told, LOCALS).mean.tobytes() == expected.mean.tobytes()
+        assert kept.given(told, LOCALS[:known]).whole.mean.tobytes() == alone.mean.tobytes()
+    expected = followed(alone, LOCALS[5:]).whole
+    assert kept.given(told, LOCALS).whole.mean.tobytes() == expected.mean.tobytes()

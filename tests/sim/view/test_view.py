@@ -334,18 +334,20 @@ def test_a_robot_that_is_done_leaves():
     ]  # fmt: skip
 
 
-def fused(robots: list[str], reasons: tuple[str, ...] = ()) -> m.FusedMap:
+def fused(
+    robots: list[str], reasons: tuple[str, ...] = (), withdrawn: tuple[str, ...] = ()
+) -> m.FusedMap:
     members = tuple(m.Member(robot, 1, 0) for robot in robots)
     return m.FusedMap(
         0, "join", bytes(8), "r1/1", False, False, 0, members, (), False, b"", b"", b"", 0.0, 0,
-        reasons,
+        reasons, (), (), withdrawn,
     )  # fmt: skip
 
 
 def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once():
     why = "r2: 1 shared landmark, 2 needed"
     alone = fused(["r1"], (why,))
-    assert told(alone, alone, fused(["r1", "r2"]), fused(["r1"])) == [
+    assert told(alone, alone, fused(["r1", "r2"]), fused(["r1"], (), ("r2",))) == [
         ("map", "r1 is in the team's map"), ("warning", why), ("map", "r2 is in the team's map"),
         ("withdrawn", "r2 was withdrawn from the map"),
     ]  # fmt: skip

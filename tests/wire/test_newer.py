@@ -1,0 +1,85 @@
+"""The newer of two messages: by what they say, whatever the order in which they come."""
+
+import msgspec
+from hypothesis import given
+from hypothesis import strategies as st
+
+from team.wire import messages as m
+from team.wire.newer import further, is_newer_map, is_newer_prior, later_end
+from tests.support import examples
+
+PRIOR = next(each for each in examples() if isinstance(each, m.Prior))
+MAP = next(each for each in examples() if isinstance(each, m.FusedMap))
+vectors = st.dictionaries(st.sampled_from(["r1", "r2", "r3"]), st.integers(0, 3))
+
+
+def members(vector: dict[str, int]) -> tuple[m.Member, ...]:
+    return tuple(m.Member(robot, 1, vector[robot]) for robot in sorted(vector))
+
+
+def prior(vector: dict[str, int], heard: int = 0, epoch: int = 1) -> m.Prior:
+    return msgspec.structs.replace(PRIOR, epoch=epoch, members=members(vector), heard=heard)
+
+
+@given(vectors, vectors, st.integers(0, 9))
+def test_a_set_that_holds_another_one_is_newer(
+    one: dict[str, int], more: dict[str, int], heard: int
+) -> None:
+    both = {r: max(one.get(r, -1), more.get(r, -1)) for r in one | more}
+    larger, smaller = prior(both, heard), prior(one, heard)
+    assert is_newer_prior(larger, smaller) == (both != one)
+    assert not is_newer_prior(smaller, larger)
+    without = {r: n for r, n in both.items() if r != "r1"}
+    assert is_newer_prior(prior(without, heard + 1), larger)
+
+
+@given(st.permutations([({"r1": 3}, 4), ({"r1": 2, "r2": 0}, 4), ({"r2": 3}, 5), ({"r2": 1}, 6)]))
+def test_whoever_hears_the_same_priors_in_any_order_holds_the_same_one(
+    said: list[tuple[dict[str, int], int]],
+) -> None:
+    held = None
+    for each in said:
+        told = prior(*each)
+        held = told if is_newer_prior(told, held) else held
+    assert held == prior({"r2": 1}, 6)
+
+
+def test_a_later_life_of_the_stream_and_a_settled_map_of_the_same_set_are_newer() -> None:
+    assert is_newer_prior(prior({}, epoch=2), prior({"r1": 3}, 9))
+    settled = msgspec.structs.replace(MAP, final=False)
+    tail = msgspec.structs.replace(settled, provisional=True)
+    assert is_newer_map(settled, tail)
+    assert not is_newer_map(tail, settled)
+    assert is_newer_map(MAP, settled)
+    assert not is_newer_map(settled, settled)
+    less = msgspec.structs.replace(MAP, members=())
+    assert not is_newer_map(less, MAP)
+
+
+def progress(stamp_ns: int, epoch: int, readings: int, submaps: int) -> m.Progress:
+    return m.Progress(stamp_ns, "robot/r1", "r1", epoch, readings, submaps)
+
+
+counters = st.builds(progress, st.integers(0, 3), st.integers(1, 2), st.integers(0, 3),
+                     st.integers(0, 3))  # fmt: skip
+
+
+@given(st.lists(counters, min_size=1))
+def test_progress_never_goes_back(said: list[m.Progress]) -> None:
+    held = None
+    for each in said:
+        before, held = held, further(each, held)
+        assert before is None or held.epoch >= before.epoch
+        if before is not None and held.epoch == before.epoch:
+            assert held.readings >= before.readings
+            assert held.submaps >= before.submaps
+            assert held.stamp_ns >= before.stamp_ns
+    assert held is not None
+    assert held.submaps == max(p.submaps for p in said if p.epoch == held.epoch)
+
+
+def test_an_older_end_does_not_take_readings_back() -> None:
+    first = m.End(1, (m.StreamEnd("r1", 1, 90), m.StreamEnd("r2", 1, 40)))
+    later = m.End(2, (m.StreamEnd("r1", 2, 10), m.StreamEnd("r2", 1, 50)))
+    assert later_end(first, later).streams == later.streams
+    assert later_end(later, first).streams == later.streams
