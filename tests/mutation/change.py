@@ -27,7 +27,7 @@ def changed(path: Path, mutant: Mutant) -> bool:
         _replace_function(path, mutant.where, code)
     else:
         _replace_constant(module, mutant.where, source, mutant.applied(source))
-    return _as_python(mutant.where.rpartition(".")[2])
+    return _as_python(path, mutant.where)
 
 
 def _functions(code: CodeType) -> set[str]:
@@ -83,25 +83,23 @@ def _ours() -> list[Any]:
     return [each for name, each in list(sys.modules.items()) if name.split(".")[0] in PACKAGES]
 
 
-def _as_python(name: str) -> bool:
-    """Kernels of this name, and all that lead to it, run as they are written."""
-    kernels = {id(x): x for x in gc.get_objects() if hasattr(type(x), "py_func") or _compiled(x)}
+def _as_python(path: Path, name: str) -> bool:
+    """The kernel of this name and all kernels that lead to it, or to this constant, as written."""
+    kernels = {id(x): x for x in gc.get_objects() if _compiled(x)}
+    codes = {i: kernel.py_func.__code__ for i, kernel in kernels.items()}
     names = {name}
+    chosen = {i for i, c in codes.items() if c.co_name == name and Path(c.co_filename) == path}
     while True:
-        callers = {
-            kernel.py_func.__name__
-            for kernel in kernels.values()
-            if names & set(kernel.py_func.__code__.co_names)
-        }
-        if callers <= names:
+        callers = {i for i, code in codes.items() if names & set(code.co_names)} - chosen
+        if not callers or (not chosen and not name.isupper()):
             break
-        names |= callers
-    plain = {i: k.py_func for i, k in kernels.items() if k.py_func.__name__ in names}
+        chosen |= callers
+        names |= {codes[i].co_name for i in callers}
     for module in _ours():
         for key, value in list(vars(module).items()):
-            if id(value) in plain:
-                setattr(module, key, plain[id(value)])
-    return bool(plain)
+            if id(value) in chosen:
+                setattr(module, key, value.py_func)
+    return bool(chosen)
 
 
 def _compiled(value: object) -> bool:
