@@ -9,6 +9,7 @@ A mutant survives when its module's tests pass, or when none fails within the bu
 """
 
 import argparse
+import faulthandler
 import json
 import os
 import random
@@ -144,6 +145,7 @@ def _child(
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(nothing, stream)
+    faulthandler.disable()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def say(**event: object) -> None:
@@ -182,14 +184,15 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of the sample of each module")
     parser.add_argument("--budget", type=float, default=20.0, help="CPU seconds of a mutant")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--only", help="mutants whose text has this")
+    parser.add_argument("--only", action="append", help="mutants whose text has this, all of them")
     options = parser.parse_args()
     chosen: list[tuple[str, Mutant | None]] = []
     for module in options.modules:
         count = max(1, round(options.share * MODULES[module][0]))
         drawn = sample(module, count, options.seed)
         if options.only:
-            drawn = [m for m in mutants((ROOT / module).read_bytes()) if options.only in str(m)]
+            every = mutants((ROOT / module).read_bytes())
+            drawn = [each for each in every if any(text in str(each) for text in options.only)]
         chosen += [(module, each) for each in drawn]
     files = sorted({name for module in options.modules for name in MODULES[module][1]})
     mutation = Mutation(chosen, options.budget)
