@@ -92,12 +92,15 @@ def test_the_page_gives_each_field_a_unit_and_a_meaning(cls: type[msgspec.Struct
 def test_the_scenario_that_a_page_shows_gives_three_robots_their_streams(
     page: str, tmp_path: Path
 ) -> None:
-    (shown,) = re.findall(r"```toml\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    shown, *changes = re.findall(r"```toml\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
     file = tmp_path / "mine.toml"
     file.write_text(shown, encoding="utf-8")
     streams = streams_of(load(file)).streams
     assert [stream.robot for stream in streams] == ["r1", "r2", "r3"]
     assert all(len(stream.landmark_detections.ids) > 100 for stream in streams)
+    for change in changes:
+        file.write_text(f'base = "thesis"\n{change}', encoding="utf-8")
+        assert load(file) != load("thesis"), "a change of a built-in one"
 
 
 def test_a_built_in_scenario_that_was_shown_is_the_same_one_as_a_file(tmp_path: Path) -> None:
