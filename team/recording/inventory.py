@@ -12,15 +12,12 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import msgpack
-import numpy as np
 
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import NO_COUNTER, Sample, opened
 from team.wire.codec import WireError
 
-FAR = 10_000_000
-"""A number that is so far behind the others is not believed: it would need memory."""
 _HEAD = 128  # bytes of a message: its tag, stamp, robot, epoch and number are within
 Kind = Literal["measurements", "submaps"]
 
@@ -35,51 +32,48 @@ class Stream(NamedTuple):
 
 @dataclass
 class Numbered:
-    """Which numbers of a stream are there: of each a check sum of its payload, 4 bytes.
+    """Which numbers of a stream are there: of each a check sum of its payload.
 
-    whole: all before it are there. newest: the last number that is known of.
+    newest: the last number that is known of. Memory is that of what is there: 4 bytes a number
+    without a gap before it, some more for the others; of what is missing nothing.
     """
 
-    whole: int = 0
     newest: int = -1
     count: int = 0
-    twice: int = 0
     contradicted: int = 0
     _sums: "array[int]" = field(default_factory=lambda: array("I"), init=False)
+    _beyond: dict[int, int] = field(default_factory=dict, init=False)
+
+    @property
+    def whole(self) -> int:
+        """All numbers before this one are there."""
+        return len(self._sums)
 
     def take(self, number: int, payload: bytes) -> bool:
         """Note a payload; False if it is there already, with the same content."""
-        if number >= len(self._sums) + FAR:
-            return True
-        if number >= len(self._sums):
-            self._sums.extend(bytes(number + 1 - len(self._sums)))
-        found = zlib.crc32(payload) or 1
-        if self._sums[number]:
-            same = self._sums[number] == found
-            self.twice += same
-            self.contradicted += not same
-            return not same
-        self._sums[number] = found
+        found = zlib.crc32(payload)
+        there = self._sums[number] if number < self.whole else self._beyond.get(number)
+        if there is not None:
+            self.contradicted += there != found
+            return there != found
         self.count += 1
         self.know(number)
-        while self.whole < len(self._sums) and self._sums[self.whole]:
-            self.whole += 1
+        self._beyond[number] = found
+        while (following := self._beyond.pop(self.whole, None)) is not None:
+            self._sums.append(following)
         return True
 
     def know(self, newest: int) -> None:
         """Somebody has said that there is this number."""
-        if newest < len(self._sums) + FAR:
-            self.newest = max(self.newest, newest)
+        self.newest = max(self.newest, newest)
 
     @property
     def missing(self) -> list[tuple[int, int]]:
         """The intervals that are known of and not there."""
-        if self.whole > self.newest:
-            return []
-        here = np.flatnonzero(np.frombuffer(self._sums, np.uint32)[self.whole :]) + self.whole
-        bounds = np.concatenate([[self.whole - 1], here[here <= self.newest], [self.newest + 1]])
-        gaps = np.flatnonzero(np.diff(bounds) > 1)
-        return [(int(bounds[k]) + 1, int(bounds[k + 1]) - 1) for k in gaps]
+        here = sorted(self._beyond)
+        begins = [self.whole, *(number + 1 for number in here)]
+        ends = [*(number - 1 for number in here), self.newest]
+        return [(b, e) for b, e in zip(begins, ends, strict=True) if b <= e]
 
 
 @dataclass

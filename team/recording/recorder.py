@@ -22,6 +22,10 @@ from team.recording.schemas import declaration_of
 from team.wire.bus import Sample
 
 METADATA = "teamslam"
+CHUNK_NS = 500_000_000
+"""Of recorded time (the publishers' wall clocks) in one chunk, as a flipped bit costs a chunk …"""
+CHUNK_LEAST = 16
+"""… or so many messages."""
 FLUSH_S = 0.5
 """Seconds between flushes: what a killed recorder can lose."""
 
@@ -51,6 +55,8 @@ class Recorder:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._failure: Exception | None = None
+        self._in_chunk = 0
+        self._span = (2**63, 0)
         self._closed = False
         try:
             self._file: IO[bytes] = self.path.open("xb")
@@ -122,9 +128,25 @@ class Recorder:
                 unflushed = True
             if unflushed and time.monotonic() - flushed >= FLUSH_S:
                 _flush(self._writer)
+                self._in_chunk, self._span = 0, (2**63, 0)
                 flushed, unflushed = time.monotonic(), False
 
+    def _bound_chunk(self, sample: Sample) -> None:
+        """End the chunk before it spans more than CHUNK_NS of recorded time.
+
+        A flipped bit costs a chunk. What comes late, out of its time, may make a chunk of
+        CHUNK_LEAST messages longer.
+        """
+        first, last = self._span
+        first, last = min(first, sample.wall_ns), max(last, sample.wall_ns)
+        if self._in_chunk >= CHUNK_LEAST and last - first > CHUNK_NS:
+            _flush(self._writer)
+            self._in_chunk, first, last = 0, sample.wall_ns, sample.wall_ns
+        self._in_chunk += 1
+        self._span = (first, last)
+
     def _write(self, sample: Sample) -> None:
+        self._bound_chunk(sample)
         channel = self._channels.get(sample.key)
         if channel is None:
             channel = self._channels[sample.key] = self._register(sample.key)

@@ -15,6 +15,7 @@ from typing import IO, NamedTuple, cast
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -28,6 +29,14 @@ MOST_RECORDS = 250_000
 """Records of one chunk: a recorder's chunk of a MiB has 34 000 of the smallest messages."""
 _FRAME = struct.Struct("<BQ")
 _BLOCK = 2**20
+_AHEAD = 4096
+_OPCODES = frozenset((*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)))
+_LENGTHS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
+"""Of what ends a file: a flipped bit makes a chunk one of them."""
+_COMPRESSION = b"\x04\0\0\0zstd"
+"""In the head of each chunk that a recorder of ours writes …"""
+_TO_COMPRESSION = _FRAME.size + 28
+"""… behind its opcode, length, two times, its size and its checksum."""
 FRAME_SIZE = _FRAME.size
 FOOTER_SIZE = FRAME_SIZE + 20
 MALFORMED = (McapError, UnicodeDecodeError, OverflowError, struct.error)
@@ -85,20 +94,51 @@ def index_damage(file: IO[bytes]) -> str | None:
 
 
 def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
-    """The whole records of the file from `start`; a record that is cut off is the end."""
+    """The whole records of the file from `start`; a record that is cut off is the end.
+
+    Where what should be a record is none, its length or the one before it is damaged: it goes on at
+    the next chunk that can be found.
+    """
     size = os.fstat(file.fileno()).st_size
     if start > size:
         raise LogError(path, f"its index claims to start at {start} of {size} bytes", REPAIR)
-    offset = file.seek(start)
+    offset = before = file.seek(start)
     while len(head := file.read(_FRAME.size)) == _FRAME.size:
         opcode, length = _FRAME.unpack(head)
-        if opcode == 0 or offset + _FRAME.size + length > size:
-            return  # zeros, or half a record: what a machine that went down leaves behind
+        none = opcode not in _OPCODES or _LENGTHS.get(opcode, length) != length
+        if none or offset + _FRAME.size + length > size:
+            # Damage, or zeros or half a record: what a machine that went down leaves behind.
+            following = _next_chunk(file, before + 1, size)
+            if following is None:
+                return
+            offset = before = file.seek(following)
+            continue
         if length > LARGEST_CHUNK:
             what = f"record of {length} bytes at offset {offset}, {LARGEST_CHUNK} at most"
             raise LogError(path, what, REPAIR)
         yield Frame(offset, opcode, file.read(length))
-        offset += _FRAME.size + length
+        before, offset = offset, offset + _FRAME.size + length
+        file.seek(offset)
+
+
+def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
+    """Where the next chunk record begins, by what its head looks like."""
+    file.seek(start)
+    kept, begin, ahead = b"", start, _AHEAD
+    while block := file.read(ahead):
+        ahead = min(2 * ahead, _BLOCK)
+        data = kept + block
+        at = data.find(_COMPRESSION)
+        while at >= 0:
+            found = begin + at - _TO_COMPRESSION
+            if found >= start and at >= _TO_COMPRESSION:
+                opcode, length = _FRAME.unpack_from(data, at - _TO_COMPRESSION)
+                if opcode == Opcode.CHUNK and found + _FRAME.size + length <= size:
+                    return found
+            at = data.find(_COMPRESSION, at + 1)
+        kept = data[-_TO_COMPRESSION - len(_COMPRESSION) :]
+        begin += len(data) - len(kept)
+    return None
 
 
 def records(data: bytes) -> Iterator[Frame]:
