@@ -107,11 +107,18 @@ def robot(
     seed: Seed = None,
     estimator: EstimatorOption = None,
     fusion: FusionOption = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(help="Its own log: what it sends and receives; `teamslam log merge` joins."),
+    ] = None,
 ) -> None:
     """A robot: runs its estimator on its sensor stream and publishes submaps, maps and poses.
 
     Started again after a crash it resumes after its last submap.
     """
+    from contextlib import nullcontext
+
+    from team.recording.own_log import own_log
     from team.robot.main import RobotShell
     from team.shell import process
 
@@ -126,8 +133,10 @@ def robot(
         )
     with (
         process(f"robot-{name}") as stop,
+        nullcontext() if log is None else own_log(log, resolved.team) as tap,
         connected(resolved.team, connect, keys, f"robot-{name}") as bus,
     ):
+        bus.tap = tap
         _connected(resolved, connect)
         RobotShell(bus, configs[name], stop, exchange=resolved.exchange).run()
 

@@ -25,7 +25,7 @@ import logging
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -142,6 +142,8 @@ class ZenohBus:
         self._published: dict[str, int] = {}
         self._newest_ns = 0
         self._since_ns = time.time_ns()
+        self.tap: Callable[[list[Sample]], None] | None = None
+        """Is handed what this bus publishes and receives."""
         self._closed = threading.Event()
         self._keys = keys
         self._session = _client(connect, patience_s, keys)
@@ -208,6 +210,8 @@ class ZenohBus:
                 self._published.get(sample.key, 0), sample.counter + 1
             )
             self._newest_ns = max(self._newest_ns, sample.stamp_ns)
+            if self.tap is not None:
+                self.tap([sample])
         except zenoh.ZError as error:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
@@ -292,7 +296,10 @@ class ZenohBus:
                 if item is None:
                     break
                 self._take(item, samples)
-        return samples + self._complete(time.monotonic())
+        samples += self._complete(time.monotonic())
+        if self.tap is not None and samples:
+            self.tap(samples)
+        return samples
 
     def _take(self, item: _Item, samples: list[Sample]) -> None:
         match item:
