@@ -1,5 +1,10 @@
 # One image for every process of a team: the command says which one it is.
-FROM python:3.11-slim AS build
+#
+# A tag can be moved, a digest can not. For an image that is the same tomorrow, look up the tag's
+# digest once (docker buildx imagetools inspect python:3.11-slim) and build by it:
+#   docker build --build-arg BASE=python:3.11-slim@sha256:DIGEST .
+ARG BASE=python:3.11-slim
+FROM ${BASE} AS build
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE constraints.txt ./
 COPY team team
@@ -8,7 +13,7 @@ COPY sim sim
 RUN pip install --no-cache-dir --constraint constraints.txt pip \
  && PIP_BUILD_CONSTRAINT=/src/constraints.txt pip wheel --no-cache-dir --no-deps --wheel-dir /dist .
 
-FROM python:3.11-slim
+FROM ${BASE}
 # Kernels are compiled for the processor that they run on, so the cache is filled at the first start
 # and kept in a volume; the log's folder belongs to the user, too.
 RUN useradd --system --uid 10001 --no-create-home teamslam \

@@ -160,7 +160,7 @@ def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(
 async def test_a_launch_with_keys_sends_the_same_bytes_as_final_map(
     team: Processes, launched: Launched
 ) -> None:
-    make_keys(team.folder / "keys", "thesis", nodes_of(["r1", "r2"]))
+    make_keys(team.folder / "keys", "short", nodes_of(["r1", "r2"]))
     result = await launch(team, launched.scenario, "--keys", "keys")
     assert result["final_map_sha256"] == launched.result["final_map_sha256"]
     said = (team.folder / "run" / "router.log").read_text()

@@ -1,0 +1,208 @@
+"""What keys and the fault boundary cost: messages per second and latency, as ratios in one run.
+
+    python benchmarks/security.py [--messages 20000] [--rounds 5] [--json FILE]
+
+Links: a router, a publisher and a receiver, each a process with Zenoh on loopback; once open over
+TCP, once with certificates and access control over TLS, alternating. Throughput: observations of
+five landmarks, as fast as they are taken. Latency: one message there and one back, at rest.
+Boundary: a node that takes the same samples through `team.containment`, and without it.
+
+Only the ratios are held against benchmarks/security.json: the machine is in both of their halves.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from team.containment import Boundary
+from team.keys.authority import make_keys
+from team.keys.credentials import credentials_of
+from team.keys.roster import load_roster, nodes_of
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing, Sample, opened
+from team.wire.codec import encoded
+from team.wire.zenoh_bus import ZenohBus, router
+
+BASELINE = Path(__file__).with_suffix(".json")
+TEAM = "bench"
+PINGS = 500
+_HERE = [sys.executable, str(Path(__file__).resolve())]
+
+
+def observations(i: int) -> m.Observations:
+    near = from_floats(np.linspace(1.0, 9.0, 5))
+    return m.Observations(i, "r1", 1, i, from_ids(range(5)), near, from_floats([0.1] * 5))
+
+
+def entered(endpoint: str, folder: Path | None, node: str) -> ZenohBus:
+    return ZenohBus(TEAM, endpoint, 20.0, folder and credentials_of(folder, node, TEAM))
+
+
+def serve(folder: Path | None) -> None:
+    """The router's process: until its input ends."""
+    own = folder and (credentials_of(folder, "router"), load_roster(folder))
+    with router("tls/127.0.0.1:0" if folder else "tcp/127.0.0.1:0", own) as endpoint:
+        print(endpoint, flush=True)
+        sys.stdin.read()
+
+
+def take(endpoint: str, folder: Path | None, count: int) -> None:
+    """The receiver's process: answers each progress by one, counts observations."""
+    with entered(endpoint, folder, "robot-r1") as bus:
+        bus.subscribe(ch.OBSERVATIONS, "r1")
+        bus.subscribe(ch.END)
+        print("there", flush=True)
+        arrived, began = 0, 0.0
+        while arrived < count:
+            for sample in bus.receive(0.05):
+                if sample.key == ch.END.key():
+                    done = m.Progress(sample.stamp_ns, "robot/r1", "r1", 1, 0, 0)
+                    bus.publish(Outgoing(ch.ROBOT_PROGRESS, "r1", done))
+                    continue
+                began = began or time.monotonic()
+                arrived += 1
+        print(json.dumps((arrived - 1) / (time.monotonic() - began)), flush=True)
+
+
+def link(folder: Path | None, count: int) -> tuple[float, float]:
+    """Messages per second, and the median time there and back [s]."""
+    more = [] if folder is None else ["--keys", str(folder)]
+    hub = subprocess.Popen(
+        [*_HERE, "--serve", *more], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert hub.stdout is not None
+        endpoint = hub.stdout.readline().strip()
+        receiver = subprocess.Popen(
+            [*_HERE, "--take", endpoint, "--messages", str(count), *more],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert receiver.stdout is not None
+        receiver.stdout.readline()
+        with entered(endpoint, folder, "world") as bus:
+            bus.subscribe(ch.ROBOT_PROGRESS, "r1")
+            took = [ping(bus, i) for i in range(PINGS + 50)][50:]
+            for i in range(count):
+                bus.publish(Outgoing(ch.OBSERVATIONS, "r1", observations(i)))
+            rate = float(receiver.communicate(timeout=120)[0])
+    finally:
+        hub.communicate("")
+    return rate, median(took)
+
+
+def ping(bus: ZenohBus, stamp_ns: int) -> float:
+    """One message there and one back; sent again while the link is still coming up."""
+    began = time.perf_counter()
+    bus.publish(Outgoing(ch.END, "", m.End(stamp_ns, ())))
+    while True:
+        back = bus.receive(1.0)
+        if any(sample.stamp_ns == stamp_ns for sample in back):
+            return time.perf_counter() - began
+        if not back:
+            bus.publish(Outgoing(ch.END, "", m.End(stamp_ns, ())))
+
+
+class Sink:
+    """A node that does nothing, so that what is around it shows."""
+
+    taken = 0
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        self.taken += 1
+        return []
+
+
+def handling(count: int, *, contained: bool) -> float:
+    """Seconds for each message: decoded at the door and handed to a node."""
+    samples = [
+        Sample(ch.OBSERVATIONS.key("r1"), encoded(observations(i)), i, 0, i) for i in range(count)
+    ]
+    node, boundary = Sink(), Boundary("robot/r1")
+
+    def plainly(sample: Sample) -> list[Outgoing]:
+        return node.handle(opened(sample)[2], sample.stamp_ns)
+
+    def within(sample: Sample) -> list[Outgoing]:
+        return boundary.take(node, sample)
+
+    hand: Callable[[Sample], list[Outgoing]] = within if contained else plainly
+    began = time.perf_counter()
+    for sample in samples:
+        hand(sample)
+    took = time.perf_counter() - began
+    assert node.taken == count
+    return took / count
+
+
+def measured(count: int, rounds: int) -> dict[str, Any]:
+    """Each round has all halves; figures are medians over rounds, ratios those of the medians."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        keys = Path(folder)
+        make_keys(keys, TEAM, nodes_of(["r1"]))
+        for _ in range(rounds):
+            free, locked = link(None, count), link(keys, count)
+            bare, within = (handling(count, contained=each) for each in (False, True))
+            rows.append((*free, *locked, bare, within))
+    open_rate, open_s, keys_rate, keys_s, bare_s, within_s = (
+        float(value) for value in np.median(np.array(rows), axis=0)
+    )
+    return {
+        "open": {"messages_per_s": open_rate, "round_trip_us": 1e6 * open_s},
+        "keys": {"messages_per_s": keys_rate, "round_trip_us": 1e6 * keys_s},
+        "handling_us": {"bare": 1e6 * bare_s, "contained": 1e6 * within_s},
+        "throughput_with_keys": keys_rate / open_rate,
+        "round_trip_with_keys": keys_s / open_s,
+        "handling_contained": within_s / bare_s,
+    }
+
+
+def worse(figures: dict[str, Any]) -> list[str]:
+    """What is worse than the baseline allows, in words."""
+    found = []
+    for name, of in json.loads(BASELINE.read_text())["figures"].items():
+        value, was, share = figures[name], of["value"], of["tolerance"]
+        bound = was * (1.0 + share) if of["better"] == "less" else was * (1.0 - share)
+        if (value > bound) if of["better"] == "less" else (value < bound):
+            found.append(f"{name} is {value:.4g}, it was {was:.4g} and may be {bound:.4g}")
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--messages", type=int, default=20_000)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--take", help=argparse.SUPPRESS)
+    parser.add_argument("--keys", type=Path, help=argparse.SUPPRESS)
+    told = parser.parse_args()
+    if told.serve:
+        serve(told.keys)
+        return 0
+    if told.take:
+        take(told.take, told.keys, told.messages)
+        return 0
+    figures = measured(told.messages, told.rounds)
+    print(json.dumps(figures, indent=1))
+    if told.json:
+        told.json.write_text(json.dumps(figures, indent=1))
+    found = worse(figures)
+    print("\n".join(found) or f"within the baseline; load {os.getloadavg()[0]:.1f}")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
