@@ -9,6 +9,9 @@ Without truth the reference is the joined map and the paths in it, with an odome
 less, so that scale comes from the ranges (expectation and maximisation in turn). Only what the
 ranges and bearings determine is learnt then: the odometry's scales, drag and veer. The sensor's own
 figures stay: a team can not see the scale of its own measure.
+
+How sure the submaps are (`covariance_factor`) is learnt without the truth in both cases, from the
+maps of single robots (`consistency`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +22,7 @@ import numpy as np
 
 from sim.calibration import motion as motion
 from sim.calibration import sensor as sensor
+from sim.calibration.consistency import covariance_factor
 from sim.calibration.data import Reference, references, true_paths
 from sim.calibration.figures import CalibrationError, Figure, jackknifed
 from sim.calibration.join import JoinedTeam, config_of, joined_team
@@ -26,6 +30,7 @@ from sim.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.scenario.scenario import Scenario
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
+from team.estimation.joining import Fold
 
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")
@@ -48,6 +53,7 @@ class Calibration:
     sensor: tuple[Figure, ...]
     by_truth: bool
     notes: tuple[str, ...]
+    central: tuple[Figure, ...] = ()
 
 
 def calibrated(
@@ -78,11 +84,12 @@ def _by_truth(
     of_sensor = jackknifed(sensor.fit_sensor, data, sensor.UNITS)
     for turn in range(ROUNDS):
         learnt = with_figures(scenario, of_motion, of_sensor)
-        scales = []
+        scales, folds = [], []
         for label, world in worlds:
             progress(f"scale of the joined map of {label}, {turn + 1} of {ROUNDS}")
             team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
             scales.append(_scale(team, world))
+            folds.append(team.fold)
         factor, spread = float(np.mean(scales)), float(np.std(scales) / np.sqrt(len(scales)))
         of_sensor = tuple(
             replace(f, value=f.value * factor, sigma=float(np.hypot(f.sigma, spread)))
@@ -90,7 +97,9 @@ def _by_truth(
             else f
             for f in of_sensor
         )
-    return Calibration(of_motion, of_sensor, True, (*notes, *_alarms(of_motion, scenario)))
+    of_central = _central_figures(folds, scenario, progress)
+    said = (*notes, *_alarms(of_motion, scenario))
+    return Calibration(of_motion, of_sensor, True, said, of_central)
 
 
 def _by_the_map(
@@ -110,8 +119,22 @@ def _by_the_map(
         found = (f for f in _motion_figures(data, learnt) if f.name in SCALES)
         figures = tuple(_with_systematic(f) for f in found)
         learnt = with_figures(scenario, figures, ())
+    folds = []
+    for label, world in worlds:
+        progress(f"joined map of {label} with what was learnt")
+        folds.append(joined_team(world, learnt).fold)
+    of_central = _central_figures(folds, scenario, progress)
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
-    return Calibration(figures, (), False, (note, *notes, *_alarms(figures, scenario)))
+    said = (note, *notes, *_alarms(figures, scenario))
+    return Calibration(figures, (), False, said, of_central)
+
+
+def _central_figures(
+    folds: Sequence[Fold], scenario: Scenario, progress: Progress
+) -> tuple[Figure, ...]:
+    progress("maps of single robots against the rest of their team")
+    factor = covariance_factor(folds, scenario.central)
+    return () if factor is None else (factor,)
 
 
 def _turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:

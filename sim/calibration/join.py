@@ -47,10 +47,11 @@ class _Track:
 
 @dataclass(frozen=True)
 class JoinedTeam:
-    """Landmarks by id and each robot's path, in the frame of the joined map."""
+    """Landmarks by id and each robot's path, in the frame of the joined map; the fold of it."""
 
     landmarks: Mapping[int, Float[np.ndarray, "2"]]
     paths: Mapping[str, Path]
+    fold: Fold
 
 
 def joined_team(
@@ -93,7 +94,7 @@ def joined_team(
         at = graph.offset[list(nodes)]
         ends = state[at[:, np.newaxis] + np.arange(3)]
         paths[robot] = _bent(tracks[robot], ends)
-    return JoinedTeam(landmarks, paths)
+    return JoinedTeam(landmarks, paths, fold)
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:

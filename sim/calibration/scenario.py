@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from central.config import CentralConfig
 from sim.calibration.calibrate import Calibration, nested
 from sim.calibration.figures import Figure
 from sim.scenario.scenario import Scenario, builtin_names
@@ -21,12 +22,13 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
         f'base = "{base}"',
     ]
     parts = (
-        ("motion", calibration.motion, MotionModel),
-        ("sensor", calibration.sensor, Sensor),
+        ("defaults.motion", calibration.motion, MotionModel),
+        ("defaults.sensor", calibration.sensor, Sensor),
+        ("central", calibration.central, CentralConfig),
     )
     for name, figures, declared in parts:
         if figures:
-            lines += ["", f"[defaults.{name}]", *_table(figures, declared)]
+            lines += ["", f"[{name}]", *_table(figures, declared)]
     return "\n".join(lines) + "\n"
 
 

@@ -55,7 +55,8 @@ def calibrate(
     except CalibrationError as error:
         fail(str(error), FAILED)
     table = Table("part", "figure", "value", "± (1 σ)", "unit")
-    for part, figures in (("motion", found.motion), ("sensor", found.sensor)):
+    parts = (("motion", found.motion), ("sensor", found.sensor), ("central", found.central))
+    for part, figures in parts:
         for figure in figures:
             numbers = (f"{figure.value:.5g}", f"{figure.sigma:.2g}")
             table.add_row(part, figure.name, *numbers, figure.unit)

@@ -1,0 +1,63 @@
+"""UTIAS sets judged with what was learnt from the others: `leave_one_out.py SET SET SET`.
+
+For each set, everything that `teamslam calibrate` learns comes from the others (about six minutes
+of a processor each); then the team runs on it in memory. A table, and with --json FILE its figures.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import msgspec
+
+from sim.calibration.calibrate import calibrated
+from sim.calibration.scenario import scenario_toml
+from sim.calibration.source import readings_of
+from sim.experiments.accuracy_utias import set_figures
+from sim.experiments.team_runs import Figures, team_run
+from sim.scenario.scenario import load
+
+SHOWN = ("aligned", "shape_nees", "coverage", "raw", "nees", "trajectory_raw")
+
+
+def left_out(path: Path, others: list[Path], folder: Path) -> Figures:
+    """The figures of a set under the models learnt from the others."""
+    read = [(other.name, *readings_of(other)) for other in others]
+    worlds = [(name, world) for name, world, _ in read]
+    start = read[0][2]
+    found = calibrated(worlds, start, lambda said: print(f"  {said}", file=sys.stderr))
+    scenario = folder / f"without-{path.stem}.toml"
+    scenario.write_text(scenario_toml(found, start, [name for name, _ in worlds]), "utf-8")
+    figures = team_run(msgspec.to_builtins(load(str(scenario))), batch=False, path=str(path))
+    return set_figures(figures)
+
+
+def main() -> int:
+    """Print the table; 2 where there are fewer than two sets."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sets", nargs="*", type=Path)
+    parser.add_argument("--json", type=Path)
+    asked = parser.parse_args()
+    sets = [path for path in asked.sets if path.exists()]
+    for path in asked.sets:
+        if path not in sets:
+            print(f"skipped: {path} is not there", file=sys.stderr)
+    if len(sets) < 2:
+        print("two UTIAS sets or more are needed, each a zip or a folder", file=sys.stderr)
+        return 2
+    table = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for path in sets:
+            print(f"{path.name}, learnt from the others", file=sys.stderr)
+            others = [other for other in sets if other != path]
+            table[path.name] = left_out(path, others, Path(folder))
+            print(path.name, *(f"{name} {table[path.name][name]:.4f}" for name in SHOWN))
+    if asked.json is not None:
+        asked.json.write_text(json.dumps(table, indent=2) + "\n", "utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

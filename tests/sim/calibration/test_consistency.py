@@ -1,0 +1,75 @@
+"""The covariance factor is learnt from how far single robots' maps are from the others'."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.config import CentralConfig
+from central.tick_fold import join_settings
+from sim.calibration.calibrate import Calibration
+from sim.calibration.consistency import covariance_factor, disagreements
+from sim.calibration.scenario import scenario_toml
+from sim.scenario.scenario import load
+from team.estimation.joining import EMPTY_FOLD, Fold, JoinSettings, converged, folded, started
+from tests.estimation.submap_world import team
+
+SIGMAS = (0.05, 0.01, 0.1)
+
+
+def folds_of(seeds, claimed=1.0):
+    """Teams of four whose submaps say `claimed` times the variance that they have."""
+    folds: list[Fold] = []
+    for seed in seeds:
+        world = team(seed, robots=4, submaps=8, landmarks=8, reach=30.0, sigmas=SIGMAS)
+        fold = EMPTY_FOLD
+        for start in world.starts:
+            fold = started(fold, start)
+        submaps = [told(each, claimed) for each in world.submaps]
+        folds.append(converged(folded(fold, submaps, JoinSettings()), JoinSettings()))
+    return folds
+
+
+def told(contribution, claimed):
+    """The submap with its covariance times `claimed`."""
+    local = replace(contribution.local, covariance=claimed * contribution.local.covariance)
+    return replace(contribution, local=local)
+
+
+def test_robots_whose_covariances_are_right_disagree_as_much_as_they_say():
+    settings = join_settings(CentralConfig())
+    found = np.array(
+        [each for fold in folds_of(range(30)) for each in disagreements(fold, settings)]
+    )
+    assert len(found) == 120
+    assert (found[:, 1] == 13).all()
+    # The four of a team share submaps in the others' maps, so their D is not independent.
+    assert found[:, 0].sum() / found[:, 1].sum() == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_factor_makes_up_for_covariances_that_are_too_small():
+    factor = covariance_factor(folds_of(range(12), 0.4), CentralConfig())
+    assert factor is not None
+    assert factor.value == pytest.approx(2.5, rel=0.2)
+    assert 0.0 < factor.sigma < 0.4
+
+
+def test_the_factor_is_never_below_one_and_one_robot_says_nothing_of_it():
+    factor = covariance_factor(folds_of(range(5), 4.0), CentralConfig())
+    assert factor is not None
+    assert factor.value == 1.0
+    world = team(1, robots=1, sigmas=SIGMAS)
+    alone = converged(folded(EMPTY_FOLD, world.submaps, JoinSettings()), JoinSettings())
+    assert covariance_factor([alone], CentralConfig()) is None
+
+
+def test_a_scenario_with_a_learnt_factor_keeps_the_rest_of_the_centre(tmp_path):
+    factor = covariance_factor(folds_of([1], 0.5), CentralConfig())
+    assert factor is not None
+    document = scenario_toml(Calibration((), (), True, (), (factor,)), load("utias"), ["a set"])
+    path = tmp_path / "learnt.toml"
+    path.write_text(document, "utf-8")
+    central = load(str(path)).central
+    assert central.covariance_factor == float(f"{factor.value:.5g}")
+    assert msgspec.structs.replace(central, covariance_factor=1.9) == load("utias").central
