@@ -55,7 +55,13 @@ def keys(
         fail(f"--days {days:g}: give a positive number", WRONG_USE)
     names = list(robot or ())
     if scenario is not None:
-        names += [r.id for r in with_options(scenario_of(scenario), robots=robots).robots]
+        resolved = with_options(scenario_of(scenario), robots=robots)
+        names += [each.id for each in resolved.robots]
+        if resolved.team != team:
+            typer.echo(
+                f"warning: {scenario} is of the team {resolved.team!r}, these keys of {team!r}",
+                err=True,
+            )
     for name in names:
         if not ROBOT.fullmatch(name):
             fail(f"{name!r} is no robot's name", WRONG_USE)

@@ -171,6 +171,7 @@ def test_the_command_makes_keys_for_a_scenario_and_says_what_it_did(tmp_path: Pa
 
     first = run("--scenario", "waypoints", "--router", "lab.example")
     assert "made     central, operator, recorder, robot-r1" in first
+    assert "waypoints is of the team 'waypoints', these keys of 'mapping'" in first
     assert "copy to each computer ca.pem and NODE.pem, NODE.key" in first
     assert "made     robot-r9, source-r9\nkept     central" in run("--robot", "r9")
     assert "revoked  robot-r9" in run("--revoke", "robot-r9")
