@@ -175,13 +175,22 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong: str) ->
 
 
 @cache
-def one_closes_windows_often() -> tuple[Sample, ...]:
-    """r3's wheels are wrong, and it has many submaps before the others have enough to be judged."""
+def one_closes_windows_often() -> list[m.Message]:
+    """r3's wheels are wrong, and it has many submaps before the others have enough to be judged.
+
+    Initial poses, inter-robot measurements and submaps until UNTIL_S, by their stamps.
+    """
     of = scenario()
     front = msgspec.structs.replace(of.robots[2].front_end, window_s=2.0, node_s=2.0)
     often = msgspec.structs.replace(of.robots[2], front_end=front)
     of = msgspec.structs.replace(of, robots=(*of.robots[:2], often))
-    return tuple(run(msgspec.structs.replace(of, central=OPERATOR), "odometry"))
+    said = [
+        opened(each)[2]
+        for each in run(msgspec.structs.replace(of, central=OPERATOR), "odometry")
+        if each.key.endswith(("/start", "/submap", "/sighting_factor"))
+    ]
+    known = [each for each in said if each.stamp_ns <= UNTIL_S * 10**9]
+    return sorted(known, key=lambda each: (each.stamp_ns, isinstance(each, m.Submap)))
 
 
 OPERATOR = CentralConfig(tick_s=10.0, broadcast_s=10.0, withdraw_above=None)
@@ -191,8 +200,9 @@ UNTIL_S = 40
 def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[JoinRule, bytes]:
     """A rule that takes messages in an order, is told a watermark [s] after so many, and ends."""
     rule = JoinRule(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8))
-    for start in messages(one_closes_windows_often(), m.Start):
-        rule.take_start(start)
+    for start in one_closes_windows_often():
+        if isinstance(start, m.Start):
+            rule.take_start(start)
     out = []
     for k, message in enumerate(order):
         if isinstance(message, m.Submap):
@@ -202,22 +212,12 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Joi
         if k in watermarks:
             out += rule.advance(1e9 * watermarks[k], round(1e9 * watermarks[k]))
     out += rule.conclude(10**12)
-    said = [each.message for each in out if isinstance(each.message, m.Withdrawal)]
-    assert {each.robot for each in said} <= set(rule.withdrawn) | {"r1", "r2"}
     return rule, encoded(out[-1].message)
 
 
 def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent() -> None:
     """At 35 s r3 is a suspect whom nobody can convict yet; five submaps later there are enough."""
-    everything = [
-        each
-        for each in (
-            *messages(one_closes_windows_often(), m.SightingFactor),
-            *messages(one_closes_windows_often(), m.Submap),
-        )
-        if each.stamp_ns <= UNTIL_S * 10**9
-    ]
-    by_time = sorted(everything, key=lambda each: (each.stamp_ns, isinstance(each, m.Submap)))
+    by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.Start)]
     ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
     at_once, expected = delivered(by_time, {})
     assert at_once.withdrawn == ("r3",)
