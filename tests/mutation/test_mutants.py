@@ -68,6 +68,7 @@ def _right() -> bool:
     return bool(np.allclose(error, [2.0, 0.0, 7.0 - 2.0 * np.pi])) and geometry.wrapped(4.0) < 0.0
 
 
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # Python 3.12 on forks
 def test_a_mutant_takes_effect_in_the_child_alone_in_kernels_too() -> None:
     assert _right()
     assert in_a_child("team/estimation/consistency.py", "state_error", "-", right=False)
