@@ -10,7 +10,8 @@ from sim.rerun.log import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
-from team.robot.node import RobotNode
+from team.robot.member import HybridMember
+from team.robot.node import LATE, RobotNode
 from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -198,7 +199,14 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     done = max((d.readings for d in _dones(log, robot, epoch)), default=None)
     said: dict[int, str] = {}
     for counter in takewhile(readings.__contains__, range(len(readings) if done is None else done)):
-        said[counter] = next(iter(node.took(readings[counter])), "lost")
+        took = node.took(readings[counter])
+        if LATE in took:  # an odometry interval that ends a window, and scans that it leaves behind
+            scans = [n for n in said if isinstance(readings[n], m.Observations)]
+            scans = [n for n in scans if not said[n].startswith("rejected")]
+            said |= dict.fromkeys(scans[-took.pop(LATE) :], LATE)
+            said[counter] = HybridMember.used
+        else:
+            said[counter] = next(iter(took), "lost")
     if said and done is not None:
         end = m.StreamEnd(robot, epoch, len(said))
         for reason, count in node.took(m.End(0, (end,))).items():

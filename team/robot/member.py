@@ -48,7 +48,8 @@ class ClosedWindow:
     """A submap with the names of its inputs, and the sightings from its pose nodes.
 
     innovation: of the window's readings that were predicted. gated: readings that no others of the
-    window confirmed, and that are not in the submap.
+    window confirmed, and that are not in the submap. late: scans of the interval that are stamped
+    behind the window's end; they are rejected.
     """
 
     sequence: int
@@ -61,6 +62,7 @@ class ClosedWindow:
     cloud: Cloud | None = None
     innovation: Innovation = NOTHING
     gated: int = 0
+    late: int = 0
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class HybridMember:
         for epoch in self._segmenter.drive(stamp_ns, duration_ns, forward, yaw_rate):
             self._advance(epoch)
         if self._is_full(stamp_ns - self._start_ns):
-            return Driven.with_submap(self._close(stamp_ns))
+            return Driven.with_submap(self._close(stamp_ns, self._segmenter.leave()))
         if self._grid is not None:
             self._grid.go_on(stamp_ns)
         moved = self.last_epoch_ns != before_ns
@@ -217,7 +219,7 @@ class HybridMember:
             self._window = windows.marked(self._window, epoch.stamp_ns)
         self.last_epoch_ns = epoch.stamp_ns
 
-    def _close(self, stamp_ns: int) -> ClosedWindow:
+    def _close(self, stamp_ns: int, late: int = 0) -> ClosedWindow:
         epochs, rest = self._segmenter.cut(stamp_ns)
         for epoch in epochs:
             self._advance(epoch)
@@ -238,6 +240,7 @@ class HybridMember:
             thinned(self._window.particles, self.whole.mean[:3]),
             self._window.innovation,
             gated,
+            late,
         )
         self._innovation = self._innovation.plus(closed.innovation)
         self.whole = joined(self.whole, local)

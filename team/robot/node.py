@@ -39,6 +39,7 @@ AHEAD = 64
 IN_SIGHTING = "in a sighting factor"
 """The disposition of a reading of teammates that was used."""
 SET_ASIDE = "rejected: its handling raised"
+LATE = "rejected: counted in a window that ends before its stamp"
 """The disposition of a reading that was set aside."""
 MOST_SET_ASIDE = 8
 """Readings of one window after which the estimator is not put back behind them any more."""
@@ -432,6 +433,9 @@ class RobotNode:
         if self._taking is not None:
             self._used(self._taking)
         self._sighted_in(closed)
+        if closed.late:
+            self._ledger[self._member.used] -= closed.late
+            self._ledger[LATE] += closed.late
         self._locals.append(closed.local)
         plain = ClosedWindow(
             closed.sequence,

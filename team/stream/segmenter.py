@@ -129,6 +129,15 @@ class Segmenter:
         self._scan_motion = np.zeros(3)
         return epochs, rest
 
+    def leave(self) -> int:
+        """A window ends: drop the scans that are stamped behind it, and say how many there were.
+
+        The window's interval of readings holds them, so no later window may use them: one that is
+        computed again, by a robot that was started again, would not have them.
+        """
+        left, self._waiting = len(self._waiting), []
+        return left
+
     @property
     def uncovered(self) -> int:
         """Scans that wait for odometry that covers their time."""

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from team import translate
 from team.pairs import PAIRS
 from team.robot import pace
-from team.robot.node import RobotNode
+from team.robot.node import LATE, RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -174,6 +174,33 @@ def test_every_reading_has_one_disposition(name, keyframe_s, estimator):
         inside = sum(s.last_reading - s.first_reading + 1 for s in submaps)
         rejected = sum(e.readings for e in done.ledger if e.disposition.startswith("rejected"))
         assert sum(used) + 1 <= inside <= sum(used) + 1 + rejected
+
+
+def out_of_order(readings):
+    """What is counted right before an odometry interval is stamped half a second behind its end."""
+    late = []
+    for reading, following in pairwise([*readings, None]):
+        ends = following is not None and isinstance(following, m.Odometry)
+        if ends and isinstance(reading, m.Observations | m.Sightings):
+            reading = msgspec.structs.replace(reading, stamp_ns=following.stamp_ns + 500_000_000)
+        late.append(reading)
+    return late
+
+
+@pytest.mark.parametrize("options", [{}, {"keyframe_s": 0.3}, {"node_s": 1.0}])
+def test_what_is_stamped_behind_its_window_is_in_no_submap_also_after_a_restart(options):
+    """Before, the next window used it too: a robot that was started again sent another submap."""
+    readings = out_of_order(published(stream("r1", 12)))
+    front_end = msgspec.structs.replace(config().front_end, **options)
+    out = driven(RobotNode(config(front_end=front_end)), readings)
+    whole = of(out, ch.SUBMAP)
+    (done,) = of(out, ch.ROBOT_DONE)
+    assert sum(entry.readings for entry in done.ledger) == len(readings)
+    assert {e.disposition: e.readings for e in done.ledger}[LATE] == len(whole) - 1
+    for taken in range(1, len(whole)):
+        node = RobotNode(config(front_end=front_end))
+        node.resume(readings[0], whole[:taken])
+        assert payloads(driven(node, readings)) == [encoded(each) for each in whole[taken:]]
 
 
 @pytest.mark.parametrize("taken", [1, 2, 3])
