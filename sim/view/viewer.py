@@ -30,7 +30,8 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     boundary = Boundary(NODE)
     due = 0.0
     final: FusedMap | None = None
-    while not (viewing.node.finished or stop.is_set()):
+    # One that comes after the end has nothing to show, so its node does not finish by the map.
+    while not (viewing.node.finished or final is not None or stop.is_set()):
         if time.monotonic() >= due:
             due = time.monotonic() + STATUS_S
             status = Status(0, NODE, "viewing", {"messages": float(published)})
@@ -40,12 +41,12 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
                 continue
             try:
                 said = heard(sample)
+                if said is not None and isinstance(said[1], FusedMap) and said[1].final:
+                    final = said[1]
                 views = viewing.take(sample, said)
             except Exception as error:  # what it can not draw it leaves out
                 bus.publish(boundary.note(error, sample, ""))
                 continue
-            if said is not None and isinstance(said[1], FusedMap) and said[1].final:
-                final = said[1]
             for shown in views:
                 bus.publish_raw(replace(shown, wall_ns=time.time_ns()))
                 published += 1

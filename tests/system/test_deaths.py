@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -68,26 +69,30 @@ def other(team: Processes, words: tuple[str, ...]) -> int | None:
     return found[0] if found else None
 
 
-async def test_a_recorder_that_is_killed_leaves_a_log_that_reads_and_can_be_repaired(
+async def test_a_recorder_that_is_killed_goes_on_and_what_it_had_reads_and_can_be_repaired(
     team: Processes,
 ) -> None:
     launch, folder = await launched(team, SLOW)
     path = folder / "log.mcap"
     await until(lambda: submaps_in(path) > 0, "the recorder flushes", 10.0)
     os.kill(await team.pid("record"), signal.SIGKILL)
-    await launch.ended()
+    cut = open_log(Path(shutil.copy(path, team.folder / "cut.mcap")))
+    assert not cut.complete
+    assert submaps_in(cut.path) > 0
+    assert await launch.ended(120.0) == 0, launch.said()
     await team.none_left(0.0)
     assert "was ended by SIGKILL: it is started again" in launch.said()
-    cut = open_log(folder / "log.mcap")
-    assert not cut.complete
-    samples = list(cut.samples())
-    assert submaps_in(path) > 0
+    samples = open_log(path).samples([ch.FINAL_MAP])
+    assert final_map([(s.key, s.payload) for s in samples]) == map_in_memory(
+        team.folder / "short.toml"
+    )
+    kept = list(cut.samples())
     repair = await team.start("repair", cut.path, "--output", "whole.mcap")
     assert await repair.ended() == 0, repair.said()
-    assert f"whole.mcap: {len(samples)} messages" in repair.said()
+    assert f"whole.mcap: {len(kept)} messages" in repair.said()
     whole = open_log(team.folder / "whole.mcap")
     assert whole.complete
-    assert list(whole.samples()) == samples
+    assert list(whole.samples()) == kept
     assert whole.metadata == cut.metadata
 
 
