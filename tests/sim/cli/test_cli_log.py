@@ -89,8 +89,9 @@ def test_check_ends_with_1_and_a_line_for_each_finding(log: Path, tmp_path: Path
         recorder.write([s for s in published() if s.counter != 3])
     status, out, _ = run("check", lost)
     assert status == 1
-    assert "source/r1/odometry: 1 message missing: 3" in out.splitlines()
-    assert all(": 1 message missing: 3" in line for line in out.splitlines())
+    stream = "source/r1: 2 measurements of life 1 of the stream missing: 7–8"
+    assert {stream, "truth/r1: 1 message missing: 3"} <= set(out.splitlines())
+    assert all(" missing: " in line for line in out.splitlines())
 
 
 def test_parts_by_the_command_merge_to_a_sound_log(log: Path, tmp_path: Path) -> None:
@@ -137,7 +138,7 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
     log: Path, tmp_path: Path
 ) -> None:
     alone = tmp_path / "r1.mcap"
-    own = [s for s in published() if s.key.startswith("robot/r1")]
+    own = [s for s in published() if s.key.startswith("source/r1")]
     with Recorder(alone, "small", {}) as recorder:
         recorder.write(own)
     status, _, err = run("export", alone, "--format", "utias", "-o", tmp_path / "out")
