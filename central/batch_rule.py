@@ -2,6 +2,9 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
 
 from central.config import CentralConfig
 from central.reading_rules import ReadingRule, Told
@@ -9,8 +12,9 @@ from central.rules import MapEstimate
 from central.team_epochs import RobotEpoch
 from team import translate
 from team.config import RobotConfig
-from team.estimation import batch
+from team.estimation import batch, sparse
 from team.estimation.batch import Batch
+from team.estimation.gauss_newton import UNSOLVABLE
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Pose
 from team.estimation.turn import Turn
@@ -66,20 +70,44 @@ class BatchRule(ReadingRule):
         return []
 
     def _told(self, *, final: bool) -> Told:
-        grown = batch.extended(self._batch, self._waiting)
-        self._waiting = []
+        self._grow()
         if final:
-            self._batch = batch.solved(grown.renewed, FINAL_ITERATIONS, FINAL_DECREMENT)
+            self._batch = self._solved(self._batch.renewed, FINAL_ITERATIONS, FINAL_DECREMENT)
             if not self._batch.converged(FINAL_DECREMENT):
                 self._findings.append(
                     f"the batch has not converged in {FINAL_ITERATIONS} iterations: the next step "
                     f"goes {self._batch.newton_decrement:.2g} sigma, {FINAL_DECREMENT:g} allowed"
                 )
         else:
-            self._batch = batch.solved(grown, RUNNING_ITERATIONS, RUNNING_DECREMENT)
+            self._batch = self._solved(self._batch, RUNNING_ITERATIONS, RUNNING_DECREMENT)
         landmarks = MapEstimate(*batch.landmark_gaussian(self._batch))
         said = (*self._poses(), *(self._paths() if final else ()))
         return Told(landmarks, self._batch.cost, self._batch.dof, said)
+
+    def _grow(self) -> None:
+        """Take the turns that wait; without what they saw, or not at all, where none is solved."""
+        turns, self._waiting = self._waiting, []
+        blind = [turn.blind for turn in turns]
+        for some in (turns, blind):
+            with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+                grown = batch.extended(self._batch, some)
+                once = batch.solved(grown, 1, RUNNING_DECREMENT)
+                if np.isfinite(once.poses).all() and np.isfinite(once.posterior.panels).all():
+                    self._batch = grown
+                    return
+            self._findings.append(
+                f"measurements of {len(turns)} steps up to {self._now_ns * 1e-9:.1f} s refused: "
+                "with them the map has no solution"
+            )
+
+    def _solved(self, grown: Batch, iterations: int, decrement: float) -> Batch:
+        """The solution; where there is none, what the steps before have left."""
+        with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+            solution = batch.solved(grown, iterations, decrement)
+            if np.isfinite(solution.poses).all() and np.isfinite(solution.posterior.panels).all():
+                return solution
+        self._findings.append("the batch has no full solution")
+        return grown
 
     def _poses(self) -> list[Outgoing]:
         """The newest pose of each robot that has moved since the last map."""
@@ -95,6 +123,9 @@ class BatchRule(ReadingRule):
         said = []
         for robot, stamps in sorted(self._stamps.items()):
             poses, covariances = batch.trajectory(self._batch, robot)
+            stamps = stamps[: len(poses) - 1]
+            if not stamps:
+                continue
             epoch = self._members[robot].epoch
             message = translate.trajectory_message(
                 stamps[-1], robot, epoch, self._digest, stamps, poses[1:], covariances[1:]

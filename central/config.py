@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.config import FusionRule, NonNegative, Positive
+from team.config import Bounds, FusionRule, NonNegative, Positive
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,6 +55,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     short weighs more and the map shrinks.
     withdraw_above: a robot of whose submaps the half and more cost above this per degree of freedom
     is withdrawn if the rest of the team agrees without it; absent: by an operator only.
+    bounds: submaps, inter-robot measurements and initial poses beyond them are refused.
     """
 
     fusion: FusionRule = "join"
@@ -62,7 +63,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     broadcast_s: Positive = 10.0
     robust_c: Positive | None = None
     landmark_submaps: Annotated[int, Meta(ge=1, le=100)] = 1
-    covariance_factor: Annotated[float, Meta(ge=1.0)] = 1.0
+    covariance_factor: Annotated[float, Meta(ge=1.0, le=1e9)] = 1.0
     normal_scale: Positive = 1.0
     gauss_newton_per_tick: Annotated[int, Meta(ge=1, le=50)] = 2
     bias_sigma: BiasSigmas = BiasSigmas()
@@ -70,3 +71,4 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joined_ranges: bool = False
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 1000
     withdraw_above: Annotated[float, Meta(ge=2.0)] | None = 4.0
+    bounds: Bounds = Bounds()

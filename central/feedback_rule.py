@@ -12,7 +12,13 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.rules import MapEstimate, covariance_intersection, kalman, kalman_per_axis
+from central.rules import (
+    MapEstimate,
+    covariance_intersection,
+    fused_totally,
+    kalman,
+    kalman_per_axis,
+)
 from team import translate
 from team.config import FusionRule
 from team.wire import channels as ch
@@ -80,22 +86,23 @@ class FeedbackRule:
             )
         counted_often = self._config.fusion != "covariance-intersection"
         final = msgspec.structs.replace(
-            last, final=True, reasons=(_NOT_VALID,) if counted_often else ()
+            last, final=True, reasons=(*last.reasons, *([_NOT_VALID] if counted_often else []))
         )
         return [Outgoing(ch.FINAL_MAP, "", final)]
 
     def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> m.FusedMap:
-        values = [
-            MapEstimate(*translate.landmarks_of(x), translate.landmark_covariance_of(x))
+        values = {
+            x.robot: MapEstimate(*translate.landmarks_of(x), translate.landmark_covariance_of(x))
             for x in maps
-        ]
+        }
+        value, refused = fused_totally(
+            RULES[self._config.fusion], values, self._config.bounds.coordinate_m
+        )
         members = tuple(m.Member(x.robot, x.epoch, x.sequence) for x in maps)
         payload = b"".join(x.ids + x.means + x.covariance for x in maps)
         previous = b"" if self._fused is None else self._fused.digest
         stamp_ns = max(x.stamp_ns for x in maps)
-        return self._message(
-            number, stamp_ns, members, RULES[self._config.fusion](values), payload + previous
-        )
+        return self._message(number, stamp_ns, members, value, payload + previous, refused)
 
     def _message(
         self,
@@ -104,6 +111,7 @@ class FeedbackRule:
         members: tuple[m.Member, ...],
         value: MapEstimate,
         inputs: bytes,
+        reasons: tuple[str, ...] = (),
     ) -> m.FusedMap:
         self.landmarks = len(value.ids)
         return fused_message(
@@ -114,4 +122,5 @@ class FeedbackRule:
             stamp_ns=stamp_ns,
             joint=self._config.fusion != "kalman-per-axis",
             exchange=number,
+            reasons=reasons,
         )

@@ -1,13 +1,18 @@
 """The message of a fused map, as the rules that do not join submaps say it."""
 
+import msgspec
+
 from central.config import CentralConfig
 from central.rules import MapEstimate
 from team import translate
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
+from team.wire.codec import unsound
 
 START_POSES = "start poses"
 """The frame of a map that lies in the frame in which the robots were told their start poses."""
+JOINT_LANDMARKS = 2000
+"""With more landmarks than this a map carries their own covariances only."""
 
 
 def fused_message(
@@ -26,8 +31,11 @@ def fused_message(
 ) -> m.FusedMap:
     """A map with its members and the name of its inputs; with landmarks' own covariances only
     unless `joint`. exchange: of the lockstep round, if there are rounds. cost: (χ², dof).
+
+    What no receiver would take is left out (`receivable`).
     """
-    return m.FusedMap(
+    joint = joint and len(value.ids) <= JOINT_LANDMARKS
+    fused = m.FusedMap(
         stamp_ns,
         config.fusion,
         digest,
@@ -44,3 +52,16 @@ def fused_message(
         *cost,
         reasons,
     )
+    return receivable(fused)
+
+
+def receivable(fused: m.FusedMap) -> m.FusedMap:
+    """The map as every receiver takes it; what it has to leave out for that stands in `reasons`."""
+    if unsound(fused) is None:
+        return fused
+    said = []
+    if not 0.0 <= fused.chi2 <= 1e300:
+        said.append(f"the cost of the map is not told: it is {fused.chi2:g}")
+        fused = msgspec.structs.replace(fused, chi2=0.0, dof=0)
+    fused, left_out = translate.receivable(fused)
+    return msgspec.structs.replace(fused, reasons=(*fused.reasons, *said, *left_out))

@@ -6,26 +6,27 @@ from typing import Literal
 import numpy as np
 
 from central.config import CentralConfig
+from central.fused import JOINT_LANDMARKS, receivable
 from central.monitor import NOTHING, finding, miscalibrations
 from central.submap_set import Stream, SubmapSet
 from central.tick_fold import TickFold
 from team import translate
 from team.estimation import marginals
 from team.estimation.joining import Fold
+from team.estimation.refusal import refusals
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
-from team.wire.codec import encoded
+from team.wire.codec import encoded, unsound
 
 Tail = Literal["final", "closed", "provisional"]
 
 PRIOR_LANDMARKS = 100
 """Landmarks in a robot's prior at the most: the nearest ones."""
+
 NAMED = 10
-"""Landmarks that are left out of the map are named up to so many."""
-JOINT_LANDMARKS = 2000
-"""With more landmarks than this the final map carries their own covariances only."""
+"""Landmarks that are left out of the map, and refusals, are named up to so many."""
 
 
 class JoinRule:
@@ -49,6 +50,7 @@ class JoinRule:
         self.warnings: list[str] = []
         self.reasons: tuple[str, ...] = ()
         self.refused = 0
+        self.not_folded = 0
 
     def take_start(self, start: m.Start) -> None:
         """A stream begins; its submaps wait for this."""
@@ -209,8 +211,20 @@ class JoinRule:
         self._published = self._ticks.members(fold)
         if tail == "final":
             out = [Outgoing(ch.TRAJECTORY, stream[0], t) for stream, t in self._paths(fold, digest)]
-            return [*out, Outgoing(ch.FINAL_MAP, "", fused)]
-        return [Outgoing(ch.FUSED_MAP, "", fused), *self._priors(fold, digest, fused)]
+            return [*self._sound(out), Outgoing(ch.FINAL_MAP, "", receivable(fused))]
+        out = self._priors(fold, digest, fused)
+        return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *self._sound(out)]
+
+    def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:
+        """What every receiver takes; the rest is withheld and named."""
+        sound = []
+        for each in out:
+            why = unsound(each.message)
+            if why is None:
+                sound.append(each)
+            else:
+                self.warnings.append(f"withheld: {each.key}, {why}")
+        return sound
 
     def _fused(self, fold: Fold, tail: Tail, digest: bytes) -> m.FusedMap:
         chi2 = dof = 0.0
@@ -231,10 +245,12 @@ class JoinRule:
             ids, means, blocks = marginals.landmark_blocks(fold, shown)
             covariance = translate.block_bytes(blocks)
         self.landmarks = len(ids)
+        self.not_folded = len(fold.refused) + len(fold.set_aside)
         biases = marginals.bias_estimates(fold)
         self.finding = self.finding.with_biases(biases)
         self.reasons = (
             *(fold.reasons[k] for k in sorted(fold.reasons)),
+            *_worded(refusals(fold)),
             *fold.doubts,
             *self._unconfirmed(fold, shown),
             *miscalibrations(biases),
@@ -314,3 +330,9 @@ class JoinRule:
             )
             paths.append(((robot, epoch), message))
         return paths
+
+
+def _worded(words: Sequence[str]) -> tuple[str, ...]:
+    """So many of them, and how many more there are."""
+    more = len(words) - NAMED
+    return (*words[:NAMED], *([f"{more} more refusals"] if more > 0 else []))

@@ -1,6 +1,7 @@
 """The rule `joint-fastslam`: multi-robot FastSLAM at the centre (Ma & Ma, section IV-D)."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from central.rules import MapEstimate
 from central.team_epochs import RobotEpoch
 from team.config import RobotConfig
 from team.estimation import joint_fastslam
-from team.estimation.gaussian import Matrix, PoseGaussian
+from team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
 from team.estimation.geometry import Pose, tangent
 from team.estimation.joint_fastslam import JointFastSlam
 from team.estimation.models import Increment
@@ -56,7 +57,14 @@ class JointFastSlamRule(ReadingRule):
             self._state = joint_fastslam.stepped(self._state, turns, self._generator)
 
     def _take(self, step: Sequence[RobotEpoch], turns: Sequence[Turn]) -> list[Outgoing]:
-        self._state = joint_fastslam.stepped(self._state, turns, self._generator)
+        blind = [turn.blind for turn in turns]
+        for some in (turns, blind):  # at the last the particles stay where they are
+            with suppress(NotACovarianceError, np.linalg.LinAlgError), np.errstate(all="ignore"):
+                after = joint_fastslam.stepped(self._state, some, self._generator)
+                if np.isfinite(after.poses).all() and np.isfinite(after.log_weights).all():
+                    self._state = after
+                    break
+            self.warnings.append("a step is refused: with it the particles have no weights")
         return [
             self._pose(each, self._pose_gaussian(each.robot))
             for each in step

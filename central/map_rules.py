@@ -6,7 +6,7 @@ from central.config import CentralConfig
 from central.feedback_rule import FeedbackRule
 from central.fused import fused_message
 from central.roll import Roll
-from central.rules import NOTHING, MapEstimate, kalman
+from central.rules import NOTHING, MapEstimate, fused_totally, kalman
 from central.submap_set import SubmapSet
 from team import translate
 from team.wire import channels as ch
@@ -156,7 +156,8 @@ class LatestRule(_MapRule):
         return [x for x in found if self._placed.get((x.robot, x.epoch))]
 
     def _fused(self, maps: Sequence[m.MapEstimate], *, final: bool) -> m.FusedMap:
-        fused = kalman([_value(x) for x in maps])
+        values = {x.robot: _value(x) for x in maps}
+        fused, refused = fused_totally(kalman, values, self._config.bounds.coordinate_m)
         self.landmarks = len(fused.ids)
         away = sorted(
             x.robot for x in self._maps.values() if not self._placed.get((x.robot, x.epoch))
@@ -168,7 +169,7 @@ class LatestRule(_MapRule):
             tuple(_member(x) for x in maps),
             stamp_ns=max((x.stamp_ns for x in maps), default=0),
             final=final,
-            reasons=tuple(f"{robot}: its start pose is not known" for robot in away),
+            reasons=(*(f"{robot}: its start pose is not known" for robot in away), *refused),
         )
 
 

@@ -16,6 +16,7 @@ from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import Matrix, PoseGaussian
 from team.estimation.geometry import Pose
+from team.estimation.plausible import start_beyond
 from team.estimation.turn import Turn
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -138,7 +139,7 @@ class ReadingRule(ABC):
         starts = self._epochs.starts
         if not starts:
             return False
-        placed = {name: start for name, (_, start) in starts.items() if start.pose}
+        placed = {name: start for name, (_, start) in starts.items() if self._is_placed(start)}
         if not placed:
             name = min(starts)
             placed = {name: starts[name][1]}
@@ -146,7 +147,10 @@ class ReadingRule(ABC):
         self._robots = {name: starts[name][0] for name in sorted(placed)}
         away = sorted(starts.keys() - placed.keys())
         self._reasons += [f"{name}: its start pose is not known" for name in away]
-        known = {name: translate.pose_of(placed[name]) for name in self._robots}
+        known = {
+            name: translate.pose_of(placed[name]) if self._is_placed(placed[name]) else (None, None)
+            for name in self._robots
+        }
         self._members = {n: m.Member(n, placed[n].epoch, 0) for n in self._robots}
         self._start(
             {
@@ -155,6 +159,11 @@ class ReadingRule(ABC):
             }
         )
         return True
+
+    def _is_placed(self, start: m.Start) -> bool:
+        """Whether the initial pose is known, and within the bounds."""
+        value = translate.start_of(start)
+        return value is not None and start_beyond(value, self._config.bounds) is None
 
     def _take_step(self, step: Sequence[RobotEpoch]) -> list[Outgoing]:
         if not step:

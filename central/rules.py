@@ -6,14 +6,19 @@ covariance loses its meaning. Covariance intersection stays consistent for any c
 landmarks that it fuses, at the price of what the maps truly have in addition.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team.estimation.gaussian import carried_along, cholesky_factor, information
+from team.estimation.gaussian import (
+    NotACovarianceError,
+    carried_along,
+    cholesky_factor,
+    information,
+)
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 SEARCH_STEPS = 60
@@ -77,6 +82,50 @@ def _one_by_one(
     for each in maps[1:]:
         fused = pair(fused, each)
     return fused
+
+
+def fused_totally(
+    rule: Callable[[Sequence[MapEstimate]], MapEstimate],
+    maps: Mapping[str, MapEstimate],
+    coordinate_m: float,
+) -> tuple[MapEstimate, tuple[str, ...]]:
+    """The fusion of the robots' maps, and why a map is left out of it.
+
+    A map beyond the bounds is, and one with which the rule has no result: they are then taken one
+    by one in the given order.
+    """
+    kept: dict[str, MapEstimate] = {}
+    reasons = []
+    for robot, each in maps.items():
+        if np.abs(each.means).max(initial=0.0) > coordinate_m:
+            reasons.append(f"{robot}: its map is refused, a coordinate beyond {coordinate_m:g} m")
+        else:
+            kept[robot] = each
+    fused = _tried(rule, list(kept.values()))
+    if fused is not None:
+        return fused, tuple(reasons)
+    fused, taken = NOTHING, list[MapEstimate]()
+    for robot, each in kept.items():
+        more = _tried(rule, [*taken, each])
+        if more is None:
+            reasons.append(f"{robot}: its map is refused, with it the fusion has no result")
+        else:
+            fused = more
+            taken.append(each)
+    return fused, tuple(reasons)
+
+
+def _tried(
+    rule: Callable[[Sequence[MapEstimate]], MapEstimate], maps: Sequence[MapEstimate]
+) -> MapEstimate | None:
+    """The rule's result; None where there is none, or none in finite numbers."""
+    try:
+        with np.errstate(all="ignore"):
+            fused = rule(maps)
+    except (NotACovarianceError, np.linalg.LinAlgError):
+        return None
+    finite = np.isfinite(fused.means).all() and np.isfinite(fused.covariance).all()
+    return fused if finite else None
 
 
 def _shared(a: MapEstimate, b: MapEstimate) -> tuple[Int64[np.ndarray, " k"], ...]:

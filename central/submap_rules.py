@@ -35,7 +35,8 @@ class SubmapRule:
     @property
     def figures(self) -> Mapping[str, float]:
         """Refused submaps, and what the monitor has found."""
-        return {"refused": float(self.joined.refused)} | self.joined.finding.figures
+        refused = self.joined.refused + self.joined.not_folded
+        return {"refused": float(refused)} | self.joined.finding.figures
 
     @property
     def findings(self) -> tuple[str, ...]:

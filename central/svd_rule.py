@@ -19,8 +19,12 @@ from central.rules import NOTHING, MapEstimate
 from central.submap_set import Stream
 from team import translate
 from team.estimation import svd_joining
-from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.contribution import named
+from team.estimation.gauss_newton import UNSOLVABLE
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.estimation.geometry import Pose
+from team.estimation.plausible import start_beyond, submap_beyond
+from team.estimation.submap import LocalMap
 from team.estimation.svd_joining import (
     NO_PAIRS,
     PointPairs,
@@ -38,11 +42,15 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """The submaps of a stream so far: how many, their map, and the digest of what is in it."""
+    """The submaps of a stream so far: how many, their map, and the digest of what is in it.
+
+    refused: the submap with which the chain has ended and why, if there is one.
+    """
 
     count: int
     state: SubmapJoining
     digest: bytes
+    refused: str = ""
 
 
 class SvdJoinRule(JoinRule):
@@ -83,11 +91,13 @@ class SvdJoinRule(JoinRule):
             return fused_message(
                 self._config, self._digest, NOTHING, (), stamp_ns=0, final=final, frame=""
             )
-        placed = [stream for stream in sorted(chains) if self._starts[stream].pose]
-        first = placed[0] if placed else min(chains)
         joined = {stream: self._extended(stream, chains[stream], final) for stream in chains}
-        maps = {s: svd_joining.landmark_gaussian(x.state) for s, x in joined.items()}
-        fused, reasons = tied(first, maps, full=self._weighting == "full")
+        told = {s: x.state for s, x in joined.items() if x.state.fold.contributions}
+        first = min(told or chains, key=lambda s: (self._believed(s) is None, s))
+        maps = {s: svd_joining.landmark_gaussian(state) for s, state in told.items()}
+        with np.errstate(all="ignore"):
+            fused, reasons = tied(first, maps, full=self._weighting == "full")
+        refused = tuple(x.refused for _, x in sorted(joined.items()) if x.refused)
         self.landmarks = len(fused.ids)
         return fused_message(
             self._config,
@@ -97,8 +107,15 @@ class SvdJoinRule(JoinRule):
             stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
             final=final,
             frame=f"{first[0]}/{first[1]}",
-            reasons=reasons,
+            reasons=(*reasons, *refused),
         )
+
+    def _believed(self, stream: Stream) -> Pose | None:
+        """The initial pose of a stream, if it is known and within the bounds."""
+        start = translate.start_of(self._starts[stream])
+        if start is None or start_beyond(start, self._config.bounds) is not None:
+            return None
+        return start.pose
 
     def _extended(self, stream: Stream, chain: Sequence[m.Submap], final: bool) -> _Joined:
         """The map of a stream's chain, from the longest one that was made before.
@@ -106,20 +123,49 @@ class SvdJoinRule(JoinRule):
         Running maps have the solution that each submap has moved on; the final one is solved to the
         end, wrong minima looked for.
         """
-        told = translate.pose_of(self._starts[stream])[0]
+        told = self._believed(stream)
         begin = svd_joining.begun(
             {stream[0]: np.zeros(3) if told is None else told}, self._weighting
         )
         before = self._joined.get(stream)
         if before is None or before.count > len(chain):
             before = _Joined(0, begin, self._digest)
-        state, digest = before.state, before.digest
+        state, digest, refused = before.state, before.digest, before.refused
         for submap in chain[before.count :]:
-            local = translate.local_map_of(submap).without_nodes
-            state = svd_joining.stepped(state, stream[0], local)
             digest = translate.digest_of(digest, encoded(submap))
-        self._joined[stream] = _Joined(len(chain), state, digest)
-        return _Joined(len(chain), svd_joining.solved(state) if final else state, digest)
+            if not refused:
+                local = translate.local_map_of(submap).without_nodes.without_biases
+                why = submap_beyond(local, self._config.bounds)
+                after = _stepped(state, stream[0], local) if why is None else None
+                if after is None:
+                    words = why or "with it the map has no solution"
+                    refused = f"submap {submap.sequence} of {named(stream)} refused: {words}"
+                else:
+                    state = after
+        self._joined[stream] = _Joined(len(chain), state, digest, refused)
+        solution = _solution(state) if final else state
+        return _Joined(len(chain), solution, digest, refused)
+
+
+def _stepped(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
+    """The map with one more submap; None where it has no solution or no covariance."""
+    try:
+        with np.errstate(all="ignore"):
+            after = svd_joining.stepped(state, robot, local)
+            landmarks = svd_joining.landmark_gaussian(after)
+    except UNSOLVABLE:
+        return None
+    finite = np.isfinite(landmarks.means).all() and np.isfinite(landmarks.covariance).all()
+    return after if finite else None
+
+
+def _solution(state: SubmapJoining) -> SubmapJoining:
+    """The full solution; where there is none, the map that the submaps have grown to."""
+    try:
+        with np.errstate(all="ignore"):
+            return svd_joining.solved(state)
+    except UNSOLVABLE:
+        return state
 
 
 def tied(
@@ -135,9 +181,10 @@ def tied(
     each other (`mutual_sighting`); they tie beside the common landmarks, not with `full`. Who
     shares too few points stays out, with the reason.
     """
-    fused = maps[first]
+    fused = maps.get(first, NO_LANDMARKS)
     frames = {first: np.zeros(3)}
     waiting = {stream: maps[stream] for stream in sorted(maps) if stream != first}
+    unsolvable: list[Stream] = []
     while waiting:
         seen = {s: _seen(s, frames, sightings) for s in waiting}
         shared = {
@@ -152,10 +199,17 @@ def tied(
             )
         except TooFewPointsError:
             break
+        except UNSOLVABLE:
+            unsolvable.append(stream)
+            del waiting[stream]
+            continue
         fused = exchange.landmarks
         frames[stream] = exchange.a_from_b.mean
         del waiting[stream]
-    reasons = []
+    reasons = [
+        f"{robot}, epoch {epoch}, not joined: its common landmarks give no place"
+        for robot, epoch in unsolvable
+    ]
     for (robot, epoch), alone in waiting.items():
         count = len(np.intersect1d(fused.ids, alone.ids))
         plural = "" if count == 1 else "s"

@@ -7,8 +7,9 @@ from itertools import groupby
 from typing import NamedTuple
 
 from team import translate
-from team.config import RobotConfig
+from team.config import Bounds, RobotConfig
 from team.stream.inbox import Inbox
+from team.stream.judge import SPEED, StreamJudge
 from team.stream.segmenter import Epoch, Segmenter
 from team.wire import messages as m
 
@@ -33,6 +34,7 @@ class _Stream:
     config: RobotConfig | None = None
     inbox: Inbox = field(default_factory=Inbox)
     segmenter: Segmenter | None = None
+    judge: StreamJudge = field(default_factory=lambda: StreamJudge(Bounds()))
     start: m.Start | None = None
     waiting: deque[RobotEpoch] = field(default_factory=deque)
     covered_ns: float = float("-inf")
@@ -64,16 +66,25 @@ class _Stream:
                 self.start = reading
                 keyframe_s = config.front_end.keyframe_s
                 self.segmenter = Segmenter(config.motion, config.sensor, keyframe_s)
+                self.judge = StreamJudge(config.bounds)
             case m.Start():
                 self.broken = True  # a later life of the stream begins who knows where
             case m.Observations() if self.segmenter is not None:
-                self.segmenter.observe(reading.stamp_ns, *translate.scan_of(reading))
-            case m.Odometry() if self.segmenter is not None and reading.duration_ns > 0:
+                ids, ranges, bearings = translate.scan_of(reading)
+                near = self.judge.near(ranges)
+                if self.judge.time(reading.stamp_ns) is None and (near.any() or not len(near)):
+                    scan = ids[near], ranges[near], bearings[near]
+                    self.segmenter.observe(reading.stamp_ns, *scan)
+            case m.Odometry() if self.segmenter is not None:
                 motion = translate.motion_of(reading, config.clock_offset_s)
+                reason = self.judge.odometry(*motion)
+                if reason not in {None, SPEED}:
+                    return
                 end_ns, duration_ns, _, _ = motion
                 if self.segmenter.now_ns is None:
                     self.segmenter.begin(end_ns - duration_ns)
-                self._file(self.segmenter.drive(*motion), reading.reading)
+                epochs = self.segmenter.drive(*motion, measured=reason is None)
+                self._file(epochs, reading.reading)
                 self.covered_ns = end_ns
             case _:
                 pass

@@ -18,6 +18,7 @@ from central.config import CentralConfig
 from central.withdrawal import convicted, suspects
 from team import translate
 from team.estimation import marginals
+from team.estimation.contribution import named
 from team.estimation.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -25,12 +26,12 @@ from team.estimation.joining import (
     JoinSettings,
     Sighting,
     converged,
-    folded,
     lean,
-    started,
 )
 from team.estimation.joining import Start as StartValue
 from team.estimation.marginals import Agreement
+from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
+from team.estimation.refusal import Tick, taken
 from team.estimation.sensitivity import BIASES
 from team.wire.messages import SightingFactor, Submap
 
@@ -255,16 +256,36 @@ class TickFold:
         )
 
     def _with_tick(self, fold: Fold, tick: int) -> Fold:
+        """The fold with all of a tick; members beyond the bounds are refused before the others."""
         gone = self._gone
-        members = {key: each for key, each in self._ticks[tick].items() if key[1] not in gone}
-        for key in sorted(members):
-            stream = members[key].stream
-            if members[key].sequence == 0 and stream in self._starts:
-                fold = started(fold, self._starts[stream])
-        order = sorted(members)
-        seen = (each for key in order for each in self._sightings[key])
-        sightings = [each for each in seen if each.teammate not in gone]
-        return folded(fold, [members[key] for key in order], self.settings, sightings)
+        order = sorted(key for key in self._ticks[tick] if key[1] not in gone)
+        members = [self._ticks[tick][key] for key in order]
+        outside = {}
+        for each in members:
+            why = submap_beyond(each.local, self._config.bounds)
+            if why is not None:
+                outside[each.key] = why
+        sightings, starts, set_aside = [], [], []
+        for sighting in (each for key in order for each in self._sightings[key]):
+            if sighting.teammate in gone:
+                continue
+            why = sighting_beyond(sighting, self._config.bounds)
+            if why is None:
+                sightings.append(sighting)
+            else:
+                of = f"{sighting.teammate} by {named(sighting.stream)}"
+                set_aside.append(f"an inter-robot measurement of {of} refused: {why}")
+        for start in (
+            self._starts[m.stream] for m in members if m.sequence == 0 and m.stream in self._starts
+        ):
+            why = start_beyond(start, self._config.bounds)
+            if why is None:
+                starts.append(start)
+            else:
+                of = named(start.stream)
+                set_aside.append(f"the initial pose of {of} refused, taken as unknown: {why}")
+        news = Tick(members, sightings, starts, outside, tuple(set_aside))
+        return taken(fold, news, self.settings)
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
         """The name of the fold's set: starts and submaps in canonical order, and `more`."""
@@ -278,10 +299,14 @@ class TickFold:
             for (robot, epoch), start in sorted(self._starts.items())
             if (robot, epoch) in fold.home
         ]
-        members = [self._digests[c.key] for c in fold.contributions]
+        keys = [*(c.key for c in fold.contributions), *fold.refused]
+        members = [self._digests[key] for key in sorted(keys)]
         gone = [f"without {robot}".encode() for robot in self.withdrawn]
         return translate.digest_of(*more, *gone, *starts, *members)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
-        """The version vector: the last sequence of each stream in the fold."""
-        return {stream: fold.next_sequence(stream) - 1 for stream in sorted(fold.home)}
+        """The version vector: the last sequence of each stream that was taken or refused."""
+        last = {stream: fold.next_sequence(stream) - 1 for stream in fold.home}
+        for _, robot, epoch, sequence in fold.refused:
+            last[robot, epoch] = max(last.get((robot, epoch), -1), sequence)
+        return {stream: last[stream] for stream in sorted(last)}

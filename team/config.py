@@ -192,13 +192,39 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("biases are named once each, in alphabetical order")
 
 
+class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is physically sensible: what lies beyond is refused, with its reason, before it is used.
+
+    coordinate_m: of a pose or a landmark in the team's frame. extent_m: of what one submap holds,
+    from its start, and of one range. speed_m_s, yaw_rate_rad_s, interval_s: of one odometry
+    interval. jump_s: between two measurements of one stream; what jumps by more is refused until
+    the next one confirms it. sigma_m, sigma_rad: least and largest standard deviation.
+    independent: the least share of a variance that the numbers before it leave unexplained, 1 − R²:
+    the conditioning of a covariance, whatever its units. sensitivity: of a submap's mean by a bias.
+    submap_landmarks: of one submap; a window closes early once it has half as many.
+    """
+
+    coordinate_m: Positive = 1e7
+    extent_m: Positive = 1e6
+    speed_m_s: Positive = 300.0
+    yaw_rate_rad_s: Positive = 100.0
+    interval_s: Positive = 1e3
+    jump_s: Positive = 1e6
+    sigma_m: tuple[Positive, Positive] = (1e-8, 1e7)
+    sigma_rad: tuple[Positive, Positive] = (1e-8, 100.0)
+    independent: Share = 1e-13
+    sensitivity: Positive = 1e9
+    submap_landmarks: Annotated[int, Meta(ge=2, le=1000)] = 500
+
+
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything that a robot's estimate depends on beside its readings.
 
     exchange_s: under a rule with feedback, the least team time between two exchanges of maps (at
     window ends; for `hybrid-thesis` at epochs). pose_s: the least team time between two running
     poses. clock_offset_s: what the odometry's clock stamps t happened at t + clock_offset_s of team
-    time, which is the sensor's clock; the robot corrects it before it uses a stamp.
+    time, which is the sensor's clock; the robot corrects it before it uses a stamp. bounds: what
+    lies beyond them is rejected.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
@@ -210,4 +236,5 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     exchange_s: NonNegative = 0.0
     pose_s: NonNegative = 0.0
     clock_offset_s: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
+    bounds: Bounds = Bounds()
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1

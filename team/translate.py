@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -14,6 +15,7 @@ from team.estimation.joining import Start as StartValue
 from team.estimation.submap import NO_COLUMNS, LocalMap
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, stamps
+from team.wire.codec import unsound
 
 NO_MAP = bytes(8)
 """The digest that stands for no map."""
@@ -230,6 +232,44 @@ def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray,
         return blocks_of(landmark_covariance_of(message))
     xx, xy, yy = floats(message.covariance, "covariance").astype(np.float64).reshape(-1, 3).T
     return np.stack((xx, xy, xy, yy), axis=1).reshape(-1, 2, 2)
+
+
+LandmarkMap = TypeVar("LandmarkMap", m.MapEstimate, m.FusedMap)
+NAMED = 10
+"""Landmarks that are left out are named up to so many."""
+
+
+def receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
+    """A map as every receiver takes it, and in words what it leaves out for that.
+
+    A joint covariance that rounding has spoilt gives way to the landmarks' own ones; a landmark
+    whose own covariance is none, or whose mean is not finite, is left out.
+    """
+    said = []
+    if message.joint and unsound(message) is not None:
+        said.append("the joint covariance is lost to rounding: each landmark has its own only")
+        blocks = block_bytes(landmark_blocks_of(message))
+        message = msgspec.structs.replace(message, joint=False, covariance=blocks)
+    if unsound(message) is not None:
+        message, left_out = _with_sound_landmarks(message)
+        said.append(f"left out, their covariance is none: {', '.join(map(str, left_out))}")
+    return message, tuple(said)
+
+
+def _with_sound_landmarks(message: LandmarkMap) -> tuple[LandmarkMap, list[int]]:
+    landmark_ids, means = landmarks_of(message)
+    blocks = landmark_blocks_of(message)
+    a, b, c = blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]
+    with np.errstate(all="ignore"):
+        sound = np.isfinite(means).all(axis=1) & np.isfinite(blocks).all(axis=(1, 2))
+        sound &= (a > 0.0) & (c > 0.0) & (np.abs(b) < np.sqrt(a) * np.sqrt(c))
+    kept = msgspec.structs.replace(
+        message,
+        ids=from_ids(landmark_ids[sound]),
+        means=from_floats(means[sound]),
+        covariance=block_bytes(blocks[sound]),
+    )
+    return kept, landmark_ids[~sound][:NAMED].tolist()
 
 
 def landmarks_of(

@@ -38,12 +38,12 @@ def brittle(monkeypatch: pytest.MonkeyPatch) -> None:
     """An estimator that raises at one odometry, in the middle of what it changes."""
     whole = HybridMember.drive
 
-    def drive(self, stamp_ns, duration_ns, forward, yaw_rate):  # type: ignore[no-untyped-def]
+    def drive(self, stamp_ns, duration_ns, forward, yaw_rate, **how):  # type: ignore[no-untyped-def]
         if stamp_ns == BROKEN_NS:
             self.sequence += 7
             self._segmenter = None
             raise ZeroDivisionError("no way")
-        return whole(self, stamp_ns, duration_ns, forward, yaw_rate)
+        return whole(self, stamp_ns, duration_ns, forward, yaw_rate, **how)
 
     monkeypatch.setattr(HybridMember, "drive", drive)
 
@@ -66,7 +66,7 @@ def test_a_reading_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_b
         ("ZeroDivisionError", "no way", BROKEN_NS)
     }
     for fault in told:
-        assert re.fullmatch(r"team\.robot\.node:RobotNode\._drive:\d+", fault.place)
+        assert re.fullmatch(r"team\.robot\.node:RobotNode\._go:\d+", fault.place)
     assert_each_reading_once(samples)
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)

@@ -60,21 +60,41 @@ def aligned(
 ) -> Alignment:
     """The most likely a_from_b, given two independent Gaussian maps of the same n ≥ 2 landmarks.
 
-    Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d with d = a − (R b + t), the metric taken at each iterate.
+    Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d with d = a − (R b + t), the metric taken at each iterate. The
+    motion is solved about the points' centroids, a − ā = R (b − b̄) + t', so that neither the
+    rounding nor the conditioning depends on how far the points lie from either origin; then
+    t = ā + t' − R b̄. Points that all lie at one place leave the heading free: `heading_sigma` is
+    infinite and the motion that of heading 0.
+    Raises NotACovarianceError where the covariance of the differences is none.
     """
     n = len(in_a)
     variances = np.diag(covariance_a) + np.diag(covariance_b)
-    a_from_b = procrustes(in_a, in_b, 1.0 / variances.reshape(n, 2).sum(axis=1))
+    of_a, of_b = in_a.mean(axis=0), in_b.mean(axis=0)
+    near_a, near_b = in_a - of_a, in_b - of_b
+    if not near_b.any():
+        return _at_one_place(of_a - of_b, n)
+    about = procrustes(near_a, near_b, 1.0 / variances.reshape(n, 2).sum(axis=1))
     for _ in range(ITERATIONS):
-        residual, metric, jacobian = _linearised(a_from_b, in_a, covariance_a, in_b, covariance_b)
+        residual, metric, jacobian = _linearised(about, near_a, covariance_a, near_b, covariance_b)
         spread = information(jacobian.T @ metric @ jacobian, "an alignment")
-        a_from_b = a_from_b + spread @ (jacobian.T @ (metric @ residual))
-        a_from_b[2] = wrapped(a_from_b[2])
-    residual, metric, jacobian = _linearised(a_from_b, in_a, covariance_a, in_b, covariance_b)
+        about = about + spread @ (jacobian.T @ (metric @ residual))
+        about[2] = wrapped(about[2])
+    residual, metric, jacobian = _linearised(about, near_a, covariance_a, near_b, covariance_b)
     spread = information(jacobian.T @ metric @ jacobian, "an alignment")
     chi2 = float(residual @ metric @ residual)
-    sigma = _shape_heading_sigma(in_b, jacobian, information(metric, "the metric of an alignment"))
-    return Alignment(a_from_b, spread, chi2, 2 * n - 3, sigma)
+    difference = information(metric, "the metric of an alignment")
+    sigma = _shape_heading_sigma(near_b, jacobian, difference)
+    c, s = np.cos(about[2]), np.sin(about[2])
+    x, y = c * of_b[0] - s * of_b[1], s * of_b[0] + c * of_b[1]
+    a_from_b = np.array([of_a[0] + about[0] - x, of_a[1] + about[1] - y, about[2]])
+    lever = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
+    return Alignment(a_from_b, lever @ spread @ lever.T, chi2, 2 * n - 3, sigma)
+
+
+def _at_one_place(shift: Float[np.ndarray, "2"], n: int) -> Alignment:
+    """What points at one place say: a shift, and no heading."""
+    unknown = np.full((3, 3), np.inf)
+    return Alignment(np.array([*shift, 0.0]), unknown, np.inf, 2 * n - 3, np.inf)
 
 
 def at_heading(
@@ -146,6 +166,8 @@ def refusal(shared: Shared, alignment: Alignment | None, heading_sigma: float) -
     """
     if alignment is None:
         return f"{shared}, {NEEDED} needed"
+    if alignment.heading_sigma == np.inf:
+        return f"{shared} at one place, which gives no heading"
     if alignment.heading_sigma > heading_sigma:
         return (
             f"{shared} too close together for their uncertainty: "

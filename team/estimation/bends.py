@@ -57,7 +57,7 @@ def walks(island: Island, node: int) -> Iterator[tuple[Island, float]]:
             by = sign * (after - before) * sigma
             walked = held(walked, int(island.graph.offset[node]) + 2, by, ITERATIONS)
             rise = walked.cost - island.cost
-            if rise > UNLIKELY:
+            if not rise <= UNLIKELY:  # nor where the cost is no number
                 break
             yield walked, rise
 
@@ -78,17 +78,18 @@ def bend(island: Island, node: int) -> Bend | None:
     None where it denies none.
     """
     mean, covariance = joint_marginal(island, [node])
-    # The χ² is that of the motion of the frame Exp(ξ), to first order ξ = A (dx, dy, dθ), so that a
-    # turn about a far point is not taken for a bend.
-    A = np.array([[1.0, 0.0, mean[1]], [0.0, 1.0, -mean[0]], [0.0, 0.0, 1.0]])
+    # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
+    # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.
+    c, s = np.cos(mean[2]), np.sin(mean[2])
+    A = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     metric = information(A @ covariance @ A.T, "a pose")
     at = int(island.graph.offset[node])
     found = []
     for walked, rise in walks(island, node):
         pose = walked.state[at : at + 3]
-        xi = logarithm(compose(pose, inverse(mean)))
+        eta = logarithm(compose(inverse(mean), pose))
         distance = float(np.hypot(*(pose - mean)[:2]))
-        found.append(Bend(distance, rise, float(xi @ metric @ xi)))
+        found.append(Bend(distance, rise, float(eta @ metric @ eta)))
     worst = max(found, key=lambda each: each.ratio, default=None)
     return None if worst is None or worst.ratio < BENT else worst
 

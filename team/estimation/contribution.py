@@ -12,6 +12,8 @@ from team.estimation.submap import LocalMap
 
 Stream: TypeAlias = tuple[str, int]
 """(robot, epoch): one unbroken life of a robot's sensor stream."""
+Key: TypeAlias = tuple[int, str, int, int]
+"""(end stamp, robot, epoch, sequence): a submap's place in the canonical order."""
 
 
 def named(stream: Stream) -> str:
@@ -35,7 +37,7 @@ class Contribution:
         return (self.robot, self.epoch)
 
     @property
-    def key(self) -> tuple[int, str, int, int]:
+    def key(self) -> Key:
         """Place in the canonical order: (end stamp, robot, epoch, sequence)."""
         return (self.end_ns, self.robot, self.epoch, self.sequence)
 

@@ -23,6 +23,7 @@ from team.config import Bias
 from team.estimation import joining_kernel as kernel
 from team.estimation import sighting_kernel as sightings
 from team.estimation import sparse
+from team.estimation.gaussian import NotACovarianceError
 from team.estimation.geometry import wrapped
 from team.estimation.submap_graph import Graph
 
@@ -82,6 +83,10 @@ class NotDeterminedError(ValueError):
     def __init__(self, node: str) -> None:
         super().__init__(f"{node} is not determined by the submaps")
         self.node = node
+
+
+UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
+"""What a solution raises where its numbers do not allow one: a value to decide on, no defect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,6 +291,22 @@ def aged(island: Island, iterations: int | None) -> Island:
 def final_cost(island: Island) -> float:
     """The cost with every robust scale at its end, so that islands can be compared."""
     return aged(island, FULL_AGE).cost
+
+
+def is_solvable(island: Island) -> bool:
+    """Whether the island has a solution: finite numbers, every unknown determined.
+
+    The pivots of the factorisation are judged by their diagonal entries (`sparse_kernel`), so units
+    and the size of covariances have no influence.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            factor, cost = island.posterior, island.cost
+    except UNSOLVABLE:
+        return False
+    return bool(np.isfinite(island.state).all() and np.isfinite(factor.panels).all()) and (
+        math.isfinite(cost)
+    )
 
 
 def _prior_terms(

@@ -38,16 +38,27 @@ class NotACovarianceError(ValueError):
 
 
 def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
-    """Lower L with L Lᵀ = covariance; `what` names the matrix in the error if there is none."""
+    """Lower L with L Lᵀ = covariance; `what` names the matrix in the error if there is none.
+
+    Symmetry is judged by the diagonal's scale, and so is rank: a pivot that is no more than n ε of
+    its diagonal entry is what rounding leaves of a singular matrix.
+    """
     if not np.isfinite(covariance).all():
         raise NotACovarianceError(what, "not finite")
-    scale = np.sqrt(np.abs(np.outer(np.diag(covariance), np.diag(covariance))))
-    if (np.abs(covariance - covariance.T) > 1e-9 * scale + 1e-300).any():
+    diagonal = np.diag(covariance)
+    if not (diagonal > 0.0).all():
+        raise NotACovarianceError(what, "not positive definite")
+    sigmas = np.sqrt(diagonal)
+    if (np.abs(covariance - covariance.T) > 1e-9 * sigmas * sigmas[:, None]).any():
         raise NotACovarianceError(what, "not symmetric")
     try:
-        return np.linalg.cholesky(covariance)
+        factor = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         raise NotACovarianceError(what, "not positive definite") from None
+    pivots = np.diag(factor) / sigmas
+    if (pivots * pivots <= len(covariance) * np.finfo(np.float64).eps).any():
+        raise NotACovarianceError(what, "not positive definite")
+    return factor
 
 
 def information(covariance: Matrix, what: str) -> Matrix:

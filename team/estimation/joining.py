@@ -7,16 +7,25 @@ boundaries. Streams whose start in the common frame is unknown are islands of th
 landmarks and sightings tie them to the main island.
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, Start, Stream, named
-from team.estimation.gauss_newton import Island, JoinSettings, final_cost, iterated
+from team.estimation.contribution import Contribution, Key, Start, Stream, named
+from team.estimation.gauss_newton import (
+    UNSOLVABLE,
+    Island,
+    JoinSettings,
+    final_cost,
+    is_solvable,
+    iterated,
+)
 from team.estimation.merging import Merge, ages, merge, sighted
-from team.estimation.minima import doubts, searched, suspicious, widened
+from team.estimation.minima import Minimum, Search, doubts, searched, suspicious, widened
 from team.estimation.sighting import Sighting
 from team.estimation.submap_graph import EMPTY_GRAPH, extended
 
@@ -86,6 +95,9 @@ class Fold:
     judged, looked: the submaps of two islands, or of one, when they were last searched for a place
                 or a minimum in vain; with it why the two were not merged.
     iterations, change: of the main island's last full solution: how many, the last step [m, rad].
+    refused:    submaps that came and are not in the map, in canonical order, and why (`taken`).
+    set_aside:  in words, what else was refused: initial poses, inter-robot measurements, and the
+                landmarks of submaps of which only the motion is in the map.
     """
 
     contributions: tuple[Contribution, ...]
@@ -100,6 +112,8 @@ class Fold:
     doubts: tuple[str, ...] = ()
     judged: Mapping[tuple[Stream, Stream], tuple[int, str]] = field(default_factory=dict)
     looked: Mapping[Stream, int] = field(default_factory=dict)
+    refused: Mapping[Key, str] = field(default_factory=dict)
+    set_aside: tuple[str, ...] = ()
 
     @property
     def main_key(self) -> Stream | None:
@@ -203,14 +217,20 @@ def lean(fold: Fold) -> Fold:
 def converged(fold: Fold, settings: JoinSettings) -> Fold:
     """The full solution of every island; `iterations` and `change` tell how it ended.
 
-    Wrong minima are looked for; what is found stands in `doubts`.
+    Wrong minima are looked for; what is found stands in `doubts`. An island that has no full
+    solution stays as the last tick has left it, and `doubts` says so.
     """
     if fold.main_key is None:
         return fold
+    with np.errstate(all="ignore"):  # what overflows has no finite cost, and is not taken
+        return _converged(fold, settings, fold.main_key)
+
+
+def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
     searches = {
-        key: searched([replace(island, settings=settings)]) for key, island in fold.islands.items()
+        key: _search(replace(island, settings=settings)) for key, island in fold.islands.items()
     }
-    main = searches[fold.main_key]
+    main = searches[main_key]
     solved = replace(
         fold,
         islands={key: each.best.island for key, each in searches.items()},
@@ -218,14 +238,28 @@ def converged(fold: Fold, settings: JoinSettings) -> Fold:
         change=main.best.change,
     )
     merged = _with_merges(solved, at_last=True)
-    last = widened(main if merged.main is main.best.island else searched([merged.main]))
+    last = main if merged.main is main.best.island else _search(merged.main)
+    wider = None
+    with suppress(*UNSOLVABLE):
+        wider = widened(last)
+    if wider is not None and is_solvable(wider.best.island):
+        last = wider
     return replace(
         merged,
-        islands={**merged.islands, fold.main_key: last.best.island},
+        islands={**merged.islands, main_key: last.best.island},
         iterations=last.best.iterations,
         change=last.best.change,
         doubts=tuple(doubts(last)),
     )
+
+
+def _search(island: Island) -> Search:
+    """The search for the island's full solution; where there is none, the island as it is."""
+    with suppress(*UNSOLVABLE):
+        found = searched([island])
+        if is_solvable(found.best.island):
+            return found
+    return Search(Minimum(island, 0, math.inf, final_cost(island)), 0.0, None)
 
 
 def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
@@ -297,5 +331,5 @@ def _looked(fold: Fold) -> Fold:
         if size < PATIENCE * looked.get(key, 0) or not suspicious(island, final_cost(island)):
             continue
         looked[key] = size
-        islands[key] = searched([island]).best.island
+        islands[key] = _search(island).best.island
     return replace(fold, islands=islands, looked=looked)

@@ -7,6 +7,7 @@ not disagree there and no other place is about as likely; else the merge waits a
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from jaxtyping import Float, Int64
 from team.estimation import alignment
 from team.estimation.alignment import Alignment, Shared
 from team.estimation.contribution import named
-from team.estimation.gauss_newton import Island, joint_marginal
+from team.estimation.gauss_newton import UNSOLVABLE, Island, is_solvable, joint_marginal
 from team.estimation.island_ties import Tie, aligned_by, headings_that_fit, ties
 from team.estimation.minima import Minimum, Search, minimum, searched
 from team.estimation.sighting import Sighting
@@ -59,7 +60,18 @@ def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[
 
 
 def merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | Waits:
-    """The other island in the main one's frame, or why it waits."""
+    """The other island in the main one's frame, or why it waits.
+
+    Where the numbers of the shared points allow no solution, they wait as well.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            return _merge(main, other, waiting)
+    except UNSOLVABLE as error:
+        return Waits(f"can not be solved for: {error}", after_search=True)
+
+
+def _merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | Waits:
     tied = ties(main.graph, other.graph, waiting)
     seen = sum(tie.seen is not None for tie in tied)
     shared = Shared(len(tied) - seen, seen)
@@ -77,6 +89,8 @@ def merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | W
         why = _ambiguous(shared, search, search.second, graph.streams[min(other.graph.streams)][0])
     if why is not None:
         return Waits(why, after_search=True)
+    if not is_solvable(search.best.island):
+        return Waits(f"{shared}, with which the map has no solution", after_search=True)
     return Merge(search.best, left, _words(other, shared, search, rise))
 
 
@@ -98,7 +112,9 @@ def _places(main: Island, other: Island, tied: Sequence[Tie]) -> list[Float[np.n
     by_sightings = [tie for tie in tied if tie.seen is not None]
     proposed: list[Alignment | None] = []
     if by_landmarks and by_sightings:
-        proposed = [aligned_by(main, other, some) for some in (by_landmarks, by_sightings)]
+        for some in (by_landmarks, by_sightings):
+            with suppress(*UNSOLVABLE):
+                proposed.append(aligned_by(main, other, some))
     places = [found.a_from_b for found in proposed if found is not None]
     return [*places, *headings_that_fit(main, other, tied)]
 

@@ -6,7 +6,8 @@ does another start that ends lower. What ends about as low elsewhere is a second
 submaps allow.
 """
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -19,7 +20,7 @@ from scipy.special import chdtri
 from team.estimation import sparse_kernel
 from team.estimation.bends import bends, ends, walks
 from team.estimation.contribution import Stream, named
-from team.estimation.gauss_newton import Island, NotDeterminedError, final_cost, settled
+from team.estimation.gauss_newton import UNSOLVABLE, Island, NotDeterminedError, final_cost, settled
 from team.estimation.geometry import wrapped
 from team.estimation.relaxation import relaxed
 
@@ -99,16 +100,28 @@ def searched(starts: Sequence[Island]) -> Search:
 
     The first start is the one that would be taken without a search. While the lowest cost is
     suspicious, and always with few landmarks, starts that leave the sightings out or doubt every
-    factor are tried as well.
+    factor are tried as well. A start that leads to no solution is left out; raises
+    NotDeterminedError where none leads to one.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
-    first = minimum(starts[0])
-    found = [first, *(minimum(start) for start in starts[1:])]
-    for start in _further(starts[0]):
-        found.append(minimum(start))
+    found = list(_minima(starts))
+    for each in _minima(_further(starts[0])):
+        found.append(each)
         if not few and not suspicious(starts[0], min(each.cost for each in found)):
             break
+    if not found:
+        raise NotDeterminedError("every place that was tried")
     return _lowest(found)
+
+
+def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
+    """The minima of those starts that lead to one: no start of a search can end it."""
+    for start in starts:
+        found = None
+        with suppress(*UNSOLVABLE), np.errstate(all="ignore"):
+            found = minimum(start)
+        if found is not None and math.isfinite(found.cost):
+            yield found
 
 
 def widened(search: Search) -> Search:
@@ -124,8 +137,9 @@ def widened(search: Search) -> Search:
         return search
     found = [search.best] if search.second is None else [search.best, search.second]
     for _, _, node in ends(best):
-        found += [minimum(walked) for walked, _ in walks(best, node)]
-    found += [minimum(each) for each in _mirrored(best)]
+        with suppress(*UNSOLVABLE):  # of the walk itself
+            found += _minima(walked for walked, _ in walks(best, node))
+    found += _minima(_mirrored(best))
     wider = _lowest(found)
     return wider._replace(gained=search.gained + search.best.cost - wider.best.cost)
 
@@ -185,13 +199,13 @@ def _further(island: Island) -> Iterator[Island]:
             island, graph=replace(graph, sightings=()), sighting_age=island.sighting_age[:0]
         )
         alone = relaxed(unseen.graph, island.state)
-        if alone is not None:
-            with suppress(NotDeterminedError):  # where only sightings tie the robots
-                yield replace(island, state=minimum(replace(unseen, state=alone)).island.state)
+        if alone is not None:  # none, where only sightings tie the robots
+            for found in _minima([replace(unseen, state=alone)]):
+                yield replace(island, state=found.island.state)
     if guess is not None and island.settings.robust_c is None:
         doubting = replace(island.settings, robust_c=1.0, robust_start=WIDE)
-        doubted = minimum(replace(island, state=guess, settings=doubting)).island
-        yield replace(island, state=doubted.state)
+        for found in _minima([replace(island, state=guess, settings=doubting)]):
+            yield replace(island, state=found.island.state)
 
 
 def _at_rest(best: Minimum) -> Minimum:
@@ -238,7 +252,9 @@ def doubts(search: Search) -> list[str]:
             f"the map does not fit its submaps: chi² {search.best.cost:.1f} with {dof} degrees of "
             "freedom; it may be a wrong minimum, or the covariances are too small"
         )
-    if search.best.change > SETTLED_M:
+    if search.best.change == math.inf:
+        found.append("the map has no full solution: it is what the last tick has left")
+    elif search.best.change > SETTLED_M:
         found.append(
             f"the map is not settled: after {search.best.iterations} iterations "
             f"a step is still {search.best.change:.2g} m or rad"
@@ -251,7 +267,8 @@ def doubts(search: Search) -> list[str]:
         for stream, sigma in sorted(_heading_sigmas(island).items())
         if sigma > limit
     ]
-    found += bends(island)
+    with suppress(*UNSOLVABLE):  # a heading that can not be moved bends nothing
+        found += bends(island)
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)
         points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]

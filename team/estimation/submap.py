@@ -48,6 +48,16 @@ class LocalMap:
         return self.mean[3 : 3 + 3 * len(self.node_stamps)].reshape(-1, 3)
 
     @property
+    def motion(self) -> "LocalMap":
+        """The marginal over the end pose alone."""
+        return LocalMap(self.ids[:0], self.mean[:3], self.covariance[:3, :3])
+
+    @property
+    def without_biases(self) -> "LocalMap":
+        """The same, the errors that the robot's submaps share taken as zero."""
+        return LocalMap(self.ids, self.mean, self.covariance, self.node_stamps)
+
+    @property
     def without_nodes(self) -> "LocalMap":
         """The marginal over end pose and landmarks."""
         if not len(self.node_stamps):

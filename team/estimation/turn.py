@@ -21,3 +21,11 @@ class Turn(NamedTuple):
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
+
+    @property
+    def blind(self) -> "Turn":
+        """The motion alone."""
+        none = slice(0)
+        return self._replace(
+            ids=self.ids[none], ranges=self.ranges[none], bearings=self.bearings[none]
+        )

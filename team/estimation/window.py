@@ -7,6 +7,7 @@ bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from team.config import FrontEnd, Sensor
 from team.estimation import fastslam
 from team.estimation.compiled import compiled
 from team.estimation.fastslam import Particles
-from team.estimation.gaussian import cholesky_factor
+from team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from team.estimation.geometry import wrapped
 from team.estimation.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import NEAREST_M, Increment
@@ -91,7 +92,9 @@ def advanced(
     The readings are accepted and corrected already (`models.acceptable`, `models.corrected`).
     forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
     """
-    expected = innovation(window.particles, increment, window.sensor, ids, ranges, bearings)
+    expected = NOTHING
+    with suppress(NotACovarianceError):  # then it is not known how well they were predicted
+        expected = innovation(window.particles, increment, window.sensor, ids, ranges, bearings)
     particles, info = fastslam.propagated_and_updated(
         window.particles,
         increment,

@@ -1,6 +1,7 @@
 """Hybrid-SLAM on one robot's readings: windows of particles, each closed into one submap."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -11,8 +12,17 @@ from team.estimation import geometry
 from team.estimation import window as windows
 from team.estimation.conditioning import pose_now
 from team.estimation.fastslam import Particles
-from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.gauss_newton import UNSOLVABLE
+from team.estimation.gaussian import (
+    LandmarkGaussian,
+    Matrix,
+    NotACovarianceError,
+    PoseGaussian,
+)
+from team.estimation.geometry import tangent
 from team.estimation.innovation import NOTHING, Innovation
+from team.estimation.models import Increment
+from team.estimation.plausible import are_landmarks, submap_beyond
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
 from team.estimation.whole_map import WholeMap, absorbed, begun, joined
@@ -49,7 +59,8 @@ class ClosedWindow:
 
     innovation: of the window's readings that were predicted. gated: readings that no others of the
     window confirmed, and that are not in the submap. late: scans of the interval that are stamped
-    behind the window's end; they are rejected.
+    behind the window's end; they are rejected. unsolved: scans that led to no Gaussian, of which
+    only the odometry's motion is in the submap.
     """
 
     sequence: int
@@ -63,6 +74,7 @@ class ClosedWindow:
     innovation: Innovation = NOTHING
     gated: int = 0
     late: int = 0
+    unsolved: int = 0
 
 
 @dataclass(frozen=True)
@@ -119,6 +131,9 @@ class HybridMember:
         self._innovation = NOTHING
         self.whole: WholeMap = begun(np.zeros(3), None)
         self.last_epoch_ns: int | None = None
+        self._motion = Increment.identity()
+        self._solvable = True
+        self._scans = 0
 
     def start(self, pose: Float[np.ndarray, "3"] | None, covariance: Matrix | None) -> None:
         """The start pose, if it is known; without one the own map's frame is the start itself."""
@@ -126,7 +141,7 @@ class HybridMember:
 
     def resume(self, closed: ClosedWindow) -> None:
         """Take over a submap of an earlier life: the next window begins where it ended."""
-        self.whole = joined(self.whole, closed.local)
+        self.whole = self._joined(closed.local)
         self.sequence = closed.sequence
         self._begin_window(closed.sequence + 1, closed.last_reading + 1, closed.end_ns)
 
@@ -136,7 +151,9 @@ class HybridMember:
 
     def observe(self, stamp_ns: int, scan: tuple[np.ndarray, np.ndarray, np.ndarray]) -> str | None:
         """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
-        return self._segmenter.observe(stamp_ns, *scan)
+        reason = self._segmenter.observe(stamp_ns, *scan)
+        self._scans += reason is None
+        return reason
 
     def sight(self, stamp_ns: int, reading: int, looks: Looks) -> str | None:
         """Take sightings of teammates; the reason if they are rejected."""
@@ -146,14 +163,23 @@ class HybridMember:
             return "older than the odometry"
         return self._grid.observe(stamp_ns, reading, looks)
 
-    def drive(self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float) -> Driven:
+    def drive(
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        *,
+        measured: bool = True,
+    ) -> Driven:
         """Take one odometry interval; the submap that it closes, if it does."""
         if self._start_ns is None:
             self._start_ns = stamp_ns - duration_ns
             self._segmenter.begin(self._start_ns)
         before_ns = self.last_epoch_ns
         self._way_m += abs(forward) * duration_ns * 1e-9
-        for epoch in self._segmenter.drive(stamp_ns, duration_ns, forward, yaw_rate):
+        motion = stamp_ns, duration_ns, forward, yaw_rate
+        for epoch in self._segmenter.drive(*motion, measured=measured):
             self._advance(epoch)
         if self._is_full(stamp_ns - self._start_ns):
             return Driven.with_submap(self._close(stamp_ns, self._segmenter.leave()))
@@ -163,7 +189,12 @@ class HybridMember:
         return Driven(None, self.last_epoch_ns if moved else None)
 
     def _is_full(self, lasting_ns: int) -> bool:
-        """Whether the window is long enough to close; one of a standing robot goes on."""
+        """Whether the window is long enough to close; one of a standing robot goes on.
+
+        One that has seen half as many landmarks as a submap may hold closes at once.
+        """
+        if 2 * len(self._window.particles.ids) >= self._config.bounds.submap_landmarks:
+            return True
         standing = self._way_m < self._config.front_end.window_m
         return lasting_ns >= self._window_ns and not (standing and lasting_ns < self._standing_ns)
 
@@ -177,11 +208,17 @@ class HybridMember:
 
     def open_window(self) -> LocalMap | None:
         """The open window's Gaussian at its last epoch, if it has one."""
-        return None if self.last_epoch_ns is None else windows.gaussian(self._window, running=True)
+        if self.last_epoch_ns is None:
+            return None
+        return self._solved(running=True) or self._moved_only()
 
     def own_pose(self, window: LocalMap | None) -> PoseGaussian:
-        """The pose of the own whole map, times the open window."""
-        return pose_now(self.whole, window).pose
+        """The pose of the own whole map, times the open window; its motion if they contradict."""
+        try:
+            with np.errstate(all="ignore"):
+                return pose_now(self.whole, window).pose
+        except UNSOLVABLE:
+            return pose_now(self.whole, None if window is None else window.motion).pose
 
     def own_map(self) -> LandmarkGaussian:
         """The landmarks of the own whole map."""
@@ -203,7 +240,35 @@ class HybridMember:
         return self._innovation.plus(self._window.innovation)
 
     def _advance(self, epoch: Epoch) -> None:
-        self._take(epoch if self._gate is None else self._gate.admitted(epoch))
+        self._motion = self._motion.then(epoch.increment)
+        self.last_epoch_ns = epoch.stamp_ns
+        self._try(lambda: self._admit(epoch))
+
+    def _try(self, step: Callable[[], None]) -> None:
+        """Take a step of the window's particles, unless one has failed: no readings then count."""
+        if self._solvable:
+            try:
+                with np.errstate(all="ignore"):
+                    step()
+            except (NotACovarianceError, np.linalg.LinAlgError):
+                self._solvable = False
+
+    def _admit(self, epoch: Epoch) -> None:
+        bounded = self._bounded(epoch)
+        self._take(bounded if self._gate is None else self._gate.admitted(bounded))
+
+    def _bounded(self, epoch: Epoch) -> Epoch:
+        """The epoch without the new landmarks that are too many for a submap; the nearest stay."""
+        known, most = self._window.particles.ids, self._config.bounds.submap_landmarks
+        if len(known) + len(epoch.ids) <= most:
+            return epoch
+        new, first = np.unique(epoch.ids[~np.isin(epoch.ids, known)], return_index=True)
+        ranges = epoch.ranges[~np.isin(epoch.ids, known)][first]
+        nearest = new[np.argsort(ranges, kind="stable")[: max(most - len(known), 0)]]
+        taken = np.isin(epoch.ids, known) | np.isin(epoch.ids, nearest)
+        return replace(
+            epoch, ids=epoch.ids[taken], ranges=epoch.ranges[taken], bearings=epoch.bearings[taken]
+        )
 
     def _take(self, epoch: Epoch) -> None:
         self._window = windows.advanced(
@@ -217,17 +282,50 @@ class HybridMember:
         )
         if epoch.is_node:
             self._window = windows.marked(self._window, epoch.stamp_ns)
-        self.last_epoch_ns = epoch.stamp_ns
+
+    def _solved(self, *, running: bool = False) -> LocalMap | None:
+        """The window as a Gaussian; None where there is none, or none that is sensible."""
+        if not self._solvable:
+            return None
+        try:
+            with np.errstate(all="ignore"):
+                local = windows.gaussian(self._window, running=running)
+        except (NotACovarianceError, np.linalg.LinAlgError):
+            return None
+        if running or submap_beyond(local, self._config.bounds) is None:
+            return local
+        return None
+
+    def _moved_only(self) -> LocalMap:
+        """The window's motion by the odometry alone, as a Gaussian in the window's frame."""
+        G = tangent(self._motion.mean[2])
+        covariance = G @ self._motion.covariance @ G.T + np.diag(windows.POSE_JITTER)
+        symmetric = 0.5 * (covariance + covariance.T)
+        return LocalMap(np.empty(0, np.uint32), self._motion.mean, symmetric)
+
+    def _joined(self, local: LocalMap) -> WholeMap:
+        """The own map with a submap; of one that contradicts it beyond all numbers, its motion."""
+        try:
+            with np.errstate(all="ignore"):
+                after = joined(self.whole, local)
+        except (NotACovarianceError, np.linalg.LinAlgError):
+            after = None
+        if after is not None and are_landmarks(after.covariance[3:, 3:]):
+            return after
+        return joined(self.whole, local.motion)
 
     def _close(self, stamp_ns: int, late: int = 0) -> ClosedWindow:
         epochs, rest = self._segmenter.cut(stamp_ns)
         for epoch in epochs:
             self._advance(epoch)
-        gated = 0 if self._gate is None else self._settle(self._gate)
+        if self._gate is not None:
+            self._try(self._settle)
+        gated = 0 if self._gate is None else self._gate.gated
         if rest.mean.any() or rest.covariance.any():
-            forward = self._segmenter.rest_forward
-            self._window = windows.moved(self._window, rest, self._generator, forward)
-        local = windows.gaussian(self._window)
+            self._motion = self._motion.then(rest)
+            self._try(lambda: self._go(rest))
+        solved = self._solved()
+        scans, self._scans = self._scans - self._segmenter.uncovered, self._segmenter.uncovered
         assert self._start_ns is not None
         closed = ClosedWindow(
             self.sequence,
@@ -235,24 +333,30 @@ class HybridMember:
             self._last_reading,
             self._start_ns,
             stamp_ns,
-            local,
-            () if self._grid is None else self._grid.sightings(),
-            thinned(self._window.particles, self.whole.mean[:3]),
-            self._window.innovation,
+            self._moved_only() if solved is None else solved,
+            () if self._grid is None or solved is None else self._grid.sightings(),
+            None if solved is None else thinned(self._window.particles, self.whole.mean[:3]),
+            NOTHING if solved is None else self._window.innovation,
             gated,
             late,
+            scans - late if solved is None else 0,
         )
         self._innovation = self._innovation.plus(closed.innovation)
-        self.whole = joined(self.whole, local)
+        self.whole = self._joined(closed.local)
         self._begin_window(self.sequence + 1, self._last_reading + 1, stamp_ns)
         return closed
 
-    def _settle(self, gate: Gate) -> int:
-        """The window once more with the readings that all of it confirms; how many it does not."""
+    def _go(self, rest: Increment) -> None:
+        """The motion after the last epoch."""
+        forward = self._segmenter.rest_forward
+        self._window = windows.moved(self._window, rest, self._generator, forward)
+
+    def _settle(self) -> None:
+        """The window once more with the readings that all of it confirms."""
+        assert self._gate is not None
         self._reopen()
-        for epoch in gate.settled():
+        for epoch in self._gate.settled():
             self._take(epoch)
-        return gate.gated
 
     def _reopen(self) -> None:
         """The window at its start; its random numbers too."""
@@ -266,6 +370,7 @@ class HybridMember:
         self._last_reading = first_reading - 1
         self._start_ns = stamp_ns
         self._way_m = 0.0
+        self._motion, self._solvable = Increment.identity(), True
         self._segmenter.begin(stamp_ns)
         if self._gate is not None:
             self._gate.begin()

@@ -48,8 +48,16 @@ class Member(Protocol):
     def sight(self, stamp_ns: int, reading: int, looks: Looks) -> str | None:
         """Take sightings of teammates; the reason if they are rejected."""
 
-    def drive(self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float) -> Driven:
-        """Take one odometry interval; what it gave."""
+    def drive(
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        *,
+        measured: bool = True,
+    ) -> Driven:
+        """Take one odometry interval, or its time alone (not measured); what it gave."""
 
     def finish(self) -> tuple[Driven, int]:
         """The stream has ended: what that gave, and how many scans no odometry covered."""

@@ -16,6 +16,7 @@ from team.config import Exchange, RobotConfig
 from team.door import absurd
 from team.estimation.gauss_newton import NotDeterminedError
 from team.estimation.gaussian import NotACovarianceError
+from team.estimation.plausible import start_beyond
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
 from team.robot.filters import NOTHING_KNOWN, KnownMap
@@ -27,11 +28,12 @@ from team.robot.sent import Sent
 from team.robot.statements import Speaker
 from team.robot.team_map import TeamMap
 from team.stream.inbox import Inbox
+from team.stream.judge import RANGE, SPEED, StreamJudge
 from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
+from team.wire.codec import decoded, encoded, unsound
 from team.wire.newer import is_newer_prior, later_end
 
 AHEAD = 64
@@ -43,6 +45,10 @@ LATE = "rejected: counted in a window that ends before its stamp"
 """The disposition of a reading that was set aside."""
 MOST_SET_ASIDE = 8
 """Readings of one window after which the estimator is not put back behind them any more."""
+UNSOLVED = "its window has no solution"
+"""Why a scan is rejected after all: of its window the odometry's motion alone is in the submap."""
+JOINT_LANDMARKS = 2000
+"""An own map of more landmarks carries their own covariances only: a message has 64 MiB at most."""
 
 
 class RobotNode:
@@ -78,6 +84,8 @@ class RobotNode:
         self._steps = 0
         self._last_map = -1
         self._ledger: Counter[str] = Counter()
+        self._judge = StreamJudge(config.bounds)
+        self._unused: str | None = None
         self._sighted: set[int] = set()
         self._withdrawn: set[str] = set()
         self._ended: list[m.Done] = []
@@ -99,6 +107,7 @@ class RobotNode:
         self.steps = 0
         self.finished = False
         self.final: m.FusedMap | None = None
+        self.withheld = 0
         self.warnings: list[str] = []
 
     # What the shell asks.
@@ -175,6 +184,7 @@ class RobotNode:
         self._ledger["in a submap"] = self._consumed = last.last_reading + 1
         self._pace.acknowledged = len(submaps)
         self._now_ns = self._passed_ns = last.stamp_ns
+        self._judge = StreamJudge(self.config.bounds, last.stamp_ns)
         self._inbox.resume(last.epoch, last.last_reading + 1)
 
     def refusal(self, message: m.Message) -> str | None:
@@ -197,6 +207,21 @@ class RobotNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
+        return self._sound(self._handled(message))
+
+    def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:
+        """What every receiver takes; the rest is withheld and named."""
+        sound = []
+        for each in out:
+            why = unsound(each.message)
+            if why is None:
+                sound.append(each)
+            else:
+                self.withheld += 1
+                self.warnings.append(f"withheld: {each.key}, {why}")
+        return sound
+
+    def _handled(self, message: m.Message) -> list[Outgoing]:
         match message:
             case m.Reading():
                 self._inbox.put(message)
@@ -232,6 +257,7 @@ class RobotNode:
             "particles": float(self.config.front_end.particles),
             "landmarks": float(len(self._member.own_map().ids)),
             "pose_sigma_m": self._pose_sigma,
+            "withheld": float(self.withheld),
         }
         nis = self._member.innovation
         if self._held.waits:
@@ -247,7 +273,8 @@ class RobotNode:
         waiting = ("no readings of this team yet",) if state == "waiting" else ()
         doubt = (self._team_map.doubt,) if self._team_map.doubt else ()
         warnings = (*waiting, *doubt, *self.warnings[-3:])
-        return m.Status(self._now_ns, node, state, figures, warnings)
+        told = {name: value for name, value in figures.items() if abs(value) <= 1e300}
+        return m.Status(self._now_ns, node, state, told, warnings)
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Go on behind a reading whose handling raised, as if it had never been there.
@@ -263,25 +290,26 @@ class RobotNode:
                 self._put_back(self._start)
         if self._done and not self._said_done:
             self._pending += self._last_words()
-        return self._go_on()
+        return self._sound(self._go_on())
 
     def _put_back(self, start: m.Start) -> None:
         self._member = member_of(self.config, start.epoch, self._known or NOTHING_KNOWN)
-        self._member.start(*translate.pose_of(start))
+        self._member.start(*self._believed(start))
         self._member.consumed(start.reading)
         for closed in self._closed:
             self._member.resume(closed)
+        self._judge = StreamJudge(
+            self.config.bounds, self._closed[-1].end_ns if self._closed else None
+        )
         for reading in self._window:
             self._member.consumed(reading.reading)
             match reading:
-                case m.Odometry() if reading.duration_ns:
-                    motion = translate.motion_of(reading, self.config.clock_offset_s)
-                    self._member.drive(*motion)
+                case m.Odometry():
+                    self._go(reading)
                 case m.Observations():
-                    self._member.observe(reading.stamp_ns, translate.scan_of(reading))
+                    self._look(reading)
                 case m.Sightings():
-                    looks = translate.looks_of(reading)
-                    self._member.sight(reading.stamp_ns, reading.reading, looks)
+                    self._see(reading)
                 case _:
                     pass
 
@@ -360,7 +388,8 @@ class RobotNode:
         return reading.stamp_ns
 
     def _begin_epoch(self, start: m.Start) -> None:
-        pose, covariance = translate.pose_of(start)
+        pose, covariance = self._believed(start)
+        self._judge = StreamJudge(self.config.bounds)
         self._member = member_of(self.config, start.epoch, self._known or NOTHING_KNOWN)
         self._member.start(pose, covariance)
         self._member.consumed(start.reading)
@@ -376,15 +405,30 @@ class RobotNode:
         self._now_ns = max(self._now_ns, start.stamp_ns)
         self._passed_ns = start.stamp_ns - 1
 
+    def _believed(self, start: m.Start) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """The initial pose and its covariance; one beyond the bounds is taken as unknown."""
+        value = translate.start_of(start)
+        why = None if value is None else start_beyond(value, self.config.bounds)
+        if why is not None:
+            self.warnings.append(f"the initial pose is refused, taken as unknown: {why}")
+            return None, None
+        return translate.pose_of(start)
+
+    def _sensible(self, known: KnownMap) -> KnownMap:
+        """A known map without the landmarks beyond the bounds."""
+        inside = np.abs(known.landmarks).max(axis=1, initial=0.0) <= self.config.bounds.coordinate_m
+        if not inside.all():
+            self.warnings.append(f"{np.count_nonzero(~inside)} known landmarks beyond the bounds")
+        return KnownMap(known.ids[inside], known.landmarks[inside])
+
     def _observe(self, reading: m.Observations) -> None:
         self._member.consumed(reading.reading)
-        reason = self._member.observe(reading.stamp_ns, translate.scan_of(reading))
+        reason = self._look(reading)
         self._ledger[self._member.used if reason is None else f"rejected: {reason}"] += 1
 
     def _sight(self, reading: m.Sightings) -> list[Outgoing]:
         self._member.consumed(reading.reading)
-        looks = translate.looks_of(reading)
-        reason = self._member.sight(reading.stamp_ns, reading.reading, looks)
+        reason = self._see(reading)
         if reason is None:
             self._sighted.add(reading.reading)
         self._ledger[IN_SIGHTING if reason is None else f"rejected: {reason}"] += 1
@@ -394,14 +438,43 @@ class RobotNode:
         self._steps += 1
         self.steps += 1
         self._member.consumed(reading.reading)
-        if reading.duration_ns == 0:
-            self._ledger["rejected: odometry over no time"] += 1
-            return []
-        motion = translate.motion_of(reading, self.config.clock_offset_s)
-        driven = self._member.drive(*motion)
+        driven = self._go(reading)
         if driven.closed is None:
             self._used(reading)
         return self._told(driven)
+
+    # A measurement within the bounds goes to the estimator; of one beyond them the reason is said.
+
+    def _look(self, reading: m.Observations) -> str | None:
+        scan = translate.scan_of(reading)
+        near = self._judge.near(scan[1])
+        reason = self._judge.time(reading.stamp_ns)
+        if reason is None and len(near) and not near.any():
+            reason = RANGE
+        if reason is None:
+            ids, ranges, bearings = (each[near] for each in scan)
+            reason = self._member.observe(reading.stamp_ns, (ids, ranges, bearings))
+        return reason
+
+    def _see(self, reading: m.Sightings) -> str | None:
+        teammates, ranges, bearings = translate.looks_of(reading)
+        others = np.array([name != self.robot for name in teammates], dtype=np.bool_)
+        near = self._judge.near(ranges) & others
+        reason = self._judge.time(reading.stamp_ns)
+        if reason is None and len(near) and not near.any():
+            reason = RANGE if others.any() else "a robot does not see itself"
+        if reason is None:
+            seen = tuple(name for name, is_near in zip(teammates, near, strict=True) if is_near)
+            looks = seen, ranges[near], bearings[near]
+            reason = self._member.sight(reading.stamp_ns, reading.reading, looks)
+        return reason
+
+    def _go(self, reading: m.Odometry) -> Driven:
+        motion = translate.motion_of(reading, self.config.clock_offset_s)
+        self._unused = self._judge.odometry(*motion)
+        if self._unused not in {None, SPEED}:
+            return Driven()
+        return self._member.drive(*motion, measured=self._unused is None)
 
     # What goes out.
 
@@ -410,7 +483,9 @@ class RobotNode:
         return Speaker(self.robot, self._epoch, self._announcement.digest)
 
     def _used(self, reading: m.Reading) -> None:
-        self._ledger[self._member.used] += 1
+        """The ledger has an interval of odometry; it is used, or rejected with its reason."""
+        unused = self._unused
+        self._ledger[self._member.used if unused is None else f"rejected: {unused}"] += 1
         self._taken(reading)
 
     def _told(self, driven: Driven) -> list[Outgoing]:
@@ -437,6 +512,10 @@ class RobotNode:
             self._ledger[self._member.used] -= closed.late
             self._ledger[LATE] += closed.late
         self._locals.append(closed.local)
+        self._judge = StreamJudge(self.config.bounds, closed.end_ns)
+        if closed.unsolved:
+            self._ledger[self._member.used] -= closed.unsolved
+            self._ledger[f"rejected: {UNSOLVED}"] += closed.unsolved
         plain = ClosedWindow(
             closed.sequence,
             closed.first_reading,
@@ -510,12 +589,16 @@ class RobotNode:
         return [self._own_map(stamp_ns)]
 
     def _own_map(self, stamp_ns: int) -> Outgoing:
+        landmarks = self._member.own_map()
         joint = self._consumer == "own/map" and self._member.joint
+        if joint and len(landmarks.ids) > JOINT_LANDMARKS:
+            joint = False
+            self.warnings.append("the own map is too large for a joint covariance")
         return self._speaker.own_map(
             stamp_ns,
             self._member.sequence,
             self._pace.awaited,
-            self._member.own_map(),
+            landmarks,
             "joint" if joint else "blocks",
         )
 
@@ -572,7 +655,10 @@ class RobotNode:
             return []
         if self._pace.answered(fused.exchange):
             ids, means = translate.landmarks_of(fused)
-            self._member.absorb(ids, means, translate.landmark_covariance_of(fused))
+            try:
+                self._member.absorb(ids, means, translate.landmark_covariance_of(fused))
+            except (NotACovarianceError, np.linalg.LinAlgError) as error:
+                self.warnings.append(f"the fused map can not be absorbed: {error}")
         return []
 
     def _take_prior(self, prior: m.Prior) -> None:
@@ -583,7 +669,7 @@ class RobotNode:
         """The newer one by its stamp; an equal one again changes nothing."""
         if self._known_ns is None or told.stamp_ns > self._known_ns:
             self._known_ns = told.stamp_ns
-            self._known = KnownMap(*translate.landmarks_of(told))
+            self._known = self._sensible(KnownMap(*translate.landmarks_of(told)))
 
     # The end.
 

@@ -1,17 +1,23 @@
 """An estimator that keeps one state from the start of a stream to its end."""
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from team.config import RobotConfig
-from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.gaussian import (
+    LandmarkGaussian,
+    Matrix,
+    NotACovarianceError,
+    PoseGaussian,
+)
 from team.estimation.innovation import NOTHING, Innovation
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
-from team.robot.filters import FILTERS, KnownMap, Start
+from team.robot.filters import FILTERS, KnownMap, Start, Step
 from team.robot.member import NOT_USED, ClosedWindow, Cloud, Driven, thinned
 from team.stream.pose_grid import Looks
 from team.stream.segmenter import Segmenter
@@ -42,6 +48,7 @@ class RunningMember:
         self._unsaid = NOTHING
         self._state: Any = self._begun(np.zeros(3), None)
         self.sequence = 0
+        self.unsolved = 0
         self.last_epoch_ns: int | None = None
 
     @property
@@ -85,13 +92,22 @@ class RunningMember:
         """Sightings of teammates are for submaps."""
         return NOT_USED
 
-    def drive(self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float) -> Driven:
+    def drive(
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        *,
+        measured: bool = True,
+    ) -> Driven:
         """Take one odometry interval and run the epochs that lie in it."""
         if self._segmenter.now_ns is None:
             self._segmenter.begin(stamp_ns - duration_ns)
             self._map_ns = stamp_ns - duration_ns
         before = self.sequence
-        for epoch in self._segmenter.drive(stamp_ns, duration_ns, forward, yaw_rate):
+        motion = stamp_ns, duration_ns, forward, yaw_rate
+        for epoch in self._segmenter.drive(*motion, measured=measured):
             self._advance(epoch.stamp_ns, epoch.increment, epoch.ids, epoch.ranges, epoch.bearings)
         if not self._filter.looks:
             _, rest = self._segmenter.cut(stamp_ns)
@@ -129,15 +145,34 @@ class RunningMember:
         ranges: np.ndarray,
         bearings: np.ndarray,
     ) -> None:
-        judged = self._filter.innovation(
-            self._state, increment, self._config.sensor, ids, ranges, bearings
-        )
-        self._unsaid = self._unsaid.plus(judged)
-        self._state = self._filter.stepped(
-            self._state, self._config, (increment, ids, ranges, bearings), self._generator
-        )
+        step = increment, ids, ranges, bearings
+        after = self._stepped(step)
+        if after is None:  # what was seen leads nowhere: the motion alone
+            self.unsolved += bool(len(ids))
+            after = self._stepped((increment, ids[:0], ranges[:0], bearings[:0]))
+        if after is not None:
+            self._state, judged = after
+            self._unsaid = self._unsaid.plus(judged)
         self.sequence += 1
         self.last_epoch_ns = stamp_ns
+
+    def _stepped(self, step: Step) -> tuple[Any, Innovation] | None:
+        """The state after a step, and how well its readings were predicted; None: there is none.
+
+        A state without a finite pose is none.
+        """
+        increment, *scan = step
+        judged = NOTHING
+        with np.errstate(all="ignore"):
+            with suppress(NotACovarianceError):  # then it is not known how well
+                judged = self._filter.innovation(self._state, increment, self._config.sensor, *scan)
+            try:
+                state = self._filter.stepped(self._state, self._config, step, self._generator)
+                pose = self._filter.pose(state)
+            except (NotACovarianceError, np.linalg.LinAlgError):
+                return None
+        finite = np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()
+        return (state, judged) if finite else None
 
     def finish(self) -> tuple[Driven, int]:
         """The stream has ended: the last keyframe and map; how many scans no odometry covered."""

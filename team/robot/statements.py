@@ -76,7 +76,10 @@ class Speaker:
         landmarks: LandmarkGaussian,
         kind: Literal["joint", "blocks"],
     ) -> Outgoing:
-        """The running map, with the joint covariance or with each landmark's own."""
+        """The running map, with the joint covariance or with each landmark's own.
+
+        What rounding has spoilt is left out.
+        """
         joint = kind == "joint"
         message = m.MapEstimate(
             stamp_ns,
@@ -89,7 +92,7 @@ class Speaker:
             from_floats(landmarks.means),
             translate.covariance_bytes(landmarks.covariance, joint=joint),
         )
-        return Outgoing(ch.OWN_MAP, self.robot, message)
+        return Outgoing(ch.OWN_MAP, self.robot, translate.receivable(message)[0])
 
     def pose(
         self,

@@ -1,5 +1,6 @@
 """From a stream of odometry intervals and observations to the epochs that an estimator takes."""
 
+from bisect import insort
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +11,9 @@ from team.estimation import geometry
 from team.estimation.models import Increment, acceptable, corrected, increment_of, located
 from team.estimation.sensitivity import carried_on, forward_column
 from team.stream.pose_grid import PoseGrid
+
+UNMEASURED = (1.0, 0.5)
+"""Where motion was not measured it is uncertain by as much as it is, and by this [m/s, rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +72,15 @@ class Segmenter:
         self._keyframe_start_ns = 0
         self._scan_motion = np.zeros(3)
         self.rest_forward = np.zeros(3)
+        self._speeds = (0.0, 0.0)
+        self._unmeasured = np.zeros((3, 3))
         self.now_ns: int | None = None
 
     def begin(self, stamp_ns: int) -> None:
         """A stream or a window begins at this team time."""
         self.now_ns = stamp_ns
         self._keyframe_start_ns = stamp_ns
+        self._speeds = (0.0, 0.0)  # what a window says depends on its own measurements alone
         if self._grid is not None:
             self._grid.begin(stamp_ns)
 
@@ -91,13 +98,29 @@ class Segmenter:
         if len(ids) and not mask.any():
             return "outside the sensor's limits"
         r, b = corrected(self._sensor, ranges[mask], bearings[mask])
-        self._waiting.append(_Scan(stamp_ns, ids[mask], r, b, np.zeros(3)))
+        scan = _Scan(stamp_ns, ids[mask], r, b, np.zeros(3))
+        insort(self._waiting, scan, key=lambda each: each.stamp_ns)
         return None
 
     def drive(
-        self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        *,
+        measured: bool = True,
     ) -> list[Epoch]:
-        """Integrate one odometry interval; the epochs that lie in it, in order."""
+        """Integrate one odometry interval; the epochs that lie in it, in order.
+
+        Where its motion was not measured (what came could not be) the last speeds go on, with
+        errors of their own size, UNMEASURED at least; a heading's stays within a turn.
+        """
+        if measured:
+            self._speeds, self._unmeasured = (forward, yaw_rate), np.zeros((3, 3))
+        else:
+            forward, yaw_rate = self._speeds
+            self._unmeasured = _unmeasured(duration_ns * 1e-9, forward, yaw_rate)
         epochs = []
         self._here_ns = stamp_ns - duration_ns
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
@@ -166,6 +189,9 @@ class Segmenter:
         if duration_ns <= 0:
             return
         step = increment_of(self._motion, duration_ns * 1e-9, forward, yaw_rate)
+        if self._unmeasured.any():
+            added = step.covariance + duration_ns * 1e-9 * self._unmeasured
+            step = Increment(step.mean, added)
         self._increment = self._increment.then(step)
         if self._motion.calibrated_speed is not None:
             column = forward_column(self._motion, duration_ns * 1e-9, forward, yaw_rate)
@@ -203,6 +229,13 @@ class Segmenter:
         return self._epoch(
             stamp_ns, np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
         )
+
+
+def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.ndarray, "3 3"]:
+    """Variance per second of a motion that nobody measured, such that errors of the speeds sum."""
+    way = max(abs(forward), UNMEASURED[0]) * duration_s
+    turn = min(max(abs(yaw_rate), UNMEASURED[1]) * duration_s, np.pi)
+    return np.diag([way * way, 0.01 * way * way, turn * turn]) / duration_s
 
 
 def _median_direction(angles: list[float]) -> float:

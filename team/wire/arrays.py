@@ -77,14 +77,16 @@ def check_ascending(data: Ids, what: str) -> None:
 
 
 def check_covariance(data: Floats, n: int, what: str) -> None:
-    """Raise ValueError unless n × n floats form a symmetric positive definite matrix."""
+    """Raise ValueError unless n × n floats form a symmetric positive definite matrix.
+
+    Symmetry is judged by the standard deviations: |Pᵢⱼ − Pⱼᵢ| ≤ 1e-9 σᵢ σⱼ.
+    """
     check_finite(data, what, n * n)
     matrix = floats(data, what).reshape(n, n)
-    with np.errstate(over="ignore"):  # of a difference that is then infinite, so not close
-        symmetric = np.allclose(matrix, matrix.T, rtol=1e-9, atol=1e-300)
-    if not symmetric:
+    scaled = _unit_diagonal(matrix, what)
+    if np.abs(scaled - scaled.T).max(initial=0.0) > 1e-9:
         raise ValueError(f"not symmetric: {what}")
-    _check_positive(matrix, what)
+    _check_positive(scaled, what)
 
 
 def check_packed_covariance(data: Floats, n: int, what: str) -> None:
@@ -95,11 +97,36 @@ def check_packed_covariance(data: Floats, n: int, what: str) -> None:
     if n:
         lower = np.zeros((n, n))
         lower.T[np.triu_indices(n)] = floats(data, what)
-        _check_positive(lower, what)
+        _check_positive(_unit_diagonal(lower, what), what)
 
 
-def _check_positive(matrix: NDArray[np.float64], what: str) -> None:
+def _unit_diagonal(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    """D⁻¹ P D⁻¹ with D = √diag P: units and scale have no influence on its conditioning."""
+    with np.errstate(over="ignore", invalid="ignore"):  # √ of what is negative is judged below
+        sigmas = np.sqrt(np.diag(matrix))
+        if not (sigmas > 0.0).all():
+            raise ValueError(f"not positive definite: {what}")
+        return np.clip(matrix / sigmas / sigmas[:, None], -2.0, 2.0)
+
+
+def least_pivot(covariance: NDArray[np.float64]) -> float:
+    """The least share 1 − Rᵢ² of a variance that the numbers before it leave unexplained.
+
+    The squared diagonal of the Cholesky factor of the matrix scaled to a unit diagonal, whose lower
+    triangle is read; 0 where there is none. No change of units alters it.
+    """
     try:
-        np.linalg.cholesky(matrix)  # reads the lower triangle
+        factor = np.linalg.cholesky(_unit_diagonal(covariance, ""))
+    except ValueError:  # numpy's LinAlgError is one
+        return 0.0
+    return float(np.min(np.diag(factor), initial=1.0) ** 2)
+
+
+def _check_positive(scaled: NDArray[np.float64], what: str) -> None:
+    """Of a matrix with a unit diagonal: each pivot is more than rounding can leave, n ε."""
+    try:
+        factor = np.linalg.cholesky(scaled)  # reads the lower triangle
     except np.linalg.LinAlgError:
         raise ValueError(f"not positive definite: {what}") from None
+    if np.min(np.diag(factor), initial=1.0) ** 2 <= len(scaled) * np.finfo(np.float64).eps:
+        raise ValueError(f"not positive definite: {what}")

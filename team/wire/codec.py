@@ -42,7 +42,27 @@ def decoded(payload: bytes, expected: type[M] | None = None) -> M:
     `expected` is the class that the channel carries; without it any known message is accepted.
     """
     fields = _unpacked(payload)
-    kind = _kind(fields, expected)
+    return cast(M, _converted(fields, _kind(fields, expected)))
+
+
+def unsound(message: Message) -> WireError | None:
+    """Why every receiver would refuse this message; None for a sound one.
+
+    What a sender asks of its own output before it speaks: the checks are those of `decoded`.
+    """
+    try:
+        _converted(msgspec.to_builtins(message, builtin_types=(bytes,)), type(message))
+    except WireError as error:
+        return error
+    size = sum(len(x) for x in msgspec.structs.astuple(message) if isinstance(x, bytes))
+    if size > LARGEST_PAYLOAD // 2:  # near the limit the payload itself is measured
+        size = len(encoded(message))
+    if size > LARGEST_PAYLOAD:
+        return WireError("too large", f"{size} bytes, {LARGEST_PAYLOAD} at most")
+    return None
+
+
+def _converted(fields: object, kind: type[Message]) -> Message:
     try:
         message = msgspec.convert(fields, type=kind, builtin_types=(bytes,), strict=True)
     except msgspec.ValidationError as error:
@@ -52,7 +72,7 @@ def decoded(payload: bytes, expected: type[M] | None = None) -> M:
     except ValueError as error:
         reason, _, detail = str(error).partition(": ")
         raise WireError(reason, f"{kind.__name__}.{detail}") from None
-    return cast(M, message)
+    return message
 
 
 def _unpacked(payload: bytes) -> object:

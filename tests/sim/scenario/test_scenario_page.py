@@ -15,13 +15,13 @@ from sim.cli.main import app
 from sim.scenario.scenario import Scenario, load
 from sim.scenario.source import streams_of
 from sim.world.worlds import Point, SimulatedWorld, UtiasWorld
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.config import Bounds, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from tests.support import ROOT
 
 PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
     Scenario, SimulatedWorld, UtiasWorld, RobotConfig, MotionModel, MotionNoise, Sensor, FrontEnd,
-    CentralConfig, BiasSigmas, CommonBiasSigmas,
+    CentralConfig, BiasSigmas, CommonBiasSigmas, Bounds,
 )  # fmt: skip
 
 

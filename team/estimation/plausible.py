@@ -1,0 +1,91 @@
+"""What lies beyond the bounds of what is physically sensible, and by what, in words.
+
+The wire's door asks whether a message can be what it says; this asks whether it can be of a robot
+on the ground. What is refused here is no error of the program: it is a value, with its reason.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from team.config import Bounds
+from team.estimation.contribution import Start
+from team.estimation.sighting import Sighting
+from team.estimation.submap import LocalMap
+
+Values = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "n n"]
+
+
+def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
+    """Why a submap is refused; None if it is within the bounds."""
+    if len(local.ids) > bounds.submap_landmarks:
+        return f"{len(local.ids)} landmarks, {bounds.submap_landmarks} at most"
+    poses = 3 * (1 + len(local.node_stamps))
+    angles = np.zeros(len(local.mean), dtype=np.bool_)
+    angles[2:poses:3] = True
+    if np.abs(local.mean[angles]).max() > 2.0 * np.pi:
+        return "a heading beyond a full turn"
+    why = _far(local.mean[~angles], bounds.extent_m, "of its start")
+    if why is None and np.abs(local.sensitivity).max(initial=0.0) > bounds.sensitivity:
+        why = f"a sensitivity beyond {bounds.sensitivity:g}"
+    return why or _spread(local.covariance, angles, bounds)
+
+
+def sighting_beyond(sighting: Sighting, bounds: Bounds) -> str | None:
+    """Why an inter-robot measurement is refused; None if it is within the bounds."""
+    why = _far(sighting.reading[:1], bounds.extent_m, "of its observer")
+    return why or _spread(sighting.covariance, np.array([False, True]), bounds)
+
+
+def start_beyond(start: Start, bounds: Bounds) -> str | None:
+    """Why an initial pose is refused; None if it is within the bounds."""
+    if abs(start.pose[2]) > 2.0 * np.pi:
+        return "a heading beyond a full turn"
+    why = _far(start.pose[:2], bounds.coordinate_m, "of the origin")
+    if why is None and start.covariance is not None:
+        why = _spread(start.covariance, np.array([False, False, True]), bounds)
+    return why
+
+
+def are_landmarks(covariance: Matrix) -> bool:
+    """Whether a joint covariance of points is finite and each point's own block is a covariance."""
+    if not np.isfinite(covariance).all():
+        return False
+    x = np.arange(0, len(covariance), 2)
+    xx, xy, yy = covariance[x, x], covariance[x, x + 1], covariance[x + 1, x + 1]
+    if not ((xx > 0.0) & (yy > 0.0)).all():
+        return False
+    return bool((np.abs(xy) < np.sqrt(xx) * np.sqrt(yy)).all())
+
+
+def _far(coordinates: Values, limit_m: float, of: str) -> str | None:
+    farthest = float(np.abs(coordinates).max(initial=0.0))
+    if farthest <= limit_m:
+        return None
+    return f"a coordinate of {farthest:.3g} m, not within {limit_m:g} m {of}"
+
+
+def _spread(covariance: Matrix, angles: np.ndarray, bounds: Bounds) -> str | None:
+    """Why a covariance with these headings is refused."""
+    variances = np.diag(covariance)
+    if not (variances > 0.0).all():
+        return "a variance that is not positive"
+    sigmas = np.sqrt(variances)
+    for of, unit, (least, most) in (
+        (sigmas[~angles], "m", bounds.sigma_m),
+        (sigmas[angles], "rad", bounds.sigma_rad),
+    ):
+        worst = [s for s in (of.min(initial=most), of.max(initial=least)) if not least <= s <= most]
+        if worst:
+            return f"a sigma of {worst[0]:.3g} {unit}, not from {least:g} to {most:g} {unit}"
+    try:
+        factor = np.linalg.cholesky(covariance / sigmas / sigmas[:, None])
+    except np.linalg.LinAlgError:
+        return "a covariance that is not positive definite"
+    left = float(np.min(np.diag(factor), initial=1.0)) ** 2
+    if left < bounds.independent:
+        return (
+            f"a number of which the others leave a share of {left:.1g} of its variance, "
+            f"{bounds.independent:g} needed"
+        )
+    return None

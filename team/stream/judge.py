@@ -1,0 +1,60 @@
+"""Whether a stream's measurements are physically sensible, one after the other."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from team.config import Bounds
+
+NO_TIME = "odometry over no time"
+OLDER = "older than the odometry"
+SPEED = "odometry beyond the bounds"
+"""Its time is believed, its motion is not."""
+TIME = "a time beyond the bounds"
+RANGE = "a range beyond the bounds"
+
+
+class StreamJudge:
+    """Of one incarnation of a sensor stream; it remembers how far the odometry has come.
+
+    A stamp that lies `jump_s` ahead of the odometry is refused, and so is the odometry itself,
+    until the next interval confirms that the clock has truly jumped.
+    """
+
+    def __init__(self, bounds: Bounds, now_ns: int | None = None) -> None:
+        self._bounds = bounds
+        self._jump_ns = round(bounds.jump_s * 1e9)
+        self._now_ns = now_ns
+        self._jumped_ns: int | None = None
+
+    def odometry(
+        self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
+    ) -> str | None:
+        """Why an interval is refused: `SPEED` for its motion alone, else the whole of it."""
+        if duration_ns == 0:
+            return NO_TIME
+        if self._now_ns is not None:
+            if stamp_ns <= self._now_ns:
+                return OLDER
+            near_ns = self._now_ns if self._jumped_ns is None else self._jumped_ns
+            ahead_ns = stamp_ns - self._now_ns
+            if ahead_ns > self._jump_ns and not 0 < stamp_ns - near_ns <= self._jump_ns:
+                self._jumped_ns = stamp_ns
+                return TIME
+        self._now_ns, self._jumped_ns = stamp_ns, None
+        bounds = self._bounds
+        sensible = (
+            duration_ns <= bounds.interval_s * 1e9
+            and abs(forward) <= bounds.speed_m_s
+            and abs(yaw_rate) <= bounds.yaw_rate_rad_s
+        )
+        return None if sensible else SPEED
+
+    def time(self, stamp_ns: int) -> str | None:
+        """Why what was seen at this time is refused."""
+        ahead_ns = 0 if self._now_ns is None else stamp_ns - self._now_ns
+        return TIME if ahead_ns > self._jump_ns else None
+
+    def near(self, ranges: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Which ranges are within the bounds."""
+        within: Bool[np.ndarray, " n"] = ranges <= self._bounds.extent_m
+        return within

@@ -1,0 +1,310 @@
+"""Every message that the door accepts is folded or refused with a reason, and the map comes.
+
+With TEAMSLAM_STORM=N as many sessions are drawn as asked for.
+"""
+
+import os
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from team.config import FusionRule
+from team.wire import messages as m
+from team.wire.arrays import floats, from_floats, from_ids, from_stamps
+from team.wire.codec import decoded, encoded
+from tests.hostile_team import CONFIG, ROBOTS, S, Team, centre_session, covariance, numbers, packed
+
+SESSIONS = int(os.environ.get("TEAMSLAM_STORM", "4"))
+FEW = settings(max_examples=SESSIONS, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fields):
+    n = 3 + 3 * len(nodes) + 2 * len(ids)
+    if mean is None:
+        places = [(5 + 3 * (i % 7), 2 - (i % 5) * 3) for i in ids]
+        mean = np.concatenate([[10.0, 0.0, 0.1], np.zeros(3 * len(nodes)), np.ravel(places)])
+    begins = sequence * 10 * S
+    return m.Submap(
+        begins + 10 * S, robot, 1, sequence, sequence * 20 + (sequence > 0), sequence * 20 + 20,
+        begins, CONFIG, from_ids(np.array(ids, np.uint32)), from_floats(mean),
+        packed(np.eye(n) * 0.01 if P is None else P), from_stamps(np.array(nodes, np.int64)),
+        **fields,
+    )  # fmt: skip
+
+
+def start(robot, pose=(0.0, 0.0, 0.0), spread=None):
+    return m.Start(
+        0, robot, 1, 0, b"" if pose is None else from_floats(pose),
+        b"" if spread is None else from_floats(spread),
+    )  # fmt: skip
+
+
+def good(robot, count=4, **known):
+    return [start(robot, **known), *(submap(robot, k) for k in range(count))]
+
+
+def sighting(by, of, stamp_ns, spread):
+    return m.SightingFactor(
+        stamp_ns, by, 1, stamp_ns // (10 * S), CONFIG, of, 3.0, 0.5, packed(spread), (5,)
+    )
+
+
+def concluded(messages, config=None):
+    """The final map of these, after everybody's last word."""
+    count = dict.fromkeys(ROBOTS, 0)
+    for each in messages:
+        if isinstance(each, m.Submap):
+            count[each.robot] += 1
+    ends = []
+    for robot, submaps in count.items():
+        now_ns = submaps * 10 * S
+        ends.append(m.Progress(now_ns, f"robot/{robot}", robot, 1, 1000, submaps))
+        ends.append(m.Done(now_ns, robot, 1, 1000, 500, submaps, ()))
+    ends.append(m.End(10**12, tuple(m.StreamEnd(robot, 1, 1000) for robot in ROBOTS)))
+    taken = [decoded(encoded(each), type(each)) for each in [*messages, *ends]]
+    centre, _ = centre_session(taken, config)
+    assert centre.final is not None
+    return centre.final
+
+
+def at_one_place(robot):
+    mean = np.array([10.0, 0.0, 0.1, 5.0, 5.0, 5.0, 5.0])
+    return submap(robot, ids=(1, 2), mean=mean)
+
+
+def scaled(*sigmas):
+    return np.diag(np.square(np.resize(sigmas, 9)))
+
+
+FAR = np.array([10.0, 0.0, 0.1, 1e9, 1e9, -1e9, 1e9, 1e9, -1e9])
+STEEP = from_floats(np.full(9, 1e200))
+NODES = (2 * S, 4 * S)
+WIDE = np.eye(15) * 0.01
+CASES = {
+    "coincident landmarks": (
+        [start("r1"), at_one_place("r1"), start("r2", None), at_one_place("r2")],
+        "at one place, which gives no heading",
+    ),
+    "a landmark at 1e9 m": (
+        [start("r1"), submap("r1", mean=FAR), *good("r2")],
+        "submap 0 of r1 (epoch 1) refused: a coordinate of 1e+09 m",
+    ),
+    "a pose at 1e9 m": (
+        [*good("r1", pose=(1e9, 0.0, 0.0)), *good("r2")],
+        "the initial pose of r1 (epoch 1) refused, taken as unknown: a coordinate of 1e+09 m",
+    ),
+    "a covariance of 1e-300": (
+        [*good("r1", spread=np.eye(3) * 1e-300), *good("r2")],
+        "the initial pose of r1 (epoch 1) refused, taken as unknown: a sigma of 1e-150 m",
+    ),
+    "a sigma of 1e12 beside one of 1e-12": (
+        [start("r1"), submap("r1", P=scaled(1e12, 1e-12)), *good("r2")],
+        "submap 0 of r1 (epoch 1) refused: a sigma of 1e",
+    ),
+    "sensitivities of 1e200": (
+        [start("r1"), submap("r1", biases=("bearing",), sensitivity=STEEP), *good("r2")],
+        "submap 0 of r1 (epoch 1) refused: a sensitivity beyond",
+    ),
+    "a sighting of 1e-300": (
+        [
+            start("r1"), sighting("r1", "r2", 2 * S, np.eye(2) * 1e-300),
+            submap("r1", nodes=NODES, sightings=1, P=WIDE), start("r2"),
+            submap("r2", nodes=NODES, P=WIDE),
+        ],
+        "an inter-robot measurement of r2 by r1 (epoch 1) refused: a sigma of 1e-150 m",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_has_no_solution_is_refused_by_name_and_the_map_comes(name):
+    messages, words = CASES[name]
+    final = concluded(messages)
+    assert any(words in reason for reason in final.reasons), final.reasons
+
+
+def test_what_is_refused_leaves_the_map_of_the_others_as_it_is():
+    alone = concluded(good("r2"))
+    beside = concluded([start("r1"), submap("r1", mean=FAR), *good("r2")])
+    assert (beside.ids, beside.means) == (alone.ids, alone.means)
+    assert m.Member("r1", 1, 0) in beside.members, "the set that the map names has it"
+
+
+def test_behind_a_refused_submap_the_chain_has_ended_and_it_is_said():
+    final = concluded([*good("r1", 1), submap("r1", 1, mean=FAR), submap("r1", 2), *good("r2")])
+    (words,) = [reason for reason in final.reasons if "refused" in reason]
+    assert words.startswith("submap 1 of r1 (epoch 1) refused")
+    assert words.endswith("the 1 behind it are not in the map either")
+
+
+def test_a_standing_robot_that_is_seen_by_another_one_stays_apart_and_it_is_said_why():
+    """As on a real data set: a place, seen again and again, gives no heading."""
+    messages = []
+    for robot, other in (("r1", "r2"), ("r2", "r1")):
+        messages.append(start(robot, None))
+        for k in range(3):
+            nodes = tuple(k * 10 * S + t * S for t in (2, 4, 6, 8))
+            still = np.zeros(15)
+            sees = robot == "r1"
+            if sees:
+                messages += [sighting(robot, other, t, np.diag([0.01, 1e-4])) for t in nodes]
+            messages.append(
+                submap(robot, k, ids=(), mean=still, P=np.diag([1e-6, 1e-6, 1e-8] * 5),
+                       nodes=nodes, sightings=4 * sees)
+            )  # fmt: skip
+    final = concluded([_with_readings(each, k) for k, each in enumerate(messages)])
+    assert any("r2 (epoch 1) not joined" in reason for reason in final.reasons), final.reasons
+
+
+def _with_readings(message, k):
+    if not isinstance(message, m.SightingFactor):
+        return message
+    fields = {name: getattr(message, name) for name in message.__struct_fields__}
+    return m.SightingFactor(**{**fields, "readings": (k + 1,)})
+
+
+def test_a_million_metres_from_the_origin_the_map_is_the_same():
+    here = concluded([*good("r1"), *good("r2")])
+    away = concluded([*good("r1", pose=(1e6, -1e6, 0.0)), *good("r2", pose=(1e6, -1e6, 0.0))])
+    assert away.ids == here.ids
+    assert not any("refused" in reason for reason in away.reasons)
+    shift = floats(away.means, "means").reshape(-1, 2) - floats(here.means, "means").reshape(-1, 2)
+    np.testing.assert_allclose(shift, [[1e6, -1e6]] * len(shift), atol=1e-6)
+    np.testing.assert_allclose(
+        floats(away.covariance, "covariance"), floats(here.covariance, "covariance"), rtol=1e-5,
+        atol=1e-9,
+    )  # fmt: skip
+
+
+@FEW
+@given(st.integers(0, 2**32), st.sampled_from([None, 1.0]))
+def test_any_hostile_team_gets_a_map_and_in_any_order_the_same(seed, robust_c):
+    rng = np.random.default_rng(seed)
+    team = Team(rng)
+    for _ in range(8):
+        team.grow()
+    config = CentralConfig(robust_c=robust_c)
+    centre, _ = centre_session([*team.messages, *team.ends()], config)
+    assert centre.final is not None
+    shuffled = [team.messages[k] for k in rng.permutation(len(team.messages))]
+    again, _ = centre_session([*shuffled, *shuffled[:3], *team.ends()], config)
+    assert again.final is not None
+    assert encoded(again.final) == encoded(centre.final)
+
+
+@pytest.mark.parametrize("fusion", ["svd-join", "svd-join-spherical"])
+@FEW
+@given(seed=st.integers(0, 2**32))
+def test_the_other_rule_on_submaps_has_a_map_too(fusion: FusionRule, seed: int):
+    team = Team(np.random.default_rng(seed))
+    for _ in range(8):
+        team.grow()
+    centre, _ = centre_session([*team.messages, *team.ends()], CentralConfig(fusion=fusion))
+    assert centre.final is not None
+
+
+@pytest.mark.parametrize(
+    "fusion", ["kalman", "kalman-per-axis", "covariance-intersection", "latest", "alone"]
+)
+@FEW
+@given(seed=st.integers(0, 2**32))
+def test_rules_on_whole_maps_fuse_what_they_can(fusion: FusionRule, seed: int):
+    rng = np.random.default_rng(seed)
+    messages: list[m.Message] = [start(robot) for robot in ROBOTS]
+    for exchange in (1, 2):
+        for robot in ROBOTS:
+            ids = np.unique(rng.integers(1, 6, 4)).astype(np.uint32)
+            n = 2 * len(ids)
+            made = m.MapEstimate(
+                exchange * S, robot, 1, exchange, exchange, True, from_ids(ids),
+                from_floats(numbers(rng, n)), packed(covariance(rng, n)),
+            )  # fmt: skip
+            tame = m.MapEstimate(
+                exchange * S, robot, 1, exchange, exchange, True, from_ids(ids),
+                from_floats(np.zeros(n)), packed(np.eye(n)),
+            )  # fmt: skip
+            try:
+                messages.append(decoded(encoded(made), m.MapEstimate))
+            except ValueError:
+                messages.append(tame)
+    messages += [m.Done(2 * S, robot, 1, 1000, 500, 0, (), 2) for robot in ROBOTS]
+    messages.append(m.End(10**12, tuple(m.StreamEnd(robot, 1, 1000) for robot in ROBOTS)))
+    centre, _ = centre_session(messages, CentralConfig(fusion=fusion))
+    assert centre.final is not None
+
+
+class HostileTeam(RuleBasedStateMachine):
+    """Whatever order, duplicate and withdrawal: the centre goes on, and its set makes its map."""
+
+    def __init__(self):
+        super().__init__()
+        self.team = Team(np.random.default_rng(0))
+        self.heard: list[m.Message] = []
+        self.unsent: list[m.Message] = []
+        self.centre = CentralNode(CentralConfig(), list(ROBOTS))
+        for robot in ROBOTS:
+            self.centre.handle(m.Liveliness(0, f"robot/{robot}", True), 0)
+        for each in self.team.messages:
+            self.hear(each)
+
+    def hear(self, message):
+        self.heard.append(message)
+        for out in self.centre.handle(message, 0):
+            decoded(encoded(out.message), type(out.message))
+
+    @rule(seed=st.integers(0, 2**32), at_once=st.booleans())
+    def grows(self, seed, at_once):
+        self.team._rng = np.random.default_rng(seed)
+        before = len(self.team.messages)
+        self.team.grow()
+        self.unsent += self.team.messages[before:]
+        while at_once and self.unsent:
+            self.hear(self.unsent.pop(0))
+
+    @rule(k=st.integers(0, 100))
+    def comes_late(self, k):
+        if self.unsent:
+            self.hear(self.unsent.pop(k % len(self.unsent)))
+
+    @rule(k=st.integers(0, 100))
+    def comes_twice(self, k):
+        self.hear(self.heard[k % len(self.heard)])
+
+    @rule(robot=st.sampled_from(ROBOTS), submaps=st.integers(0, 8))
+    def reports(self, robot, submaps):
+        now_ns = submaps * 10 * S
+        self.hear(m.Progress(now_ns, f"robot/{robot}", robot, 1, 1000, submaps))
+
+    @rule()
+    def is_withdrawn(self):
+        self.hear(m.Withdrawal(0, "r3", "operator", "a test"))
+
+    @invariant()
+    def says_what_every_receiver_takes(self):
+        status = self.centre.status()
+        decoded(encoded(status), m.Status)
+
+    def teardown(self):
+        for each in self.unsent:
+            self.hear(each)
+        for each in self.team.ends():
+            self.hear(each)
+        assert self.centre.final is not None
+        members = [each for each in self.heard if not isinstance(each, m.Progress | m.Done | m.End)]
+        again, _ = centre_session([*members, *self.team.ends()])
+        assert again.final is not None
+        assert encoded(again.final) == encoded(self.centre.final)
+
+
+HostileTeam.TestCase.settings = settings(
+    max_examples=max(2, SESSIONS // 2),
+    stateful_step_count=12,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+TestHostileTeam = HostileTeam.TestCase

@@ -1,0 +1,236 @@
+"""Messages that are valid on the wire and hardly of this world, and sessions of nodes with them.
+
+Everything is drawn from a NumPy generator, so that a seed names a session.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from team.config import RobotConfig
+from team.robot.node import RobotNode
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import Outgoing
+from team.wire.codec import WireError, decoded, encoded
+
+S = 1_000_000_000
+CONFIG = bytes(8)
+SCALES = (0.0, 1e-300, 1e-12, 1e-6, 1e-3, 1.0, 1.0, 1.0, 30.0, 1e3, 1e6, 1e9, 1e15, 1e200)
+SIGMAS = (1e-150, 1e-30, 1e-9, 1e-6, 1e-3, 0.1, 0.1, 0.1, 1.0, 30.0, 1e3, 1e6, 1e12, 1e140)
+ROBOTS = ("r1", "r2", "r3")
+
+
+def valid(message: m.Message) -> m.Message | None:
+    """The message as a receiver has it; None where its door refuses it."""
+    try:
+        return decoded(encoded(message), type(message))
+    except (WireError, OverflowError):
+        return None
+
+
+def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
+    """A covariance of one of the kinds that break solvers."""
+    mild = rng.random() < 0.5
+    sigmas = (
+        np.full(n, 0.1) if mild else rng.choice(SIGMAS, n if rng.random() < 0.3 else 1) * np.ones(n)
+    )
+    kind = rng.integers(4)
+    if kind == 0:
+        correlation = np.eye(n)
+    elif kind == 1:  # all of one piece, but for a little
+        v = rng.choice([-1.0, 1.0], n)[:, None]
+        left = 10.0 ** rng.uniform(-16.0, -1.0)
+        correlation = (1.0 - left) * (v @ v.T) + left * np.eye(n)
+    else:  # of fewer dimensions than it has, but for a little
+        A = rng.normal(size=(n, max(1, n - int(rng.integers(0, 3)))))
+        raw = A @ A.T + 10.0 ** rng.uniform(-15.0, 0.0) * np.eye(n)
+        d = np.sqrt(np.diag(raw))
+        correlation = raw / d / d[:, None]
+    P = correlation * sigmas * sigmas[:, None]
+    return 0.5 * (P + P.T)
+
+
+def numbers(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Coordinates: mostly sensible, some at one place, some far off."""
+    if rng.random() < 0.6:
+        return rng.uniform(-20.0, 20.0, n)
+    if rng.random() < 0.3:
+        return np.full(n, rng.choice(SCALES))
+    return rng.normal(size=n) * rng.choice(SCALES, n)
+
+
+def packed(P: np.ndarray) -> bytes:
+    return from_floats(P[np.triu_indices(len(P))])
+
+
+class Team:
+    """The robots of a hostile team: chains of submaps that continue, so that a set takes them."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._next = dict.fromkeys(ROBOTS, 0)
+        self.messages: list[m.Message] = []
+        for robot in ROBOTS:
+            self._add(self.start(robot))
+
+    def _add(self, message: m.Message) -> bool:
+        found = valid(message)
+        if found is not None:
+            self.messages.append(found)
+        return found is not None
+
+    def start(self, robot: str, epoch: int = 1) -> m.Start:
+        rng = self._rng
+        if rng.random() < 0.5:
+            return m.Start(0, robot, epoch, 0, b"", b"")
+        pose = np.append(numbers(rng, 2), rng.uniform(-3.0, 3.0))
+        spread = b"" if rng.random() < 0.5 else from_floats(covariance(rng, 3))
+        exact = m.Start(0, robot, epoch, 0, from_floats(pose), spread)
+        return exact if valid(exact) else m.Start(0, robot, epoch, 0, from_floats(pose), b"")
+
+    def submap(self, robot: str) -> m.Submap:
+        rng, k = self._rng, self._next[robot]
+        ids = np.unique(rng.integers(1, 8, int(rng.integers(0, 6)))).astype(np.uint32)
+        nodes = np.unique(rng.integers(1, 6, int(rng.integers(0, 3)))) * 2 * S + k * 10 * S
+        n = 3 + 3 * len(nodes) + 2 * len(ids)
+        mean = numbers(rng, n)
+        if rng.random() < 0.3:  # a standing robot that sees everything at one place
+            mean[:] = 0.0
+        poses = 3 * (1 + len(nodes))
+        mean[2:poses:3] = np.clip(mean[2:poses:3], -3.1, 3.1)
+        biases = ("bearing", "range_scale") if rng.random() < 0.2 else ()
+        return m.Submap(
+            (k + 1) * 10 * S, robot, 1, k, k * 20 + (k > 0), k * 20 + 20, k * 10 * S, CONFIG,
+            from_ids(ids), from_floats(mean), packed(covariance(rng, n)), from_stamps(nodes),
+            0, biases, from_floats(numbers(rng, n * len(biases))), 0,
+        )  # fmt: skip
+
+    def grow(self) -> None:
+        """One more submap of one robot, with the sightings from its nodes."""
+        rng = self._rng
+        robot = str(rng.choice(ROBOTS))
+        made = self.submap(robot)
+        stamps = np.frombuffer(made.nodes, "<i8")
+        seen = [self._sighting(made, int(t)) for t in stamps if rng.random() < 0.7]
+        seen = [each for each in seen if valid(each) is not None]
+        if self._add(
+            m.Submap(
+                *((seen and [*_fields(made)[:12], len(seen), *_fields(made)[13:]]) or _fields(made))
+            )
+        ):
+            self._next[robot] += 1
+            for each in seen:
+                self._add(each)
+
+    def _sighting(self, submap: m.Submap, stamp_ns: int) -> m.SightingFactor:
+        rng = self._rng
+        teammate = str(rng.choice([r for r in ROBOTS if r != submap.robot]))
+        distance = float(abs(numbers(rng, 1)[0])) or 1.0
+        return m.SightingFactor(
+            stamp_ns, submap.robot, 1, submap.sequence, CONFIG, teammate, distance,
+            float(rng.uniform(-3.0, 3.0)), packed(covariance(rng, 2)), (stamp_ns // S,),
+        )  # fmt: skip
+
+    def ends(self) -> list[m.Message]:
+        """The last words of the robots and of the world."""
+        out: list[m.Message] = []
+        for robot, count in self._next.items():
+            now_ns = count * 10 * S
+            out.append(m.Progress(now_ns, f"robot/{robot}", robot, 1, 1000, count))
+            out.append(m.Done(now_ns, robot, 1, 1000, 500, count, ()))
+        return [*out, m.End(10**12, tuple(m.StreamEnd(robot, 1, 1000) for robot in ROBOTS))]
+
+
+def _fields(message: m.Message) -> list[object]:
+    return [getattr(message, name) for name in message.__struct_fields__]
+
+
+def centre_session(
+    messages: Sequence[m.Message], config: CentralConfig | None = None
+) -> tuple[CentralNode, list[Outgoing]]:
+    """A centre that hears these; what it says is what every receiver takes."""
+    centre = CentralNode(config or CentralConfig(), list(ROBOTS))
+    out = centre.begin()
+    for robot in ROBOTS:
+        out += centre.handle(m.Liveliness(0, f"robot/{robot}", True), 0)
+    for message in messages:
+        out += centre.handle(message, 0)
+    for each in [*out, Outgoing(out[0].channel, "central", centre.status())]:
+        decoded(encoded(each.message), type(each.message))
+    return centre, out
+
+
+def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator[m.Message]:
+    """The measurements of one robot, as a broken driver may send them, and what comes back."""
+    yield Team(rng).start(robot)
+    now_ns = 0
+    counter = 0
+    while counter < count:
+        counter += 1
+        kind = rng.integers(12)
+        stamp_ns = now_ns
+        if kind == 0:  # a clock that stands, goes back or leaps
+            stamp_ns = now_ns + int(rng.choice([-3600, -1, 0, 3600, 10**7, 10**9])) * S
+        if kind <= 5:
+            duration_ns = int(rng.choice([0, 1, S // 10, S, S, S, S, 3600 * S]))
+            speed = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 1.0
+            yaw = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 0.1
+            end_ns = stamp_ns + duration_ns
+            yield m.Odometry(end_ns, robot, 1, counter, duration_ns, speed, yaw)
+            if kind != 0:
+                now_ns = end_ns
+        elif kind <= 10:
+            n = int(rng.choice([0, 1, 2, 3, 6, 300], p=[0.1, 0.2, 0.3, 0.2, 0.18, 0.02]))
+            ids = rng.integers(1, 8 if n < 300 else 5000, n)
+            ranges = np.abs(numbers(rng, n))
+            bearings = rng.uniform(-np.pi, np.pi, n) * (rng.random() < 0.8)
+            yield m.Observations(
+                stamp_ns, robot, 1, counter, from_ids(ids), from_floats(ranges),
+                from_floats(bearings),
+            )  # fmt: skip
+        else:
+            names = tuple(str(x) for x in rng.choice(ROBOTS, int(rng.integers(0, 3))))
+            yield m.Sightings(
+                stamp_ns, robot, 1, counter, names, from_floats(np.abs(numbers(rng, len(names)))),
+                from_floats(rng.uniform(-np.pi, np.pi, len(names))),
+            )  # fmt: skip
+        if rng.random() < 0.05:
+            yield prior(rng, robot)
+    yield m.End(now_ns, (m.StreamEnd(robot, 1, counter + 1),))
+
+
+def prior(rng: np.random.Generator, robot: str) -> m.Prior:
+    """What a centre may say of the robot's place."""
+    ids = np.unique(rng.integers(1, 8, int(rng.integers(0, 5)))).astype(np.uint32)
+    n = 3 + 2 * len(ids)
+    sequence = int(rng.integers(-1, 4))
+    return m.Prior(
+        sequence * 10 * S, robot, 1, sequence, CONFIG, from_ids(ids), from_floats(numbers(rng, n)),
+        packed(covariance(rng, n)),
+    )  # fmt: skip
+
+
+def robot_session(
+    messages: Iterator[m.Message], config: RobotConfig
+) -> tuple[RobotNode, list[Outgoing]]:
+    """A robot that hears what of these its door lets in; what it says every receiver takes."""
+    node = RobotNode(config)
+    out = node.begin()
+    if config.estimator == "localisation":
+        out += node.handle(m.KnownMap(0, from_ids([1, 2, 3]), from_floats([5, 0, 0, 6, -4, 3])), 0)
+    taken = 0
+    for message in messages:
+        found = valid(message)
+        if found is None:
+            continue
+        taken += 1
+        out += node.handle(found, 0)
+        answers = [each.message for each in out if isinstance(each.message, m.Submap)]
+        if answers:
+            out += node.handle(m.Progress(0, "central", node.robot, 1, 0, len(answers)), 0)
+    for each in [*out, Outgoing(out[0].channel, "", node.status())]:
+        decoded(encoded(each.message), type(each.message))
+    return node, out

@@ -1,0 +1,154 @@
+"""A robot goes on whatever its sensors say: rejected with a reason, never dead, nothing unsound."""
+
+import os
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from team.config import (
+    Bounds,
+    Estimator,
+    FrontEnd,
+    FusionRule,
+    MotionModel,
+    MotionNoise,
+    RobotConfig,
+)
+from team.robot.node import RobotNode
+from team.stream.judge import OLDER, RANGE, SPEED, TIME
+from team.wire import messages as m
+from team.wire.arrays import floats, from_floats, from_ids, ids
+from tests.hostile_team import S, hostile_stream, robot_session
+
+SESSIONS = int(os.environ.get("TEAMSLAM_STORM", "3"))
+LANDMARKS = {1: (5.0, 0.0), 2: (0.0, 6.0), 3: (-4.0, 3.0)}
+PAIRS: tuple[tuple[Estimator, FusionRule], ...] = (
+    ("hybrid", "join"),
+    ("hybrid", "alone"),
+    ("hybrid-thesis", "alone"),
+    ("hybrid-thesis-coded", "alone"),
+    ("ekf-slam", "alone"),
+    ("fastslam1", "alone"),
+    ("fastslam2", "alone"),
+    ("localisation", "alone"),
+    ("dead-reckoning", "alone"),
+)
+
+
+def config(estimator: Estimator = "hybrid", fusion: FusionRule = "join", **fields) -> RobotConfig:
+    front = {"particles": 10, "window_s": 10.0} | fields.pop("front_end", {})
+    return RobotConfig(
+        "r1",
+        motion=MotionModel(
+            forward=MotionNoise(per_s=0.03, per_m=0.04), turn=MotionNoise(per_s=0.02)
+        ),
+        front_end=FrontEnd(**front),
+        estimator=estimator,
+        fusion=fusion,
+        **fields,
+    )
+
+
+def drive(
+    steps: int, odd: dict[int, m.Message] | None = None, *, sees: bool = True
+) -> list[m.Message]:
+    """A circle at 1 m/s, three landmarks each second; `odd`: what comes in place of a second's."""
+    out: list[m.Message] = [m.Start(0, "r1", 1, 0, from_floats([0.0, 0.0, 0.0]), b"")]
+    for k in range(1, steps + 1):
+        own = m.Odometry(k * S, "r1", 1, 2 * k, S, 1.0, 0.1)
+        scan = [(i, float(np.hypot(*p)), 0.3 * i - 1.0) for i, p in LANDMARKS.items()]
+        seen, ranges, bearings = zip(*scan, strict=True) if sees else ((), (), ())
+        look = m.Observations(
+            k * S, "r1", 1, 2 * k - 1, from_ids(seen), from_floats(ranges), from_floats(bearings)
+        )
+        out += [look, (odd or {}).get(k) or own]
+    return [*out, m.End(steps * S, (m.StreamEnd("r1", 1, 2 * steps + 1),))]
+
+
+def lived(messages, **fields) -> tuple[RobotNode, list[m.Submap], Counter[str]]:
+    node, out = robot_session(iter(messages), config(**fields))
+    (done,) = [each.message for each in out if isinstance(each.message, m.Done)]
+    submaps = [each.message for each in out if isinstance(each.message, m.Submap)]
+    ledger = Counter({each.disposition: each.readings for each in done.ledger})
+    assert sum(ledger.values()) == done.readings, "each measurement has one disposition"
+    return node, submaps, ledger
+
+
+@pytest.mark.parametrize("speed", [1e3, 1e7, 1e300])
+def test_an_interval_that_is_too_fast_is_rejected_and_the_robot_drives_on(speed):
+    glitch = m.Odometry(15 * S, "r1", 1, 30, S, speed, 0.0)
+    _, submaps, ledger = lived(drive(40, {15: glitch}, sees=False))
+    assert ledger[f"rejected: {SPEED}"] == 1
+    _, good, _ = lived(drive(40, sees=False))
+    sigmas = [[floats(each.covariance, "")[0] ** 0.5 for each in some] for some in (submaps, good)]
+    more = np.array(sigmas[0]) / np.array(sigmas[1])
+    assert more[1] > 3.0, "nobody measured that second: its submap knows less of where it ended"
+    np.testing.assert_allclose(np.delete(more, 1), 1.0, atol=1e-9)
+
+
+def test_time_that_stands_goes_back_or_leaps_is_rejected():
+    odd = {
+        12: m.Odometry(11 * S, "r1", 1, 24, S, 1.0, 0.1),
+        14: m.Odometry(3 * S, "r1", 1, 28, S, 1.0, 0.1),
+        16: m.Odometry(16 * S + 10**18, "r1", 1, 32, S, 1.0, 0.1),
+    }
+    _, submaps, ledger = lived(drive(40, odd))
+    assert ledger[f"rejected: {OLDER}"] == 2
+    assert ledger[f"rejected: {TIME}"] == 1
+    assert submaps[-1].stamp_ns == 40 * S
+
+
+def test_a_clock_that_has_truly_leapt_is_followed_from_the_second_interval_on():
+    away = 10**18
+    odd = {k: m.Odometry(k * S + away, "r1", 1, 2 * k, S, 1.0, 0.1) for k in range(21, 41)}
+    _, submaps, ledger = lived(drive(40, odd))
+    assert ledger[f"rejected: {TIME}"] == 1
+    assert submaps[-1].stamp_ns == 40 * S + away
+
+
+def test_a_range_beyond_the_bounds_is_not_taken():
+    far = m.Observations(5 * S, "r1", 1, 9, from_ids([1]), from_floats([9e5]), from_floats([0.0]))
+    messages = [far if getattr(x, "reading", None) == 9 else x for x in drive(20)]
+    _, _, ledger = lived(messages, bounds=Bounds(extent_m=1e4))
+    assert ledger[f"rejected: {RANGE}"] == 1
+
+
+def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bounds():
+    messages = []
+    for each in drive(20):
+        if isinstance(each, m.Observations):
+            k = each.reading
+            n = 2000 if k == 21 else 60
+            seen = np.arange(1, n + 1) + 60 * k
+            ranges = np.linspace(1.0, 50.0, n)
+            each = m.Observations(
+                each.stamp_ns, "r1", 1, k, from_ids(seen), from_floats(ranges),
+                from_floats(np.linspace(-3.0, 3.0, n)),
+            )  # fmt: skip
+        messages.append(each)
+    bounds = Bounds(submap_landmarks=200)
+    _, submaps, _ = lived(messages, bounds=bounds)
+    counts = [len(ids(each.ids, "ids")) for each in submaps]
+    assert max(counts) == 200
+    assert len(submaps) > 5, "windows close early: 10 s would be two"
+    assert all(a.stamp_ns == b.start_ns for a, b in pairwise(submaps))
+
+
+@pytest.mark.parametrize(("estimator", "fusion"), PAIRS)
+@settings(max_examples=SESSIONS, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32))
+def test_any_estimator_goes_on_through_a_hostile_stream(estimator, fusion, seed):
+    rng = np.random.default_rng(seed)
+    front = {
+        "node_s": 2.0 * (fusion == "join"),
+        "garbage": 0.1 * (estimator == "hybrid" and seed % 2),
+    }
+    node, out = robot_session(
+        hostile_stream(rng, "r1", 60), config(estimator, fusion, front_end=front)
+    )
+    assert any(isinstance(each.message, m.Done) for each in out), node.warnings
+    assert not any("submap" in text for text in node.warnings if "withheld" in text)
