@@ -26,6 +26,7 @@ from sim.cli.options import (
     over_tls,
     own_keys,
     parsed_speed,
+    refuse_existing,
     refuse_open_door,
     scenario_of,
 )
@@ -200,6 +201,8 @@ def record(
         "scenario": dumps(resolved),
     }
     again = output.exists()
+    if again and not output.is_file():
+        refuse_existing(output)
     try:
         if again:
             check_continues(output, resolved.team, metadata)
