@@ -616,11 +616,12 @@ class RobotNode:
         if prior is None or prior.epoch != self._epoch:
             return out
         try:
-            posed = self._team_map.pose(prior, self._locals, window).pose
+            with np.errstate(all="ignore"):  # what is no number is withheld
+                posed = self._team_map.pose(prior, self._locals, window).pose
         except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
             self.warnings.append(f"no team pose from the fused map: {error}")
             return out
-        self._pose_sigma = float(np.sqrt(posed[1][0, 0] + posed[1][1, 1]))
+        self._pose_sigma = max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0) ** 0.5
         return [*out, self._pose(ch.TEAM_POSE, stamp_ns, prior.digest, posed)]
 
     def _pose(
