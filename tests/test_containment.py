@@ -189,7 +189,7 @@ def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
     shell.report(last=True)
     fault, status = (opened(s)[2] for s in sink.receive())
     assert isinstance(fault, m.Fault)
-    assert (fault.key, fault.text) == ("status", "no word")
+    assert (fault.origin, fault.text) == ("status", "no word")
     assert isinstance(status, m.Status)
     assert status.figures["faults"] == 1.0
     assert "status: RuntimeError at team.shell:Shell.contained:" in status.warnings[-1]

@@ -51,7 +51,7 @@ class MapResult:
     truth: the true positions, rows without truth zero; known: which rows have it. errors: of those.
     payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
     covariance_scale: how many times the submaps' covariances ought to be taken; None: not known.
-    withdrawn: the robots that the map goes without.
+    withdrawn: the robots that the map goes without. lost: those that are not wholly in it.
     """
 
     rule: str
@@ -70,6 +70,7 @@ class MapResult:
     joined: tuple[str, ...] = ()
     withdrawn: tuple[str, ...] = ()
     covariance_scale: float | None = None
+    lost: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         robots,
         positions,
         {key: log.traffic[key] for key in sorted(log.traffic)},
-        (*(end.notes if isinstance(end, m.End) else ()), *_lost(log), *_set_aside(faults)),
+        (*(end.notes if isinstance(end, m.End) else ()), *_lost(fused), *_set_aside(faults)),
         log.unsound,
         _by_robot(log, "joint_cost_per_dof."),
         len(faults),
@@ -163,10 +164,9 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     )
 
 
-def _lost(log: Collected) -> list[str]:
+def _lost(fused: MapResult | None) -> list[str]:
     """Of whom the final map has not all that it was to have."""
-    final = log.sound(log.last(ch.FINAL_MAP))
-    lost = final.lost if isinstance(final, m.FusedMap) else ()
+    lost = () if fused is None else fused.lost
     return [f"the final map is provisional: {robot} lost, and not wholly in it" for robot in lost]
 
 
@@ -176,7 +176,7 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
     for fault in faults:
         by_node.setdefault(fault.node, []).append(fault)
     return [
-        f"{node} set {len(found)} messages aside; the first, {found[0].key}, raised "
+        f"{node} set {len(found)} messages aside; the first, {found[0].origin}, raised "
         f"{found[0].error} at {found[0].place}: {found[0].text}"
         for node, found in sorted(by_node.items())
     ]
@@ -316,6 +316,7 @@ def _map_result(
         joined=message.joined,
         withdrawn=message.withdrawn,
         covariance_scale=message.covariance_scale or None,
+        lost=message.lost,
     )
 
 

@@ -59,7 +59,7 @@ class Watch:
         """The first of a node is a failure by name; its status counts the rest."""
         named = f"{fault.node} set aside "
         if not any(failure.startswith(named) for failure in self.failures):
-            what = f"{fault.key}: {fault.error} at {fault.place}: {fault.text}"
+            what = f"{fault.origin}: {fault.error} at {fault.place}: {fault.text}"
             self.failures.append(f"{named}{what}")
 
     def note(self, text: str) -> None:

@@ -529,15 +529,15 @@ class Status(Message, frozen=True, array_like=True, gc=False, tag="status/1"):
 class Fault(Message, frozen=True, array_like=True, gc=False, tag="fault/1"):
     """A node could not handle a message and set it aside; stamp_ns is the message's.
 
-    key: where it came from, the query's for a reply, the duty's name if there was no message.
-    counter: its publisher's count of the key; -1: none. message: its tag; empty where it raised
-    before it was one. error, text: the exception's class and words. place: module:function:line.
-    digest: 8 bytes, the payload's BLAKE2b.
+    origin: its key, the query's for a reply, the duty's name if there was no message. count: its
+    publisher's count of the key; -1: none. message: its tag; empty where it raised before it was
+    one. error, text: the exception's class and words. place: module:function:line. digest: 8 bytes,
+    the payload's BLAKE2b.
     """
 
     node: Text
-    key: Text
-    counter: Annotated[int, Meta(ge=-1, le=2**63 - 1)]
+    origin: Text
+    count: Annotated[int, Meta(ge=-1, le=2**63 - 1)]
     message: Text
     error: Text
     text: Text

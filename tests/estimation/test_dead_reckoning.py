@@ -56,7 +56,13 @@ def mean_nees(covariance_of, runs=200):
 def test_its_covariance_is_true_and_one_that_is_only_added_up_is_not():
     low, high = chi2_interval(3, 0.999, 200)
     assert low < mean_nees(lambda told: reckoned(told).pose.covariance) < high
-    assert not low < mean_nees(lambda told: sum(step.covariance for step in told)) < high
+    assert not low < mean_nees(added_up) < high
+
+
+def added_up(told):
+    """The covariance of a robot that never turns; a little more, since so it is singular."""
+    covariance = sum(step.covariance for step in told)
+    return covariance + 1e-9 * np.diag(np.diag(covariance))
 
 
 @settings(deadline=None, max_examples=50)

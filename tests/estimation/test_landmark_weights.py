@@ -89,10 +89,10 @@ def test_beyond_its_gate_a_landmark_counts_by_the_gate_over_its_chi_square():
     world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
     island = fold_of(world, mistaken(world, 4), ROBUST, solved).main
     graph, state, expected = island.graph, island.state, []
-    for contribution, nodes in graph.submaps:
-        local = contribution.local
+    for joined in graph.submaps:
+        local = joined.contribution.local
         for k, id_ in enumerate(local.ids.tolist()):
-            at, start = graph.offset[graph.landmarks[id_]], graph.offset[nodes[0]]
+            at, start = graph.offset[graph.landmarks[id_]], graph.offset[joined.nodes[0]]
             place = seen_from(state[start : start + 3], state[at] + 1j * state[at + 1])
             r = np.array([place.real, place.imag]) - local.landmarks[k]
             block = local.covariance[3 + 2 * k : 5 + 2 * k, 3 + 2 * k : 5 + 2 * k]

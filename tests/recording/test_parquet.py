@@ -25,7 +25,8 @@ pq = pytest.importorskip("pyarrow.parquet", reason="pip install '.[parquet]'")
 
 
 def sampled(channel: c.Channel, message: m.Message, counter: int) -> Sample:
-    return Sample(channel.key("alpha"), encoded(message), message.stamp_ns, 7 + counter, counter)
+    name = getattr(message, "node", "alpha") if "{node}" in channel.template else "alpha"
+    return Sample(channel.key(name), encoded(message), message.stamp_ns, 7 + counter, counter)
 
 
 def recorded(path: Path, samples: list[Sample]) -> Log:
@@ -36,6 +37,7 @@ def recorded(path: Path, samples: list[Sample]) -> Log:
 
 def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
     by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
+    by_class[m.Configured] = c.ROBOT_CONFIG  # of the three nodes that announce one, the example's
     kept = [message for message in examples() if type(message) in by_class]
     samples = [sampled(by_class[type(x)], x, i) for i, x in enumerate(kept)]
     samples.append(Sample(samples[0].key, b"\x90", 0, 0, 99))
