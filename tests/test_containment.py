@@ -59,7 +59,7 @@ def test_a_reading_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_b
 ) -> None:
     samples = list(team_samples(thesis(45)))
     told = faults(samples)
-    assert [(f.node, f.key, f.message) for f in told] == [
+    assert [(f.node, f.origin, f.message) for f in told] == [
         (f"robot/{r}", ch.ODOMETRY.key(r), "odometry/1") for r in ("r1", "r2")
     ]
     assert {(f.error, f.text, f.stamp_ns) for f in told} == {
@@ -176,7 +176,7 @@ def test_a_message_that_raised_is_not_handled_again_when_it_comes_again(
     shell, sink = heard
     one, two = (sampled(submap(k), "robot/alpha/submap", k) for k in range(2))
     shell.take([one, two, one, two])
-    assert [f.counter for f in faults(sink.receive())] == [0, 1]
+    assert [f.count for f in faults(sink.receive())] == [0, 1]
     assert shell.boundary.faults == 2
     with pytest.raises(FaultyRunError, match=r"2 set aside after a fault, the last: submap/1"):
         shell.end(None)

@@ -95,6 +95,8 @@ def is_loopback(endpoint: str) -> bool:
 
 def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
     """End with an error where strangers could reach a router that lets everyone in."""
+    if "/" not in listen:
+        fail(f"can not listen at {listen}: not an endpoint, as tcp/HOST:PORT", WRONG_USE)
     if not (keys or insecure or is_loopback(listen)):
         fail(
             f"--listen {listen}: whoever reaches it could end the run or forge its map: give "

@@ -68,8 +68,15 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
             ["nowhere.mcap: not found", "need"],
         ),
         (["report", "nowhere.mcap", "-o", "out"], ["nowhere.mcap: not found"]),
-        (["router", "--listen", "banana"], ["can not listen at banana"]),
-        (["router", "--listen", "tcp/203.0.113.1:7447"], ["can not listen", "not this machine's"]),
+        (["router", "--listen", "banana"], ["can not listen at banana", "tcp/HOST:PORT"]),
+        (
+            ["router", "--listen", "tcp/203.0.113.1:7447"],
+            ["--listen tcp/203.0.113.1:7447", "--keys", "--insecure"],
+        ),
+        (
+            ["router", "--insecure", "--listen", "tcp/203.0.113.1:7447"],
+            ["can not listen", "not this machine's"],
+        ),
     ],
 )
 async def test_wrong_use_is_told_with_what_to_do(
