@@ -28,7 +28,7 @@ from team.pairs import PAIRS
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import opened
+from team.wire.bus import Outgoing, opened
 from team.wire.codec import encoded
 from tests.support import ROOT
 from tests.teams import Team, config, driven, of, published, stream, world_of
@@ -354,7 +354,7 @@ SEEDS = {
 
 
 def played(seed, estimator, fusion):
-    """A team to its rest; in some a robot dies, and in some of those it comes back."""
+    """A team to its rest; in some a robot dies; half of those come back, the rest are given up."""
     rng = random.Random(seed)
     team = team_of(unequal(rng), rng, estimator=estimator, fusion=fusion)
     if rng.random() < 0.4:
@@ -368,6 +368,9 @@ def played(seed, estimator, fusion):
             team.step()
         if rng.random() < 0.5:
             team.resume(team.robots[victim].config)
+        else:
+            order = m.GivenUp(0, ch.robot_node(victim), "operator", "it fell into the water")
+            team.send("operator", [Outgoing(ch.GIVEN_UP, order.node, order)])
     team.run()
     return team
 

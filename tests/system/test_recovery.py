@@ -84,7 +84,7 @@ async def test_a_robot_that_dies_and_is_started_again_changes_no_bit_of_the_map(
 async def test_readings_that_a_cut_link_loses_are_asked_for_at_their_source(
     cut_for: str, team: Processes
 ) -> None:
-    found = await assembled(team, "25")
+    found = await assembled(team, "12")
     with (
         Link(found.endpoint) as link,
         Observer(found.endpoint, [ch.SUBMAP, ch.ODOMETRY, ch.END]) as seen,

@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from foxglove.websocket import PlaybackStatus
+from mcap.reader import make_reader
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -131,7 +132,10 @@ def test_an_event_is_at_the_time_of_what_it_is_about(samples, tmp_path):
 
 def test_a_damaged_chunk_costs_the_page_no_more_than_itself(log, tmp_path):
     data = bytearray(log.read_bytes())
-    data[len(data) // 2] ^= 0xFF
+    with log.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    chunk = chunks[len(chunks) // 2]
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
     (tmp_path / "damaged.mcap").write_bytes(data)
     found = told(tmp_path / "damaged.mcap")
     assert found[-1]["k"] == "eof"
