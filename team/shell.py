@@ -79,6 +79,7 @@ class Shell:
         self._name = name
         self._stop = stop
         self._status_due = 0.0
+        self._begun = False
         self._remind_due = time.monotonic() + REMIND_S
         self.boundary = Boundary(name)
         self.notes: Callable[[], tuple[str, ...]] = tuple
@@ -91,6 +92,7 @@ class Shell:
         """Say what the node says first and declare it alive; its subscriptions are made before."""
         self.publish(self.node.begin())
         self.bus.declare_alive(self._name)
+        self._begun = True
         self.report()
 
     @property
@@ -111,9 +113,11 @@ class Shell:
                     self.publish([fault])
 
     def take(self, samples: Iterable[Sample]) -> None:
-        """Decode at the door, hand to the node, publish its answer."""
+        """Decode at the door, hand to the node, publish its answer; a long queue is no silence."""
         for sample in samples:
             self.publish(self.boundary.take(self.node, sample))
+            if self._begun:
+                self.report()
 
     def take_replies(
         self, channel: Channel, name: str, replies: Iterable[bytes], expected: type[Message]
