@@ -183,8 +183,8 @@ function lookAtMap() {
   $('cost-box').hidden = !store.figures.has('central');
   put('cost', cost ? cost.toFixed(2) : '–', cost ? levelOf(cost) : '');
   const scale = figures && figures.covariance_scale;
-  $('scale-box').hidden = !scale;
-  put('scale', scale ? scale.toFixed(2) : '–', scale && scaleSays(scale) ? 'warn' : '');
+  $('covariance-scale-box').hidden = !scale;
+  put('covariance-scale', scale ? scale.toFixed(2) : '–', scale && scaleSays(scale) ? 'warn' : '');
 }
 
 /** What is wrong with covariances of this scale; empty where nothing is. */
