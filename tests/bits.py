@@ -1,0 +1,172 @@
+"""The bits of final maps: what a change that is only about structure must not move.
+
+    python -m tests.bits                 computes every case and compares it with the table
+    python -m tests.bits --only pair     the cases whose name begins so
+    python -m tests.bits --rewrite       writes what was computed into the table
+
+A row holds three hashes: of the encoded final map (another version of a message or of a
+configuration changes it), of its means and covariance alone, and of each robot's last own pose and
+map. The table names what it was computed with: another processor's linear algebra rounds
+differently.
+"""
+
+import argparse
+import hashlib
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import msgspec
+import numba
+import numpy as np
+import scipy
+from threadpoolctl import threadpool_info
+
+from sim.in_memory.team import final_map, run_team
+from sim.scenario.scenario import Scenario, load, with_options
+from sim.scenario.source import streams_of
+from team.pairs import PAIRS
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.codec import encoded
+from tests.support import ROOT
+
+TABLE = Path(__file__).with_suffix(".json")
+SETS = ROOT.parent / "shared" / "utias"
+PAIR_STEPS = 30
+ESTIMATES = ("estimate", "robots")
+"""The hashes that no version of a message changes."""
+Row = Mapping[str, str]
+
+
+def world(name: str, seed: int = 1, **changes: object) -> Scenario:
+    """A built-in scenario with this seed and other fields of its world."""
+    scenario = with_options(load(name), seed=seed)
+    return msgspec.structs.replace(
+        scenario, world=msgspec.structs.replace(scenario.world, **changes)
+    )
+
+
+def pair(estimator: str, fusion: str) -> Scenario:
+    """A small world for an estimator and a rule."""
+    return with_options(world("thesis", steps=PAIR_STEPS), estimator=estimator, fusion=fusion)
+
+
+def outliers() -> Scenario:
+    """Three measurements in ten have nothing to do with their landmark; the robots know it."""
+    scenario = world("thesis", garbage=0.3)
+    robots = tuple(
+        msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, garbage=0.3))
+        for r in scenario.robots
+    )
+    central = msgspec.structs.replace(scenario.central, landmark_submaps=2, robust_c=2.0)
+    return msgspec.structs.replace(scenario, robots=robots, central=central)
+
+
+def utias(number: int) -> Scenario:
+    """A UTIAS data set beside the project."""
+    return with_options(load("utias"), dataset=SETS / f"MRCLAM_Dataset{number}.zip")
+
+
+CASES: Mapping[str, Callable[[], Scenario]] = {
+    "thesis 1": lambda: world("thesis"),
+    "thesis 2": lambda: world("thesis", seed=2),
+    "thesis-b 1": lambda: world("thesis-b"),
+    "random-3 1": lambda: world("random-3"),
+    "waypoints 1": lambda: world("waypoints"),
+    "unknown initial poses": lambda: world("thesis", unknown_starts=("*", "!r1")),
+    "outliers": outliers,
+    **{f"pair {e} + {f}": lambda e=e, f=f: pair(e, f) for e, f in sorted(PAIRS)},
+    "utias 1": lambda: utias(1),
+    "utias 2": lambda: utias(2),
+    "utias 6": lambda: utias(6),
+}
+
+
+def is_here(name: str) -> bool:
+    """Whether the data that a case needs is beside the project."""
+    return not name.startswith("utias") or (SETS / f"MRCLAM_Dataset{name[-1]}.zip").is_file()
+
+
+def computed(name: str) -> Row:
+    """The hashes of a case, computed in memory."""
+    scenario = CASES[name]()
+    samples = list(run_team(scenario, streams_of(scenario)))
+    fused = final_map(samples)
+    return {
+        "message": _hash(encoded(fused)),
+        "estimate": _hash(fused.means + fused.covariance),
+        "robots": _hash(b"".join(_own_estimates(samples))),
+    }
+
+
+def _own_estimates(samples: list[Sample]) -> Iterator[bytes]:
+    """The numbers of each robot's last own pose and last own map."""
+    last = {s.key: s for s in samples if s.key.endswith(("/own/pose", "/own/map"))}
+    for key in sorted(last):
+        _, _, message = opened(last[key])
+        means = message.pose if isinstance(message, m.PoseEstimate) else message.means
+        yield means + message.covariance
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def machine() -> dict[str, str]:
+    """What the bits depend on beside the program."""
+    kernels = {str(each.get("architecture")) for each in threadpool_info()}
+    return {
+        "processor": platform.machine(),
+        "kernels": ", ".join(sorted(kernels)),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def table() -> dict[str, dict[str, str]]:
+    """The committed rows, and `machine`: what they were computed with."""
+    return json.loads(TABLE.read_text("utf-8")) if TABLE.is_file() else {}
+
+
+def differences(names: list[str]) -> Iterator[tuple[str, Row, str]]:
+    """Each case as it is now, and what differs from the table; empty: nothing."""
+    committed = table()
+    for name in names:
+        now = computed(name)
+        before = committed.get(name, {})
+        fields = [field for field in now if now[field] != before.get(field)]
+        yield name, now, "" if not fields else "new" if not before else ", ".join(fields)
+
+
+def main() -> int:
+    """1 where an estimate differs from the table."""
+    parser = argparse.ArgumentParser(description="The bits of final maps against the table.")
+    parser.add_argument("--only", default="", metavar="NAME", help="the cases that begin so")
+    parser.add_argument("--rewrite", action="store_true", help="write what was computed")
+    options = parser.parse_args()
+    rows, moved = table(), 0
+    chosen = [name for name in CASES if name.startswith(options.only) and is_here(name)]
+    if rows and rows["machine"] != machine():
+        print(f"the table was made with {rows['machine']}, this is {machine()}")
+    begun = time.perf_counter()
+    for name, now, differs in differences(chosen):
+        took, begun = time.perf_counter() - begun, time.perf_counter()
+        moved += any(field in differs for field in ESTIMATES)
+        print(f"{name:42} {' '.join(now.values())} {took:5.1f} s {differs}", flush=True)
+        rows[name] = dict(now)
+    if options.rewrite:
+        kept = {name: rows[name] for name in CASES if name in rows}
+        text = json.dumps({"machine": machine()} | kept, indent=1)
+        TABLE.write_text(text + "\n", "utf-8")
+    elif moved:
+        print(f"{moved} of {len(chosen)} cases have other estimates", file=sys.stderr)
+    return int(bool(moved) and not options.rewrite)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
