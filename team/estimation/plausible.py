@@ -47,6 +47,19 @@ def start_beyond(start: Start, bounds: Bounds) -> str | None:
     return why
 
 
+def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None:
+    """Why a prior (x, y, θ, x₁, y₁, …) is refused; None if it is within the bounds.
+
+    A variance of zero is a known constant; what many submaps agree on has any small one.
+    """
+    points = np.arange(len(mean)) != 2
+    why = _far(mean[points], bounds.coordinate_m, "of the origin")
+    largest = float(np.sqrt(np.max(np.diag(covariance)[points], initial=0.0)))
+    if why is None and largest > bounds.sigma_m[1]:
+        why = f"a sigma of {largest:.3g} m, not up to {bounds.sigma_m[1]:g} m"
+    return why
+
+
 def are_landmarks(covariance: Matrix) -> bool:
     """Whether a joint covariance of points is finite and each point's own block is a covariance."""
     if not np.isfinite(covariance).all():

@@ -128,7 +128,11 @@ def _worst(tie: Tie, gate: float) -> int | None:
     z = tie.multiplier.reshape(-1, 2)
     at = np.arange(len(z))
     own = tie.inverse.reshape(len(z), 2, len(z), 2)[at, :, at]
-    gain = np.einsum("ki,ki->k", z, np.linalg.solve(own, z[:, :, None])[:, :, 0])
+    try:
+        weighted = np.linalg.solve(own, z[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError as error:
+        raise NotACovarianceError("a known landmark's innovation", "singular") from error
+    gain = np.einsum("ki,ki->k", z, weighted)
     worst = int(gain.argmax())
     return worst if gain[worst] > gate else None
 

@@ -9,6 +9,7 @@ from team.recording.counters import Counters, Told
 from team.recording.cut import CUT
 from team.recording.declared import declared, misdeclared
 from team.recording.inventory import Inventory
+from team.recording.last_words import LastWords
 from team.recording.reader import Log, LogError
 from team.recording.records import index_damage
 from team.recording.repair import salvaged
@@ -87,12 +88,16 @@ class _Evidence:
     inventory: Inventory = field(default_factory=Inventory)
     counters: dict[str, Counters] = field(default_factory=lambda: defaultdict(Counters))
     tallies: dict[str, list[Told]] = field(default_factory=lambda: defaultdict(list))
+    last_words: LastWords = field(default_factory=LastWords)
     last_word: tuple[str, ...] = ()
+    heard: set[ch.Channel] = field(default_factory=set)
 
     def take(self, sample: Sample) -> None:
         self.counters[sample.key].take(sample)
         self.inventory.take(sample)
         row = ch.channel_of(sample.key)
+        if row is not None and row[0] in (ch.END, *_OF_AN_END):
+            self.heard.add(row[0])
         if row is None or row[0] not in (ch.TALLY, ch.STATUS):
             return
         try:
@@ -101,7 +106,10 @@ class _Evidence:
             return
         if isinstance(message, m.Status) and row[1] == "recorder":
             self.last_word = message.warnings
+        elif isinstance(message, m.Status):
+            self.last_words.take_status(row[1], sample)
         elif isinstance(message, m.Tally):
+            self.last_words.take_tally(message, sample.wall_ns)
             for key, count in zip(message.keys, message.counts, strict=True):
                 self.tallies[key].append(Told(message.since_ns, sample.wall_ns, count))
 
@@ -118,16 +126,22 @@ class _Evidence:
             for line in self.counters[key].findings(
                 part=self.part, numbered=numbered, tallies=told
             ):
-                yield Finding(key, line)
+                yield Finding(key, line + (DRAWN if ch.VIEW.owner(key) is not None else ""))
         if not self.part:
-            for key, line in self.inventory.findings():
+            for key, line in (*self.inventory.findings(), *self.last_words.findings()):
                 yield Finding(key, line)
+            if self.heard and ch.END not in self.heard:
+                yield Finding(ch.END.key(), NO_END)
         for said in self.last_word:
             if said.startswith(MISSING):
                 yield Finding("recorder", said)
 
 
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
+_OF_AN_END = (ch.ROBOT_DONE, ch.FINAL_MAP)
+"""Who says this has heard of the end of the streams."""
+NO_END = "missing: how many measurements there were is not known"
+DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
 MISSING = "missing: "
 """How the recorder's last word on what it lacks begins."""
 

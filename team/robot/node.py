@@ -16,7 +16,7 @@ from team.config import Exchange, RobotConfig
 from team.door import absurd
 from team.estimation.gauss_newton import NotDeterminedError
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.plausible import start_beyond
+from team.estimation.plausible import prior_beyond, start_beyond
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
 from team.robot.filters import NOTHING_KNOWN, KnownMap
@@ -663,8 +663,14 @@ class RobotNode:
         return []
 
     def _take_prior(self, prior: m.Prior) -> None:
-        if is_newer_prior(prior, self._prior):
+        if not is_newer_prior(prior, self._prior):
+            return
+        whole = translate.prior_of(prior).whole
+        why = prior_beyond(whole.mean, whole.covariance, self.config.bounds)
+        if why is None:
             self._prior = prior
+        else:
+            self.warnings.append(f"the team's map is refused: {why}")
 
     def _take_known(self, told: m.KnownMap) -> None:
         """The newer one by its stamp; an equal one again changes nothing."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from team import translate
 from team.estimation.conditioning import Followed, Posed, Shared, followed, mostly, pose_now
+from team.estimation.gauss_newton import UNSOLVABLE
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
 
@@ -19,7 +20,7 @@ class TeamMap:
         self._prior: m.Prior | None = None
         self._submaps = 0
         self._shared = Shared()
-        self._followed: Followed | None = None
+        self._followed: Followed | Exception | None = None
         self.known = 0
         self.refused = 0
         self.doubt = ""
@@ -49,11 +50,17 @@ class TeamMap:
     def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
         """The prior times those of the epoch's submaps that are not in it.
 
-        The prior may have more of them than a robot that has come back.
+        The prior may have more of them than a robot that has come back. That a prior and submaps
+        have no solution is found once, not at every keyframe, and raised again.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             told = translate.prior_of(prior)
             pending = [told.shared.taken(each) for each in submaps[max(0, prior.sequence + 1) :]]
-            self._followed = followed(told.whole, pending)
             self._prior, self._shared, self._submaps = prior, told.shared, len(submaps)
+            try:
+                self._followed = followed(told.whole, pending)
+            except UNSOLVABLE as error:
+                self._followed = error
+        if isinstance(self._followed, Exception):
+            raise self._followed.with_traceback(None)
         return self._followed

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from team.wire.channels import ALIVE, ORDER, REPLIES, Channel, channel_of
+from team.wire.channels import ALIVE, ORDER, REPLIES, VIEW, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
     Configured,
@@ -167,6 +167,8 @@ CLOUDS_KEPT = 1_024
 """… of particles: kilobytes each."""
 MAPS_KEPT = 256
 """… of maps: tens of kilobytes each, a joint covariance more."""
+VIEWS_KEPT = 256
+"""… of views: tens of kilobytes each."""
 ALL_KEPT = 1_000_000
 
 
@@ -176,6 +178,8 @@ def kept_of(channel: Channel) -> int:
         return ALL_KEPT
     if channel.message in (FusedMap, MapEstimate, Prior):
         return MAPS_KEPT
+    if channel is VIEW:
+        return VIEWS_KEPT
     return CLOUDS_KEPT if channel.message is ParticleCloud else LATEST_KEPT
 
 

@@ -159,7 +159,7 @@ SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsWanted, "query", "strea
 FINAL_KEPT = Channel("final_kept", "router/final", m.FinalWanted, "query", "stream", False, False,
                      "a query; the reply is the final map, when the centre has left, too")  # fmt: skip
 
-VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "stream", True, False,
+VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "latest", True, False,
                "what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
@@ -193,3 +193,11 @@ def channel_of(key: str) -> tuple[Channel, str] | None:
         if channel not in UNOPENED and (name := channel.owner(key)) is not None:
             return channel, name
     return None
+
+
+def row_of(key: str) -> Channel | None:
+    """The row of a relative key, a view's too."""
+    found = channel_of(key)
+    if found is not None:
+        return found[0]
+    return VIEW if VIEW.owner(key) is not None else None

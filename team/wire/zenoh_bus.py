@@ -41,7 +41,7 @@ from team.keys.roster import Roster
 from team.wire.access import access_control
 from team.wire.arrivals import Arrivals
 from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of, replied
-from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, TALLY, Channel, channel_of
+from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, TALLY, Channel, row_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.handshake import why_refused
 from team.wire.messages import FinalKept, Liveliness, Message, Tally
@@ -216,8 +216,8 @@ class ZenohBus:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
     def _declared(self, key: str) -> _Publisher:
-        found = channel_of(key)
-        if found is None or found[0].delivery == "stream":
+        row = row_of(key)
+        if row is None or row.delivery == "stream":
             return self._session.declare_publisher(
                 self._prefix + key,
                 congestion_control=_BLOCK,
@@ -230,7 +230,7 @@ class ZenohBus:
             congestion_control=_BLOCK,
             priority=_PRIORITY,
             reliability=_RELIABLE,
-            cache=ext.CacheConfig(max_samples=kept_of(found[0]), replies_config=_REPLIES),
+            cache=ext.CacheConfig(max_samples=kept_of(row), replies_config=_REPLIES),
             # Periodic, not sporadic: a sporadic heartbeat that falls into a cut is never repeated.
             sample_miss_detection=ext.MissDetectionConfig(
                 heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
@@ -343,8 +343,8 @@ class ZenohBus:
         """Of a `latest` channel nothing is asked for that is older than the first heard of."""
         found = self._arrivals.get((key, publisher))
         if found is None:
-            row = channel_of(key)
-            whole = row is None or row[0].delivery == "all" or row[0].name in self._whole
+            row = row_of(key)
+            whole = row is None or row.delivery == "all" or row.name in self._whole
             found = Arrivals(0 if whole else heard, in_order=whole)
             self._arrivals[key, publisher] = found
         return found

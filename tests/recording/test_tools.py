@@ -124,6 +124,48 @@ def test_what_a_stream_is_known_to_have_and_the_log_has_not_is_named(path: Path)
     ]
 
 
+def test_a_log_without_the_end_of_the_streams_says_so(path: Path, tmp_path: Path) -> None:
+    """Whoever has heard of the end shows that there was one."""
+    said = drive("alpha", 1)
+    done = sampled(c.ROBOT_DONE, "alpha", m.Done(0, "alpha", 1, 10, 2, 0, ()), 0)
+    end = sampled(c.END, "", m.End(0, (m.StreamEnd("alpha", 1, 10),)), 0)
+    lacking = "world/end: missing: how many measurements there were is not known"
+    assert found(recorded(path, [*said, done])) == [lacking]
+    assert found(recorded(tmp_path / "whole.mcap", [*said, done, end])) == []
+    assert found(recorded(tmp_path / "cut.mcap", [*said, done], cut="said")) == []
+
+
+def test_a_process_without_a_last_word_is_named(path: Path) -> None:
+    """A killed robot's second life says what it has published; of the first nobody knows."""
+
+    def status(counter: int, wall_s: int) -> Sample:
+        said = m.Status(counter * 10**9, "robot/alpha", "mapping", {})
+        return replace(sampled(c.STATUS, "robot/alpha", said, counter), wall_ns=wall_s * 10**9)
+
+    def tally(node: str, since_s: int, until_s: int, count: int) -> Sample:
+        keys = (f"{node}/status",)
+        said = m.Tally(0, node, since_s * 10**9, keys, (count,))
+        return replace(sampled(c.TALLY, node, said, 0), wall_ns=until_s * 10**9)
+
+    first = [status(k, 10 + k) for k in range(3)]
+    second = [status(k, 20 + k) for k in range(2)]
+    last = tally("robot/alpha", 19, 23, 2)
+    (named,) = found(recorded(path, [*first, *second, last]))
+    assert named.startswith("robot/alpha/tally: no last word of the process that spoke until 2.0 s")
+    both = [*first, *second, tally("robot/alpha", 9, 13, 3), last]
+    assert found(recorded(path.with_name("both.mcap"), both)) == []
+    assert found(recorded(path.with_name("memory.mcap"), first)) == []
+
+
+def test_views_that_are_missing_can_be_drawn_again(path: Path) -> None:
+    views = [replace(sampled(c.STATUS, "central", m.Status(0, "central", "", {}), k),
+                     key="view/log") for k in (0, 2)]  # fmt: skip
+    (named,) = found(recorded(path, views))
+    assert named == (
+        "view/log: 1 message missing: 1; `teamslam view LOG --export NEW` draws all views again"
+    )
+
+
 def test_what_was_asked_for_later_is_not_held_against_the_counters(path: Path) -> None:
     late = [
         replace(s, counter=NO_COUNTER, wall_ns=s.wall_ns + 50) if s.counter in (2, 3) else s

@@ -1,7 +1,13 @@
 """The robot's team map: a submap is in it once, whether the prior or the robot brings it."""
 
+import numpy as np
+import pytest
+
 from team import translate
+from team.config import Bounds
 from team.estimation.conditioning import followed
+from team.estimation.gauss_newton import UNSOLVABLE
+from team.estimation.plausible import prior_beyond
 from team.robot.team_map import TeamMap
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -32,3 +38,42 @@ def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already() 
         assert kept.given(told, LOCALS[:known]).whole.mean.tobytes() == alone.mean.tobytes()
     expected = followed(alone, LOCALS[5:]).whole
     assert kept.given(told, LOCALS).whole.mean.tobytes() == expected.mean.tobytes()
+
+
+def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried: list[int] = []
+
+    def unsolvable(whole, pending):
+        tried.append(1)
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("team.robot.team_map.followed", unsolvable)
+    kept, told = TeamMap(), prior(1)
+    for _ in range(5):
+        with pytest.raises(UNSOLVABLE):
+            kept.pose(told, LOCALS, None)
+    assert len(tried) == 1
+    with pytest.raises(UNSOLVABLE):
+        kept.pose(prior(2), LOCALS, None)
+    assert len(tried) == 2
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "sigma", "why"),
+    [
+        (0, 1e9, 0.1, "a coordinate of 1e+09 m"),
+        (4, -1e9, 0.1, "a coordinate of 1e+09 m"),
+        (3, 1.0, 1e9, "a sigma of 1e+09 m"),
+        (3, 1.0, 0.0, None),
+        (2, 1.0, 0.1, None),
+    ],
+)
+def test_a_prior_beyond_the_bounds_is_refused(
+    at: int, value: float, sigma: float, why: str | None
+) -> None:
+    mean = np.zeros(7)
+    mean[at] = value
+    refused = prior_beyond(mean, sigma**2 * np.eye(7), Bounds())
+    assert refused == why if why is None else refused is not None and refused.startswith(why)
