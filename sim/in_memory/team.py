@@ -19,6 +19,10 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 
+ROUND_S = 1.0
+"""Team time of which everybody gets the measurements before the next: as in real time, no robot is
+windows ahead of the news of its teammates."""
+
 
 @runtime_checkable
 class World(Protocol):
@@ -71,7 +75,9 @@ def run_team(
     """Run the team to its final map; everything that a recorder would take, in its order."""
     expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
     announced = translate.configured("world", 0, 0, scenario)
-    world = WorldNode(streams, expected, announced, tells_map=tells_map(scenario, streams))
+    world = WorldNode(
+        streams, expected, announced, tells_map=tells_map(scenario, streams), batch_s=ROUND_S
+    )
     yield from run_nodes(scenario, world, None, robot, central)
 
 

@@ -111,6 +111,7 @@ class WorldNode:
     start at an unknown pose, and readings that count from there. configurations: what the others
     are to announce; the world does not begin while anyone has announced something else.
     tells_map: the robots are told the landmarks, since they only localise themselves.
+    batch_s: team time between two looks at what has come in, at the most.
     """
 
     streams: WorldStreams
@@ -120,6 +121,7 @@ class WorldNode:
     cache: int | None = None
     configurations: Configurations = field(default_factory=lambda: Configurations({}))
     tells_map: bool = False
+    batch_s: float = float("inf")
     ended: bool = field(default=False, init=False)
     finished: bool = field(default=False, init=False)
     final: m.FusedMap | None = field(default=None, init=False)
@@ -293,7 +295,7 @@ class WorldNode:
         return self._published - self._unrecorded - sum(self._recorded.values())
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """The next readings, at most BATCH: as many as pace and credit allow at `clock_s`."""
+        """The next readings, at most BATCH and of batch_s: as many as pace and credit allow."""
         if self.ended:  # a new epoch may begin after the end; it has its own last counters
             out, self._starts = self._starts, []
             return [*out, Outgoing(ch.END, "", self._end())] if out else []
@@ -306,10 +308,14 @@ class WorldNode:
             self._starts += self._skip() if self._consumed else []
         horizon = self._horizon_ns(clock_s)
         out, self._starts = self._starts, []
+        until_ns = float("inf")
         while self._order and len(out) < BATCH:
             robot, index = self._order[0]
             source = self._sources[self._names[robot]]
             stamp_ns = int(source.stream.stamps_ns[index])
+            until_ns = min(until_ns, stamp_ns + self.batch_s * 1e9)
+            if stamp_ns >= until_ns:
+                break
             if stamp_ns > horizon:
                 self._held_up = None
                 break

@@ -72,3 +72,19 @@ def test_a_recorder_gets_what_it_would_get_of_processes():
 def test_a_run_without_a_final_map_says_so():
     with pytest.raises(LookupError, match="without a final map"):
         final_map([])
+
+
+def test_a_team_pose_is_at_most_two_submaps_and_the_open_window_ahead_of_its_prior():
+    prior, behind, ahead = {}, {"r1": [], "r2": []}, []
+    for sample in run("hybrid", "join", steps=80):
+        channel, name, message = opened(sample)
+        if channel is ch.PRIOR:
+            prior[name] = message
+        if channel is ch.TEAM_POSE:
+            behind[name].append(1e-9 * (message.stamp_ns - prior[name].stamp_ns))
+            ahead.append(message.sequence - prior[name].sequence)
+    window_s = load("thesis").robots[0].front_end.window_s
+    for of_robot in behind.values():
+        assert len(of_robot) > 50
+        assert max(of_robot) <= 2.0 * window_s
+    assert max(ahead) <= 3

@@ -1,6 +1,7 @@
 """The world's node: everything in order, never too far ahead, and an answer for what was missed."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -69,6 +70,19 @@ def test_readings_come_by_stamp_then_robot_and_count_from_0():
         assert [r.reading for r in mine] == list(range(len(each)))
         assert {r.epoch for r in mine} == {1}
         assert isinstance(mine[0], m.Start)
+
+
+def test_a_batch_spans_no_more_than_it_may():
+    node = world(batch_s=0.4)
+    batches = []
+    while not node.ended:
+        batches.append([r.stamp_ns for r in readings(node.publish(0.0))])
+    in_order = [stamp_ns for batch in batches for stamp_ns in batch]
+    assert in_order == [r.stamp_ns for r in readings(all_of(world()))]
+    assert all(batches)
+    assert max(max(batch) - min(batch) for batch in batches) < 400_000_000
+    for batch, later in pairwise(batches):
+        assert min(later) - min(batch) >= 400_000_000
 
 
 def test_every_message_is_on_its_channel_and_passes_the_door():
