@@ -58,6 +58,7 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
+        self._bus.request(ch.ORDERS_KEPT, "", m.OrdersWanted(0))
         self._shell.look_for_the_end()
         self._shell.begin()
         while self._shell.going:

@@ -83,7 +83,7 @@ class Shell:
         self._remind_due = time.monotonic() + REMIND_S
         self.boundary = Boundary(name)
         self.notes: Callable[[], tuple[str, ...]] = tuple
-        self.the_end = TheEnd(bus)
+        self.the_end = TheEnd(bus, name)
         self._messages = 0
         self._bytes = 0
         self._since = time.monotonic()

@@ -23,11 +23,13 @@ class TheEnd:
 
     A process that starts again, or that was stopped or cut off while the centre left, learns of it
     so. A map that is older than the process is another run's, unless whoever started it says that
-    the run began earlier (SINCE).
+    the run began earlier (SINCE), or the router knows an earlier process of this node that was in
+    that run and never said a last word.
     """
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, node: str = "") -> None:
         self._bus = bus
+        self._node = node
         self._due = 0.0
         began = os.environ.get(SINCE)
         self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
@@ -40,10 +42,11 @@ class TheEnd:
             return []
         self._due = now + FINAL_S
         try:
-            replies = self._bus.ask(FINAL_KEPT, "", FinalWanted(0), FINAL_ASK_S)
-            kept = [decoded(reply, FinalKept) for reply in replies]
+            # Before the question: its age is told as of the answer, which may take its time.
             life_s = time.monotonic() - self._began + max(self._before_s, 0.0)
-            return [_sample(k.final) for k in kept[:1] if 1e-9 * k.age_ns <= life_s]
+            replies = self._bus.ask(FINAL_KEPT, "", FinalWanted(0, self._node), FINAL_ASK_S)
+            kept = [decoded(reply, FinalKept) for reply in replies]
+            return [_sample(k.final) for k in kept[:1] if k.missed or 1e-9 * k.age_ns <= life_s]
         except (BusError, WireError) as error:
             _LOG.debug("%s", error)
             return []

@@ -175,8 +175,9 @@ def examples() -> Iterator[m.Message]:
     yield m.End(9_000, (m.StreamEnd("alpha", 1, 200),), ("gap of 3 s",))
     yield m.Status(9_000, "recorder", "recording", {"messages": 12.0}, ("slow disk",))
     yield m.GivenUp(9_000, "robot/alpha", "operator", "it fell into the water")
-    yield m.FinalWanted(0)
-    yield m.FinalKept(0, 5_000_000_000, b"\x91\xc0")
+    yield m.FinalWanted(0, "robot/alpha")
+    yield m.FinalKept(0, 5_000_000_000, b"\x91\xc0", True)
+    yield m.OrdersWanted(0)
     yield m.Fault(
         9_000, "central", "robot/alpha/submap", 7, "submap/1", "ValueError", "no frame",
         "central.node:CentralNode.handle:58", b"\x01\x02\x03\x04\x05\x06\x07\x08",

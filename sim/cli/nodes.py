@@ -299,8 +299,8 @@ def end(
 ) -> None:
     """Let a running team end without a robot that is lost: what has come of it stays in the map.
 
-    The final map names it as lost and is provisional, and every process ends with 1. A centre that
-    is started again later must be told again.
+    The final map names it as lost and is provisional, and every process ends with 1. The router
+    keeps the order for a centre that is started again, until the run is over.
     """
     from sim.launch.withdraw import WithdrawError, give_up
 

@@ -26,7 +26,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     bus.watch_alive()
     bus.declare_alive(NODE)
     published = 0
-    end = TheEnd(bus)
+    end = TheEnd(bus, NODE)
     boundary = Boundary(NODE)
     due = 0.0
     final: FusedMap | None = None

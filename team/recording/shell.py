@@ -248,7 +248,7 @@ def record(
     with closing(loop):
         due = time.monotonic()
         remind_due = due + _REMIND_S
-        end = TheEnd(bus)
+        end = TheEnd(bus, NODE)
         while not stop.is_set():
             if loop.finished:
                 # A token goes with a higher priority than data: what it overtook is on its way.

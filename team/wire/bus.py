@@ -150,7 +150,7 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
     """
     message: Message = decoded(payload)
     of = next((c for c in REPLIES[channel] if isinstance(message, c.message)), None)
-    robot = getattr(message, "robot", "")
+    robot = getattr(message, "robot", getattr(message, "node", ""))
     if of is None or ("{robot}" in channel.template and robot != name):
         text = f"{type(message).__name__} of {robot!r} is no reply to {channel.key(name)!r}"
         raise WireError("wrong field", text)

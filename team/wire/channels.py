@@ -159,15 +159,19 @@ SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsWanted, "query", "strea
 FINAL_KEPT = Channel("final_kept", "router/final", m.FinalWanted, "query", "stream", False, False,
                      "a query; the reply is the final map, when the centre has left, too")  # fmt: skip
 
+ORDERS_KEPT = Channel("orders_kept", "router/orders", m.OrdersWanted, "query", "stream", False, False,
+                      "a query; the replies are the orders `given_up` that hold, when who gave them has left, too")  # fmt: skip
+
 VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "latest", True, False,
                "what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
-QUERIES = (READINGS, SUBMAPS, SENT, FINAL_KEPT)
+QUERIES = (READINGS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT)
 REPLIES = {
     READINGS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
     SENT: (START, SUBMAP, SIGHTING_FACTOR),
+    ORDERS_KEPT: (GIVEN_UP,),
 }
 """The channels whose messages answer a query."""
 UNOPENED = (*QUERIES, VIEW)

@@ -593,14 +593,24 @@ class SubmapsWanted(Message, frozen=True, array_like=True, gc=False, tag="submap
 
 
 class FinalWanted(Message, frozen=True, array_like=True, gc=False, tag="final_wanted/1"):
-    """A query to the router: the team's final map, if there is one already."""
+    """A query to the router: the team's final map, if there is one already. node: who asks."""
+
+    node: Text = ""
 
 
 class FinalKept(Message, frozen=True, array_like=True, gc=False, tag="final_kept/1"):
-    """The router's answer: the payload of the newest final map, and how long ago it came [ns]."""
+    """The router's answer: the payload of the newest final map, and how long ago it came [ns].
+
+    missed: a process of the node that asks was in that run and went without a last word.
+    """
 
     age_ns: Count
     final: bytes
+    missed: bool = False
+
+
+class OrdersWanted(Message, frozen=True, array_like=True, gc=False, tag="orders_wanted/1"):
+    """A query to the router: the orders that hold in this run, from operators who have left."""
 
 
 def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: bool) -> None:

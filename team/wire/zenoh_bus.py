@@ -25,6 +25,7 @@ import logging
 import struct
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -41,10 +42,20 @@ from team.keys.roster import Roster
 from team.wire.access import access_control
 from team.wire.arrivals import Arrivals
 from team.wire.bus import ALL_KEPT, Answer, BusError, Outgoing, Sample, kept_of, replied
-from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, TALLY, Channel, row_of
-from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
+from team.wire.channels import (
+    ALIVE,
+    FINAL_KEPT,
+    FINAL_MAP,
+    GIVEN_UP,
+    ORDERS_KEPT,
+    TALLY,
+    Channel,
+    row_of,
+)
+from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded
 from team.wire.handshake import why_refused
-from team.wire.messages import FinalKept, Liveliness, Message, Tally
+from team.wire.kept import Kept
+from team.wire.messages import FinalWanted, Liveliness, Message, Tally
 
 _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
@@ -646,7 +657,7 @@ def router(
             f"choose another, or port 0 for any free one"
         ) from error
     with session:
-        _keep_final_maps(session)
+        _Keeper(session)
         replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
         locators = [json.loads(r.ok.payload.to_string())["locators"] for r in replies if r.ok]
         if not (locators and locators[0]):
@@ -654,21 +665,56 @@ def router(
         yield str(locators[0][0])
 
 
-def _keep_final_maps(session: zenoh.Session) -> None:
-    """Keep each team's newest final map and answer for it: the centre leaves with its team."""
-    kept: dict[str, tuple[float, bytes]] = {}
-    ends = "/" + FINAL_MAP.key(), "/" + FINAL_KEPT.key()
+class _Keeper:
+    """Keeps each team's final map and orders at the router, and answers for who has left."""
 
-    def keep(sample: zenoh.Sample) -> None:
-        team = str(sample.key_expr).removesuffix(ends[0])
-        kept[team] = (time.monotonic(), sample.payload.to_bytes())
+    def __init__(self, session: zenoh.Session) -> None:
+        self._teams: defaultdict[str, Kept] = defaultdict(Kept)
+        for channel in (FINAL_MAP, GIVEN_UP, TALLY):
+            key = f"team/*/{channel.key('**')}"
+            session.declare_subscriber(key, Callback(self._take, indirect=False))
+        session.liveliness().declare_subscriber(
+            f"team/*/{ALIVE.key('**')}", Callback(self._token, indirect=False), history=True
+        )
+        for channel, answer in ((FINAL_KEPT, self._final), (ORDERS_KEPT, self._orders)):
+            key = f"team/*/{channel.key()}"
+            session.declare_queryable(key, Callback(answer, indirect=False))
 
-    def answer(query: zenoh.Query) -> None:
+    def _of(self, key: zenoh.KeyExpr) -> tuple[Kept, str]:
+        """What is kept of a key's team, and the key within the team."""
+        _, team, rest = str(key).split("/", 2)
+        return self._teams[team], rest
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        kept, key = self._of(sample.key_expr)
+        if key == FINAL_MAP.key():
+            kept.end(sample.payload.to_bytes(), time.monotonic())
+        elif (node := GIVEN_UP.owner(key)) is not None:
+            kept.order(node, sample.payload.to_bytes())
+        elif (node := TALLY.owner(key)) is not None:
+            kept.last_word(node)
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        kept, key = self._of(sample.key_expr)
+        if (node := ALIVE.owner(key)) is not None:
+            kept.token(node, alive=sample.kind == zenoh.SampleKind.PUT)
+
+    def _final(self, query: zenoh.Query) -> None:
         with query:
-            found = kept.get(str(query.key_expr).removesuffix(ends[1]))
+            kept, _ = self._of(query.key_expr)
+            found = kept.answer(_asker(query), time.monotonic())
             if found is not None:
-                age_ns = round(1e9 * (time.monotonic() - found[0]))
-                query.reply(query.key_expr, encoded(FinalKept(0, age_ns, found[1])))
+                query.reply(query.key_expr, encoded(found))
 
-    session.declare_subscriber(f"team/*{ends[0]}", Callback(keep, indirect=False))
-    session.declare_queryable(f"team/*{ends[1]}", Callback(answer, indirect=False))
+    def _orders(self, query: zenoh.Query) -> None:
+        with query:
+            for order in self._of(query.key_expr)[0].orders():
+                query.reply(query.key_expr, order)
+
+
+def _asker(query: zenoh.Query) -> str:
+    """The node that asks for a final map; nobody's name where it does not say."""
+    with suppress(WireError):
+        request = b"" if query.payload is None else query.payload.to_bytes()
+        return decoded(request, FinalWanted).node
+    return ""

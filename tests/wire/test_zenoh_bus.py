@@ -314,3 +314,57 @@ def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(
         assert TheEnd(straggler).missed() == [], "a process begins that knows nothing of that run"
         monkeypatch.setenv(the_end.SINCE, str(time.time_ns() - 60 * 10**9))
         assert TheEnd(straggler).missed(), "whoever started it says that it belongs to that run"
+
+
+def ends(endpoint: str, node: str, tally: bool) -> None:
+    """A process of this node is there for a moment; it says its last word, or is killed."""
+    bus = ZenohBus("t", endpoint)
+    bus.declare_alive(node)
+    wait_until(lambda: watcher_sees(endpoint, node))
+    if not tally:
+        bus._tell_tally = lambda: None  # type: ignore[method-assign] # as if it were killed
+    bus.close()
+
+
+def watcher_sees(endpoint: str, node: str) -> bool:
+    with ZenohBus("t", endpoint) as watcher:
+        return watcher.is_alive(node)
+
+
+def test_who_was_killed_in_a_run_and_begins_after_its_end_is_told_once(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new process of a node that had ended well, or never was there, is of another run."""
+    ends(endpoint, "robot/alpha", tally=False)
+    ends(endpoint, "robot/bravo", tally=True)
+    with ZenohBus("t", endpoint) as centre:
+        centre.publish(Outgoing(c.FINAL_MAP, "", FINAL))
+        wait_until(lambda: bool(TheEnd(centre).missed()))
+        monkeypatch.setattr(the_end, "_STARTED", time.monotonic())
+        assert TheEnd(centre, "robot/bravo").missed() == []
+        assert TheEnd(centre, "robot/other").missed() == []
+        (sample,) = TheEnd(centre, "robot/alpha").missed()
+        assert decoded(sample.payload, m.FusedMap) == FINAL
+        assert TheEnd(centre, "robot/alpha").missed() == [], "the next one is of another run"
+
+
+def test_an_order_outlives_the_operator_and_ends_with_the_team(endpoint: str) -> None:
+    order = m.GivenUp(0, "robot/alpha", "operator", "it fell into the water")
+
+    def asked(bus: ZenohBus) -> list[m.Message]:
+        bus.request(c.ORDERS_KEPT, "", m.OrdersWanted(0))
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            if found := bus.receive(0.1):
+                return [opened(sample)[2] for sample in found]
+        return []
+
+    with ZenohBus("t", endpoint) as robot:
+        robot.declare_alive("robot/bravo")
+        with ZenohBus("t", endpoint) as operator:
+            operator.publish(Outgoing(c.GIVEN_UP, "robot/alpha", order))
+        with ZenohBus("t", endpoint) as centre, ZenohBus("other", endpoint) as stranger:
+            wait_until(lambda: asked(centre) == [order])
+            assert asked(stranger) == []
+    with ZenohBus("t", endpoint) as centre:
+        wait_until(lambda: asked(centre) == [])

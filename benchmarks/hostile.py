@@ -1,0 +1,270 @@
+"""Hostile traffic: mutated payloads at the door, and valid hostile messages into running nodes.
+
+    python benchmarks/hostile.py [--mutated 1000000] [--messages 100000] [--through 20000]
+                                 [--keys] [--json FILE]
+
+Door: mutated payloads of every message are opened as a receiver opens them; what raises anything
+but `WireError` has escaped. Nodes: a team is launched as real processes, and a stranger publishes
+valid messages that no honest node would send, and mutated ones, on everybody's keys while it runs.
+Without keys no process may die and nothing may be set aside as a fault; what a stranger can do to
+the map then stands in docs/security.md, and orders and ends of the run are not among what is sent.
+With --keys the stranger has a certificate of the team in the name of a robot that is not in the
+scenario, says everything, and the final map must be that of the same team in memory. Ends with 1
+if anything of this does not hold.
+"""
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from kills import PROGRAM, children, final_in
+
+from sim.in_memory.team import run_team
+from sim.scenario.scenario import load
+from sim.scenario.source import streams_of
+from team.keys.authority import make_keys
+from team.keys.credentials import credentials_of
+from team.keys.roster import nodes_of
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import BusError, Sample, opened
+from team.wire.codec import WireError, encoded
+from team.wire.zenoh_bus import ZenohBus
+from tests.hostile_team import Team, hostile_stream, prior, valid
+from tests.support import examples
+
+ROBOTS = ("r1", "r2")
+SUBMAPS = 1_500
+"""Hostile submaps of a storm: the centre folds each of them that it does not refuse."""
+OF_THE_RUN = (m.FusedMap, m.End, m.Done, m.Withdrawal, m.WithdrawalHeard, m.GivenUp)
+"""What only keys can keep a stranger from: he ends the run, or makes it wait."""
+SKIPPED = (*ch.QUERIES, ch.VIEW, ch.ALIVE)
+
+
+def payloads(rng: random.Random) -> Iterator[tuple[ch.Channel, str, bytes]]:
+    """Sound messages of every kind, and what hostile teams send, each on its channel."""
+    of_type: dict[type, list[ch.Channel]] = {}
+    for channel in ch.CHANNELS:
+        if channel not in SKIPPED:
+            of_type.setdefault(channel.message, []).append(channel)
+    while True:
+        numbers = np.random.default_rng(rng.getrandbits(32))
+        team = Team(numbers)
+        for _ in range(20):
+            team.grow()
+        robot = rng.choice(ROBOTS)
+        said = [*team.messages, *team.ends(), *hostile_stream(numbers, robot, 60)]
+        said += [found for _ in range(10) if (found := valid(prior(numbers, robot)))]
+        said += [_elsewhere(rng, each) for each in examples()]
+        for message in said:
+            for channel in of_type.get(type(message), ()):
+                name = getattr(message, "robot", getattr(message, "node", robot)) or robot
+                named = "{" in channel.template
+                yield channel, name if named else "", encoded(message)
+
+
+def _elsewhere(rng: random.Random, message: m.Message) -> m.Message:
+    """An example as one of the team's, with other numbers where it stays valid."""
+    changes: dict[str, object] = {}
+    for name in message.__struct_fields__:
+        value = getattr(message, name)
+        if name == "robot" and isinstance(value, str):
+            changes[name] = rng.choice(ROBOTS)
+        elif isinstance(value, int) and not isinstance(value, bool) and rng.random() < 0.3:
+            changes[name] = rng.choice([0, 1, 2, 7, 2**31, 2**53, 2**62, -1])
+        elif isinstance(value, float) and rng.random() < 0.3:
+            changes[name] = rng.choice([0.0, 1e-300, 1.0, -1.0, 1e9, 1e300])
+    try:
+        changed = msgspec.structs.replace(message, **changes)
+        return valid(changed) or message
+    except (ValueError, TypeError):
+        return message
+
+
+def mutated(rng: random.Random, payload: bytes) -> bytes:
+    """Bytes flipped, cut, doubled, or put in from elsewhere."""
+    data = bytearray(payload)
+    for _ in range(rng.choice([1, 1, 1, 2, 5, 20])):
+        if not data:
+            break
+        at = rng.randrange(len(data))
+        match rng.randrange(6):
+            case 0:
+                data[at] ^= 1 << rng.randrange(8)
+            case 1:
+                data[at] = rng.choice([0, 0x7F, 0x80, 0xC0, 0xC1, 0xCF, 0xDD, 0xDF, 0xFF])
+            case 2:
+                del data[at:]
+            case 3:
+                del data[at : at + rng.randrange(1, 9)]
+            case 4:
+                data[at:at] = rng.randbytes(rng.randrange(1, 9))
+            case _:
+                data[at : at + 8] = rng.choice([b"\0" * 8, b"\xff" * 8, b"\0\0\0\0\0\0\xf8\x7f"])
+    return bytes(data)
+
+
+def door(count: int, seed: int) -> tuple[int, int, list[str]]:
+    """How many mutated payloads were refused, how many passed, and what escaped."""
+    rng = random.Random(seed)
+    refused = passed = 0
+    escaped: list[str] = []
+    source = payloads(rng)
+    pool = [next(source) for _ in range(4_000)]
+    for k in range(count):
+        if k % 100_000 == 99_999:
+            pool = [next(source) for _ in range(4_000)]
+        channel, name, payload = rng.choice(pool)
+        try:
+            opened(Sample(channel.key(name), mutated(rng, payload), 0, 0, 0))
+            passed += 1
+        except WireError:
+            refused += 1
+        except Exception as error:
+            escaped.append(f"{channel.name}: {type(error).__name__}: {error}")
+    return refused, passed, escaped
+
+
+def storm(bus: ZenohBus, options: argparse.Namespace, launch: subprocess.Popen[bytes]) -> Counter:
+    """Publish until everything is said or the run is over; how many of each channel."""
+    rng = random.Random(options.seed)
+    sent: Counter[str] = Counter()
+    mutants = options.through
+    per_s, began = options.rate, time.monotonic()
+    for channel, name, payload in payloads(rng):
+        total = sent.total()
+        if total >= options.messages + options.through or launch.poll() is not None:
+            break
+        if not options.keys:
+            if channel.message in OF_THE_RUN:
+                continue
+            if channel is ch.SUBMAP and sent["submap"] >= SUBMAPS:
+                continue
+        as_it_is = rng.random() * (options.messages + options.through) >= mutants
+        data = payload if as_it_is else mutated(rng, payload)
+        key = channel.key(name)
+        try:
+            bus.publish_raw(Sample(key, data, 0, time.time_ns(), sent[key]))
+        except BusError as error:
+            print(f"the stranger is cut off: {error}")
+            break
+        sent[channel.name if as_it_is else "mutated"] += 1
+        ahead = total / per_s - (time.monotonic() - began)
+        if ahead > 0.01:
+            time.sleep(ahead)
+    return sent
+
+
+def nodes(options: argparse.Namespace) -> dict[str, object]:
+    """A team with a stranger in it: what became of it."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place).resolve()
+        scenario = folder / "long.toml"
+        scenario.write_text(f'base = "thesis"\n[world]\nsteps = {options.steps}\n')
+        resolved = load(scenario)
+        door_of: list[str] = []
+        credentials = None
+        if options.keys:
+            keys = folder / "keys"
+            make_keys(keys, resolved.team, nodes_of([*ROBOTS, "r9"]))
+            door_of = ["--keys", str(keys)]
+            credentials = credentials_of(keys, "robot-r9", resolved.team)
+        said = (folder / "said").open("wb")
+        launch = subprocess.Popen(
+            [*PROGRAM, "launch", scenario, "--speed", options.speed, "--no-report",
+             "--output", "run", "--json", "result.json", *door_of],
+            cwd=folder, stdout=said, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+        endpoint = await_text(folder / "run" / "router.log", "listening at ").split()[0]
+        for robot in ROBOTS:
+            await_text(folder / "run" / f"robot-{robot}.log", "connected")
+        began = time.monotonic()
+        with ZenohBus(resolved.team, endpoint, 20.0, credentials) as bus:
+            sent = storm(bus, options, launch)
+            storm_s = time.monotonic() - began
+            waits = False
+            try:
+                status = launch.wait(options.patience)
+            except subprocess.TimeoutExpired:
+                waits = True
+                launch.send_signal(signal.SIGINT)
+                status = launch.wait(60.0)
+        said.close()
+        result = json.loads((folder / "result.json").read_text()) if not waits else {}
+        text = (folder / "said").read_text("utf-8", "replace")
+        left = children(launch.pid, folder)
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+        final = final_in(folder)
+        equal = None
+        if options.keys:
+            samples = run_team(resolved, streams_of(resolved))
+            (expected,) = [s.payload for s in samples if s.key == ch.FINAL_MAP.key()]
+            equal = final == expected
+        if options.keep:
+            subprocess.run(["cp", "-r", folder, options.keep], check=False)
+    return {
+        "sent": dict(sent), "total": sent.total(), "storm_s": round(storm_s, 1), "exit": status,
+        "waits": waits, "restarts": result.get("restarts", {}), "equal": equal,
+        "faults": [line for line in text.splitlines() if "set aside" in line],
+        "deaths": [line for line in text.splitlines() if "is started again" in line],
+        "final": final is not None, "left": len(left), "failures": result.get("failures", []),
+    }  # fmt: skip
+
+
+def await_text(path: Path, text: str) -> str:
+    """What follows a text in a file, once it stands there."""
+    end = time.monotonic() + 120.0
+    while not (path.exists() and text in path.read_text("utf-8", "replace")):
+        if time.monotonic() > end:
+            raise RuntimeError(f"{path}: not within 120 s: {text}")
+        time.sleep(0.05)
+    return path.read_text("utf-8", "replace").partition(text)[2]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--mutated", type=int, default=1_000_000)
+    parser.add_argument("--messages", type=int, default=100_000)
+    parser.add_argument("--through", type=int, default=20_000, help="mutated ones over the wire")
+    parser.add_argument("--rate", type=float, default=3_000.0, help="messages a second, at most")
+    parser.add_argument("--steps", type=int, default=500)
+    parser.add_argument("--speed", default="10")
+    parser.add_argument("--patience", type=float, default=300.0, help="for the run's end [s]")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--keys", action="store_true")
+    parser.add_argument("--keep", help="copy the run's folder here")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    refused, passed, escaped = door(options.mutated, options.seed)
+    print(f"door: {options.mutated} mutated, {refused} refused, {passed} passed, "
+          f"{len(escaped)} escaped", flush=True)  # fmt: skip
+    found: dict[str, object] = {"refused": refused, "passed": passed, "escaped": escaped[:20]}
+    bad = bool(escaped)
+    if options.messages:
+        after = nodes(options)
+        found |= after
+        print(json.dumps(after, indent=1), flush=True)
+        bad |= bool(after["deaths"] or after["faults"] or after["left"])
+        bad |= bool(options.keys) and (after["equal"] is not True or after["exit"] != 0)
+    if options.json:
+        options.json.write_text(json.dumps(found | {"load": os.getloadavg()[0]}, indent=1))
+    return int(bad)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
