@@ -3,8 +3,8 @@
 import msgspec
 
 from central.config import CentralConfig
-from central.rules import MapEstimate
 from team import translate
+from team.estimation.gaussian import LandmarkGaussian
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import unsound
@@ -18,7 +18,7 @@ JOINT_LANDMARKS = 2000
 def fused_message(
     config: CentralConfig,
     digest: bytes,
-    value: MapEstimate,
+    value: LandmarkGaussian,
     members: tuple[m.Member, ...],
     *,
     stamp_ns: int,

@@ -11,9 +11,9 @@ from central.monitor import NOTHING, finding, miscalibrations
 from central.submap_set import Stream, SubmapSet
 from central.tick_fold import TickFold
 from team import translate
-from team.estimation import marginals
-from team.estimation.joining import Fold
-from team.estimation.refusal import refusals
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.refusal import refusals
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids

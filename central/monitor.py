@@ -19,7 +19,7 @@ from scipy.stats import chi2 as chi_squared
 
 from team.config import Bias
 from team.estimation.consistency import Scale, covariance_scale
-from team.estimation.marginals import Agreement, BiasEstimate, SubmapCost
+from team.estimation.map_joining.marginals import Agreement, BiasEstimate, SubmapCost
 
 WARN = 1.1
 FAIL = 1.3

@@ -12,10 +12,10 @@ from central.config import CentralConfig
 from central.fused import fused_message
 from central.roll import Roll
 from central.rule import Refuses, rule_of
-from central.rules import NOTHING
 from central.submap_rules import SubmapRule
 from team import translate
 from team.door import Door
+from team.estimation.gaussian import NO_LANDMARKS
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -121,7 +121,9 @@ class CentralNode:
         newest = self._newest
         if newest is None:
             digest, now_ns = self._announcement.digest, self._roll.now_ns
-            newest = fused_message(self.config, digest, NOTHING, (), stamp_ns=now_ns, joint=False)
+            newest = fused_message(
+                self.config, digest, NO_LANDMARKS, (), stamp_ns=now_ns, joint=False
+            )
         reasons = (*newest.reasons, f"not the final map, which raised: {why}")
         lost = tuple(self._roll.missing(self._rule.dealt))
         final = msgspec.structs.replace(

@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
-from central.batch_rule import BatchRule
+from central.baselines.batch_rule import BatchRule
+from central.baselines.joint_fastslam_rule import JointFastSlamRule
+from central.baselines.map_rules import AloneRule, ExchangeRule, LatestRule
 from central.config import CentralConfig
-from central.joint_fastslam_rule import JointFastSlamRule
-from central.map_rules import AloneRule, ExchangeRule, LatestRule
 from central.roll import Roll
 from central.submap_rules import submap_rule
 from team.pairs import FEEDBACK

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 
+from central.baselines.svd_rule import SvdJoinRule
 from central.config import CentralConfig
 from central.hearsay import Hearsay
 from central.join_rule import JoinRule
 from central.roll import Roll
 from central.submap_set import Stream
-from central.svd_rule import SvdJoinRule
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing

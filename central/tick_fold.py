@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from central.config import CentralConfig
 from central.withdrawal import convicted, suspects
 from team import translate
-from team.estimation import marginals
 from team.estimation.contribution import named
-from team.estimation.joining import (
+from team.estimation.hybrid_slam.sensitivity import BIASES
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,
@@ -28,11 +29,10 @@ from team.estimation.joining import (
     converged,
     lean,
 )
-from team.estimation.joining import Start as StartValue
-from team.estimation.marginals import Agreement
+from team.estimation.map_joining.joining import Start as StartValue
+from team.estimation.map_joining.marginals import Agreement
+from team.estimation.map_joining.refusal import Tick, taken
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
-from team.estimation.refusal import Tick, taken
-from team.estimation.sensitivity import BIASES
 from team.wire.messages import SightingFactor, Submap
 
 Stream = tuple[str, int]

@@ -10,7 +10,7 @@ it is alone, since two that disagree do not say which of them is wrong.
 from collections.abc import Callable, Collection
 from statistics import median
 
-from team.estimation.marginals import Agreement
+from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
 """A robot is judged by so many submaps or more."""

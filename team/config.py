@@ -169,7 +169,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sighting_s: a sighting is used if such a time is no farther from it than this. teammate_speed:
     how fast a teammate may move in between [m/s].
     garbage: the share of readings that may have nothing to do with their landmark; above 0 a window
-    takes only readings that others of it confirm (`team.estimation.consensus`).
+    takes only readings that others of it confirm (`team.estimation.hybrid_slam.consensus`).
     biases: the errors shared by all of the robot's windows that the centre estimates; each submap
     carries its derivative by each of them.
     """

@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.estimation.conditioning import RobotPrior, Shared
 from team.estimation.gaussian import Matrix, packed, unpacked
-from team.estimation.joining import Contribution, Sighting
-from team.estimation.joining import Start as StartValue
+from team.estimation.map_joining.conditioning import RobotPrior, Shared
+from team.estimation.map_joining.joining import Contribution, Sighting
+from team.estimation.map_joining.joining import Start as StartValue
 from team.estimation.submap import NO_COLUMNS, LocalMap
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, stamps

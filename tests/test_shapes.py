@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from team.estimation import fastslam
+from team.estimation.hybrid_slam import fastslam
 from team.estimation.models import Increment
 from tests import shapes
 

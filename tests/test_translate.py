@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from team import translate
 from team.config import RobotConfig
-from team.estimation.conditioning import RobotPrior, Shared
-from team.estimation.sighting import Sighting
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.conditioning import RobotPrior, Shared
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids

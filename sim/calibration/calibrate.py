@@ -30,7 +30,7 @@ from sim.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.scenario.scenario import Scenario
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation.joining import Fold
+from team.estimation.map_joining.joining import Fold
 
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")

@@ -20,11 +20,11 @@ from central.tick_fold import join_settings
 from sim.calibration.figures import Figure
 from sim.evaluation.errors import map_errors, moved, rigid_alignment
 from team.estimation.contribution import Start, Stream
-from team.estimation.gauss_newton import Island, JoinSettings, joint_marginal, settled
 from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.joining import Fold
-from team.estimation.merging import ages
-from team.estimation.submap_graph import EMPTY_GRAPH, extended
+from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.merging import ages
+from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 
 LEAST_LANDMARKS = 3
 """Two have one number between them: their distance."""

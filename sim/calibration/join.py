@@ -20,7 +20,8 @@ from sim.world.streams import (
 )
 from team.config import RobotConfig
 from team.estimation.geometry import compose
-from team.estimation.joining import (
+from team.estimation.hybrid_slam.window import Window
+from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,
@@ -29,7 +30,6 @@ from team.estimation.joining import (
     folded,
     started,
 )
-from team.estimation.window import Window
 from team.robot.member import ClosedWindow, HybridMember
 
 LONGEST_NS = 250_000_000

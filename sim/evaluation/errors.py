@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from scipy.linalg import solve_triangular
 
-from team.estimation.alignment import NEEDED, procrustes
 from team.estimation.consistency import chi2_interval, coverage, nees
 from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import between
+from team.estimation.map_joining.alignment import NEEDED, procrustes
 
 TRUTH_GAP_NS = 1_000_000_000
 """Truth is interpolated between samples that are at most this far apart."""

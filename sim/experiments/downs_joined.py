@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from central.baselines.svd_rule import tied
 from central.submap_set import Stream
-from central.svd_rule import tied
 from sim.evaluation.errors import MapErrors, Path, map_errors, pose_errors
 from sim.evaluation.evaluation import Evaluation, evaluate
 from sim.experiments.curves import messages, said_poses, true_landmarks
@@ -28,17 +28,18 @@ from sim.scenario.source import streams_of
 from sim.world.worlds import UtiasWorld
 from team import translate
 from team.config import Sensor
-from team.estimation import joining, svd_joining
-from team.estimation.contribution import Contribution
-from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.models import corrected
-from team.estimation.svd_joining import (
+from team.estimation.baselines import svd_joining
+from team.estimation.baselines.svd_joining import (
     SETTINGS,
     PointPairs,
     SubmapJoining,
     mutual_sighting,
     weighted,
 )
+from team.estimation.contribution import Contribution
+from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.map_joining import joining
+from team.estimation.models import corrected
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened

@@ -31,8 +31,8 @@ from sim.experiments.task import Task
 from sim.experiments.team_runs import Figures
 from sim.scenario.scenario import load, with_options
 from sim.world.worlds import SimulatedWorld, UtiasWorld
-from team.estimation.alignment import procrustes
 from team.estimation.geometry import wrapped
+from team.estimation.map_joining.alignment import procrustes
 
 STEPS = 600
 """Of his simulator: most landmarks are seen by then."""

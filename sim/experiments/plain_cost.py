@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
-from team.estimation.submap_graph import Graph
+from team.estimation.map_joining.submap_graph import Graph
 
 Values = Float[np.ndarray, " _"]
 Rows = Float[np.ndarray, "r _"]

@@ -22,8 +22,8 @@ from sim.evaluation.evaluation import Evaluation
 from sim.experiments.plain_cost import PlainCost
 from sim.rerun.log import Recorded
 from team import translate
-from team.estimation.gauss_newton import Island
-from team.estimation.joining import Fold, converged
+from team.estimation.map_joining.gauss_newton import Island
+from team.estimation.map_joining.joining import Fold, converged
 from team.wire import messages as m
 from team.wire.bus import Sample
 

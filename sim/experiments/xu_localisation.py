@@ -2,8 +2,8 @@
 
 Its figures 3.2 to 3.5 are those of Fox et al. 2000, without figures. Here the same is shown on the
 thesis' own world: the three steps of the filter one by one at the end of a blind stretch, and a
-start anywhere. The states are those of `team.estimation.localisation`; the motions and readings are
-what the robot of such a run hears, cut into epochs as at every node.
+start anywhere. The states are those of `team.estimation.baselines.localisation`; the motions and
+readings are what the robot of such a run hears, cut into epochs as at every node.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.team_epochs import RobotEpoch, TeamEpochs
+from central.baselines.team_keyframes import RobotEpoch, TeamEpochs
 from sim.evaluation.evaluation import evaluate
 from sim.experiments.curves import true_landmarks
 from sim.experiments.drawing import figure, ruled, spread
@@ -30,11 +30,12 @@ from sim.scenario.scenario import Scenario, load, loads, with_options
 from sim.scenario.source import streams_of
 from sim.world.worlds import SimulatedWorld
 from team import translate
-from team.estimation import fastslam, localisation
+from team.estimation.baselines import localisation
+from team.estimation.baselines.localisation import Localisation
 from team.estimation.consistency import nees
-from team.estimation.fastslam import Particles
 from team.estimation.geometry import wrapped
-from team.estimation.localisation import Localisation
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
 from team.wire import messages as m

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from sim.evaluation.evaluation import MapResult
 from sim.limit.readings import Chain
-from team.estimation.batch import EXACT_SIGMA, FLOOR_SIGMAS
+from team.estimation.baselines.batch import EXACT_SIGMA, FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Point, Pose, tangent
 from team.estimation.models import located, noise, predicted

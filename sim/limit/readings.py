@@ -14,9 +14,9 @@ from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Pose, between, compose
+from team.estimation.hybrid_slam.keyframes import Epoch, Segmenter
+from team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
 from team.estimation.models import Increment
-from team.stream.pose_grid import NodeSighting, PoseGrid
-from team.stream.segmenter import Epoch, Segmenter
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened

@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterator, Mapping
 
 import msgspec
 
+from central.baselines.feedback_rule import FeedbackRule
+from central.baselines.map_rules import AloneRule, LatestRule
+from central.baselines.svd_rule import SvdJoinRule
 from central.config import CentralConfig
-from central.feedback_rule import FeedbackRule
 from central.join_rule import JoinRule, Tail
-from central.map_rules import AloneRule, LatestRule
 from central.roll import Roll
 from central.rule import rule_of
-from central.svd_rule import SvdJoinRule
 from sim.rerun.log import Identity, Recorded, Stream, identity
 from team.config import FusionRule
 from team.pairs import FEEDBACK

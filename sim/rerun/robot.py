@@ -9,10 +9,10 @@ import msgspec
 from sim.rerun.log import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
+from team.estimation.hybrid_slam.pose_grid import NO_NODE
 from team.pairs import FEEDBACK
 from team.robot.member import HybridMember
 from team.robot.node import LATE, RobotNode
-from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing

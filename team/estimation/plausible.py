@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from team.config import Bounds
 from team.estimation.contribution import Start
-from team.estimation.sighting import Sighting
+from team.estimation.inter_robot import Sighting
 from team.estimation.submap import LocalMap
 
 Values = Float[np.ndarray, " _"]

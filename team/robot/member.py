@@ -9,10 +9,6 @@ from jaxtyping import Float
 
 from team.config import RobotConfig
 from team.estimation import geometry
-from team.estimation import window as windows
-from team.estimation.conditioning import pose_now
-from team.estimation.fastslam import Particles
-from team.estimation.gauss_newton import UNSOLVABLE
 from team.estimation.gaussian import (
     LandmarkGaussian,
     Matrix,
@@ -20,16 +16,20 @@ from team.estimation.gaussian import (
     PoseGaussian,
 )
 from team.estimation.geometry import tangent
-from team.estimation.innovation import NOTHING, Innovation
+from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from team.estimation.hybrid_slam.keyframes import Epoch, Segmenter
+from team.estimation.hybrid_slam.outliers import Gate
+from team.estimation.hybrid_slam.pose_grid import Looks, NodeSighting, PoseGrid
+from team.estimation.hybrid_slam.window import Window
+from team.estimation.map_joining.conditioning import pose_now
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.map_joining.whole_map import WholeMap, absorbed, begun, joined
 from team.estimation.models import Increment
 from team.estimation.plausible import are_landmarks, submap_beyond
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
-from team.estimation.whole_map import WholeMap, absorbed, begun, joined
-from team.estimation.window import Window
-from team.robot.gate import Gate
-from team.stream.pose_grid import Looks, NodeSighting, PoseGrid
-from team.stream.segmenter import Epoch, Segmenter
 
 CLOUD_PARTICLES = 32
 """Particles in a cloud for viewers."""

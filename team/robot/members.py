@@ -7,13 +7,13 @@ from jaxtyping import Float
 
 from team.config import RobotConfig
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.innovation import Innovation
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.hybrid_slam.pose_grid import Looks
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK
-from team.robot.filters import NOTHING_KNOWN, KnownMap
+from team.robot.baselines.filters import NOTHING_KNOWN, KnownMap
+from team.robot.baselines.running import RunningMember
 from team.robot.member import ClosedWindow, Driven, HybridMember
-from team.robot.running_member import RunningMember
-from team.stream.pose_grid import Looks
 
 
 @runtime_checkable

@@ -14,12 +14,13 @@ import numpy as np
 from team import translate
 from team.config import Exchange, RobotConfig
 from team.door import absurd
-from team.estimation.gauss_newton import NotDeterminedError
 from team.estimation.gaussian import NotACovarianceError
+from team.estimation.hybrid_slam.pose_grid import NO_NODE
+from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond, start_beyond
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
-from team.robot.filters import NOTHING_KNOWN, KnownMap
+from team.robot.baselines.filters import NOTHING_KNOWN, KnownMap
 from team.robot.member import ClosedWindow, Driven
 from team.robot.members import Member, member_of
 from team.robot.pace import Pace
@@ -29,7 +30,6 @@ from team.robot.statements import Speaker
 from team.robot.team_map import TeamMap
 from team.stream.inbox import Inbox
 from team.stream.judge import RANGE, SPEED, StreamJudge
-from team.stream.pose_grid import NO_NODE
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing

@@ -3,8 +3,15 @@
 from collections.abc import Sequence
 
 from team import translate
-from team.estimation.conditioning import Followed, Posed, Shared, followed, mostly, pose_now
-from team.estimation.gauss_newton import UNSOLVABLE
+from team.estimation.map_joining.conditioning import (
+    Followed,
+    Posed,
+    Shared,
+    followed,
+    mostly,
+    pose_now,
+)
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
 

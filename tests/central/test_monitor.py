@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from central.monitor import finding
-from team.estimation import marginals
 from team.estimation.consistency import covariance_scale
-from team.estimation.joining import (
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     JoinSettings,

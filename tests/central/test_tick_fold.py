@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from central.config import CentralConfig
 from central.tick_fold import TickFold
 from team import translate
-from team.estimation.joining import EMPTY_FOLD, folded, started
+from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.wire.codec import encoded
 from tests.teams import stream, submaps_of
 

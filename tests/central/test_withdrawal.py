@@ -22,8 +22,8 @@ from sim.world.simulator import simulated
 from sim.world.worlds import GarbageKind, SimulatedWorld
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.joining import converged
-from team.estimation.marginals import Agreement, SubmapCost, joint_cost, landmark_map
+from team.estimation.map_joining.joining import converged
+from team.estimation.map_joining.marginals import Agreement, SubmapCost, joint_cost, landmark_map
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import encoded

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from team.estimation.contribution import Contribution, Start
-from team.estimation.joining import EMPTY_FOLD, folded, started
-from team.estimation.sighting import Sighting
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.estimation.submap import LocalMap
 from tests.estimation.submap_world import correlated, drawn, local_truth, seen_from, wrap
 

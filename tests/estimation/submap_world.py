@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from team.estimation.contribution import Contribution, Start
-from team.estimation.gauss_newton import settled
+from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.submap import LocalMap
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from team.config import Sensor
+from team.estimation.baselines.robot_step import Turn
 from team.estimation.geometry import compose, exponential
 from team.estimation.models import Increment
-from team.estimation.turn import Turn
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.01)
 OTHER = Sensor(range_sigma=0.3, bearing_sigma=0.005)

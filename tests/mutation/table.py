@@ -12,44 +12,71 @@ CENTRE = (
     "central/test_confirmed.py",
 )
 JOIN = (
-    "estimation/test_joining.py",
-    "estimation/test_annealing.py",
-    "estimation/test_landmark_weights.py",
-    "estimation/test_sightings.py",
-    "estimation/test_alignment.py",
-    "estimation/test_minima.py",
+    "estimation/map_joining/test_joining.py",
+    "estimation/map_joining/test_annealing.py",
+    "estimation/map_joining/test_landmark_weights.py",
+    "estimation/map_joining/test_sightings.py",
+    "estimation/map_joining/test_alignment.py",
+    "estimation/map_joining/test_minima.py",
 )
-WINDOW = ("estimation/test_window.py", "estimation/test_pose_nodes.py")
+WINDOW = ("estimation/hybrid_slam/test_window.py", "estimation/hybrid_slam/test_pose_nodes.py")
 
 MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
-    "team/estimation/window.py": (12, (*WINDOW, "estimation/test_correlated_readings.py")),
-    "team/estimation/fastslam.py": (8, ("estimation/test_fastslam.py", *WINDOW)),
-    "team/estimation/fastslam_kernel.py": (8, ("estimation/test_fastslam.py",)),
-    "team/estimation/landmark_kernel.py": (8, ("estimation/test_fastslam.py",)),
-    "team/estimation/innovation.py": (6, ("estimation/test_innovation.py",)),
+    "team/estimation/hybrid_slam/window.py": (
+        12,
+        (*WINDOW, "estimation/hybrid_slam/test_correlated_readings.py"),
+    ),
+    "team/estimation/hybrid_slam/fastslam.py": (
+        8,
+        ("estimation/hybrid_slam/test_fastslam.py", *WINDOW),
+    ),
+    "team/estimation/hybrid_slam/fastslam_kernel.py": (
+        8,
+        ("estimation/hybrid_slam/test_fastslam.py",),
+    ),
+    "team/estimation/hybrid_slam/landmark_kernel.py": (
+        8,
+        ("estimation/hybrid_slam/test_fastslam.py",),
+    ),
+    "team/estimation/hybrid_slam/innovation.py": (
+        6,
+        ("estimation/hybrid_slam/test_innovation.py",),
+    ),
     "team/estimation/models.py": (8, ("estimation/test_models.py",)),
     "team/estimation/geometry.py": (6, ("estimation/test_geometry.py",)),
-    "team/estimation/sensitivity.py": (6, ("estimation/test_sensitivity.py",)),
-    "team/estimation/consensus.py": (12, ("estimation/test_consensus.py", "robot/test_gate.py")),
-    "team/estimation/consensus_kernel.py": (10, ("estimation/test_consensus.py",)),
-    "team/estimation/conditioning.py": (
+    "team/estimation/hybrid_slam/sensitivity.py": (
         6,
-        ("estimation/test_conditioning.py", "robot/test_team_map.py"),
+        ("estimation/hybrid_slam/test_sensitivity.py",),
     ),
-    "team/estimation/whole_map.py": (
+    "team/estimation/hybrid_slam/consensus.py": (
+        12,
+        ("estimation/hybrid_slam/test_consensus.py", "estimation/hybrid_slam/test_outliers.py"),
+    ),
+    "team/estimation/hybrid_slam/consensus_kernel.py": (
         10,
-        ("estimation/test_whole_map.py", "estimation/test_conditioning.py"),
+        ("estimation/hybrid_slam/test_consensus.py",),
     ),
-    "team/estimation/tie_kernel.py": (
+    "team/estimation/map_joining/conditioning.py": (
+        6,
+        ("estimation/map_joining/test_conditioning.py", "robot/test_team_map.py"),
+    ),
+    "team/estimation/map_joining/whole_map.py": (
+        10,
+        ("estimation/map_joining/test_whole_map.py", "estimation/map_joining/test_conditioning.py"),
+    ),
+    "team/estimation/map_joining/tie_kernel.py": (
         8,
-        ("estimation/test_whole_map.py", "estimation/test_conditioning.py"),
+        ("estimation/map_joining/test_whole_map.py", "estimation/map_joining/test_conditioning.py"),
     ),
-    "team/estimation/joining.py": (10, (*JOIN, *CENTRE)),
-    "team/estimation/joining_kernel.py": (10, JOIN),
-    "team/estimation/gauss_newton.py": (14, JOIN),
-    "team/estimation/submap_graph.py": (8, JOIN),
-    "team/estimation/submap_factor.py": (6, (*JOIN, "estimation/test_sensitivity.py")),
-    "team/estimation/marginals.py": (
+    "team/estimation/map_joining/joining.py": (10, (*JOIN, *CENTRE)),
+    "team/estimation/map_joining/joining_kernel.py": (10, JOIN),
+    "team/estimation/map_joining/gauss_newton.py": (14, JOIN),
+    "team/estimation/map_joining/submap_graph.py": (8, JOIN),
+    "team/estimation/map_joining/submap_factor.py": (
+        6,
+        (*JOIN, "estimation/hybrid_slam/test_sensitivity.py"),
+    ),
+    "team/estimation/map_joining/marginals.py": (
         12,
         (
             *JOIN,
@@ -58,25 +85,40 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
             "central/test_join_rule.py",
         ),
     ),
-    "team/estimation/merging.py": (8, JOIN),
-    "team/estimation/alignment.py": (10, JOIN),
-    "team/estimation/island_ties.py": (6, JOIN),
-    "team/estimation/minima.py": (8, (*JOIN, "estimation/test_bends.py")),
-    "team/estimation/sighting.py": (
-        6,
-        ("estimation/test_sightings.py", "stream/test_pose_grid.py"),
+    "team/estimation/map_joining/merging.py": (8, JOIN),
+    "team/estimation/map_joining/alignment.py": (10, JOIN),
+    "team/estimation/map_joining/island_ties.py": (6, JOIN),
+    "team/estimation/map_joining/minima.py": (
+        8,
+        (*JOIN, "estimation/map_joining/test_nonlinearity.py"),
     ),
-    "team/estimation/sighting_kernel.py": (6, ("estimation/test_sightings.py",)),
-    "team/estimation/sparse.py": (6, ("estimation/test_sparse.py", "estimation/test_joining.py")),
-    "team/estimation/sparse_kernel.py": (
+    "team/estimation/inter_robot.py": (
         6,
-        ("estimation/test_sparse.py", "estimation/test_big_panels.py"),
+        ("estimation/map_joining/test_sightings.py", "estimation/hybrid_slam/test_pose_grid.py"),
     ),
-    "team/estimation/sparse_layout.py": (
+    "team/estimation/map_joining/inter_robot_kernel.py": (
         6,
-        ("estimation/test_sparse.py", "estimation/test_joining.py"),
+        ("estimation/map_joining/test_sightings.py",),
     ),
-    "team/estimation/ordering.py": (5, ("estimation/test_sparse.py",)),
+    "team/estimation/sparse_cholesky/sparse.py": (
+        6,
+        ("estimation/sparse_cholesky/test_sparse.py", "estimation/map_joining/test_joining.py"),
+    ),
+    "team/estimation/sparse_cholesky/sparse_kernel.py": (
+        6,
+        (
+            "estimation/sparse_cholesky/test_sparse.py",
+            "estimation/sparse_cholesky/test_big_panels.py",
+        ),
+    ),
+    "team/estimation/sparse_cholesky/sparse_layout.py": (
+        6,
+        ("estimation/sparse_cholesky/test_sparse.py", "estimation/map_joining/test_joining.py"),
+    ),
+    "team/estimation/sparse_cholesky/ordering.py": (
+        5,
+        ("estimation/sparse_cholesky/test_sparse.py",),
+    ),
     "central/tick_fold.py": (12, CENTRE),
     "central/submap_set.py": (10, CENTRE),
     "central/join_rule.py": (14, CENTRE),

@@ -9,8 +9,10 @@ from tests.support import ROOT
 DIGESTS = """
 import hashlib
 import numpy as np
-from team.estimation.sparse import Pattern, analysed, factorised, inverse_block, selected_inverse
-from team.estimation.sparse_kernel import has_big_panel
+from team.estimation.sparse_cholesky.sparse import (
+    Pattern, analysed, factorised, inverse_block, selected_inverse,
+)
+from team.estimation.sparse_cholesky.sparse_kernel import has_big_panel
 
 n, root = 700, 600
 tied = np.ones((n, n), dtype=bool)

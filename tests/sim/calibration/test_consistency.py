@@ -12,7 +12,14 @@ from sim.calibration.calibrate import Calibration
 from sim.calibration.consistency import covariance_factor, disagreements
 from sim.calibration.scenario import scenario_toml
 from sim.scenario.scenario import load
-from team.estimation.joining import EMPTY_FOLD, Fold, JoinSettings, converged, folded, started
+from team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    Fold,
+    JoinSettings,
+    converged,
+    folded,
+    started,
+)
 from tests.estimation.submap_world import team
 
 SIGMAS = (0.05, 0.01, 0.1)

@@ -13,7 +13,7 @@ from sim.scenario.scenario import Scenario, with_options
 from sim.world.simulator import simulated
 from sim.world.worlds import SimulatedWorld
 from team.config import Bias, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.marginals import BiasEstimate
+from team.estimation.map_joining.marginals import BiasEstimate
 
 SPEED = 0.25
 """[m/s]; the models below say that they were learnt at up to 0.09."""

@@ -25,7 +25,7 @@ from sim.experiments.team_runs import Figures
 from sim.scenario.scenario import load, with_options
 from sim.scenario.source import streams_of
 from sim.world.worlds import UtiasWorld
-from team.estimation.alignment import procrustes
+from team.estimation.map_joining.alignment import procrustes
 
 SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 

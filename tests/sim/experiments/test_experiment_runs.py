@@ -138,7 +138,12 @@ def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> N
 
 def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
     sources = sources_of("sim.experiments.team_runs", ROOTS)
-    wanted = {"team.estimation.fastslam_kernel", "central.join_rule", "sim.limit.graph", "sim"}
+    wanted = {
+        "team.estimation.hybrid_slam.fastslam_kernel",
+        "central.join_rule",
+        "sim.limit.graph",
+        "sim",
+    }
     assert wanted <= sources.keys()
     assert "sim.experiments.output" not in sources
     assert not {name for name in sources if name.partition(".")[0] == "numpy"}

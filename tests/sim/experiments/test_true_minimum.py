@@ -12,8 +12,8 @@ from sim.experiments.plain_cost import PlainCost
 from sim.experiments.true_minimum import final_fold, judged, true_minimum
 from sim.in_memory.team import final_map, run_team
 from sim.scenario.source import streams_of
-from team.estimation.gauss_newton import Island, JoinSettings
-from team.estimation.minima import minimum, searched
+from team.estimation.map_joining.gauss_newton import Island, JoinSettings
+from team.estimation.map_joining.minima import minimum, searched
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import Team, team
 from tests.sim.experiments.test_experiment_runs import short
@@ -103,10 +103,10 @@ def test_the_judge_owes_nothing_to_what_it_judges(monkeypatch: pytest.MonkeyPatc
     turned[first + 2] += 0.2
     wrong = replace(wrong, state=turned)
     for place in ("gauss_newton.settled", "minima.settled"):
-        monkeypatch.setattr(f"team.estimation.{place}", lambda island: (island, 1, 0.0))
+        monkeypatch.setattr(f"team.estimation.map_joining.{place}", lambda island: (island, 1, 0.0))
     for place in ("gauss_newton.final_cost", "minima.final_cost"):
-        monkeypatch.setattr(f"team.estimation.{place}", lambda island: 0.0)
-    monkeypatch.setattr("team.estimation.minima.elsewhere", lambda one, best: False)
+        monkeypatch.setattr(f"team.estimation.map_joining.{place}", lambda island: 0.0)
+    monkeypatch.setattr("team.estimation.map_joining.minima.elsewhere", lambda one, best: False)
     assert judged(island, landmarks, paths) == sound
     assert judged(wrong, landmarks, paths).wrong
 

@@ -17,7 +17,7 @@ from sim.limit.limit import Limit, LimitError, batch_map
 from sim.limit.readings import Chain, Scan, anchored, chains_of
 from sim.scenario.scenario import Scenario
 from team.config import MotionModel, MotionNoise, RobotConfig
-from team.estimation.batch import FLOOR_SIGMAS
+from team.estimation.baselines.batch import FLOOR_SIGMAS
 from team.estimation.geometry import between, compose, exponential, tangent
 from team.estimation.models import increment_of
 from team.wire import channels as ch

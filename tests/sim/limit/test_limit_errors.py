@@ -16,8 +16,8 @@ from sim.limit.readings import Chain, Scan, chains_of
 from sim.scenario.scenario import Scenario
 from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam.pose_grid import NodeSighting
 from team.estimation.models import increment_of, noise, predicted
-from team.stream.pose_grid import NodeSighting
 from tests.sim.logs import joined_log, scenario
 
 LANDMARKS = {7: np.array([4.0, 1.0]), 9: np.array([2.0, -3.0])}

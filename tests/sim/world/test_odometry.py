@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from central.team_epochs import TeamEpochs
+from central.baselines.team_keyframes import TeamEpochs
 from sim.in_memory.team import final_map, run_team
 from sim.scenario.scenario import Scenario, load
 from sim.scenario.source import streams_of

@@ -1,0 +1,1 @@
+"""Fusion rules of the sources, for comparison; the product runs without them."""

@@ -1,0 +1,151 @@
+"""The rule `batch`: the batch MAP over all robots' raw readings, while they come."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from central.baselines.measurement_rules import ReadingRule, Told
+from central.baselines.team_keyframes import RobotEpoch
+from central.config import CentralConfig
+from team import translate
+from team.config import RobotConfig
+from team.estimation.baselines import batch
+from team.estimation.baselines.batch import Batch
+from team.estimation.baselines.robot_step import Turn
+from team.estimation.gaussian import Matrix
+from team.estimation.geometry import Pose
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.sparse_cholesky import sparse
+from team.wire import channels as ch
+from team.wire.bus import Outgoing
+
+RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
+"""Of a broadcast's map: from the last solution few are needed, to a Newton step of so many σ."""
+FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
+"""Of the final map; what is not there by then is said."""
+
+
+class BatchRule(ReadingRule):
+    """Every pose of every robot at its epochs and all landmarks, solved anew at each broadcast.
+
+    Poses are said with the map, each robot's newest; with the final map the whole paths. Errors of
+    sensors that persist and biases are taken as white, and that is said.
+    """
+
+    _batch: Batch
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
+        super().__init__(config, digest, robots)
+        self._waiting: list[Turn] = []
+        self._newest: dict[str, RobotEpoch] = {}
+        self._stamps: dict[str, list[int]] = defaultdict(list)
+        self._findings: list[str] = []
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """The poses, and the joint cost of the last map."""
+        if not self._robots:
+            return {}
+        figures = {"poses": float(len(self._batch.poses))}
+        if self._batch.dof > 0:
+            figures["joint_cost_per_dof"] = self._batch.cost / self._batch.dof
+        return figures
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What is taken as white though it persists, and whether the final map has converged."""
+        return tuple(self._findings)
+
+    def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
+        self._batch = batch.begun(starts, self._config.robust_c)
+        self._findings += taken_as_white(self._robots)
+
+    def _take(self, step: Sequence[RobotEpoch], turns: Sequence[Turn]) -> list[Outgoing]:
+        self._waiting += turns
+        for each in step:
+            self._newest[each.robot] = each
+            self._stamps[each.robot].append(each.stamp_ns)
+        return []
+
+    def _told(self, *, final: bool) -> Told:
+        self._grow()
+        if final:
+            self._batch = self._solved(self._batch.renewed, FINAL_ITERATIONS, FINAL_DECREMENT)
+            if not self._batch.converged(FINAL_DECREMENT):
+                self._findings.append(
+                    f"the batch has not converged in {FINAL_ITERATIONS} iterations: the next step "
+                    f"goes {self._batch.newton_decrement:.2g} sigma, {FINAL_DECREMENT:g} allowed"
+                )
+        else:
+            self._batch = self._solved(self._batch, RUNNING_ITERATIONS, RUNNING_DECREMENT)
+        landmarks = batch.landmark_gaussian(self._batch)
+        said = (*self._poses(), *(self._paths() if final else ()))
+        return Told(landmarks, self._batch.cost, self._batch.dof, said)
+
+    def _grow(self) -> None:
+        """Take the turns that wait; without what they saw, or not at all, where none is solved."""
+        turns, self._waiting = self._waiting, []
+        blind = [turn.blind for turn in turns]
+        for some in (turns, blind):
+            with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+                grown = batch.extended(self._batch, some)
+                once = batch.solved(grown, 1, RUNNING_DECREMENT)
+                if np.isfinite(once.poses).all() and np.isfinite(once.posterior.panels).all():
+                    self._batch = grown
+                    return
+            self._findings.append(
+                f"measurements of {len(turns)} steps up to {self._now_ns * 1e-9:.1f} s refused: "
+                "with them the map has no solution"
+            )
+
+    def _solved(self, grown: Batch, iterations: int, decrement: float) -> Batch:
+        """The solution; where there is none, what the steps before have left."""
+        with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+            solution = batch.solved(grown, iterations, decrement)
+            if np.isfinite(solution.poses).all() and np.isfinite(solution.posterior.panels).all():
+                return solution
+        self._findings.append("the batch has no full solution")
+        return grown
+
+    def _poses(self) -> list[Outgoing]:
+        """The newest pose of each robot that has moved since the last map."""
+        said = [
+            self._pose(each, batch.pose_gaussian(self._batch, robot))
+            for robot, each in sorted(self._newest.items())
+            if self._pose_is_due(each)
+        ]
+        self._newest = {}
+        return said
+
+    def _paths(self) -> list[Outgoing]:
+        said = []
+        for robot, stamps in sorted(self._stamps.items()):
+            poses, covariances = batch.trajectory(self._batch, robot)
+            stamps = stamps[: len(poses) - 1]
+            if not stamps:
+                continue
+            epoch = self._members[robot].epoch
+            message = translate.trajectory_message(
+                stamps[-1], robot, epoch, self._digest, stamps, poses[1:], covariances[1:]
+            )
+            said.append(Outgoing(ch.TRAJECTORY, robot, message))
+        return said
+
+
+def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:
+    """The errors that are declared to persist, by the robots that declare the same."""
+    declared = defaultdict(list)
+    for name, config in sorted(robots.items()):
+        sensor, biases = config.sensor, config.front_end.biases
+        shares = {"range_white": sensor.range_white, "bearing_white": sensor.bearing_white}
+        lasting = [f"{each} = {share:g}" for each, share in shares.items() if share < 1.0]
+        if lasting or biases:
+            words = [*lasting, *([f"biases {', '.join(biases)}"] if biases else [])]
+            declared["; ".join(words)].append(name)
+    return [
+        f"{', '.join(names)}: errors that persist ({words}) are taken as white, "
+        "so the covariance is too small"
+        for words, names in declared.items()
+    ]

@@ -1,0 +1,216 @@
+"""Rules that fuse whole maps which the robots then absorb: kept because users compare them.
+
+`kalman_per_axis` and `kalman` treat the maps as independent. They are not once a robot has absorbed
+a fused map and sends its own again: every reading is then counted again with each exchange, and the
+covariance loses its meaning. Covariance intersection stays consistent for any correlation of the
+landmarks that it fuses, at the price of what the maps truly have in addition.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation.gaussian import (
+    NO_LANDMARKS,
+    LandmarkGaussian,
+    NotACovarianceError,
+    carried_along,
+    cholesky_factor,
+    information,
+)
+
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+SEARCH_STEPS = 60
+"""Golden sections of [0, 1]: the last interval is 3·10⁻¹³ wide."""
+
+
+SMALLEST_VARIANCE = 1e-12
+"""m²: re-absorbing halves the variance with every round; it must stay a number."""
+
+
+def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
+    """Full-covariance Kalman fusion in the given order, as if the maps were independent.
+
+    K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's further landmarks follow
+    by regression on c. Counts readings again when its result is absorbed and sent once more.
+    """
+    return _one_by_one(_kalman_pair, maps)
+
+
+def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
+    """The thesis' fusion: each coordinate by itself, correlations dropped (Xu, eq. 5.1-5.4).
+
+    TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and
+    S = S^A S^B/(S^A + S^B). Counts readings again when its result is absorbed and sent once more.
+    """
+    return _one_by_one(_per_axis_pair, maps)
+
+
+def covariance_intersection(
+    maps: Sequence[LandmarkGaussian], criterion: Literal["trace", "det"] = "det"
+) -> LandmarkGaussian:
+    """Fusion that holds for any correlation between the maps (Julier & Uhlmann 1997).
+
+    On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
+    of the least trace or determinant of C. The landmarks of one map alone follow by regression on
+    the common ones in that map; what the regression leaves is taken as that map's own.
+    """
+
+    def pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
+        return _intersected_pair(a, b, criterion)
+
+    return _one_by_one(pair, maps)
+
+
+def _one_by_one(
+    pair: Callable[[LandmarkGaussian, LandmarkGaussian], LandmarkGaussian],
+    maps: Sequence[LandmarkGaussian],
+) -> LandmarkGaussian:
+    if not maps:
+        return NO_LANDMARKS
+    fused = maps[0]
+    for each in maps[1:]:
+        fused = pair(fused, each)
+    return fused
+
+
+def fused_totally(
+    rule: Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian],
+    maps: Mapping[str, LandmarkGaussian],
+    coordinate_m: float,
+) -> tuple[LandmarkGaussian, tuple[str, ...]]:
+    """The fusion of the robots' maps, and why a map is left out of it.
+
+    A map beyond the bounds is, and one with which the rule has no result: they are then taken one
+    by one in the given order.
+    """
+    kept: dict[str, LandmarkGaussian] = {}
+    reasons = []
+    for robot, each in maps.items():
+        if np.abs(each.means).max(initial=0.0) > coordinate_m:
+            reasons.append(f"{robot}: its map is refused, a coordinate beyond {coordinate_m:g} m")
+        else:
+            kept[robot] = each
+    fused = _tried(rule, list(kept.values()))
+    if fused is not None:
+        return fused, tuple(reasons)
+    fused, taken = NO_LANDMARKS, list[LandmarkGaussian]()
+    for robot, each in kept.items():
+        more = _tried(rule, [*taken, each])
+        if more is None:
+            reasons.append(f"{robot}: its map is refused, with it the fusion has no result")
+        else:
+            fused = more
+            taken.append(each)
+    return fused, tuple(reasons)
+
+
+def _tried(
+    rule: Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian], maps: Sequence[LandmarkGaussian]
+) -> LandmarkGaussian | None:
+    """The rule's result; None where there is none, or none in finite numbers."""
+    try:
+        with np.errstate(all="ignore"):
+            fused = rule(maps)
+    except (NotACovarianceError, np.linalg.LinAlgError):
+        return None
+    finite = np.isfinite(fused.means).all() and np.isfinite(fused.covariance).all()
+    return fused if finite else None
+
+
+def _shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.ndarray, " k"], ...]:
+    """Places of the common landmarks' coordinates in a and in b."""
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    return _points(in_a), _points(in_b)
+
+
+def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    return (2 * index[:, None] + np.arange(2)).ravel()
+
+
+def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
+    """`fused` with those landmarks of `a` that it does not know, by regression on the others."""
+    in_a, in_fused = _shared(a, fused)
+    mean, covariance = carried_along(
+        a.means.ravel(), a.covariance, in_a, fused.means.ravel(), fused.covariance, in_fused
+    )
+    ids = np.concatenate([np.setdiff1d(a.ids, fused.ids), fused.ids])
+    order = np.argsort(ids)
+    place = _points(order)
+    return LandmarkGaussian(
+        ids[order], mean.reshape(-1, 2)[order], covariance[np.ix_(place, place)]
+    )
+
+
+def _kalman_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
+    in_a, in_b = _shared(a, b)
+    R = b.covariance[np.ix_(in_b, in_b)]
+    innovation = information(a.covariance[np.ix_(in_a, in_a)] + R, "two maps' difference")
+    gain = a.covariance[:, in_a] @ innovation
+    moved = a.means.ravel() + gain @ (b.means.ravel()[in_b] - a.means.ravel()[in_a])
+    rest = np.eye(2 * len(a.ids))
+    rest[:, in_a] -= gain
+    covariance = rest @ a.covariance @ rest.T + gain @ R @ gain.T
+    updated = LandmarkGaussian(a.ids, moved.reshape(-1, 2), 0.5 * (covariance + covariance.T))
+    return _carried(b, updated)
+
+
+def _per_axis_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
+    ids = np.union1d(a.ids, b.ids)
+    means = np.zeros((len(ids), 2))
+    variances = np.zeros((len(ids), 2))
+    for each in (a, b):
+        place = np.searchsorted(ids, each.ids)
+        means[place] = each.means
+        variances[place] = np.diag(each.covariance).reshape(-1, 2)
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    both = np.searchsorted(ids, a.ids[in_a])
+    of_a = np.diag(a.covariance).reshape(-1, 2)[in_a]
+    of_b = np.diag(b.covariance).reshape(-1, 2)[in_b]
+    share = of_a / (of_a + of_b)
+    means[both] = a.means[in_a] + share * (b.means[in_b] - a.means[in_a])
+    variances[both] = np.maximum(share * of_b, SMALLEST_VARIANCE)
+    return LandmarkGaussian(ids, means, np.diag(variances.ravel()))
+
+
+def _intersected_pair(a: LandmarkGaussian, b: LandmarkGaussian, criterion: str) -> LandmarkGaussian:
+    in_a, in_b = _shared(a, b)
+    common = NO_LANDMARKS
+    if len(in_a):
+        info_a = information(a.covariance[np.ix_(in_a, in_a)], "a map's common landmarks")
+        info_b = information(b.covariance[np.ix_(in_b, in_b)], "a map's common landmarks")
+        omega = _least(lambda w: _size(w * info_a + (1.0 - w) * info_b, criterion))
+        spread = information(omega * info_a + (1.0 - omega) * info_b, "the intersection")
+        mean = spread @ (
+            omega * (info_a @ a.means.ravel()[in_a])
+            + (1.0 - omega) * (info_b @ b.means.ravel()[in_b])
+        )
+        common = LandmarkGaussian(a.ids[in_a[::2] // 2], mean.reshape(-1, 2), spread)
+    return _carried(b, _carried(a, common))
+
+
+def _size(metric: Float[np.ndarray, "n n"], criterion: str) -> float:
+    """Trace of C, or ln det C, of the covariance C = metric⁻¹."""
+    if criterion == "trace":
+        return float(np.trace(information(metric, "the intersection")))
+    factor = cholesky_factor(metric, "the intersection")
+    return float(-2.0 * np.log(np.diag(factor)).sum())
+
+
+def _least(size: Callable[[float], float]) -> float:
+    """ω in [0, 1] of the least size by golden section; size is convex in ω."""
+    low, high = 0.0, 1.0
+    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    at_left, at_right = size(left), size(right)
+    for _ in range(SEARCH_STEPS):
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - GOLDEN * (high - low)
+            at_left = size(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + GOLDEN * (high - low)
+            at_right = size(right)
+    return 0.5 * (low + high)

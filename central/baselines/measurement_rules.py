@@ -1,0 +1,232 @@
+"""What rules on raw readings share: the team's epochs in, poses and the map out."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from central.baselines.team_keyframes import RobotEpoch, TeamEpochs
+from central.config import CentralConfig
+from central.fused import START_POSES, fused_message
+from central.roll import Roll
+from team import translate
+from team.config import RobotConfig
+from team.estimation.baselines.robot_step import Turn
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.geometry import Pose
+from team.estimation.plausible import start_beyond
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a map is made of: the landmarks and, where the rule has one, the joint cost.
+
+    before: messages that go out before it.
+    """
+
+    landmarks: LandmarkGaussian = NO_LANDMARKS
+    chi2: float = 0.0
+    dof: int = 0
+    before: tuple[Outgoing, ...] = ()
+
+
+class ReadingRule(ABC):
+    """An estimate over all robots' raw readings at the centre.
+
+    The epochs of one team time are one step. The robots' models come with what they announce. A
+    robot whose start pose is not known is left out; where no start is known the first robot's is
+    the frame. A map's members name each robot's last reading in it.
+    """
+
+    listens = (*ch.SENSORS, ch.ROBOT_CONFIG)
+    submaps = 0
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
+        self._config = config
+        self._config_digest = digest
+        self._epochs = TeamEpochs(robots)
+        self._robots: dict[str, RobotConfig] = {}
+        self._members: dict[str, m.Member] = {}
+        self._pose_ns: dict[str, int] = {}
+        self._reasons: list[str] = []
+        self._frame = START_POSES
+        self._broadcast_ns: int | None = None
+        self._now_ns = 0
+        self.landmarks = 0
+        self.warnings: list[str] = []
+
+    @abstractmethod
+    def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
+        """The robots' start poses; covariances in (x, y, θ), None: exactly known."""
+
+    @abstractmethod
+    def _take(self, step: Sequence[RobotEpoch], turns: Sequence[Turn]) -> list[Outgoing]:
+        """One step of the team, which the members already name; the poses that it gives."""
+
+    @abstractmethod
+    def _told(self, *, final: bool) -> Told:
+        """The map of all steps so far."""
+
+    @property
+    @abstractmethod
+    def figures(self) -> Mapping[str, float]:
+        """Figures for people."""
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What a reader of the map must know; the final map says it too."""
+        return ()
+
+    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """File a reading, a robot's models or the last counters."""
+        match message:
+            case m.Reading():
+                self._epochs.put(message)
+            case m.Configured() if message.node.startswith("robot/"):
+                self._configure(message)
+            case m.End():
+                self._epochs.end(message)
+            case _:
+                pass
+        return []
+
+    def _configure(self, message: m.Configured) -> None:
+        try:
+            config = msgspec.json.decode(message.configuration, type=RobotConfig)
+        except msgspec.DecodeError as error:
+            self.warnings.append(f"{message.node} runs another version: {error}")
+        else:
+            self._epochs.configure(config.id, config)
+
+    def dealt(self, done: m.Done) -> bool:
+        """Nothing that the robot itself has sent is needed."""
+        return True
+
+    def complete(self, end: m.End) -> bool:
+        """Every reading of every stream has been used."""
+        return self._epochs.complete
+
+    def advance(self, roll: Roll) -> list[Outgoing]:
+        """Every step whose turn has come: the poses, and the map at broadcasts."""
+        if not self._robots and not self._begin():
+            return []
+        out: list[Outgoing] = []
+        for step in self._epochs.steps():
+            out += self._broadcast(step[0].stamp_ns)
+            out += self._take_step([each for each in step if each.robot in self._robots])
+        return out
+
+    def conclude(self, now_ns: int) -> list[Outgoing]:
+        """The map after the last step."""
+        return self._said(final=True)
+
+    def kept(self, robot: str) -> Sequence[m.Message]:
+        """It keeps no submaps: a robot that was started again takes its stream from the start."""
+        return ()
+
+    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
+        """Readings that the link has lost."""
+        return self._epochs.wanted(now_ns)
+
+    def _begin(self) -> bool:
+        """The start poses, when all of them are here."""
+        starts = self._epochs.starts
+        if not starts:
+            return False
+        placed = {name: start for name, (_, start) in starts.items() if self._is_placed(start)}
+        if not placed:
+            name = min(starts)
+            placed = {name: starts[name][1]}
+            self._frame = f"{name}/{placed[name].epoch}"
+        self._robots = {name: starts[name][0] for name in sorted(placed)}
+        away = sorted(starts.keys() - placed.keys())
+        self._reasons += [f"{name}: its start pose is not known" for name in away]
+        known = {
+            name: translate.pose_of(placed[name]) if self._is_placed(placed[name]) else (None, None)
+            for name in self._robots
+        }
+        self._members = {n: m.Member(n, placed[n].epoch, 0) for n in self._robots}
+        self._start(
+            {
+                name: (np.zeros(3) if pose is None else pose, covariance)
+                for name, (pose, covariance) in known.items()
+            }
+        )
+        return True
+
+    def _is_placed(self, start: m.Start) -> bool:
+        """Whether the initial pose is known, and within the bounds."""
+        value = translate.start_of(start)
+        return value is not None and start_beyond(value, self._config.bounds) is None
+
+    def _take_step(self, step: Sequence[RobotEpoch]) -> list[Outgoing]:
+        if not step:
+            return []
+        turns = [
+            Turn(
+                each.robot,
+                each.epoch.increment,
+                self._robots[each.robot].sensor,
+                each.epoch.ids,
+                each.epoch.ranges,
+                each.epoch.bearings,
+            )
+            for each in step
+        ]
+        self._now_ns = step[-1].stamp_ns
+        for each in step:
+            epoch = self._members[each.robot].epoch
+            self._members[each.robot] = m.Member(each.robot, epoch, each.reading)
+        return self._take(step, turns)
+
+    def _pose_is_due(self, each: RobotEpoch) -> bool:
+        last_ns = self._pose_ns.get(each.robot)
+        pose_ns = self._robots[each.robot].pose_s * 1e9
+        return last_ns is None or each.stamp_ns - last_ns >= pose_ns
+
+    def _pose(self, each: RobotEpoch, pose: PoseGaussian) -> Outgoing:
+        """The pose at the end of an epoch."""
+        self._pose_ns[each.robot] = each.stamp_ns
+        epoch = self._members[each.robot].epoch
+        message = translate.pose_message(
+            each.stamp_ns, each.robot, epoch, each.reading, translate.NO_MAP, *pose
+        )
+        return Outgoing(ch.CENTRAL_POSE, each.robot, message)
+
+    def _broadcast(self, stamp_ns: int) -> list[Outgoing]:
+        """The map before the first step of each broadcast_s of team time."""
+        if self._broadcast_ns is None:
+            self._broadcast_ns = stamp_ns
+        if stamp_ns - self._broadcast_ns < self._config.broadcast_s * 1e9:
+            return []
+        self._broadcast_ns = stamp_ns
+        return self._said(final=False)
+
+    @property
+    def _digest(self) -> bytes:
+        """The name of the readings so far."""
+        members = (self._members[robot] for robot in sorted(self._members))
+        named = b"".join(f"{x.robot}/{x.epoch}/{x.sequence} ".encode() for x in members)
+        return translate.digest_of(self._config_digest, named)
+
+    def _said(self, *, final: bool) -> list[Outgoing]:
+        told = self._told(final=final) if self._robots else Told()
+        self.landmarks = len(told.landmarks.ids)
+        lost = [f"{robot}: its stream began anew" for robot in self._epochs.broken]
+        fused = fused_message(
+            self._config,
+            self._digest,
+            told.landmarks,
+            tuple(self._members[robot] for robot in sorted(self._members)),
+            stamp_ns=self._now_ns,
+            final=final,
+            frame=self._frame,
+            cost=(told.chi2, told.dof),
+            reasons=(*self._reasons, *lost, *self.findings) if final else (),
+        )
+        return [*told.before, Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]

@@ -1,0 +1,233 @@
+"""Map joining as in Downs' thesis: each robot joins its own submaps, the maps are tied by SVD.
+
+Every robot's submaps make one map by least squares in the frame of its own start (section 4.1). A
+robot's map is then turned into the frame of the others' by a singular value decomposition over the
+landmarks that both have, and the landmarks are joined (section 4.3). The start pose of the first
+robot fixes the frame; what the others are told of theirs has no influence.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from central.config import CentralConfig
+from central.fused import fused_message
+from central.join_rule import JoinRule
+from central.submap_set import Stream
+from team import translate
+from team.estimation.baselines import svd_joining
+from team.estimation.baselines.svd_joining import (
+    NO_PAIRS,
+    PointPairs,
+    SubmapJoining,
+    TooFewPointsError,
+    Weighting,
+)
+from team.estimation.contribution import named
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from team.estimation.geometry import Pose
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.plausible import start_beyond, submap_beyond
+from team.estimation.submap import LocalMap
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded
+
+NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """The submaps of a stream so far: how many, their map, and the digest of what is in it.
+
+    refused: the submap with which the chain has ended and why, if there is one.
+    """
+
+    count: int
+    state: SubmapJoining
+    digest: bytes
+    refused: str = ""
+
+
+class SvdJoinRule(JoinRule):
+    """The set of `join`, another map of it: `svd-join` with the submaps' covariances, and
+    `svd-join-spherical` with Downs' identity instead of them.
+
+    A later epoch of a robot is a stream of its own, in a frame of its own.
+    """
+
+    def __init__(self, config: CentralConfig, digest: bytes) -> None:
+        super().__init__(config, digest)
+        self._weighting: Weighting = "full" if config.fusion == "svd-join" else "identity"
+        self._joined: dict[Stream, _Joined] = {}
+        self._said_ns: int | None = None
+
+    def advance(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
+        """A broadcast of what is here, when one is due; a later one may put any of it elsewhere."""
+        since = None if self._said_ns is None else newest_ns - self._said_ns
+        if since is not None and since < self._config.broadcast_s * 1e9:
+            return []
+        chains = self._chains()
+        if not chains:
+            return []
+        self._said_ns = newest_ns
+        return [Outgoing(ch.FUSED_MAP, "", self.retold_map(chains, final=False))]
+
+    def conclude(self, newest_ns: int) -> list[Outgoing]:
+        """The map of all submaps."""
+        return [Outgoing(ch.FINAL_MAP, "", self.retold_map(self._chains(), final=True))]
+
+    def _chains(self) -> dict[Stream, list[m.Submap]]:
+        found = {s: self._set.chain(s) for s in self.streams if s in self._starts}
+        return {stream: chain for stream, chain in found.items() if chain}
+
+    def retold_map(self, chains: Mapping[Stream, Sequence[m.Submap]], *, final: bool) -> m.FusedMap:
+        """The map of these submaps: a function of them and of the starts alone."""
+        if not chains:
+            return fused_message(
+                self._config, self._digest, NO_LANDMARKS, (), stamp_ns=0, final=final, frame=""
+            )
+        joined = {stream: self._extended(stream, chains[stream], final) for stream in chains}
+        told = {s: x.state for s, x in joined.items() if x.state.fold.contributions}
+        first = min(told or chains, key=lambda s: (self._believed(s) is None, s))
+        maps = {s: svd_joining.landmark_gaussian(state) for s, state in told.items()}
+        with np.errstate(all="ignore"):
+            fused, reasons = tied(first, maps, full=self._weighting == "full")
+        refused = tuple(x.refused for _, x in sorted(joined.items()) if x.refused)
+        self.landmarks = len(fused.ids)
+        return fused_message(
+            self._config,
+            translate.digest_of(self._digest, *(joined[s].digest for s in sorted(joined))),
+            fused,
+            tuple(m.Member(*stream, joined[stream].count - 1) for stream in sorted(joined)),
+            stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
+            final=final,
+            frame=f"{first[0]}/{first[1]}",
+            reasons=(*reasons, *refused),
+        )
+
+    def _believed(self, stream: Stream) -> Pose | None:
+        """The initial pose of a stream, if it is known and within the bounds."""
+        start = translate.start_of(self._starts[stream])
+        if start is None or start_beyond(start, self._config.bounds) is not None:
+            return None
+        return start.pose
+
+    def _extended(self, stream: Stream, chain: Sequence[m.Submap], final: bool) -> _Joined:
+        """The map of a stream's chain, from the longest one that was made before.
+
+        Running maps have the solution that each submap has moved on; the final one is solved to the
+        end, wrong minima looked for.
+        """
+        told = self._believed(stream)
+        begin = svd_joining.begun(
+            {stream[0]: np.zeros(3) if told is None else told}, self._weighting
+        )
+        before = self._joined.get(stream)
+        if before is None or before.count > len(chain):
+            before = _Joined(0, begin, self._digest)
+        state, digest, refused = before.state, before.digest, before.refused
+        for submap in chain[before.count :]:
+            digest = translate.digest_of(digest, encoded(submap))
+            if not refused:
+                local = translate.local_map_of(submap).without_nodes.without_biases
+                why = submap_beyond(local, self._config.bounds)
+                after = _stepped(state, stream[0], local) if why is None else None
+                if after is None:
+                    words = why or "with it the map has no solution"
+                    refused = f"submap {submap.sequence} of {named(stream)} refused: {words}"
+                else:
+                    state = after
+        self._joined[stream] = _Joined(len(chain), state, digest, refused)
+        solution = _solution(state) if final else state
+        return _Joined(len(chain), solution, digest, refused)
+
+
+def _stepped(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
+    """The map with one more submap; None where it has no solution or no covariance."""
+    try:
+        with np.errstate(all="ignore"):
+            after = svd_joining.stepped(state, robot, local)
+            landmarks = svd_joining.landmark_gaussian(after)
+    except UNSOLVABLE:
+        return None
+    finite = np.isfinite(landmarks.means).all() and np.isfinite(landmarks.covariance).all()
+    return after if finite else None
+
+
+def _solution(state: SubmapJoining) -> SubmapJoining:
+    """The full solution; where there is none, the map that the submaps have grown to."""
+    try:
+        with np.errstate(all="ignore"):
+            return svd_joining.solved(state)
+    except UNSOLVABLE:
+        return state
+
+
+def tied(
+    first: Stream,
+    maps: Mapping[Stream, LandmarkGaussian],
+    *,
+    full: bool,
+    sightings: Mapping[tuple[Stream, Stream], PointPairs] = NO_SIGHTINGS,
+) -> tuple[LandmarkGaussian, tuple[str, ...]]:
+    """The maps in the frame of the first, one by one: next who shares most with those that are in.
+
+    sightings: by two streams in their order, the robots' own places in both maps where they saw
+    each other (`mutual_sighting`); they tie beside the common landmarks, not with `full`. Who
+    shares too few points stays out, with the reason.
+    """
+    fused = maps.get(first, NO_LANDMARKS)
+    frames = {first: np.zeros(3)}
+    waiting = {stream: maps[stream] for stream in sorted(maps) if stream != first}
+    unsolvable: list[Stream] = []
+    while waiting:
+        seen = {s: _seen(s, frames, sightings) for s in waiting}
+        shared = {
+            s: len(np.intersect1d(fused.ids, x.ids)) + len(seen[s].in_a) for s, x in waiting.items()
+        }
+        stream = max(waiting, key=lambda s: shared[s])
+        try:
+            exchange = (
+                svd_joining.exchanged_fully(fused, waiting[stream])
+                if full
+                else svd_joining.exchanged(fused, waiting[stream], seen[stream])
+            )
+        except TooFewPointsError:
+            break
+        except UNSOLVABLE:
+            unsolvable.append(stream)
+            del waiting[stream]
+            continue
+        fused = exchange.landmarks
+        frames[stream] = exchange.a_from_b.mean
+        del waiting[stream]
+    reasons = [
+        f"{robot}, epoch {epoch}, not joined: its common landmarks give no place"
+        for robot, epoch in unsolvable
+    ]
+    for (robot, epoch), alone in waiting.items():
+        count = len(np.intersect1d(fused.ids, alone.ids))
+        plural = "" if count == 1 else "s"
+        needed = f"{count} shared landmark{plural}, {svd_joining.NEEDED} needed"
+        reasons.append(f"{robot}, epoch {epoch}, not joined: {needed}")
+    return fused, tuple(reasons)
+
+
+def _seen(
+    stream: Stream,
+    frames: Mapping[Stream, Pose],
+    sightings: Mapping[tuple[Stream, Stream], PointPairs],
+) -> PointPairs:
+    """The points of a stream with all those in the map, in the map's frame and in its own."""
+    found = [NO_PAIRS]
+    for other, frame in frames.items():
+        pairs = sightings.get((min(stream, other), max(stream, other)))
+        if pairs is not None:
+            theirs, own = pairs if other < stream else (pairs.in_b, pairs.in_a)
+            c, s = np.cos(frame[2]), np.sin(frame[2])
+            found.append(PointPairs(theirs @ np.array([[c, s], [-s, c]]) + frame[:2], own))
+    return PointPairs(*(np.concatenate(each) for each in zip(*found, strict=True)))

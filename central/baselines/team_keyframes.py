@@ -1,0 +1,165 @@
+"""All robots' raw readings as one sequence of epochs, the same for any order of arrival."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import NamedTuple
+
+from team import translate
+from team.config import Bounds, RobotConfig
+from team.estimation.hybrid_slam.keyframes import Epoch, Segmenter
+from team.stream.inbox import Inbox
+from team.stream.judge import SPEED, StreamJudge
+from team.wire import messages as m
+
+
+class RobotEpoch(NamedTuple):
+    """One robot's motion and what it saw at its end; `reading`: the counter that closed it."""
+
+    stamp_ns: int
+    robot: str
+    reading: int
+    epoch: Epoch
+
+
+@dataclass
+class _Stream:
+    """The readings of one robot, from its start pose on.
+
+    covered_ns: no epoch before this team time can still come. start: reading 0.
+    """
+
+    robot: str
+    config: RobotConfig | None = None
+    inbox: Inbox = field(default_factory=Inbox)
+    segmenter: Segmenter | None = None
+    judge: StreamJudge = field(default_factory=lambda: StreamJudge(Bounds()))
+    start: m.Start | None = None
+    waiting: deque[RobotEpoch] = field(default_factory=deque)
+    covered_ns: float = float("-inf")
+    broken: bool = False
+    end: m.StreamEnd | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Every reading of it has been taken."""
+        end = self.end
+        return self.broken or (end is not None and self.inbox.complete(end))
+
+    def take(self) -> None:
+        """Cut the readings whose turn has come into epochs."""
+        if self.config is None:
+            return
+        for reading in self.inbox.taken():
+            if not self.broken:
+                self._take(reading, self.config)
+        if self.complete and self.covered_ns != float("inf"):
+            segmenter = self.segmenter
+            if segmenter is not None and segmenter.now_ns is not None and not self.broken:
+                self._file(segmenter.cut(segmenter.now_ns)[0], self.inbox.next_reading - 1)
+            self.covered_ns = float("inf")
+
+    def _take(self, reading: m.Reading, config: RobotConfig) -> None:
+        match reading:
+            case m.Start() if self.start is None:
+                self.start = reading
+                keyframe_s = config.front_end.keyframe_s
+                self.segmenter = Segmenter(config.motion, config.sensor, keyframe_s)
+                self.judge = StreamJudge(config.bounds)
+            case m.Start():
+                self.broken = True  # a later life of the stream begins who knows where
+            case m.Observations() if self.segmenter is not None:
+                ids, ranges, bearings = translate.scan_of(reading)
+                near = self.judge.near(ranges)
+                if self.judge.time(reading.stamp_ns) is None and (near.any() or not len(near)):
+                    scan = ids[near], ranges[near], bearings[near]
+                    self.segmenter.observe(reading.stamp_ns, *scan)
+            case m.Odometry() if self.segmenter is not None:
+                motion = translate.motion_of(reading, config.clock_offset_s)
+                reason = self.judge.odometry(*motion)
+                if reason not in {None, SPEED}:
+                    return
+                end_ns, duration_ns, _, _ = motion
+                if self.segmenter.now_ns is None:
+                    self.segmenter.begin(end_ns - duration_ns)
+                epochs = self.segmenter.drive(*motion, measured=reason is None)
+                self._file(epochs, reading.reading)
+                self.covered_ns = end_ns
+            case _:
+                pass
+
+    def _file(self, epochs: Sequence[Epoch], reading: int) -> None:
+        self.waiting += [RobotEpoch(e.stamp_ns, self.robot, reading, e) for e in epochs]
+
+
+class TeamEpochs:
+    """The team's epochs by (stamp, robot), as far as every robot's stream is known.
+
+    So the sequence is a function of the streams alone. A stream that begins anew at an unknown pose
+    ends there; sightings of teammates are not used.
+    """
+
+    def __init__(self, robots: Sequence[str]) -> None:
+        self._streams = {robot: _Stream(robot) for robot in sorted(robots)}
+
+    def configure(self, robot: str, config: RobotConfig) -> None:
+        """The models of a robot; its readings wait for them."""
+        if robot in self._streams and self._streams[robot].config is None:
+            self._streams[robot].config = config
+
+    def put(self, reading: m.Reading) -> None:
+        """Take a reading, in any order."""
+        if reading.robot in self._streams:
+            self._streams[reading.robot].inbox.put(reading)
+
+    def end(self, end: m.End) -> None:
+        """The last counters of the streams."""
+        for name, stream in self._streams.items():
+            mine = [s for s in end.streams if s.robot == name]
+            stream.end = mine[0] if mine else m.StreamEnd(name, stream.inbox.epoch, 0)
+
+    @property
+    def starts(self) -> dict[str, tuple[RobotConfig, m.Start]] | None:
+        """Every robot's models and start; None until all are here."""
+        found = {}
+        for name, stream in self._streams.items():
+            stream.take()
+            if stream.config is not None and stream.start is not None:
+                found[name] = (stream.config, stream.start)
+            elif not stream.complete:
+                return None
+        return found
+
+    @property
+    def broken(self) -> list[str]:
+        """Robots whose stream began anew."""
+        return [name for name, stream in self._streams.items() if stream.broken]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every reading of every stream has been taken."""
+        return all(stream.complete for stream in self._streams.values())
+
+    def steps(self) -> Iterator[list[RobotEpoch]]:
+        """The epochs whose turn has come, those of one team time together."""
+        for stream in self._streams.values():
+            stream.take()
+        horizon = min(stream.covered_ns for stream in self._streams.values())
+        ready: list[RobotEpoch] = []
+        for stream in self._streams.values():
+            while stream.waiting and stream.waiting[0].stamp_ns < horizon:
+                ready.append(stream.waiting.popleft())
+        # The sort is stable: the epochs of one robot keep their order.
+        ready.sort(key=lambda each: (each.stamp_ns, each.robot))
+        for _, step in groupby(ready, key=lambda each: each.stamp_ns):
+            yield list(step)
+
+    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
+        """The readings that are missing and must be asked for at their source."""
+        found = []
+        for name, stream in self._streams.items():
+            missing = stream.inbox.missing(stream.end)
+            if missing is not None and not stream.broken:
+                found.append(m.ReadingsWanted(now_ns, name, *missing))
+        return found

@@ -1,0 +1,364 @@
+"""The batch MAP over all raw readings: every pose of every robot, and one map.
+
+Minimises Σ rᵀP⁻¹r of the start poses and of the odometry + Σ ρ(rᵀR⁻¹r) of the readings (their
+residuals: `batch_factors`) over one pose per robot and epoch and all landmarks: full smoothing
+(Dellaert & Kaess 2006, Square root SAM), with the information matrix instead of its root. ρ is the
+identity, or Cauchy's c² log(1 + χ²/c²) by iterated re-weighting. A reading's noise is the sensor's
+at the range that the estimate predicts, and is not differentiated. Nothing is ever linearised for
+good: the estimate grows with the readings and every iteration is over all of them.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from team.estimation.baselines import batch_factors as factors_of
+from team.estimation.baselines.batch_factors import Factors, Linear, Motions, Readings, Starts
+from team.estimation.baselines.robot_step import Turn
+from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian, information
+from team.estimation.geometry import Pose, compose, tangent
+from team.estimation.models import located, variances
+from team.estimation.sparse_cholesky import sparse
+
+FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
+"""Added to each epoch's motion (forward [m], left [m], turn [rad]): the covariance of a robot that
+can not slip is singular, and that of no motion at all is zero."""
+EXACT_SIGMA = 1e-5
+"""Of a start pose that is exactly known [m, rad]."""
+ROBUST_START, ROBUST_DECAY = 8.0, 0.7
+"""A reading's robust scale begins at 8 c and narrows with each iteration that it lives through,
+until it is c: what is far off since a pose was dead-reckoned is not taken for an outlier."""
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Of an undamped step, tried before damping: the odometry makes long curved valleys, in which a
+damped step crawls."""
+LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e8
+ROUNDING = 1e-10
+"""A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
+
+Values = Float[np.ndarray, " _"]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """An estimate of everything, in the map frame.
+
+    poses:     (x [m], y [m], θ [rad]), in the order in which they came.
+    pose_robot: place in `robots` of each pose's robot.
+    landmarks: [m], in the order in which they were first seen; ids are theirs.
+    age:       iterations that each reading has lived through; its robust scale follows from it.
+    robust_c:  Cauchy's scale on √χ² of a reading (2 numbers); None for least squares.
+    """
+
+    robots: tuple[str, ...]
+    factors: Factors
+    poses: Float[np.ndarray, "K 3"]
+    pose_robot: Int64[np.ndarray, " K"]
+    landmarks: Float[np.ndarray, "L 2"]
+    ids: UInt32[np.ndarray, " L"]
+    age: Int64[np.ndarray, " n"]
+    robust_c: float | None
+
+    @cached_property
+    def _seen(self) -> Linear:
+        return factors_of.reading_residuals(self.factors.readings, self.poses, self.landmarks)
+
+    @cached_property
+    def _precision(self) -> Float[np.ndarray, "n 2"]:
+        """1/σ² of (range, bearing) of each reading at the range that the estimate predicts."""
+        readings = self.factors.readings
+        distance = self._seen.residual[:, 0] + readings.ranges
+        at_zero, per_m, bearing = readings.variances.T
+        return 1.0 / np.column_stack([at_zero + per_m * distance**2, bearing])
+
+    @property
+    def narrow(self) -> bool:
+        """Whether every reading's robust scale has come to its end."""
+        return self.robust_c is None or bool((self._widening <= 1.0).all())
+
+    @property
+    def _widening(self) -> Values:
+        widening: Values = ROBUST_START * ROBUST_DECAY ** self.age.astype(np.float64)
+        return widening
+
+    @cached_property
+    def _weight(self) -> Values:
+        """Robust weight of each reading, 1/(1 + χ²/c²); 1 without a robust loss."""
+        if self.robust_c is None:
+            return np.ones(len(self.age))
+        scale = self.robust_c * np.maximum(self._widening, 1.0)
+        chi2 = np.sum(self._seen.residual**2 * self._precision, axis=1)
+        weight: Values = 1.0 / (1.0 + chi2 / scale**2)
+        return weight
+
+    def cost_of(self, other: "Batch") -> float:
+        """Σ w χ² of another estimate with this one's noise and weights: what a step lowers.
+
+        Its fall is a fall of the robust cost too, since each loss lies below its parabola.
+        """
+        told, _ = factors_of.start_residuals(self.factors.starts, other.poses)
+        moved = factors_of.motion_residuals(self.factors.motions, other.poses).residual
+        chi2 = np.sum(other._seen.residual**2 * self._precision, axis=1)
+        return (
+            float(np.einsum("ni,nij,nj->", told, self.factors.starts.information, told))
+            + float(np.einsum("ni,nij,nj->", moved, self.factors.motions.information, moved))
+            + float(self._weight @ chi2)
+        )
+
+    @property
+    def cost(self) -> float:
+        """Σ w χ² of all factors; about `dof` where the models are right."""
+        return self.cost_of(self)
+
+    @property
+    def dof(self) -> int:
+        """Numbers in all factors less the number of unknowns: 2 n − 2 L, since there are as many
+        starts and motions as poses.
+        """
+        return 2 * len(self.age) - 2 * len(self.ids)
+
+    @cached_property
+    def normal_equations(self) -> tuple[Values, Values]:
+        """A = Σ w JᵀP⁻¹J in the layout of the factors' pattern, and the gradient Σ w JᵀP⁻¹r.
+
+        Unknowns: ξ of each pose, then the landmarks.
+        """
+        starts, motions = self.factors.starts, self.factors.motions
+        told, of_start = factors_of.start_residuals(starts, self.poses)
+        moved, before, after = factors_of.motion_residuals(motions, self.poses)
+        seen, of_pose, of_landmark = self._seen
+        start = of_start.transpose(0, 2, 1) @ starts.information
+        before_, after_ = (J.transpose(0, 2, 1) @ motions.information for J in (before, after))
+        precision = self._weight[:, None, None] * self._precision[:, None, :]
+        pose_ = of_pose.transpose(0, 2, 1) * precision
+        landmark_ = of_landmark.transpose(0, 2, 1) * precision
+        values = self.factors.assembled(
+            (
+                start @ of_start,
+                before_ @ before,
+                after_ @ before,
+                after_ @ after,
+                pose_ @ of_pose,
+                landmark_ @ of_pose,
+                landmark_ @ of_landmark,
+            )
+        )
+        gradient = self.factors.gathered(
+            (
+                start @ told[:, :, None],
+                before_ @ moved[:, :, None],
+                after_ @ moved[:, :, None],
+                pose_ @ seen[:, :, None],
+                landmark_ @ seen[:, :, None],
+            )
+        )
+        return values, gradient
+
+    @cached_property
+    def posterior(self) -> sparse.Cholesky:
+        """Cholesky factor of the information matrix at this estimate."""
+        return sparse.factorised(self.factors.analysis, self.normal_equations[0])
+
+    @cached_property
+    def newton_step(self) -> Values:
+        """−A⁻¹g: ξ of each pose, then the landmarks' δ."""
+        step: Values = -sparse.solved(self.posterior, self.normal_equations[1][:, None])[:, 0]
+        return step
+
+    @property
+    def newton_decrement(self) -> float:
+        """√(gᵀA⁻¹g): how far the next Newton step goes, in standard deviations."""
+        return math.sqrt(max(-float(self.normal_equations[1] @ self.newton_step), 0.0))
+
+    def converged(self, least_decrement: float) -> bool:
+        """Whether every robust scale is at its end and the next step goes no farther than that."""
+        return self.narrow and self.newton_decrement <= least_decrement
+
+    @cached_property
+    def selected_covariance(self) -> Values:
+        """Entries of the covariance in the layout of the factors' pattern."""
+        return sparse.selected_inverse(self.posterior)
+
+    @property
+    def renewed(self) -> "Batch":
+        """Every reading's robust scale begins anew."""
+        return replace(self, age=np.zeros_like(self.age))
+
+
+def begun(starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | None) -> Batch:
+    """The robots' start poses with their covariances in (x, y, θ); None: exactly known."""
+    mean = np.array([pose for pose, _ in starts.values()]).reshape(-1, 3)
+    order = np.arange(len(starts))
+    told = np.array([_start_information(*start) for start in starts.values()]).reshape(-1, 3, 3)
+    none, nothing = np.empty(0, np.int64), np.empty(0)
+    factors = Factors(
+        len(starts),
+        0,
+        Starts(order, mean, told),
+        Motions(none, none, np.empty((0, 3)), np.empty((0, 3, 3))),
+        Readings(none, none, nothing, nothing, np.empty((0, 3))),
+    )
+    ids = np.empty(0, np.uint32)
+    return Batch(tuple(starts), factors, mean, order, np.empty((0, 2)), ids, none, robust_c)
+
+
+def _start_information(pose: Pose, covariance: Matrix | None) -> Matrix:
+    if covariance is None:
+        return np.eye(3) / EXACT_SIGMA**2
+    G = tangent(pose[2])
+    own = G.T @ covariance @ G
+    return information(0.5 * (own + own.T), "a start pose")
+
+
+def extended(batch: Batch, turns: Sequence[Turn]) -> Batch:
+    """The batch with more turns, in the given order.
+
+    A new pose is dead-reckoned from the robot's newest one, a new landmark is where its first
+    reading puts it. Raises ValueError for a robot that has no start.
+    """
+    newest = {
+        robot: int(np.flatnonzero(batch.pose_robot == k)[-1])
+        for k, robot in enumerate(batch.robots)
+    }
+    poses = list(batch.poses)
+    place = {id_: k for k, id_ in enumerate(batch.ids.tolist())}
+    landmarks = list(batch.landmarks)
+    before, seen = [], []
+    for turn in turns:
+        if turn.robot not in newest:
+            raise ValueError(f"{turn.robot} has no start")
+        before.append(newest[turn.robot])
+        pose = compose(poses[newest[turn.robot]], turn.increment.mean)
+        newest[turn.robot] = len(poses)
+        poses.append(pose)
+        for id_, r, b in zip(turn.ids.tolist(), turn.ranges, turn.bearings, strict=True):
+            if id_ not in place:
+                place[id_] = len(landmarks)
+                landmarks.append(located(pose, float(r), float(b)))
+            seen.append(place[id_])
+    factors = batch.factors
+    after = np.arange(len(batch.poses), len(poses))
+    motions, readings = factors.motions, factors.readings
+    counts = [len(turn.ids) for turn in turns]
+    floor = np.diag(FLOOR_SIGMAS) ** 2
+    added = Motions(
+        np.array(before, np.int64),
+        after,
+        np.array([turn.increment.mean for turn in turns]).reshape(-1, 3),
+        np.array(
+            [information(turn.increment.covariance + floor, "a motion") for turn in turns]
+        ).reshape(-1, 3, 3),
+    )
+    looks = Readings(
+        np.repeat(after, counts),
+        np.array(seen, np.int64),
+        np.concatenate([np.empty(0), *(turn.ranges for turn in turns)]),
+        np.concatenate([np.empty(0), *(turn.bearings for turn in turns)]),
+        np.repeat(
+            np.array([variances(turn.sensor) for turn in turns]).reshape(-1, 3), counts, axis=0
+        ),
+    )
+    return replace(
+        batch,
+        factors=Factors(
+            len(poses),
+            len(landmarks),
+            factors.starts,
+            Motions(*(np.concatenate(each) for each in zip(motions, added, strict=True))),
+            Readings(*(np.concatenate(each) for each in zip(readings, looks, strict=True))),
+        ),
+        poses=np.array(poses),
+        pose_robot=np.concatenate(
+            [
+                batch.pose_robot,
+                np.array([batch.robots.index(turn.robot) for turn in turns], np.int64),
+            ]
+        ),
+        landmarks=np.array(landmarks).reshape(-1, 2),
+        ids=np.array(list(place), np.uint32),
+        age=np.concatenate([batch.age, np.zeros(len(seen), np.int64)]),
+    )
+
+
+def solved(batch: Batch, iterations: int, least_decrement: float) -> Batch:
+    """The estimate after at most so many iterations of Gauss-Newton, ended where it has converged.
+
+    A step that does not lower the cost is shortened, then damped. Where no damping helps it ends,
+    too: `converged` tells.
+    """
+    damping = 0.0
+    for _ in range(iterations):
+        if batch.converged(least_decrement) or damping >= MOST_DAMPING:
+            break
+        batch, damping = _iterated(batch, damping)
+    return batch
+
+
+def _iterated(batch: Batch, damping: float) -> tuple[Batch, float]:
+    """One step that lowers the cost, and the damping for the next one."""
+    values, gradient = batch.normal_equations
+    diagonal = batch.factors.pattern.diagonal
+    before = batch.cost
+    while damping < MOST_DAMPING:
+        step = batch.newton_step
+        if damping:
+            damped = values.copy()
+            damped[diagonal] *= 1.0 + damping
+            cholesky = sparse.factorised(batch.factors.analysis, damped)
+            step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
+        for share in (1.0,) if damping else SHARES:
+            moved = _moved(batch, share * step)
+            if batch.cost_of(moved) <= before * (1.0 + ROUNDING) + ROUNDING:
+                return moved, damping / 10.0 if damping > LEAST_DAMPING else 0.0
+        damping = max(10.0 * damping, LEAST_DAMPING)
+    return batch, damping
+
+
+def _moved(batch: Batch, step: Values) -> Batch:
+    """Pose ∘ Exp(ξ), landmark + δ."""
+    split = 3 * len(batch.poses)
+    return replace(
+        batch,
+        poses=factors_of.composed(
+            batch.poses, factors_of.exponentials(step[:split].reshape(-1, 3))
+        ),
+        landmarks=batch.landmarks + step[split:].reshape(-1, 2),
+        age=batch.age + 1,
+    )
+
+
+def landmark_gaussian(batch: Batch) -> LandmarkGaussian:
+    """Mean and joint marginal covariance of all landmarks."""
+    order = np.argsort(batch.ids)
+    unknowns = 3 * len(batch.poses) + (2 * order[:, None] + np.arange(2)).ravel()
+    covariance = sparse.inverse_columns(batch.posterior, unknowns)[unknowns]
+    return LandmarkGaussian(
+        batch.ids[order], batch.landmarks[order], 0.5 * (covariance + covariance.T)
+    )
+
+
+def pose_gaussian(batch: Batch, robot: str) -> PoseGaussian:
+    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ).
+
+    Raises ValueError for a robot that is not in the batch.
+    """
+    newest = np.flatnonzero(batch.pose_robot == batch.robots.index(robot))[-1:]
+    unknowns = 3 * int(newest[0]) + np.arange(3)
+    own = sparse.inverse_columns(batch.posterior, unknowns)[unknowns]
+    G = tangent(batch.poses[newest[0], 2])
+    covariance = G @ own @ G.T
+    return PoseGaussian(batch.poses[newest[0]], 0.5 * (covariance + covariance.T))
+
+
+def trajectory(
+    batch: Batch, robot: str
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
+    """The robot's poses from its start on, each with its marginal covariance in (x, y, θ)."""
+    own = np.flatnonzero(batch.pose_robot == batch.robots.index(robot))
+    pattern, entries = batch.factors.pattern, batch.selected_covariance
+    blocks = np.array([pattern.diagonal_block(entries, int(k)) for k in own])
+    G = np.array([tangent(heading) for heading in batch.poses[own, 2]])
+    return batch.poses[own], G @ blocks @ G.transpose(0, 2, 1)

@@ -1,0 +1,119 @@
+"""Hybrid-SLAM as the thesis states it: after each step all particles become their weighted mean.
+
+W. Xu, sections 4.2 and 4.3. The reset forgets how the pose and the landmarks depend on each other
+and all of the pose's uncertainty but that of the last step, so the covariances come out far too
+small; `window` is the estimator that does not. Two things are set right: the initial covariance of
+a landmark follows from the reading (the thesis sets 30 m), and the weights start anew with each
+step, as its text says, not as its program does.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import Sensor
+from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.window import moments
+from team.estimation.models import Increment
+
+
+@dataclass(frozen=True)
+class ThesisState:
+    """The mean pose and a map of independent landmarks, in the map frame.
+
+    pose:            (x [m], y [m], theta [rad]).
+    pose_covariance: the spread of the last step's particles, [m², m·rad, rad²]; may be singular.
+    ids:             strictly ascending.
+    landmarks:       positions [m]; covariances: one 2 × 2 matrix each [m²].
+    """
+
+    pose: Pose
+    pose_covariance: Float[np.ndarray, "3 3"]
+    ids: UInt32[np.ndarray, " L"]
+    landmarks: Float[np.ndarray, "L 2"]
+    covariances: Float[np.ndarray, "L 2 2"]
+
+
+def started(pose: Pose) -> ThesisState:
+    """A robot that knows its pose and no landmark."""
+    return ThesisState(
+        pose, np.zeros((3, 3)), np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 2, 2))
+    )
+
+
+def stepped(
+    state: ThesisState,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    particles: int,
+    generator: np.random.Generator,
+) -> ThesisState:
+    """Sample poses about the mean, update and weigh (FastSLAM 1.0), and reset to eq. 4.5-4.6.
+
+    The landmarks that are not read keep their values exactly. ranges [m] and bearings [rad] are
+    corrected by the calibration.
+    """
+    after, _ = fastslam.stepped(
+        reset(state, ids, particles),
+        increment,
+        sensor,
+        ids,
+        ranges,
+        bearings,
+        "fastslam1",
+        generator,
+    )
+    mean, P = moments(after.poses, np.exp(after.log_weights), after.means, after.covariances)
+    columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)
+    return absorbed(
+        ThesisState(mean[:3], P[:3, :3], state.ids, state.landmarks, state.covariances),
+        after.ids,
+        mean[3:].reshape(-1, 2),
+        P[columns[:, :, None], columns[:, None, :]],
+    )
+
+
+def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> Particles:
+    """So many particles, all of them at the mean: what a step knows of these landmarks before it.
+
+    Nothing in it depends on anything else, and of the pose's covariance nothing is left.
+    """
+    kept = np.isin(state.ids, ids)
+    blocks = state.covariances[kept]
+    triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
+    return Particles(
+        poses=np.tile(state.pose, (particles, 1)),
+        log_weights=np.full(particles, -np.log(particles)),
+        ids=state.ids[kept],
+        means=np.tile(state.landmarks[kept], (particles, 1, 1)),
+        covariances=np.tile(triangles, (particles, 1, 1)),
+    )
+
+
+def absorbed(
+    state: ThesisState,
+    ids: UInt32[np.ndarray, " n"],
+    landmarks: Float[np.ndarray, "n 2"],
+    covariances: Float[np.ndarray, "n 2 2"],
+) -> ThesisState:
+    """These landmarks replace the state's own of the same id; unknown ones are added.
+
+    This is the feedback of the thesis' fused map (section 5.2): what is fused from this state again
+    counts its readings again.
+    """
+    kept = ~np.isin(state.ids, ids)
+    merged = np.concatenate((state.ids[kept], ids))
+    order = np.argsort(merged)
+    return ThesisState(
+        state.pose,
+        state.pose_covariance,
+        merged[order],
+        np.concatenate((state.landmarks[kept], landmarks))[order],
+        np.concatenate((state.covariances[kept], covariances))[order],
+    )

@@ -1,0 +1,91 @@
+"""FastSLAM over the whole run: one set of particles from the start to the end.
+
+Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Every resampling throws away
+paths, and no later step brings them back: after a long run all particles share their early path,
+so the landmarks' covariance is far too small. `window` is the use of the same particles that is
+not over-confident.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import Sensor
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam import Particles, Proposal
+from team.estimation.hybrid_slam.window import moments
+from team.estimation.models import Increment
+
+
+@dataclass(frozen=True)
+class PlainFastSlam:
+    """Weighted particles in the map frame, and how they are drawn and resampled.
+
+    resample_below: a step begins with a resampling if the effective sample size is below this part
+        of the particles (Xu, eq. 3.24-3.25: 0.5); 1: at every step, as Ma & Ma and Montemerlo do.
+    """
+
+    particles: Particles
+    proposal: Proposal
+    resample_below: float
+
+
+def begun(pose: Pose, particles: int, proposal: Proposal, resample_below: float) -> PlainFastSlam:
+    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    poses = np.tile(pose, (particles, 1))
+    return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
+
+
+def stepped(
+    state: PlainFastSlam,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    generator: np.random.Generator,
+) -> PlainFastSlam:
+    """Resample if the particles are thin, move, take the readings (`propagated_and_updated`)."""
+    particles, _ = fastslam.propagated_and_updated(
+        state.particles,
+        increment,
+        sensor,
+        ids,
+        ranges,
+        bearings,
+        state.proposal,
+        state.resample_below,
+        generator,
+    )
+    return replace(state, particles=particles)
+
+
+def pose_gaussian(state: PlainFastSlam) -> PoseGaussian:
+    """Mean and covariance of the particles' poses, the heading on the circle."""
+    return pose_moments(state.particles)
+
+
+def landmark_gaussian(state: PlainFastSlam) -> LandmarkGaussian:
+    """The mixture Σ wᵢ N(μᵢ, blkdiag(Σ₁, …, Σ_L)) as one Gaussian (Xu, eq. 4.5-4.6)."""
+    return landmark_moments(state.particles)
+
+
+def pose_moments(particles: Particles) -> PoseGaussian:
+    """Moments of the weighted poses; singular where fewer than four of them differ."""
+    none = particles.means[:, :0], particles.covariances[:, :0]
+    return PoseGaussian(*moments(particles.poses, np.exp(particles.log_weights), *none))
+
+
+def landmark_moments(particles: Particles) -> LandmarkGaussian:
+    """Moments of the landmarks; the spread between particles is what ties them to each other."""
+    order = np.argsort(particles.ids)
+    mean, P = moments(
+        particles.poses,
+        np.exp(particles.log_weights),
+        particles.means[:, order],
+        particles.covariances[:, order],
+    )
+    return LandmarkGaussian(particles.ids[order], mean[3:].reshape(-1, 2), P[3:, 3:])

@@ -1,0 +1,271 @@
+"""Map joining as in Downs' thesis: least squares with spherical covariances, frames tied by SVD.
+
+Submaps are joined by argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) (eq. 4.1), but of each only the mean is
+kept: P is the identity, so a radian of heading counts as a metre (sections 3.2 and 4.3). Two robots
+that see each other exchange their maps, turn one into the frame of the other by a singular value
+decomposition and join the landmarks alone (section 4.3 and appendix II). The minimiser is the one
+of `joining`: only the covariances differ.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation.contribution import Contribution, Start
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
+from team.estimation.geometry import Pose, wrapped
+from team.estimation.map_joining import joining
+from team.estimation.map_joining.alignment import procrustes
+from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
+from team.estimation.map_joining.joining import EMPTY_FOLD, Fold
+from team.estimation.models import located
+from team.estimation.submap import LocalMap
+
+Weighting = Literal["identity", "spherical", "full"]
+SETTINGS = JoinSettings()
+NEEDED = 2
+"""Points that tie two frames."""
+
+
+class TooFewPointsError(ValueError):
+    """Two maps share too few points to find how one lies in the other."""
+
+    def __init__(self, points: int) -> None:
+        plural = "" if points == 1 else "s"
+        super().__init__(f"{points} common point{plural} of two maps, {NEEDED} needed")
+        self.points = points
+
+
+def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
+    """The submap with the covariance that it is joined with.
+
+    "identity": I, whatever it was. "spherical": a position and every landmark get half the trace
+    of their block times I, a heading keeps its variance, all correlations are dropped (each block
+    commutes with rotations, which is what Huang's count of minima needs). "full": as it is.
+    """
+    if weighting == "full":
+        return local
+    if weighting == "identity":
+        return replace(local, covariance=np.eye(len(local.mean)))
+    variances = np.diag(local.covariance).copy()
+    behind = len(variances) - 2 * len(local.ids)
+    poses, landmarks = variances[:behind].reshape(-1, 3), variances[behind:].reshape(-1, 2)
+    poses[:, :2] = poses[:, :2].mean(axis=1, keepdims=True)
+    landmarks[:] = landmarks.mean(axis=1, keepdims=True)
+    return replace(local, covariance=np.diag(variances))
+
+
+@dataclass(frozen=True, eq=False)
+class SubmapJoining:
+    """The submaps of one or more robots with known starts, and their least-squares map."""
+
+    fold: Fold
+    weighting: Weighting
+
+
+def begun(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> SubmapJoining:
+    """No submap yet; every robot's start pose is exactly known."""
+    fold = EMPTY_FOLD
+    for robot, pose in poses.items():
+        fold = joining.started(fold, Start(robot, 0, pose))
+    return SubmapJoining(fold, weighting)
+
+
+def stepped(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining:
+    """Take a robot's next submap, which begins where its last one ended, and iterate."""
+    count = len(state.fold.contributions)
+    sequence = state.fold.next_sequence((robot, 0))
+    taken = Contribution(robot, 0, sequence, count, weighted(local, state.weighting))
+    return replace(state, fold=joining.folded(state.fold, [taken], SETTINGS))
+
+
+def solved(state: SubmapJoining) -> SubmapJoining:
+    """The full least-squares solution."""
+    return replace(state, fold=joining.converged(state.fold, SETTINGS))
+
+
+def variance_factor(state: SubmapJoining) -> float:
+    """σ̂², by which the covariance of the solution is scaled.
+
+    With the identity the residuals must say how large the errors are: σ̂² = Σ‖r‖²/(residuals −
+    unknowns), the variance of unit weight (1 while nothing is redundant). Else 1.
+    """
+    island = state.fold.main
+    redundancy = int(island.graph.dimensions.sum()) - island.graph.unknowns
+    if state.weighting != "identity" or redundancy <= 0:
+        return 1.0
+    return island.cost / redundancy
+
+
+def pose_gaussian(state: SubmapJoining, robot: str) -> PoseGaussian:
+    """The end of a robot's last submap. Raises KeyError for a robot without submaps."""
+    graph = state.fold.main.graph
+    mean, covariance = joint_marginal(state.fold.main, [graph.streams[robot, 0][-1]])
+    return PoseGaussian(mean, variance_factor(state) * covariance)
+
+
+def landmark_gaussian(state: SubmapJoining) -> LandmarkGaussian:
+    """All landmarks: σ̂² (JᵀP⁻¹J)⁻¹. Raises KeyError before the first submap."""
+    landmarks = state.fold.main.graph.landmarks
+    ids = sorted(landmarks)
+    mean, covariance = joint_marginal(state.fold.main, [landmarks[id_] for id_ in ids])
+    factor = variance_factor(state)
+    return LandmarkGaussian(np.array(ids, np.uint32), mean.reshape(-1, 2), factor * covariance)
+
+
+class PointPairs(NamedTuple):
+    """The same points in the frames of two maps [m]."""
+
+    in_a: Float[np.ndarray, "n 2"]
+    in_b: Float[np.ndarray, "n 2"]
+
+
+NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)))
+
+
+class Exchange(NamedTuple):
+    """What two maps make together, and how the second lies in the first."""
+
+    landmarks: LandmarkGaussian
+    a_from_b: PoseGaussian
+
+
+def mutual_sighting(
+    pose_a: Pose,
+    range_to_b: float,
+    bearing_to_b: float,
+    pose_b: Pose,
+    range_to_a: float,
+    bearing_to_a: float,
+) -> PointPairs:
+    """The two robots as points, when each sees the other: where each is in both maps.
+
+    A robot is where its own map has it and, in the other map, where the other one sees it; these
+    take the place of shared poses (Downs, chapter 3). pose_a is in frame a, pose_b in frame b.
+    """
+    return PointPairs(
+        np.stack((pose_a[:2], located(pose_a, range_to_b, bearing_to_b))),
+        np.stack((located(pose_b, range_to_a, bearing_to_a), pose_b[:2])),
+    )
+
+
+def exchanged(a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_PAIRS) -> Exchange:
+    """Two maps as one in the frame of a, from their common landmarks and the robots' positions.
+
+    argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): given (R, t), each common
+    xᵢ is the middle of its two, and what is left, ½ Σ ‖aᵢ − R bᵢ − t‖², is minimised in closed form
+    by singular values (`procrustes`). So turning first and joining then is the whole minimum.
+
+    With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have
+    σ̂² D + E Σ_T Eᵀ: D = 1 and E = 0 for those of a alone, 1 and G for those of b alone, 1/2 and G/2
+    for the common ones; σ̂² = cost/(2n − 3). What the maps say of their own errors is discarded, as
+    Downs does, so how far each has drifted as a whole is not in the covariance.
+    Raises TooFewPointsError for n < 2.
+    """
+    ids = np.union1d(a.ids, b.ids)
+    of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    tie_a = np.concatenate((a.means[in_a], robots.in_a))
+    tie_b = np.concatenate((b.means[in_b], robots.in_b))
+    n = len(tie_a)
+    if n < NEEDED:
+        raise TooFewPointsError(n)
+    a_from_b = procrustes(tie_a, tie_b, np.ones(n))
+    moved, G = _moved(a_from_b, tie_b)
+    variance = 0.5 * float(((tie_a - moved) ** 2).sum()) / (2 * n - 3)
+    of_motion = 2.0 * variance * information(G.T @ G, "two maps' points")
+    common = np.isin(ids, a.ids) & np.isin(ids, b.ids)
+    from_b = np.where(common, 0.5, np.isin(ids, b.ids))
+    in_frame_a, slopes = np.zeros((len(ids), 2)), np.zeros((2 * len(ids), 3))
+    rows = (2 * of_b[:, None] + np.arange(2)).ravel()
+    in_frame_a[of_b], slopes[rows] = _moved(a_from_b, b.means)
+    means = from_b[:, None] * in_frame_a
+    means[of_a] += (1.0 - from_b[of_a])[:, None] * a.means
+    E = np.repeat(from_b, 2)[:, None] * slopes
+    own = variance * np.where(common, 0.5, 1.0)
+    covariance = np.diag(np.repeat(own, 2)) + E @ of_motion @ E.T
+    return Exchange(
+        LandmarkGaussian(ids, means, 0.5 * (covariance + covariance.T)),
+        PoseGaussian(a_from_b, of_motion),
+    )
+
+
+def _moved(
+    a_from_b: Pose, points: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 3"]]:
+    """R b + t and its derivative by (t, θ): [I, R b turned by 90°]."""
+    c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
+    turned = points @ np.array([[c, s], [-s, c]])
+    G = np.zeros((2 * len(points), 3))
+    G[0::2, 0] = G[1::2, 1] = 1.0
+    G[0::2, 2], G[1::2, 2] = -turned[:, 1], turned[:, 0]
+    return turned + a_from_b[:2], G
+
+
+ITERATIONS = 10
+"""Gauss-Newton steps of two maps' joint solution, at the most."""
+STANDS_STILL = 1e-9
+"""A step that moves no coordinate by more than this [m, rad] is the last."""
+
+
+def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> Exchange:
+    """Two independent maps as one in the frame of a, each with the covariance that it has.
+
+    argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over the points x and (t, θ), from the
+    turn and shift of `exchanged`; the covariance is (JᵀWJ)⁻¹. So Downs' exchange with what the maps
+    say of their errors: how far each has drifted as a whole is in it, as far as the maps know that.
+    Raises TooFewPointsError for fewer than two common landmarks, NotACovarianceError for a map
+    whose covariance is none.
+    """
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    if len(in_a) < NEEDED:
+        raise TooFewPointsError(len(in_a))
+    ids = np.union1d(a.ids, b.ids)
+    columns_a, columns_b = (3 + _points(np.searchsorted(ids, each.ids)) for each in (a, b))
+    a_from_b = procrustes(a.means[in_a], b.means[in_b], np.ones(len(in_a)))
+    state = np.zeros(3 + 2 * len(ids))
+    state[:3] = a_from_b
+    state[columns_b] = _moved(a_from_b, b.means)[0].ravel()
+    state[columns_a] = a.means.ravel()
+    of_a, of_b = information(a.covariance, "a map"), information(b.covariance, "a map")
+    for _ in range(ITERATIONS):
+        residual, J = _seen_from(state, columns_b)
+        residual -= b.means.ravel()
+        hessian = J.T @ of_b @ J
+        hessian[np.ix_(columns_a, columns_a)] += of_a
+        gradient = J.T @ (of_b @ residual)
+        gradient[columns_a] += of_a @ (state[columns_a] - a.means.ravel())
+        covariance = information(hessian, "two maps' joint solution")
+        step = covariance @ gradient
+        state -= step
+        state[2] = wrapped(state[2])
+        if np.abs(step).max() < STANDS_STILL:
+            break
+    return Exchange(
+        LandmarkGaussian(ids, state[3:].reshape(-1, 2), covariance[3:, 3:]),
+        PoseGaussian(state[:3], covariance[:3, :3]),
+    )
+
+
+def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    """Places of the coordinates of the points with these indices."""
+    return (2 * index[:, None] + np.arange(2)).ravel()
+
+
+def _seen_from(
+    state: Float[np.ndarray, " n"], columns: Int64[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    """Rᵀ(x − t) of the points in these columns, and its derivative by the whole (t, θ, x)."""
+    c, s = np.cos(state[2]), np.sin(state[2])
+    back = np.array([[c, s], [-s, c]])
+    offsets = state[columns].reshape(-1, 2) - state[:2]
+    seen = offsets @ back.T
+    J = np.zeros((len(columns), len(state)))
+    J[0::2, :2], J[1::2, :2] = -back[0], -back[1]
+    J[0::2, 2], J[1::2, 2] = seen[:, 1], -seen[:, 0]
+    for k in range(len(offsets)):
+        J[2 * k : 2 * k + 2, columns[2 * k : 2 * k + 2]] = back
+    return seen.ravel(), J

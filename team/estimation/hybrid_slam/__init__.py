@@ -1,0 +1,1 @@
+"""Hybrid-SLAM, the front end: measurements become independent submaps."""

@@ -1,0 +1,205 @@
+"""FastSLAM with known data association: particles over paths, an EKF for each landmark of each.
+
+p(path, landmarks | z) = p(path | z) Π p(landmark | path, z): the first factor is the weighted
+particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et al. 2005, ch. 13.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from team.config import Sensor
+from team.estimation.compiled import compiled
+from team.estimation.gaussian import NotACovarianceError
+from team.estimation.hybrid_slam import fastslam_kernel
+from team.estimation.models import Increment, variances
+
+Proposal = Literal["fastslam2", "fastslam1"]
+
+
+@dataclass(frozen=True)
+class Particles:
+    """M weighted poses, each with its own estimate of the L landmarks seen so far.
+
+    poses:       (x [m], y [m], theta [rad]) in the frame of the window's start.
+    log_weights: normalised, Σ exp = 1.
+    ids:         the landmarks in order of first sight; means and covariances follow it.
+    means:       landmark positions [m].
+    covariances: (xx, xy, yy) of each landmark given the particle's path [m²].
+    """
+
+    poses: Float[np.ndarray, "M 3"]
+    log_weights: Float[np.ndarray, " M"]
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "M L 2"]
+    covariances: Float[np.ndarray, "M L 3"]
+
+
+@dataclass(frozen=True)
+class StepInfo:
+    """What one step showed.
+
+    effective_sample_size: 1/Σ w² after the step, in [1, M].
+    parents:               the particle each particle was copied from before the step, or None.
+    log_evidence:          log p(z | earlier z) as the particles see it; 0 without a re-observation.
+    """
+
+    effective_sample_size: float
+    parents: Int64[np.ndarray, " M"] | None
+    log_evidence: float
+
+
+def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
+    """Equal particles at these poses that know no landmark."""
+    count = len(poses)
+    return Particles(
+        poses=poses,
+        log_weights=np.full(count, -math.log(count)),
+        ids=np.empty(0, np.uint32),
+        means=np.empty((count, 0, 2)),
+        covariances=np.empty((count, 0, 3)),
+    )
+
+
+@compiled
+def effective_sample_size(log_weights: Float[np.ndarray, " M"]) -> float:
+    """1/Σ w² of normalised log weights."""
+    total = 0.0
+    for log_weight in log_weights:
+        total += math.exp(2.0 * log_weight)
+    return 1.0 / total
+
+
+@compiled
+def normalised(log_weights: Float[np.ndarray, " M"]) -> tuple[Float[np.ndarray, " M"], float]:
+    """(log w − log Σ w, log Σ w), with the largest weight factored out of the sum."""
+    largest = log_weights.max()
+    total = 0.0
+    for log_weight in log_weights:
+        total += math.exp(log_weight - largest)
+    log_sum = largest + math.log(total)
+    return log_weights - log_sum, log_sum
+
+
+@compiled
+def systematic_parents(
+    log_weights: Float[np.ndarray, " M"], uniform: float
+) -> Int64[np.ndarray, " M"]:
+    """Systematic resampling: particle i is copied ⌊M w_i⌋ or ⌈M w_i⌉ times, M w_i on average.
+
+    The M points (k + uniform)/M fall into the intervals of the cumulated weights; 0 ≤ uniform < 1.
+    Kitagawa 1996; Thrun et al. 2005, table 4.4.
+    """
+    count = len(log_weights)
+    parents = np.empty(count, np.int64)
+    parent = 0
+    cumulated = math.exp(log_weights[0])
+    for k in range(count):
+        while (k + uniform) / count >= cumulated and parent < count - 1:
+            parent += 1
+            cumulated += math.exp(log_weights[parent])
+        parents[k] = parent
+    return parents
+
+
+def resampled(
+    particles: Particles, generator: np.random.Generator
+) -> tuple[Particles, Int64[np.ndarray, " M"]]:
+    """Equal weights again, each particle a copy of its parent; draws one uniform number."""
+    parents = systematic_parents(particles.log_weights, generator.random())
+    count = len(parents)
+    return (
+        Particles(
+            particles.poses[parents],
+            np.full(count, -math.log(count)),
+            particles.ids,
+            particles.means[parents],
+            particles.covariances[parents],
+        ),
+        parents,
+    )
+
+
+def propagated_and_updated(
+    particles: Particles,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    proposal: Proposal,
+    resample_below: float,
+    generator: np.random.Generator,
+) -> tuple[Particles, StepInfo]:
+    """One step: resample if the particles are thin, move, then take the readings (`step`).
+
+    Resampling comes first, when the effective sample size that the last step left is below
+    `resample_below`·M: so the particles of a window's last step keep their weights. ranges [m] and
+    bearings [rad] are corrected by the calibration; an id may occur twice. Draws one uniform number
+    if it resamples and M × 3 normal ones.
+    Raises NotACovarianceError if the motion's covariance is not positive semi-definite.
+    """
+    parents = None
+    if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):
+        particles, parents = resampled(particles, generator)
+    moved, log_evidence = stepped(
+        particles, increment, sensor, ids, ranges, bearings, proposal, generator
+    )
+    return moved, StepInfo(effective_sample_size(moved.log_weights), parents, log_evidence)
+
+
+def stepped(
+    particles: Particles,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    proposal: Proposal,
+    generator: np.random.Generator,
+) -> tuple[Particles, float]:
+    """As `propagated_and_updated` without resampling; the log evidence beside the particles."""
+    count, known = len(particles.poses), len(particles.ids)
+    L = fastslam_kernel.semidefinite_factor(increment.covariance)
+    if not np.isfinite(L).all():
+        raise NotACovarianceError("the motion", "not positive semi-definite")
+    ids_after, slots, first = fastslam_kernel.slots_of(particles.ids, ids)
+    means = np.empty((count, len(ids_after), 2))
+    covariances = np.empty((count, len(ids_after), 3))
+    means[:, :known] = particles.means
+    covariances[:, :known] = particles.covariances
+    poses = np.empty((count, 3))
+    log_weights = particles.log_weights.copy()
+    fastslam_kernel.step(
+        particles.poses,
+        increment.mean,
+        L,
+        generator.standard_normal((count, 3)),
+        known,
+        slots,
+        first,
+        np.column_stack((ranges, bearings)),
+        variances(sensor),
+        proposal == "fastslam2",
+        poses,
+        log_weights,
+        means,
+        covariances,
+    )
+    log_weights, log_evidence = normalised(log_weights)
+    return Particles(poses, log_weights, ids_after, means, covariances), log_evidence
+
+
+def propagated(
+    particles: Particles, increment: Increment, generator: np.random.Generator
+) -> Particles:
+    """Motion without readings: pose ∘ mean ∘ Exp(xi), weights and landmarks as they were."""
+    nothing = np.empty(0)
+    ids = np.empty(0, np.uint32)
+    moved, _ = stepped(
+        particles, increment, Sensor(), ids, nothing, nothing, "fastslam1", generator
+    )
+    return replace(moved, log_weights=particles.log_weights)

@@ -1,0 +1,240 @@
+"""Were the readings as the particles expected them? The normalised innovation squared (NIS).
+
+What a filter predicts can be held against what it then reads, so this check needs no truth.
+Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+from scipy.linalg import solve_triangular
+
+from team.config import Sensor
+from team.estimation.compiled import compiled
+from team.estimation.gaussian import cholesky_factor
+from team.estimation.geometry import compose, tangent, wrapped
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor, slots_of
+from team.estimation.hybrid_slam.landmark_kernel import Triple, seen
+from team.estimation.models import (
+    Increment,
+    landmark_jacobian,
+    noise,
+    pose_jacobian,
+    predicted,
+    variances,
+)
+
+
+class Innovation(NamedTuple):
+    """squared: Σ νᵀ S⁻¹ ν, χ² of `dof` degrees of freedom, two for each reading that was predicted.
+
+    Innovations of different epochs are independent where the models are right, so both add up.
+    """
+
+    squared: float
+    dof: int
+
+    def plus(self, other: "Innovation") -> "Innovation":
+        """Of both."""
+        return Innovation(self.squared + other.squared, self.dof + other.dof)
+
+    @property
+    def per_dof(self) -> float | None:
+        """Near 1 where the models are right, above where the noise is larger; None without any."""
+        return self.squared / self.dof if self.dof else None
+
+
+NOTHING = Innovation(0.0, 0)
+
+
+def innovation(
+    particles: Particles,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """ν = z − ẑ of one epoch's readings in the metric of their joint predictive covariance S.
+
+    The particles of the epoch before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of all readings of
+    landmarks that they know; ẑ and S are its moments, bearings on the circle:
+
+        ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,
+        S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ.
+
+    It is the prediction before the readings: FastSLAM 2.0 draws its particles from a proposal that
+    has seen them, so after that step there is no innovation left to judge. A first sight has a flat
+    prior and is left out. ranges [m] and bearings [rad] are accepted and corrected by the
+    calibration. R is white, as in the particles' weights.
+    Raises NotACovarianceError if S is not positive definite.
+    """
+    _, slots, _ = slots_of(particles.ids, ids)
+    known = slots < len(particles.ids)
+    if not known.any():
+        return NOTHING
+    error, S = _predictive(
+        particles.poses,
+        np.exp(particles.log_weights),
+        particles.means,
+        particles.covariances,
+        increment.mean,
+        semidefinite_factor(increment.covariance),
+        slots[known],
+        np.column_stack((ranges, bearings))[known],
+        variances(sensor),
+    )
+    return _squared(error, S)
+
+
+def joint_innovation(
+    landmarks: UInt32[np.ndarray, " L"],
+    mean: Float[np.ndarray, " N"],
+    covariance: Float[np.ndarray, "N N"],
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """As `innovation`, of one Gaussian over the pose and the landmarks, such as that of an EKF.
+
+        S = A P Aᵀ + Hₓ Q Hₓᵀ + R,  A = (Hₓ Gᵀ F, Hₗ),
+
+    F = ∂(pose ∘ mean)/∂pose, and G = blkdiag(R(θ'), 1) turns the tangent of the predicted pose into
+    (x, y, θ). mean: (x, y, θ) and the position of each of `landmarks`, N = 3 + 2 L.
+    """
+    _, at, _ = slots_of(landmarks, ids)
+    known = at < len(landmarks)
+    if not known.any():
+        return NOTHING
+    read, slots = np.unique(at[known], return_inverse=True)
+    columns = np.concatenate((np.arange(3), (3 + 2 * read[:, None] + np.arange(2)).ravel()))
+    places = mean[columns[3:]].reshape(-1, 2)
+    pose = compose(mean[:3], increment.mean)
+    dx, dy = pose[:2] - mean[:2]
+    F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    to_own = tangent(pose[2]).T @ F
+    m = 2 * len(slots)
+    error, A, H = np.empty(m), np.zeros((m, len(columns))), np.empty((m, 3))
+    R = np.empty(m)
+    readings = np.column_stack((ranges, bearings))[known]
+    for k, slot in enumerate(slots):
+        rows = slice(2 * k, 2 * k + 2)
+        distance, bearing = predicted(pose, places[slot])
+        error[rows] = readings[k, 0] - distance, wrapped(readings[k, 1] - bearing)
+        R[rows] = noise(sensor, distance)
+        H[rows] = pose_jacobian(distance, bearing)
+        A[rows, :3] = H[rows] @ to_own
+        A[rows, 3 + 2 * slot : 5 + 2 * slot] = landmark_jacobian(distance, pose[2] + bearing)
+    S = A @ covariance[np.ix_(columns, columns)] @ A.T + H @ increment.covariance @ H.T + np.diag(R)
+    return _squared(error, S)
+
+
+def _squared(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> Innovation:
+    L = cholesky_factor(S, "the prediction of readings")
+    whitened = solve_triangular(L, error, lower=True)
+    return Innovation(float(whitened @ whitened), len(error))
+
+
+@compiled
+def _predictive(
+    poses: Float[np.ndarray, "M 3"],
+    weights: Float[np.ndarray, " M"],
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+    motion: Float[np.ndarray, "3"],
+    L: Float[np.ndarray, "3 3"],
+    slots: Int64[np.ndarray, " n"],
+    readings: Float[np.ndarray, "n 2"],
+    sensor: Triple,
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
+    """(z − ẑ, S) of n readings as (range, bearing, range, …), m = 2n; L Lᵀ is the motion's Q.
+
+    S = A Aᵀ + blocks: row j of A is √wᵢ (Hₓ L, dᵢ) of all particles, one behind the other.
+    """
+    count, m = len(poses), 2 * len(slots)
+    # What was read less what each particle predicts lies near zero, where angles have a mean.
+    errors = np.empty((m, count))
+    A, of_landmark = np.empty((m, 4 * count)), np.empty((m, 2, count))
+    S = np.zeros((m, m))
+    for i in range(count):
+        root = math.sqrt(weights[i])
+        _predict(
+            compose(poses[i], motion), means[i], L, slots, readings, errors[:, i],
+            A[:, 4 * i : 4 * i + 3], of_landmark[:, :, i],
+        )  # fmt: skip
+        A[:, 4 * i : 4 * i + 3] *= root
+        for k in range(len(slots)):
+            distance = readings[k, 0] - errors[2 * k, i]
+            S[2 * k, 2 * k] += weights[i] * (sensor[0] + sensor[1] * distance * distance)
+            S[2 * k + 1, 2 * k + 1] += weights[i] * sensor[2]
+    mean = np.empty(m)
+    for j in range(m):
+        mean[j] = _centred(errors[j], weights, j % 2 == 1)
+        A[j, 3::4] = np.sqrt(weights) * errors[j]
+    for j in range(m):
+        for k in range(j + 1):
+            total = 0.0
+            for column in range(4 * count):
+                total += A[j, column] * A[k, column]
+            if slots[j // 2] == slots[k // 2]:
+                for i in range(count):
+                    xx, xy, yy = covariances[i, slots[j // 2]]
+                    x, y = of_landmark[k, 0, i], of_landmark[k, 1, i]
+                    along = of_landmark[j, 0, i] * (xx * x + xy * y)
+                    total += weights[i] * (along + of_landmark[j, 1, i] * (xy * x + yy * y))
+            S[j, k] += total
+            S[k, j] = S[j, k]
+    return mean, S
+
+
+@compiled
+def _predict(
+    pose: Float[np.ndarray, "3"],
+    means: Float[np.ndarray, "L 2"],
+    L: Float[np.ndarray, "3 3"],
+    slots: Int64[np.ndarray, " n"],
+    readings: Float[np.ndarray, "n 2"],
+    errors: Float[np.ndarray, " m"],
+    of_motion: Float[np.ndarray, "m 3"],
+    of_landmark: Float[np.ndarray, "m 2"],
+) -> None:
+    """One particle's z − ẑ and the Jacobians Hₓ L and Hₗ of ẑ, all in place."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for k in range(len(slots)):
+        r, b = 2 * k, 2 * k + 1
+        distance, ex, ey = seen((pose[0], pose[1], pose[2]), means[slots[k]])
+        u, v = c * ex + s * ey, c * ey - s * ex
+        errors[r] = readings[k, 0] - distance
+        errors[b] = wrapped(readings[k, 1] - math.atan2(v, u))
+        of_motion[r, 0] = -u * L[0, 0] - v * L[1, 0]
+        of_motion[r, 1] = -v * L[1, 1]
+        of_motion[r, 2] = 0.0
+        of_motion[b, 0] = (v * L[0, 0] - u * L[1, 0]) / distance - L[2, 0]
+        of_motion[b, 1] = -u * L[1, 1] / distance - L[2, 1]
+        of_motion[b, 2] = -L[2, 2]
+        of_landmark[r, 0], of_landmark[r, 1] = ex, ey
+        of_landmark[b, 0], of_landmark[b, 1] = -ey / distance, ex / distance
+
+
+@compiled
+def _centred(
+    values: Float[np.ndarray, " M"], weights: Float[np.ndarray, " M"], is_angle: bool
+) -> float:
+    """The weighted mean, of angles on the circle; the values become deviations from it."""
+    mean, sine, cosine = 0.0, 0.0, 0.0
+    for i in range(len(values)):
+        mean += weights[i] * values[i]
+        sine += weights[i] * math.sin(values[i])
+        cosine += weights[i] * math.cos(values[i])
+    if is_angle:
+        mean = math.atan2(sine, cosine)
+    for i in range(len(values)):
+        values[i] -= mean
+        if is_angle:
+            values[i] = wrapped(values[i])
+    return mean

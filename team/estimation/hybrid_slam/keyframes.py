@@ -1,0 +1,244 @@
+"""From a stream of odometry intervals and observations to the epochs that an estimator takes."""
+
+from bisect import insort
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import MotionModel, Sensor
+from team.estimation import geometry
+from team.estimation.hybrid_slam.pose_grid import PoseGrid
+from team.estimation.hybrid_slam.sensitivity import carried_on, forward_column
+from team.estimation.models import Increment, acceptable, corrected, increment_of, located
+
+UNMEASURED = (1.0, 0.5)
+"""Where motion was not measured it is uncertain by as much as it is, and by this [m/s, rad/s]."""
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """The motion since the last epoch and what was seen at its end (accepted and calibrated).
+
+    is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
+    forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
+    """
+
+    stamp_ns: int
+    increment: Increment
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+    is_node: bool = False
+    forward: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """One observation message; `pose` is where the robot was, since the keyframe's start."""
+
+    stamp_ns: int
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+    pose: Float[np.ndarray, "3"]
+
+
+class Segmenter:
+    """Integrates odometry between epochs; an interval is split where an observation falls into it.
+
+    With keyframe_s = 0 every observation message is an epoch. Otherwise the scans within keyframe_s
+    are reduced to one range and bearing per landmark (the median, each scan first moved by the
+    odometry to the end of the interval that closes the keyframe). With a grid each of its times is
+    an epoch without readings.
+    """
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        sensor: Sensor,
+        keyframe_s: float,
+        grid: PoseGrid | None = None,
+    ) -> None:
+        self._motion = motion
+        self._sensor = sensor
+        self._keyframe_ns = round(keyframe_s * 1e9)
+        self._grid = grid
+        self._here_ns = 0
+        self._increment = Increment.identity()
+        self._forward = np.zeros(3)
+        self._waiting: list[_Scan] = []
+        self._keyframe: list[_Scan] = []
+        self._keyframe_start_ns = 0
+        self._scan_motion = np.zeros(3)
+        self.rest_forward = np.zeros(3)
+        self._speeds = (0.0, 0.0)
+        self._unmeasured = np.zeros((3, 3))
+        self.now_ns: int | None = None
+
+    def begin(self, stamp_ns: int) -> None:
+        """A stream or a window begins at this team time."""
+        self.now_ns = stamp_ns
+        self._keyframe_start_ns = stamp_ns
+        self._speeds = (0.0, 0.0)  # what a window says depends on its own measurements alone
+        if self._grid is not None:
+            self._grid.begin(stamp_ns)
+
+    def observe(
+        self,
+        stamp_ns: int,
+        ids: UInt32[np.ndarray, " n"],
+        ranges: Float[np.ndarray, " n"],
+        bearings: Float[np.ndarray, " n"],
+    ) -> str | None:
+        """Keep a scan until the odometry covers its time; the reason if it is rejected instead."""
+        if self.now_ns is not None and stamp_ns < self.now_ns:
+            return "older than the odometry"
+        mask = acceptable(self._sensor, ranges, bearings)
+        if len(ids) and not mask.any():
+            return "outside the sensor's limits"
+        r, b = corrected(self._sensor, ranges[mask], bearings[mask])
+        scan = _Scan(stamp_ns, ids[mask], r, b, np.zeros(3))
+        insort(self._waiting, scan, key=lambda each: each.stamp_ns)
+        return None
+
+    def drive(
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        *,
+        measured: bool = True,
+    ) -> list[Epoch]:
+        """Integrate one odometry interval; the epochs that lie in it, in order.
+
+        Where its motion was not measured (what came could not be) the last speeds go on, with
+        errors of their own size, UNMEASURED at least; a heading's stays within a turn.
+        """
+        if measured:
+            self._speeds, self._unmeasured = (forward, yaw_rate), np.zeros((3, 3))
+        else:
+            forward, yaw_rate = self._speeds
+            self._unmeasured = _unmeasured(duration_ns * 1e-9, forward, yaw_rate)
+        epochs = []
+        self._here_ns = stamp_ns - duration_ns
+        while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
+            scan = self._waiting.pop(0)
+            epochs += self._nodes(scan.stamp_ns - 1, forward, yaw_rate)
+            at_ns = self._go_to(scan.stamp_ns, forward, yaw_rate)
+            if self._keyframe_ns:
+                self._keyframe.append(
+                    _Scan(at_ns, scan.ids, scan.ranges, scan.bearings, self._scan_motion)
+                )
+            else:
+                epochs.append(self._epoch(at_ns, scan.ids, scan.ranges, scan.bearings))
+        epochs += self._nodes(stamp_ns, forward, yaw_rate)
+        self._go_to(stamp_ns, forward, yaw_rate)
+        self.now_ns = stamp_ns
+        if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
+            epochs.append(self._close_keyframe(stamp_ns))
+        return epochs
+
+    def cut(self, stamp_ns: int) -> tuple[list[Epoch], Increment]:
+        """A window ends here: its last epoch if one is open, and the motion after it.
+
+        That motion's shift by an error of the scale of speed is `rest_forward`.
+        """
+        epochs = [self._close_keyframe(stamp_ns)] if self._keyframe else []
+        rest, self.rest_forward = self._increment, self._forward
+        self._increment, self._forward = Increment.identity(), np.zeros(3)
+        self._keyframe_start_ns = stamp_ns
+        self._scan_motion = np.zeros(3)
+        return epochs, rest
+
+    def leave(self) -> int:
+        """A window ends: drop the scans that are stamped behind it, and say how many there were.
+
+        The window's interval of readings holds them, so no later window may use them: one that is
+        computed again, by a robot that was started again, would not have them.
+        """
+        left, self._waiting = len(self._waiting), []
+        return left
+
+    @property
+    def uncovered(self) -> int:
+        """Scans that wait for odometry that covers their time."""
+        return len(self._waiting)
+
+    def _nodes(self, until_ns: int, forward: float, yaw_rate: float) -> list[Epoch]:
+        """The grid times up to until_ns; sightings up to there find their node."""
+        epochs = []
+        grid = self._grid
+        while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
+            self._go_to(next_ns, forward, yaw_rate)
+            if grid.reach():
+                nothing = np.empty(0)
+                seen = np.empty(0, np.uint32), nothing, nothing
+                epochs.append(replace(self._epoch(next_ns, *seen), is_node=True))
+        return epochs
+
+    def _go_to(self, stamp_ns: int, forward: float, yaw_rate: float) -> int:
+        """Integrate up to a stamp; what lies before the interval's start is at its start."""
+        at_ns = max(stamp_ns, self._here_ns)
+        self._integrate(at_ns - self._here_ns, forward, yaw_rate)
+        self._here_ns = at_ns
+        return at_ns
+
+    def _integrate(self, duration_ns: int, forward: float, yaw_rate: float) -> None:
+        if duration_ns <= 0:
+            return
+        step = increment_of(self._motion, duration_ns * 1e-9, forward, yaw_rate)
+        if self._unmeasured.any():
+            added = step.covariance + duration_ns * 1e-9 * self._unmeasured
+            step = Increment(step.mean, added)
+        self._increment = self._increment.then(step)
+        if self._motion.calibrated_speed is not None:
+            column = forward_column(self._motion, duration_ns * 1e-9, forward, yaw_rate)
+            self._forward = carried_on(self._forward, step.mean) + column
+        if self._grid is not None:
+            self._grid.moved(step)
+        if self._keyframe_ns:
+            self._scan_motion = geometry.compose(self._scan_motion, step.mean)
+
+    def _epoch(
+        self,
+        stamp_ns: int,
+        ids: UInt32[np.ndarray, " n"],
+        ranges: Float[np.ndarray, " n"],
+        bearings: Float[np.ndarray, " n"],
+    ) -> Epoch:
+        epoch = Epoch(stamp_ns, self._increment, ids, ranges, bearings, forward=self._forward)
+        self._increment = Increment.identity()
+        self._forward = np.zeros(3)
+        return epoch
+
+    def _close_keyframe(self, stamp_ns: int) -> Epoch:
+        points: dict[int, list[tuple[float, float]]] = {}
+        for scan in self._keyframe:
+            back = geometry.between(self._scan_motion, scan.pose)
+            for landmark, r, b in zip(scan.ids, scan.ranges, scan.bearings, strict=True):
+                x, y = located(back, float(r), float(b))
+                points.setdefault(int(landmark), []).append((np.hypot(x, y), np.arctan2(y, x)))
+        ids = sorted(points)
+        ranges = [float(np.median([r for r, _ in points[i]])) for i in ids]
+        bearings = [_median_direction([b for _, b in points[i]]) for i in ids]
+        self._keyframe = []
+        self._keyframe_start_ns = stamp_ns
+        self._scan_motion = np.zeros(3)
+        return self._epoch(
+            stamp_ns, np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
+        )
+
+
+def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.ndarray, "3 3"]:
+    """Variance per second of a motion that nobody measured, such that errors of the speeds sum."""
+    way = max(abs(forward), UNMEASURED[0]) * duration_s
+    turn = min(max(abs(yaw_rate), UNMEASURED[1]) * duration_s, np.pi)
+    return np.diag([way * way, 0.01 * way * way, turn * turn]) / duration_s
+
+
+def _median_direction(angles: list[float]) -> float:
+    """The median of directions, taken about the first of them."""
+    offsets = [geometry.wrapped(angle - angles[0]) for angle in angles]
+    return geometry.wrapped(angles[0] + float(np.median(offsets)))

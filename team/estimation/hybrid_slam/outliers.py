@@ -1,0 +1,74 @@
+"""The open window's readings, and which of them the others confirm."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64, UInt32
+
+from team.config import Sensor
+from team.estimation.hybrid_slam.consensus import agreeing, confirmed
+from team.estimation.hybrid_slam.keyframes import Epoch
+from team.estimation.models import Increment
+
+
+class Gate:
+    """Lets readings pass that agree with others of the same window; it forgets at its end.
+
+    While the window is open a reading passes if earlier ones (or some beside it) agree with it; for
+    the submap all are judged again with all others, since the first reading of a landmark is only
+    confirmed by a later one.
+    """
+
+    def __init__(self, sensor: Sensor, garbage: float) -> None:
+        self._sensor = sensor
+        self._garbage = garbage
+        self._epochs: list[Epoch] = []
+        self.gated = 0
+
+    def begin(self) -> None:
+        """A window begins."""
+        self._epochs = []
+        self.gated = 0
+
+    def admitted(self, epoch: Epoch) -> Epoch:
+        """The epoch with those of its readings that agree with what was read up to it."""
+        self._epochs.append(epoch)
+        if not len(epoch.ids):
+            return epoch
+        taken = agreeing(*self._all(), self._sensor, self._garbage)
+        return _with(epoch, taken[-len(epoch.ids) :])
+
+    def settled(self) -> Sequence[Epoch]:
+        """All epochs of the window with the readings that are confirmed; counts the others."""
+        taken = confirmed(*self._all(), self._sensor, self._garbage)
+        self.gated = int(np.count_nonzero(~taken))
+        bounds = np.cumsum([0, *(len(epoch.ids) for epoch in self._epochs)])
+        return [
+            _with(epoch, taken[begin:end])
+            for epoch, begin, end in zip(self._epochs, bounds, bounds[1:], strict=False)
+        ]
+
+    def _all(
+        self,
+    ) -> tuple[
+        list[Increment],
+        Int64[np.ndarray, " N"],
+        UInt32[np.ndarray, " N"],
+        Float[np.ndarray, "N 2"],
+    ]:
+        epochs = self._epochs
+        counts = [len(epoch.ids) for epoch in epochs]
+        readings = [np.column_stack((epoch.ranges, epoch.bearings)) for epoch in epochs]
+        return (
+            [epoch.increment for epoch in epochs],
+            np.repeat(np.arange(len(epochs)), counts),
+            np.concatenate([np.empty(0, np.uint32), *(epoch.ids for epoch in epochs)]),
+            np.concatenate([np.empty((0, 2)), *readings]),
+        )
+
+
+def _with(epoch: Epoch, taken: Bool[np.ndarray, " n"]) -> Epoch:
+    return replace(
+        epoch, ids=epoch.ids[taken], ranges=epoch.ranges[taken], bearings=epoch.bearings[taken]
+    )

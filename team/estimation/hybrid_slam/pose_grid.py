@@ -1,0 +1,139 @@
+"""The team's grid of times at which every robot has a pose node, and the sightings at these nodes.
+
+A robot does not know when it is seen, so all robots put nodes at the same times: the multiples of
+node_s. A sighting belongs to the grid time nearest to it, if that lies in the open window and not
+too far away. The observer's odometry carries it there; the sightings of one teammate at one node
+become one reading.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from team.config import FrontEnd, Sensor
+from team.estimation.inter_robot import Carried, carried_back, carried_on, point_seen, reduced
+from team.estimation.models import Increment, acceptable, corrected
+
+NO_NODE = "no pose node near it"
+"""Why a sighting is not used."""
+Looks = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+"""Teammates, ranges [m] and bearings [rad] of one message."""
+
+
+@dataclass(frozen=True, eq=False)
+class NodeSighting:
+    """One teammate seen from one pose node: range [m], bearing [rad], their covariance.
+
+    readings: the counters of the sensor's messages that went into it, ascending.
+    """
+
+    stamp_ns: int
+    teammate: str
+    reading: Float[np.ndarray, "2"]
+    covariance: Float[np.ndarray, "2 2"]
+    readings: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A teammate seen in message `counter`; `motion` of the observer since, until the node."""
+
+    stamp_ns: int
+    counter: int
+    teammate: str
+    seen: Carried
+    node_ns: int
+    motion: Increment
+
+
+class PoseGrid:
+    """The grid times and the sightings of the open window; the segmenter tells it of the motion."""
+
+    def __init__(self, sensor: Sensor, front_end: FrontEnd) -> None:
+        self._sensor = sensor
+        self._grid_ns = round(front_end.node_s * 1e9)
+        self._near_ns = round(front_end.sighting_s * 1e9)
+        self._window_ns = round(front_end.window_s * 1e9)
+        self._teammate_speed = front_end.teammate_speed
+        self._begin_ns = self._node_ns = self._last_ns = 0
+        self._uncovered: list[_Look] = []
+        self._ahead: list[_Look] = []
+        self._at_node: dict[tuple[int, str], list[tuple[int, Carried]]] = {}
+        self._since_node = Increment.identity()
+
+    def begin(self, stamp_ns: int) -> None:
+        """A window begins; its nodes are the grid times within window_s from here."""
+        self._begin_ns = stamp_ns
+        self._node_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
+        self._last_ns = stamp_ns + self._window_ns
+        self._uncovered, self._ahead, self._at_node = [], [], {}
+
+    def go_on(self, stamp_ns: int) -> None:
+        """The window is open still: it may reach the next grid time after its planned end."""
+        if stamp_ns >= self._begin_ns + self._window_ns:
+            self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
+
+    def observe(self, stamp_ns: int, counter: int, looks: Looks) -> str | None:
+        """Keep sightings until the odometry covers their time; the reason if all are rejected."""
+        teammates, ranges, bearings = looks
+        node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
+        away_ns = abs(stamp_ns - node_ns)
+        if away_ns > self._near_ns or not self._begin_ns < node_ns <= self._last_ns:
+            return NO_NODE
+        mask = acceptable(self._sensor, ranges, bearings)
+        distances, directions = corrected(self._sensor, ranges, bearings)
+        distances = distances - self._sensor.marker_range_offset
+        mask &= distances > 0.0
+        for k in np.flatnonzero(mask):
+            drift = self._teammate_speed * away_ns * 1e-9
+            seen = point_seen(self._sensor, float(distances[k]), float(directions[k]), drift)
+            look = _Look(stamp_ns, counter, teammates[k], seen, node_ns, Increment.identity())
+            self._uncovered.append(look)
+        return None if mask.any() else "outside the sensor's limits"
+
+    @property
+    def next_ns(self) -> int | None:
+        """Team time of the next node or sighting, whichever comes first; None: nothing is left."""
+        times = [look.stamp_ns for look in self._uncovered[:1]]
+        if self._node_ns <= self._last_ns:
+            times.append(self._node_ns)
+        return min(times, default=None)
+
+    def reach(self) -> bool:
+        """The observer is at `next_ns` now; True if that is a pose node (before what is seen)."""
+        is_node = self.next_ns == self._node_ns <= self._last_ns
+        if not is_node:
+            look = self._uncovered.pop(0)
+            if look.stamp_ns < look.node_ns:
+                self._ahead.append(look)
+            else:
+                self._keep(look, carried_back(look.seen, self._since_node))
+            return False
+        for look in self._ahead:
+            self._keep(look, carried_on(look.seen, look.motion))
+        self._ahead = []
+        self._since_node = Increment.identity()
+        self._node_ns += self._grid_ns
+        return True
+
+    def moved(self, step: Increment) -> None:
+        """The observer has moved."""
+        self._since_node = self._since_node.then(step)
+        self._ahead = [replace(each, motion=each.motion.then(step)) for each in self._ahead]
+
+    def sightings(self) -> tuple[NodeSighting, ...]:
+        """What the window has seen, by node and teammate; what reached no node is not in it."""
+        return tuple(
+            NodeSighting(
+                node_ns,
+                teammate,
+                *reduced([seen for _, seen in looks]),
+                tuple(sorted({counter for counter, _ in looks})),
+            )
+            for (node_ns, teammate), looks in sorted(self._at_node.items())
+        )
+
+    def _keep(self, look: _Look, at_node: Carried) -> None:
+        key = (look.node_ns, look.teammate)
+        self._at_node.setdefault(key, []).append((look.counter, at_node))

@@ -1,0 +1,1 @@
+"""Map joining, the back end: submaps become one map by least squares."""

@@ -1,0 +1,424 @@
+"""The solution of a submap graph: Gauss-Newton, shortened or damped where the cost would rise.
+
+Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start or bias − prior‖², where ρ is the identity, or
+Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters with a wide
+scale that narrows with each iteration it has lived through, so a true loop closure is not taken for
+an outlier before the chain has bent.
+
+With a robust loss each landmark of a submap has a weight of its own besides, so that a landmark
+that was mistaken for another does not break the robot's chain: beyond the gate g its χ² counts
+g (1 + log(χ²/g)), whose slope, the weight, is g/χ². The weight enters as additional variance of
+that landmark alone (`joining_kernel.discounted_information`).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.config import Bias
+from team.estimation.gaussian import NotACovarianceError
+from team.estimation.geometry import wrapped
+from team.estimation.map_joining import inter_robot_kernel as sightings
+from team.estimation.map_joining import joining_kernel as kernel
+from team.estimation.map_joining.submap_graph import Graph
+from team.estimation.sparse_cholesky import sparse
+
+Values = Float[np.ndarray, " _"]
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Of an undamped step, tried before damping: a long curved valley is gone along, not shunned."""
+LEAST_DAMPING = 1e-4
+MOST_DAMPING = 1e8
+STUCK = math.inf
+"""The damping that says that no step lowers the cost."""
+LEAST_WEIGHT = 1e-6
+"""No landmark is discounted more, so that each stays determined."""
+FULL_AGE = 1_000_000
+"""Iterations after which every robust scale has come to its end."""
+ROUNDING = 1e-10
+"""A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
+
+
+@dataclass(frozen=True)
+class JoinSettings:
+    """How submaps are joined.
+
+    iterations_per_tick: Gauss-Newton iterations of `folded`.
+    robust_c: Cauchy's scale on √(χ²/dim) of a factor; None for least squares. The scale begins at
+        robust_start · c and is multiplied by robust_decay with each iteration until it is c.
+    landmark_gate: χ² (2 numbers) from which a submap's landmark is discounted by itself, when there
+        is a robust loss; it narrows like the scale.
+    covariance_factor: every submap's covariance is taken times this.
+    max_iterations, step_tolerance: a full solve ends when no unknown moves by more [m, rad].
+    alignment_confidence: quantile of the χ² test before a free island is merged.
+    alignment_heading_sigma: the shape of the shared landmarks must give a heading this well [rad].
+    bias_sigma: how large the errors are that a robot's submaps share, before they are estimated.
+    common_bias_sigma: the same of errors that all robots share, as of a calibration of their kind;
+        they add to each robot's own.
+    joined_ranges: errors of ranges are proportional to the range, and it is taken from the joined
+        map (`joining_kernel.with_joined_ranges`).
+    """
+
+    iterations_per_tick: int = 2
+    robust_c: float | None = None
+    robust_start: float = 8.0
+    robust_decay: float = 0.7
+    landmark_gate: float = 13.8
+    covariance_factor: float = 1.0
+    max_iterations: int = 50
+    step_tolerance: float = 1e-6
+    alignment_confidence: float = 0.999
+    alignment_heading_sigma: float = 0.3
+    bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
+    common_bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
+    joined_ranges: bool = False
+
+
+class NotDeterminedError(ValueError):
+    """The submaps leave a node of the graph undetermined."""
+
+    def __init__(self, node: str) -> None:
+        super().__init__(f"{node} is not determined by the submaps")
+        self.node = node
+
+
+UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
+"""What a solution raises where its numbers do not allow one: a value to decide on, no defect."""
+
+
+@dataclass(frozen=True, eq=False)
+class Island:
+    """One frame: its graph, the state (poses and landmarks by node) and the factors' ages.
+
+    age, sighting_age: iterations that each submap and each sighting has lived through; the robust
+    scale follows from it.
+    """
+
+    graph: Graph
+    state: Values
+    age: Int64[np.ndarray, " F"]
+    sighting_age: Int64[np.ndarray, " S"]
+    settings: JoinSettings
+
+    @property
+    def scale(self) -> Float[np.ndarray, " F"]:
+        """The robust scale c of each submap at its age."""
+        return _scale_at(self.age, self.settings)
+
+    @property
+    def sighting_scale(self) -> Float[np.ndarray, " S"]:
+        """The robust scale c of each sighting at its age."""
+        return _scale_at(self.sighting_age, self.settings)
+
+    @cached_property
+    def _submaps(self) -> kernel.Factors:
+        """The submaps with the noise that they have at this state."""
+        factors = self.graph.factors
+        if not self.settings.joined_ranges:
+            return factors
+        return kernel.with_joined_ranges(self.state, self.graph.offset, factors)
+
+    @cached_property
+    def _landmark_chi2_and_gate(self) -> tuple[Values, Values]:
+        """χ² of each landmark of each submap by itself, and its gate."""
+        factors, settings = self._submaps, self.settings
+        if settings.robust_c is None:
+            return np.zeros(len(factors.block)), np.ones(len(factors.block))
+        chi2 = kernel.landmark_chi2(
+            self.state, self.graph.offset, factors, settings.covariance_factor
+        )
+        gate = settings.landmark_gate * (self.scale / settings.robust_c) ** 2
+        return chi2, np.repeat(gate, np.diff(factors.block_start))
+
+    @cached_property
+    def landmark_weight(self) -> Float[np.ndarray, " B"]:
+        """The weight of each landmark of each submap: 1 up to its gate, 1 without a robust loss."""
+        chi2, gate = self._landmark_chi2_and_gate
+        weight, beyond = np.ones(len(chi2)), chi2 > gate
+        weight[beyond] = np.maximum(gate[beyond] / chi2[beyond], LEAST_WEIGHT)
+        return weight
+
+    @cached_property
+    def factors(self) -> kernel.Factors:
+        """The submaps with their landmarks discounted."""
+        return self._discounted(self.landmark_weight)
+
+    def _discounted(self, weight: Values) -> kernel.Factors:
+        factors = self._submaps
+        if (weight == 1.0).all():
+            return factors
+        return factors._replace(information=kernel.discounted_information(factors, weight))
+
+    @cached_property
+    def dimensions(self) -> Float[np.ndarray, " F"]:
+        """Numbers in each submap, discounted ones as far as they count."""
+        factors = self.graph.factors
+        of = np.repeat(np.arange(len(self.graph.submaps)), np.diff(factors.block_start))
+        lost = np.bincount(of, 2.0 * (1.0 - self.landmark_weight), len(self.graph.submaps))
+        return self.graph.dimensions - lost.astype(np.float64)
+
+    @cached_property
+    def chi2(self) -> Float[np.ndarray, " F"]:
+        """rᵀ(f P)⁻¹r of each submap, landmarks discounted."""
+        factor = self.settings.covariance_factor
+        return kernel.costs(self.state, self.graph.offset, self.factors, factor)
+
+    @cached_property
+    def whole_chi2(self) -> Float[np.ndarray, " F"]:
+        """rᵀ(f P)⁻¹r of each submap, nothing discounted."""
+        factor = self.settings.covariance_factor
+        return kernel.costs(self.state, self.graph.offset, self._submaps, factor)
+
+    @cached_property
+    def counted_chi2(self) -> Float[np.ndarray, " F"]:
+        """χ² of each submap with each landmark's share w χ² counted w times.
+
+        That is how the share of its numbers counts in `dimensions`: what is discounted says
+        nothing of whether the rest agrees.
+        """
+        factors, factor = self._discounted(self.landmark_weight**2), self.settings.covariance_factor
+        return kernel.costs(self.state, self.graph.offset, factors, factor)
+
+    @property
+    def weight(self) -> Float[np.ndarray, " F"]:
+        """Robust weight of each submap, 1 without a robust loss."""
+        relative: Values = self.chi2 / (self.graph.dimensions * self.scale**2)
+        return 1.0 / (1.0 + relative)
+
+    @cached_property
+    def sighting_chi2(self) -> Float[np.ndarray, " S"]:
+        """rᵀR⁻¹r of each sighting."""
+        return sightings.sighting_costs(self.state, self.graph.offset, self.graph.sighting_factors)
+
+    @property
+    def sighting_weight(self) -> Float[np.ndarray, " S"]:
+        """Robust weight of each sighting, 1 without a robust loss."""
+        return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * self.sighting_scale**2))
+
+    @cached_property
+    def prior_chi2(self) -> Float[np.ndarray, " priors"]:
+        """χ² of each prior on a start."""
+        return np.array([_prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
+
+    def quadratic(self, state: Values) -> float:
+        """The cost of another state with the weights of this one: what an iteration lowers.
+
+        Its fall is a fall of the robust cost too, since each loss lies below its parabola.
+        """
+        other = replace(self, state=state)
+        factor, offset = self.settings.covariance_factor, self.graph.offset
+        chi2 = float((self.weight * kernel.costs(state, offset, self.factors, factor)).sum())
+        seen = float((self.sighting_weight * other.sighting_chi2).sum())
+        return chi2 + seen + float(other.prior_chi2.sum())
+
+    @cached_property
+    def cost(self) -> float:
+        """What is minimised, at the present scales."""
+        if self.settings.robust_c is None:
+            chi2 = float(self.chi2.sum() + self.prior_chi2.sum())
+            return chi2 + float(self.sighting_chi2.sum())
+        scale = self.scale**2 * self.graph.dimensions
+        cost = float((scale * np.log1p(self.chi2 / scale)).sum() + self.prior_chi2.sum())
+        own, gate = self._landmark_chi2_and_gate
+        beyond = own > gate
+        cost += float((gate[beyond] * np.log(own[beyond] / gate[beyond])).sum())
+        scale = 2.0 * self.sighting_scale**2
+        return cost + float((scale * np.log1p(self.sighting_chi2 / scale)).sum())
+
+    @cached_property
+    def normal_equations(self) -> tuple[Values, Values]:
+        """A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and the gradient Σ w JᵀP⁻¹r."""
+        graph, pattern = self.graph, self.graph.pattern
+        values, gradient, _ = kernel.normal_equations(
+            self.state,
+            graph.offset,
+            graph.fixed,
+            self.factors,
+            self.settings.covariance_factor,
+            self.scale,
+            graph.entry,
+            pattern.column_start,
+            pattern.value_start,
+        )
+        sightings.add_sightings(
+            values,
+            gradient,
+            self.state,
+            graph.offset,
+            graph.fixed,
+            graph.sighting_factors,
+            self.sighting_scale,
+            graph.entry,
+            pattern.value_start,
+        )
+        for k, prior in enumerate(graph.priors):
+            slope, hessian, _ = _prior_terms(self, k)
+            begin = graph.offset[prior.node]
+            gradient[begin : begin + len(slope)] += slope
+            pattern.diagonal_block(values, prior.node)[...] += hessian
+        return values, gradient
+
+    @cached_property
+    def posterior(self) -> sparse.Cholesky:
+        """Cholesky factor of the information matrix at this state."""
+        return _factorised(self.graph, self.normal_equations[0])
+
+    @cached_property
+    def selected_covariance(self) -> Values:
+        """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
+        return sparse.selected_inverse(self.posterior)
+
+
+def _scale_at(age: Int64[np.ndarray, " k"], settings: JoinSettings) -> Float[np.ndarray, " k"]:
+    if settings.robust_c is None:
+        return np.full(len(age), math.inf)
+    wide = settings.robust_start * settings.robust_decay ** age.astype(np.float64)
+    return settings.robust_c * np.maximum(1.0, wide)
+
+
+def aged(island: Island, iterations: int | None) -> Island:
+    """The island so many iterations older; None: every factor begins anew."""
+    if iterations is None:
+        age, sighting_age = np.zeros_like(island.age), np.zeros_like(island.sighting_age)
+    else:
+        age, sighting_age = island.age + iterations, island.sighting_age + iterations
+    return replace(island, age=age, sighting_age=sighting_age)
+
+
+def final_cost(island: Island) -> float:
+    """The cost with every robust scale at its end, so that islands can be compared."""
+    return aged(island, FULL_AGE).cost
+
+
+def is_solvable(island: Island) -> bool:
+    """Whether the island has a solution: finite numbers, every unknown determined.
+
+    The pivots of the factorisation are judged by their diagonal entries (`sparse_kernel`), so units
+    and the size of covariances have no influence.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            factor, cost = island.posterior, island.cost
+    except UNSOLVABLE:
+        return False
+    return bool(np.isfinite(island.state).all() and np.isfinite(factor.panels).all()) and (
+        math.isfinite(cost)
+    )
+
+
+def _prior_terms(
+    island: Island, k: int
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], float]:
+    node, mean, information = island.graph.priors[k]
+    begin = island.graph.offset[node]
+    residual = island.state[begin : begin + len(mean)] - mean
+    if len(mean) == 3:
+        residual[2] = wrapped(residual[2])
+    slope = information @ residual
+    return slope, information, float(residual @ slope)
+
+
+def _factorised(graph: Graph, values: Values) -> sparse.Cholesky:
+    try:
+        return sparse.factorised(graph.analysis, values)
+    except sparse.NotPositiveDefiniteError as error:
+        raise NotDeterminedError(graph.name(error.variable)) from error
+
+
+def _moved(island: Island, step: Values) -> Island:
+    state = island.state + step
+    headings = state[island.graph.headings]
+    state[island.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
+    return replace(island, state=state)
+
+
+def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
+    """One iteration: the island, the damping for the next one, the whole step's largest change.
+
+    A step is taken if it lowers the cost; else, undamped, a share of it; else one more damped. None
+    is taken where no damping helps: the damping is then STUCK, the change that of the first step.
+    """
+    values, gradient = island.normal_equations
+    diagonal = island.graph.pattern.diagonal
+    before = island.quadratic(island.state)
+    refused = None
+    while damping < MOST_DAMPING:
+        damped = values.copy()
+        damped[diagonal] *= 1.0 + damping
+        cholesky = island.posterior if damping == 0.0 else _factorised(island.graph, damped)
+        step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
+        for share in SHARES if damping == 0.0 else (1.0,):
+            moved = _moved(island, share * step)
+            if island.quadratic(moved.state) <= before * (1.0 + ROUNDING) + ROUNDING:
+                eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
+                return aged(moved, 1), eased, _largest(step)
+        refused = _largest(step) if refused is None else refused
+        damping = max(10.0 * damping, LEAST_DAMPING)
+    return aged(island, 1), STUCK, math.inf if refused is None else refused
+
+
+def _largest(step: Values) -> float:
+    return float(np.abs(step).max(initial=0.0))
+
+
+def iterated(island: Island) -> Island:
+    """The iterations of one tick."""
+    damping = 0.0
+    for _ in range(island.settings.iterations_per_tick):
+        island, damping, _ = _iterated(island, _eased(damping))
+    return island
+
+
+def _eased(damping: float) -> float:
+    """What the next iteration begins with: a robust cost is another one at its next scale."""
+    return 0.0 if damping == STUCK else damping
+
+
+def settled(island: Island) -> tuple[Island, int, float]:
+    """The full solution from here, the iterations it took and the last change [m, rad].
+
+    A robust scale is annealed anew for all factors. Ends at `max_iterations` at the latest, or
+    where no step lowers the cost: the last change tells whether it converged.
+    """
+    settings = island.settings
+    island = aged(island, None)
+    damping, change, count = 0.0, math.inf, 0
+    while count < settings.max_iterations:
+        scales = np.concatenate([island.scale, island.sighting_scale])
+        narrow = settings.robust_c is None or bool((scales == settings.robust_c).all())
+        island, damping, change = _iterated(island, _eased(damping))
+        count += 1
+        if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):
+            break
+    return island, count, change
+
+
+def held(island: Island, unknown: int, by: float, iterations: int) -> Island:
+    """One number of the state moved by so much, everything else solved for given that.
+
+    With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose part
+    along w is what is missing: the point of the constraint with the least cost to second order.
+    """
+    missing = by
+    for _ in range(iterations):
+        right = np.column_stack([-island.normal_equations[1], np.zeros(len(island.state))])
+        right[unknown, 1] = 1.0
+        p, q = sparse.solved(island.posterior, right).T
+        step = p + (missing - p[unknown]) / q[unknown] * q
+        island, missing = _moved(island, step), missing - float(step[unknown])
+    return island
+
+
+def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:
+    """Mean and joint covariance of some nodes in their order; a fixed node has covariance 0."""
+    graph = island.graph
+    spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
+    unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
+    covariance = sparse.inverse_block(island.posterior, unknowns)
+    constant = np.repeat(graph.fixed[list(nodes)], [len(span) for span in spans])
+    covariance[constant] = 0.0
+    covariance[:, constant] = 0.0
+    return island.state[unknowns], covariance

@@ -1,0 +1,109 @@
+"""What ties two islands: points that are known in the frames of both.
+
+A shared landmark is such a point. So is a teammate that is seen from a pose node: in the observer's
+island it lies at pose ∘ (range, bearing), in its own at its pose node. One sighting and its reverse
+are two points.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining import alignment
+from team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from team.estimation.map_joining.submap_graph import Graph, pose_node
+from team.estimation.models import located
+
+Points = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
+"""n points [m] and their joint covariance, m = 2n."""
+HEADINGS = 24
+MOST_POINTS = 24
+"""More points than these do not fit at two headings, and would make the search slow."""
+HOPELESS = 100.0
+"""A heading whose χ² is higher by this much than the best one's is not looked at."""
+
+
+class Tie(NamedTuple):
+    """A point: its node in the main island and in the other one; how it is seen, if it is.
+
+    seen: the sighting. from_main: its observer is in the main island, so there the node is his.
+    """
+
+    main: int
+    other: int
+    seen: Sighting | None = None
+    from_main: bool = False
+
+
+def ties(main: Graph, other: Graph, sightings: Sequence[Sighting]) -> list[Tie]:
+    """Shared landmarks by id, then the sightings across in their order."""
+    shared = sorted(main.landmarks.keys() & other.landmarks.keys())
+    found = [Tie(main.landmarks[id_], other.landmarks[id_]) for id_ in shared]
+    for each in sightings:
+        for observers, seen, from_main in ((main, other, True), (other, main, False)):
+            observer = observers.poses.get((each.stream, each.stamp_ns))
+            teammate = pose_node(seen, each.teammate, each.stamp_ns)
+            if observer is not None and teammate is not None:
+                nodes = (observer, teammate) if from_main else (teammate, observer)
+                found.append(Tie(*nodes, each, from_main))
+    return found
+
+
+def aligned_by(main: Island, other: Island, tied: Sequence[Tie]) -> alignment.Alignment | None:
+    """Where the other island lies in the main one; None with too few ties."""
+    if len(tied) < alignment.NEEDED:
+        return None
+    in_main = _points(main, [(t.main, t.seen if t.from_main else None) for t in tied])
+    in_other = _points(other, [(t.other, None if t.from_main else t.seen) for t in tied])
+    return alignment.aligned(*in_main, *in_other)
+
+
+def _points(island: Island, at: Sequence[tuple[int, Sighting | None]]) -> Points:
+    """The positions of nodes, or of what is seen from them, with their joint covariance."""
+    mean, covariance = joint_marginal(island, [node for node, _ in at])
+    points = np.empty((len(at), 2))
+    J = np.zeros((2 * len(at), len(mean)))
+    noise = np.zeros((2 * len(at), 2 * len(at)))
+    begin = 0
+    for k, (node, seen) in enumerate(at):
+        rows, value = slice(2 * k, 2 * k + 2), mean[begin:]
+        J[rows, begin : begin + 2] = np.eye(2)
+        points[k] = value[:2]
+        if seen is not None:
+            distance, bearing = float(seen.reading[0]), float(seen.reading[1])
+            points[k] = located(value[:3], distance, bearing)
+            x, y = points[k] - value[:2]
+            J[rows, begin + 2] = -y, x
+            direction = math.atan2(y, x)
+            c, s = math.cos(direction), math.sin(direction)
+            polar = np.array([[c, -distance * s], [s, distance * c]])
+            noise[rows, rows] = polar @ seen.covariance @ polar.T
+        begin += int(island.graph.offset[node + 1] - island.graph.offset[node])
+    return points, J @ covariance @ J.T + noise
+
+
+def headings_that_fit(
+    main: Island, other: Island, tied: Sequence[Tie]
+) -> list[Float[np.ndarray, "3"]]:
+    """Every main_from_other at whose heading the tied points fit better than at its neighbours'.
+
+    The best translation at each heading of a grid follows in closed form from the joint covariance
+    of the points. Hopeless headings are left out, and with many points all but the best one are.
+    """
+    if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
+        return []
+    in_main = _points(main, [(t.main, t.seen if t.from_main else None) for t in tied])
+    in_other = _points(other, [(t.other, None if t.from_main else t.seen) for t in tied])
+    grid = [2.0 * math.pi * k / HEADINGS - math.pi for k in range(HEADINGS)]
+    found = [alignment.at_heading(*in_main, *in_other, heading) for heading in grid]
+    costs = [chi2 for _, chi2 in found]
+    limit = min(costs) + HOPELESS
+    return [
+        np.array([*shift, heading])
+        for k, (heading, (shift, chi2)) in enumerate(zip(grid, found, strict=True))
+        if chi2 <= min(costs[k - 1], costs[(k + 1) % HEADINGS], limit)
+    ]

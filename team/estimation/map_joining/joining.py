@@ -1,0 +1,342 @@
+"""The team's map as a fold over its submaps in their canonical order.
+
+Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over all submaps of
+all robots, and over the sightings of teammates between their pose nodes. The fold takes the submaps
+by ticks, each with the sightings from it; it is a pure function of their order and of the ticks'
+boundaries. Streams whose start in the common frame is unknown are islands of their own until shared
+landmarks and sightings tie them to the main island.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from team.estimation.contribution import Contribution, Key, Start, Stream, named
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.gauss_newton import (
+    UNSOLVABLE,
+    Island,
+    JoinSettings,
+    final_cost,
+    is_solvable,
+    iterated,
+)
+from team.estimation.map_joining.merging import Merge, ages, merge, sighted
+from team.estimation.map_joining.minima import (
+    Minimum,
+    Search,
+    doubts,
+    searched,
+    suspicious,
+    widened,
+)
+from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+
+__all__ = [
+    "EMPTY_FOLD",
+    "Contribution",
+    "Fold",
+    "GapError",
+    "JoinSettings",
+    "LateStartError",
+    "NotCanonicalError",
+    "Sighting",
+    "Start",
+    "Stream",
+    "converged",
+    "folded",
+    "lean",
+    "started",
+]
+
+PATIENCE = 1.1
+"""What was searched in vain is searched again when there are so many times the submaps."""
+
+
+class NotCanonicalError(ValueError):
+    """A submap is not behind the ones before it in the canonical order."""
+
+    def __init__(self, contribution: Contribution) -> None:
+        super().__init__(
+            f"submap {contribution.sequence} of {named(contribution.stream)} comes out of order; "
+            "sort by (end stamp, robot, epoch, sequence), for a late one fold again from before it"
+        )
+        self.contribution = contribution
+
+
+class GapError(ValueError):
+    """Submaps of a stream are missing before this one, so its start pose is not in the graph."""
+
+    def __init__(self, contribution: Contribution, expected: int) -> None:
+        super().__init__(
+            f"{named(contribution.stream)}: submap {contribution.sequence} came, {expected} is next"
+        )
+        self.contribution = contribution
+        self.expected = expected
+
+
+class LateStartError(ValueError):
+    """A start was given to a stream that the fold has submaps of already."""
+
+    def __init__(self, start: Start) -> None:
+        super().__init__(
+            f"the start of {named(start.stream)} comes after its first submap; "
+            "fold again with the start known from the beginning"
+        )
+        self.start = start
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """What the submaps taken so far say.
+
+    home:       island (a key of `islands`) of each stream.
+    reasons:    why an island other than the main one is not merged, by its frame.
+    joined:     how an island was merged into another one and how sure that is, by its old frame.
+    doubts:     of the full solution, what speaks for another minimum, in words.
+    waiting:    sightings whose pose nodes are not both in one island, in canonical order.
+    judged, looked: the submaps of two islands, or of one, when they were last searched for a place
+                or a minimum in vain; with it why the two were not merged.
+    iterations, change: of the main island's last full solution: how many, the last step [m, rad].
+    refused:    submaps that came and are not in the map, in canonical order, and why (`taken`).
+    set_aside:  in words, what else was refused: initial poses, inter-robot measurements, and the
+                landmarks of submaps of which only the motion is in the map.
+    """
+
+    contributions: tuple[Contribution, ...]
+    starts: Mapping[Stream, Start]
+    islands: Mapping[Stream, Island]
+    home: Mapping[Stream, Stream]
+    reasons: Mapping[Stream, str]
+    waiting: tuple[Sighting, ...] = ()
+    iterations: int = 0
+    change: float = 0.0
+    joined: Mapping[Stream, str] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
+    judged: Mapping[tuple[Stream, Stream], tuple[int, str]] = field(default_factory=dict)
+    looked: Mapping[Stream, int] = field(default_factory=dict)
+    refused: Mapping[Key, str] = field(default_factory=dict)
+    set_aside: tuple[str, ...] = ()
+
+    @property
+    def main_key(self) -> Stream | None:
+        """Key of the island with the known starts, else of the one with the smallest stream."""
+        started = sorted(stream for stream in self.home if stream in self.starts)
+        streams = started or sorted(self.home)
+        return self.home[streams[0]] if streams else None
+
+    @property
+    def main(self) -> Island:
+        """The island whose map is the team's. Raises KeyError before the first submap."""
+        if self.main_key is None:
+            raise KeyError("no submap has come yet")
+        return self.islands[self.main_key]
+
+    @property
+    def frame(self) -> Stream | None:
+        """The main island's frame is named by its smallest stream; None before any submap."""
+        return None if self.main_key is None else min(self.main.graph.streams)
+
+    def island(self, robot: str, epoch: int) -> Island:
+        """The island of a stream. Raises KeyError for a stream without submaps."""
+        return self.islands[self.home[(robot, epoch)]]
+
+    def next_sequence(self, stream: Stream) -> int:
+        """Sequence of the submap that the fold takes next from a stream."""
+        if stream not in self.home:
+            return 0
+        return len(self.islands[self.home[stream]].graph.streams[stream]) - 1
+
+
+EMPTY_FOLD = Fold((), {}, {}, {}, {})
+
+
+def started(fold: Fold, start: Start) -> Fold:
+    """The fold that knows where a stream starts; before that stream's first submap."""
+    if start.stream in fold.home:
+        raise LateStartError(start)
+    return replace(fold, starts={**fold.starts, start.stream: start})
+
+
+def folded(
+    fold: Fold,
+    contributions: Sequence[Contribution],
+    settings: JoinSettings,
+    sightings: Sequence[Sighting] = (),
+) -> Fold:
+    """One tick: take the submaps, place what is new, iterate, merge islands that can be.
+
+    Contributions stand in canonical order, behind all that the fold has, without a gap in a
+    stream; else NotCanonicalError or GapError. Islands without news keep their state. sightings:
+    those from the submaps of this tick; each is a factor from the tick on in which both of its pose
+    nodes are in one island.
+    """
+    _check(fold, contributions)
+    home = dict(fold.home)
+    news: dict[Stream, list[Contribution]] = {}
+    for contribution in contributions:
+        stream = contribution.stream
+        if stream not in home:
+            common = [home[other] for other in home if other in fold.starts]
+            home[stream] = common[0] if common and stream in fold.starts else stream
+        news.setdefault(home[stream], []).append(contribution)
+    waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
+    islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
+    for key, taken in news.items():
+        island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
+        graph, state = extended(
+            island.graph,
+            island.state,
+            taken,
+            fold.starts,
+            settings.bias_sigma,
+            settings.common_bias_sigma,
+        )
+        age = np.concatenate([island.age, ages(len(taken))])
+        island, waiting = sighted(replace(island, graph=graph, state=state, age=age), waiting)
+        islands[key] = iterated(island)
+    grown = replace(
+        fold,
+        contributions=(*fold.contributions, *contributions),
+        islands=islands,
+        home=home,
+        waiting=waiting,
+    )
+    return _with_merges(_looked(grown))
+
+
+def lean(fold: Fold) -> Fold:
+    """The same fold without what can be computed again from it: a checkpoint to keep.
+
+    It shares the submaps with the folds before and after it; its own are the state and the graph's
+    nodes, a hundredth of what a fold holds that was solved.
+    """
+    islands = {
+        key: replace(island, graph=replace(island.graph)) for key, island in fold.islands.items()
+    }
+    return replace(fold, islands=islands)
+
+
+def converged(fold: Fold, settings: JoinSettings) -> Fold:
+    """The full solution of every island; `iterations` and `change` tell how it ended.
+
+    Wrong minima are looked for; what is found stands in `doubts`. An island that has no full
+    solution stays as the last tick has left it, and `doubts` says so.
+    """
+    if fold.main_key is None:
+        return fold
+    with np.errstate(all="ignore"):  # what overflows has no finite cost, and is not taken
+        return _converged(fold, settings, fold.main_key)
+
+
+def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
+    searches = {
+        key: _search(replace(island, settings=settings)) for key, island in fold.islands.items()
+    }
+    main = searches[main_key]
+    solved = replace(
+        fold,
+        islands={key: each.best.island for key, each in searches.items()},
+        iterations=main.best.iterations,
+        change=main.best.change,
+    )
+    merged = _with_merges(solved, at_last=True)
+    last = main if merged.main is main.best.island else _search(merged.main)
+    wider = None
+    with suppress(*UNSOLVABLE):
+        wider = widened(last)
+    if wider is not None and is_solvable(wider.best.island):
+        last = wider
+    return replace(
+        merged,
+        islands={**merged.islands, main_key: last.best.island},
+        iterations=last.best.iterations,
+        change=last.best.change,
+        doubts=tuple(doubts(last)),
+    )
+
+
+def _search(island: Island) -> Search:
+    """The search for the island's full solution; where there is none, the island as it is."""
+    with suppress(*UNSOLVABLE):
+        found = searched([island])
+        if is_solvable(found.best.island):
+            return found
+    return Search(Minimum(island, 0, math.inf, final_cost(island)), 0.0, None)
+
+
+def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
+    for before, after in pairwise((*fold.contributions[-1:], *contributions)):
+        if not before.key < after.key:
+            raise NotCanonicalError(after)
+    expected: dict[Stream, int] = {}
+    for contribution in contributions:
+        stream = contribution.stream
+        wanted = expected.get(stream, fold.next_sequence(stream))
+        if contribution.sequence != wanted:
+            raise GapError(contribution, wanted)
+        expected[stream] = wanted + 1
+
+
+def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
+    """Merge islands while any two can be; the smallest frame stays, that of known starts before it.
+
+    A pair that was judged is judged again when it has grown by PATIENCE, or `at_last`.
+    """
+    main_key = fold.main_key
+    keys = sorted(
+        fold.islands, key=lambda key: (key != main_key, min(fold.islands[key].graph.streams))
+    )
+    reasons: dict[Stream, str] = {}
+    judged = dict(fold.judged)
+    for key, other_key in combinations(keys, 2):
+        main, other = fold.islands[key], fold.islands[other_key]
+        size = len(main.graph.submaps) + len(other.graph.submaps)
+        before = judged.get((key, other_key))
+        if before is None or at_last or size >= PATIENCE * before[0]:
+            found = merge(main, other, fold.waiting)
+            if isinstance(found, Merge):
+                return _with_merges(_merged(replace(fold, judged=judged), key, other_key, found))
+            why = found.why
+            if found.after_search:
+                judged[key, other_key] = (size, why)
+        else:
+            why = before[1]
+        if key == main_key:
+            frame = min(other.graph.streams)
+            reasons[frame] = f"{named(frame)} not joined: {why}"
+    return replace(fold, reasons=reasons, judged=judged)
+
+
+def _merged(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
+    """The fold with one island less; how that came about stands under the frame that is gone."""
+    islands = {at: each for at, each in fold.islands.items() if at != other_key}
+    islands[key] = found.best.island
+    gone = min(fold.islands[other_key].graph.streams)
+    gone_keys = {key, other_key}
+    return replace(
+        fold,
+        islands=islands,
+        home={stream: key if at == other_key else at for stream, at in fold.home.items()},
+        waiting=found.waiting,
+        joined={**fold.joined, gone: found.words},
+        judged={pair: said for pair, said in fold.judged.items() if not gone_keys & {*pair}},
+        iterations=found.best.iterations,
+        change=found.best.change,
+    )
+
+
+def _looked(fold: Fold) -> Fold:
+    """Islands whose cost is suspicious are searched for a lower minimum, now and then."""
+    islands, looked = dict(fold.islands), dict(fold.looked)
+    for key, island in fold.islands.items():
+        size = len(island.graph.submaps)
+        if size < PATIENCE * looked.get(key, 0) or not suspicious(island, final_cost(island)):
+            continue
+        looked[key] = size
+        islands[key] = _search(island).best.island
+    return replace(fold, islands=islands, looked=looked)

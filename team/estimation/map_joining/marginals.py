@@ -1,0 +1,287 @@
+"""What a joined map says: means and marginal covariances, and how well its submaps agree.
+
+Everything is in the frame of an island: the main one, or the one that a stream is in.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import Bias
+from team.estimation.contribution import Stream
+from team.estimation.map_joining import joining_kernel as kernel
+from team.estimation.map_joining.conditioning import RobotPrior, Shared
+from team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from team.estimation.map_joining.inter_robot_kernel import explained_by_sightings
+from team.estimation.map_joining.joining import Fold
+
+BELIEVED = 0.5
+"""A submap whose landmark has at least this weight is believed."""
+
+
+class LandmarkMap(NamedTuple):
+    """Landmarks by ascending id: means [m], joint covariance [m²] of (x₁, y₁, x₂, …)."""
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+class LandmarkBlocks(NamedTuple):
+    """Landmarks by ascending id: means [m] and each one's own covariance [m²]."""
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariances: Float[np.ndarray, "L 2 2"]
+
+
+class Trajectory(NamedTuple):
+    """End poses of a stream's submaps in their order, each with its covariance."""
+
+    poses: Float[np.ndarray, "K 3"]
+    covariances: Float[np.ndarray, "K 3 3"]
+
+
+class BiasEstimate(NamedTuple):
+    """An error that the submaps of a stream share, ± one sigma."""
+
+    stream: Stream
+    bias: Bias
+    value: float
+    sigma: float
+
+
+class SubmapCost(NamedTuple):
+    """How one submap agrees with the rest: χ² should be near dof.
+
+    chi2 is unweighted, nothing discounted; dof = dim − w tr(JᵀP⁻¹J Σ) is the part of its dimension
+    that the solution does not take up (its redundancy, Baarda 1968); weight w is robust, 1 without
+    a robust loss.
+    """
+
+    stream: Stream
+    sequence: int
+    chi2: float
+    dof: float
+    weight: float
+
+
+class Agreement(NamedTuple):
+    """Joint cost Σ w χ² and its degrees of freedom, in all, per robot and per submap.
+
+    A sighting counts with its observer, a discounted landmark as far as it is believed. Without a
+    robust loss the joint dof is the sum of the submaps' dimensions (and of the sightings' and the
+    priors') less the number of unknowns. A lasting chi2/dof above 1.1 is a warning, above 1.3 the
+    covariances are not to be trusted.
+    """
+
+    chi2: float
+    dof: float
+    robots: dict[str, tuple[float, float]]
+    submaps: tuple[SubmapCost, ...]
+
+
+def bias_estimates(fold: Fold) -> list[BiasEstimate]:
+    """The errors that each stream's submaps share, in the island that the stream is in.
+
+    A robot's own and what the team has in common, together.
+    """
+    return sorted(each for island in fold.islands.values() for each in _biases_in(island))
+
+
+def _biases_in(island: Island) -> list[BiasEstimate]:
+    found = []
+    for (stream, bias), node in sorted(island.graph.biases.items()):
+        common = island.graph.common
+        if bias in common:
+            mean, covariance = joint_marginal(island, [node, common[bias]])
+        else:
+            mean, covariance = _own_marginal(island, node)
+        sigma = float(np.sqrt(covariance.sum()))
+        found.append(BiasEstimate(stream, bias, float(mean.sum()), sigma))
+    return found
+
+
+def confirmed(fold: Fold, submaps: int) -> list[int]:
+    """The main island's landmarks, by id, that so many submaps or more have and are believed in.
+
+    A submap is believed where the robust loss does not discount its landmark below BELIEVED: of
+    two that contradict each other one is left, and nothing confirms it.
+    """
+    island = fold.main
+    if submaps <= 1:
+        return sorted(island.graph.landmarks)
+    ids = np.concatenate([each.local.ids for each, *_ in island.graph.submaps])
+    found, counts = np.unique(ids[island.landmark_weight >= BELIEVED], return_counts=True)
+    return [int(id_) for id_ in found[counts >= submaps]]
+
+
+def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
+    """The main island's landmarks (all, or those asked for) with their joint covariance."""
+    chosen = sorted(fold.main.graph.landmarks if ids is None else ids)
+    mean, covariance = joint_marginal(fold.main, _nodes(fold.main, chosen))
+    return LandmarkMap(np.array(chosen, dtype=np.uint32), mean.reshape(-1, 2), covariance)
+
+
+def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
+    """The main island's landmarks (all, or those asked for), each with its own covariance.
+
+    By selected inversion.
+    """
+    island = fold.main
+    chosen = sorted(island.graph.landmarks if ids is None else ids)
+    means = np.zeros((len(chosen), 2))
+    covariances = np.zeros((len(chosen), 2, 2))
+    for k, node in enumerate(_nodes(island, chosen)):
+        means[k], covariances[k] = _own_marginal(island, node)
+    return LandmarkBlocks(np.array(chosen, dtype=np.uint32), means, covariances)
+
+
+def prior_for(fold: Fold, robot: str, epoch: int, ids: Sequence[int] | None = None) -> RobotPrior:
+    """What a robot needs to place itself: its last end pose and the landmarks, jointly."""
+    stream = (robot, epoch)
+    return _priors_in(fold.island(robot, epoch), [stream], ids)[stream]
+
+
+def main_priors(
+    fold: Fold,
+    streams: Sequence[Stream],
+    most: int | None = None,
+    chosen: Sequence[int] | None = None,
+) -> dict[Stream, RobotPrior]:
+    """`prior_for` of some streams of the main island.
+
+    chosen: the landmarks by ascending id; None: all. most: of more than these each prior has those
+    nearest to its pose only. What a robot has no prior of is new to it until the next one: less
+    accurate, and as consistent.
+    """
+    island = fold.main
+    ids = np.array(sorted(island.graph.landmarks) if chosen is None else chosen)
+    if most is None or len(ids) <= most:
+        return _priors_in(island, streams, ids.tolist())  # the landmarks are solved for once
+    places = np.array([_mean(island, node) for node in _nodes(island, ids.tolist())])
+    priors: dict[Stream, RobotPrior] = {}
+    for stream in streams:
+        offsets = places - _mean(island, island.graph.streams[stream][-1])[:2]
+        nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")[:most]
+        priors |= _priors_in(island, [stream], ids[nearest].tolist())
+    return priors
+
+
+def _priors_in(
+    island: Island, streams: Sequence[Stream], ids: Sequence[int] | None
+) -> dict[Stream, RobotPrior]:
+    chosen = sorted(island.graph.landmarks if ids is None else ids)
+    poses = [island.graph.streams[stream][-1] for stream in streams]
+    mean, covariance = joint_marginal(island, [*poses, *_nodes(island, chosen)])
+    shared = np.arange(3 * len(poses), len(mean))
+    biases = _biases_in(island)
+    priors = {}
+    for k, stream in enumerate(streams):
+        kept = np.concatenate([np.arange(3 * k, 3 * k + 3), shared])
+        own = tuple((b.bias, b.value, b.sigma) for b in biases if b.stream == stream)
+        priors[stream] = RobotPrior(
+            mean[kept[:3]],
+            np.array(chosen, dtype=np.uint32),
+            mean[shared].reshape(-1, 2),
+            covariance[np.ix_(kept, kept)],
+            Shared(island.settings.covariance_factor, own),
+        )
+    return priors
+
+
+def trajectory(fold: Fold, robot: str, epoch: int) -> Trajectory:
+    """Where the submaps of a stream end, in the frame of its island."""
+    island = fold.island(robot, epoch)
+    nodes = island.graph.streams[(robot, epoch)][1:]
+    marginals = [_own_marginal(island, node) for node in nodes]
+    return Trajectory(
+        np.array([pose for pose, _ in marginals]), np.array([spread for _, spread in marginals])
+    )
+
+
+def joint_cost(fold: Fold) -> Agreement:
+    """The agreement of the main island's submaps, at the present estimate."""
+    island = fold.main
+    graph = island.graph
+    explained = kernel.explained(
+        island.state,
+        graph.offset,
+        island.factors,
+        island.settings.covariance_factor,
+        graph.entry,
+        graph.pattern.value_start,
+        island.selected_covariance,
+    )
+    weight = island.weight
+    taken = weight * explained
+    submaps = tuple(
+        SubmapCost(of.stream, of.sequence, float(chi2), float(own), float(w))
+        for (of, *_), chi2, own, w in zip(
+            graph.submaps, island.whole_chi2, graph.dimensions - taken, weight, strict=True
+        )
+    )
+    counted = zip(
+        graph.submaps, weight * island.counted_chi2, island.dimensions - taken, strict=True
+    )
+    robots: dict[str, tuple[float, float]] = {}
+    for robot, chi2, own in [
+        *((of.robot, float(chi2), float(own)) for (of, *_), chi2, own in counted),
+        *_priors(island),
+        *_sightings(island),
+    ]:
+        before = robots.get(robot, (0.0, 0.0))
+        robots[robot] = (before[0] + chi2, before[1] + own)
+    chi2 = sum(robots[robot][0] for robot in sorted(robots))
+    total = sum(robots[robot][1] for robot in sorted(robots))
+    return Agreement(chi2, total, {robot: robots[robot] for robot in sorted(robots)}, submaps)
+
+
+def _nodes(island: Island, ids: Sequence[int]) -> list[int]:
+    return [island.graph.landmarks[id_] for id_ in ids]
+
+
+def _mean(island: Island, node: int) -> Float[np.ndarray, " k"]:
+    return island.state[island.graph.offset[node] : island.graph.offset[node + 1]]
+
+
+def _own_marginal(
+    island: Island, node: int
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    block = island.graph.pattern.diagonal_block(island.selected_covariance, node)
+    fixed = bool(island.graph.fixed[node])
+    return _mean(island, node), np.zeros_like(block) if fixed else block
+
+
+def _sightings(island: Island) -> list[tuple[str, float, float]]:
+    """(observer, w χ², dof) of the sightings."""
+    graph, weight = island.graph, island.sighting_weight
+    explained = explained_by_sightings(
+        island.state,
+        graph.offset,
+        graph.sighting_factors,
+        graph.entry,
+        graph.pattern.value_start,
+        island.selected_covariance,
+    )
+    chi2, dof = weight * island.sighting_chi2, 2.0 - weight * explained
+    observers = [each.sighting.robot for each in graph.sightings]
+    return list(zip(observers, chi2.tolist(), dof.tolist(), strict=True))
+
+
+def _priors(island: Island) -> list[tuple[str, float, float]]:
+    """(robot, χ², dof) of the priors on starts and biases; the team's counts with its frame."""
+    robots = {nodes[0]: stream[0] for stream, nodes in island.graph.streams.items()}
+    robots |= {node: stream[0] for (stream, _), node in island.graph.biases.items()}
+    robots |= dict.fromkeys(island.graph.common.values(), min(island.graph.streams)[0])
+    return [
+        (
+            robots[prior.node],
+            float(chi2),
+            len(prior.mean)
+            - float(np.sum(prior.information * _own_marginal(island, prior.node)[1])),
+        )
+        for prior, chi2 in zip(island.graph.priors, island.prior_chi2, strict=True)
+    ]

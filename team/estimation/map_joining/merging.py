@@ -1,0 +1,150 @@
+"""Two islands become one when the points that both know leave one likely place for the other.
+
+A merge is tried from every place that the tied points propose: all of them, the landmarks alone,
+the sightings alone, and every heading at which the points fit well. Each is solved in full, and so
+is a start that owes nothing to any of them (`minima`). The lowest cost is taken if the two maps do
+not disagree there and no other place is about as likely; else the merge waits and says why.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation.contribution import named
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining import alignment
+from team.estimation.map_joining.alignment import Alignment, Shared
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island, is_solvable, joint_marginal
+from team.estimation.map_joining.island_ties import Tie, aligned_by, headings_that_fit, ties
+from team.estimation.map_joining.minima import Minimum, Search, minimum, searched
+from team.estimation.map_joining.submap_graph import merged, met
+
+WORTH_TELLING = 1.0
+"""A search that gained less than this in χ² found the place that the first guess led to."""
+
+
+class Merge(NamedTuple):
+    """The islands as one, the sightings that still wait, and how sure it is, in words."""
+
+    best: Minimum
+    waiting: tuple[Sighting, ...]
+    words: str
+
+
+class Waits(NamedTuple):
+    """Why two islands stay apart; after_search: places were solved for, which took its time."""
+
+    why: str
+    after_search: bool
+
+
+def ages(count: int) -> Int64[np.ndarray, " count"]:
+    """The ages of so many new factors."""
+    return np.zeros(count, dtype=np.int64)
+
+
+def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[Sighting, ...]]:
+    """The island with the sightings that it has both pose nodes of, and those that still wait."""
+    candidates = [(each, met(island.graph, each)) for each in waiting]
+    found = [between for _, between in candidates if between is not None]
+    if not found:
+        return island, tuple(waiting)
+    graph = replace(island.graph, sightings=(*island.graph.sightings, *found))
+    age = np.concatenate([island.sighting_age, ages(len(found))])
+    left = tuple(each for each, between in candidates if between is None)
+    return replace(island, graph=graph, sighting_age=age), left
+
+
+def merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | Waits:
+    """The other island in the main one's frame, or why it waits.
+
+    Where the numbers of the shared points allow no solution, they wait as well.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            return _merge(main, other, waiting)
+    except UNSOLVABLE as error:
+        return Waits(f"can not be solved for: {error}", after_search=True)
+
+
+def _merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | Waits:
+    tied = ties(main.graph, other.graph, waiting)
+    seen = sum(tie.seen is not None for tie in tied)
+    shared = Shared(len(tied) - seen, seen)
+    found = aligned_by(main, other, tied)
+    why = alignment.refusal(shared, found, main.settings.alignment_heading_sigma)
+    if found is None or why is not None:
+        return Waits(why or str(shared), after_search=False)
+    both, left = _placed(main, other, found.a_from_b, waiting)
+    graph = both.graph
+    others = [_placed(main, other, place, ())[0] for place in _places(main, other, tied)]
+    search = searched([both, *(replace(both, state=each.state) for each in others)])
+    rise = search.best.cost - minimum(main).cost - minimum(other).cost
+    why = alignment.disagreement(shared, rise, main.settings.alignment_confidence)
+    if why is None and search.second is not None and search.ambiguous:
+        why = _ambiguous(shared, search, search.second, graph.streams[min(other.graph.streams)][0])
+    if why is not None:
+        return Waits(why, after_search=True)
+    if not is_solvable(search.best.island):
+        return Waits(f"{shared}, with which the map has no solution", after_search=True)
+    return Merge(search.best, left, _words(other, shared, search, rise))
+
+
+def _placed(
+    main: Island,
+    other: Island,
+    main_from_other: Float[np.ndarray, "3"],
+    waiting: Sequence[Sighting],
+) -> tuple[Island, tuple[Sighting, ...]]:
+    """Both islands as one, every factor's robust scale anew."""
+    graph, state = merged(main.graph, main.state, other.graph, other.state, main_from_other)
+    new = ages(len(graph.submaps)), ages(len(graph.sightings))
+    return sighted(Island(graph, state, *new, main.settings), waiting)
+
+
+def _places(main: Island, other: Island, tied: Sequence[Tie]) -> list[Float[np.ndarray, "3"]]:
+    """Further places of the other island that its points propose."""
+    by_landmarks = [tie for tie in tied if tie.seen is None]
+    by_sightings = [tie for tie in tied if tie.seen is not None]
+    proposed: list[Alignment | None] = []
+    if by_landmarks and by_sightings:
+        for some in (by_landmarks, by_sightings):
+            with suppress(*UNSOLVABLE):
+                proposed.append(aligned_by(main, other, some))
+    places = [found.a_from_b for found in proposed if found is not None]
+    return [*places, *headings_that_fit(main, other, tied)]
+
+
+def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
+    begin = island.graph.offset[node]
+    return island.state[begin : begin + 3]
+
+
+def _ambiguous(shared: Shared, search: Search, second: Minimum, node: int) -> str:
+    """Why a merge waits: another place is about as likely."""
+    away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
+    return (
+        f"{shared} leave two places {np.hypot(away[0], away[1]):.1f} m apart: "
+        f"chi² of one is only {second.cost - search.best.cost:.1f} more"
+    )
+
+
+def _words(other: Island, shared: Shared, search: Search, rise: float) -> str:
+    """How an island was joined and how sure its place is."""
+    stream = min(other.graph.streams)
+    node = search.best.island.graph.streams[stream][0]
+    _, covariance = joint_marginal(search.best.island, [node])
+    sigma_m = float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
+    sigma_deg = float(np.degrees(np.sqrt(covariance[2, 2])))
+    dof = 2 * sum(shared) - 3
+    text = (
+        f"{named(stream)} joined: {shared}, chi² {max(rise, 0.0) / dof:.1f} per degree of freedom, "
+        f"transform sigma {sigma_m:.2g} m / {sigma_deg:.2g}°"
+    )
+    if search.gained > WORTH_TELLING:
+        text += f"; the first guess led to a minimum {search.gained:.0f} higher in chi²"
+    return text

@@ -1,0 +1,299 @@
+"""The search for wrong minima: the same island solved from several starts, the lowest cost kept.
+
+Headings make joining a problem with many minima: after a long way without a landmark Gauss-Newton
+may fold a chain wrongly and stay there. A cost far above its degrees of freedom betrays that; so
+does another start that ends lower. What ends about as low elsewhere is a second map that the same
+submaps allow.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import chdtri
+
+from team.estimation.contribution import Stream, named
+from team.estimation.geometry import wrapped
+from team.estimation.map_joining.gauss_newton import (
+    UNSOLVABLE,
+    Island,
+    NotDeterminedError,
+    final_cost,
+    settled,
+)
+from team.estimation.map_joining.nonlinearity import bends, ends, walks
+from team.estimation.map_joining.relaxation import relaxed
+from team.estimation.sparse_cholesky import sparse_kernel
+
+Values = Float[np.ndarray, " _"]
+
+LIKELY = 0.999
+"""Quantile of χ² that a cost must exceed to be suspicious, and a second minimum to be unlikely."""
+SUSPICIOUS = 1.3
+"""… and by this factor its degrees of freedom: submaps are Gaussian only nearly."""
+SETTLED_M = 1e-3
+"""A solution whose last step was longer [m, rad] is no minimum yet."""
+MORE_SOLUTIONS = 4
+"""So often the best one is solved on before it is said not to settle."""
+FEW_LANDMARKS = 6
+"""With so few a chain may fold wrongly at a cost that is not suspicious."""
+WIDE = 30.0
+"""Cauchy's scale at which the annealed start begins."""
+
+
+class Minimum(NamedTuple):
+    """A full solution, the iterations that it took, its last change [m, rad] and its cost."""
+
+    island: Island
+    iterations: int
+    change: float
+    cost: float
+
+
+class Search(NamedTuple):
+    """The lowest minimum; by how much it lies below the first start's, and below a second place.
+
+    second: None where no second minimum was found.
+    """
+
+    best: Minimum
+    gained: float
+    second: Minimum | None
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether a second minimum is about as likely as the best one."""
+        return self.second is not None and self.second.cost - self.best.cost < likely_rise()
+
+
+def minimum(island: Island) -> Minimum:
+    """The full solution from the island's state."""
+    solved, iterations, change = settled(island)
+    return Minimum(solved, iterations, change, final_cost(solved))
+
+
+def degrees_of_freedom(island: Island) -> int:
+    """What is measured less what is unknown."""
+    graph = island.graph
+    priors = sum(len(prior.mean) for prior in graph.priors)
+    measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
+    return measured - graph.unknowns
+
+
+def suspicious(island: Island, cost: float) -> bool:
+    """Whether the cost is far above what its degrees of freedom allow."""
+    dof = degrees_of_freedom(island)
+    return dof > 0 and cost > max(SUSPICIOUS * dof, _quantile(dof))
+
+
+@lru_cache(maxsize=4096)
+def _quantile(dof: int) -> float:
+    return float(chdtri(dof, 1.0 - LIKELY))
+
+
+def likely_rise() -> float:
+    """A place in the plane whose cost is higher by more than this is unlikely: χ² of 3."""
+    return _quantile(3)
+
+
+def searched(starts: Sequence[Island]) -> Search:
+    """The lowest minimum from some starts of one graph, and from the relaxation of its headings.
+
+    The first start is the one that would be taken without a search. While the lowest cost is
+    suspicious, and always with few landmarks, starts that leave the sightings out or doubt every
+    factor are tried as well. A start that leads to no solution is left out; raises
+    NotDeterminedError where none leads to one.
+    """
+    few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
+    found = list(_minima(starts))
+    for each in _minima(_further(starts[0])):
+        found.append(each)
+        if not few and not suspicious(starts[0], min(each.cost for each in found)):
+            break
+    if not found:
+        raise NotDeterminedError("every place that was tried")
+    return _lowest(found)
+
+
+def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
+    """The minima of those starts that lead to one: no start of a search can end it."""
+    for start in starts:
+        found = None
+        with suppress(*UNSOLVABLE), np.errstate(all="ignore"):
+            found = minimum(start)
+        if found is not None and math.isfinite(found.cost):
+            yield found
+
+
+def widened(search: Search) -> Search:
+    """The search with the minima beside the best one; with few landmarks.
+
+    Each heading of a first or last pose that is known badly is moved as far as is likely, and each
+    stream is mirrored where it goes from one landmark to another, as a chain folds over to the
+    other side of the line between two points. A solution that does not come back has crossed into
+    another valley.
+    """
+    best = search.best.island
+    if len(best.graph.landmarks) > FEW_LANDMARKS:
+        return search
+    found = [search.best] if search.second is None else [search.best, search.second]
+    for _, _, node in ends(best):
+        with suppress(*UNSOLVABLE):  # of the walk itself
+            found += _minima(walked for walked, _ in walks(best, node))
+    found += _minima(_mirrored(best))
+    wider = _lowest(found)
+    return wider._replace(gained=search.gained + search.best.cost - wider.best.cost)
+
+
+def _mirrored(island: Island) -> Iterator[Island]:
+    """The island with a stream's poses on the other side of a line through two landmarks.
+
+    With the line's direction α: p' = a + R(2α) conj(p − a), θ' = 2α − θ.
+    """
+    graph = island.graph
+    for stream in sorted(graph.streams):
+        own = [node for (of, _), node in graph.poses.items() if of == stream]
+        poses = np.array([n for n in (*graph.streams[stream], *own) if not graph.fixed[n]])
+        at = graph.offset[poses]
+        for pair in _passages(island, stream):
+            a, b = (complex(*island.state[at_l : at_l + 2]) for at_l in pair)
+            if a == b:
+                continue
+            turned = ((b - a) / abs(b - a)) ** 2
+            p = island.state[at] + 1j * island.state[at + 1]
+            p = a + turned * np.conj(p - a)
+            state = island.state.copy()
+            state[at], state[at + 1] = p.real, p.imag
+            state[at + 2] = [wrapped(np.angle(turned) - h) for h in island.state[at + 2].tolist()]
+            yield replace(island, state=state)
+
+
+def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
+    """The pairs of landmarks, as places in the state, that a stream sees one after the other."""
+    graph, before = island.graph, set[int]()
+    pairs: set[tuple[int, int]] = set()
+    for contribution, *_ in graph.submaps:
+        seen = {graph.landmarks[id_] for id_ in contribution.local.ids.tolist()}
+        if contribution.stream != stream or not seen:
+            continue
+        pairs |= {(min(a, b), max(a, b)) for a in before for b in seen - before if a not in seen}
+        before = seen
+    return [(int(graph.offset[a]), int(graph.offset[b])) for a, b in sorted(pairs)]
+
+
+def _lowest(found: Sequence[Minimum]) -> Search:
+    """Of minima of one graph, the first of them the one that would be taken without a search."""
+    best = _at_rest(min(found, key=lambda each: each.cost))
+    others = [each for each in found if each.change < SETTLED_M and elsewhere(each, best)]
+    second = min(others, key=lambda each: each.cost, default=None)
+    return Search(best, found[0].cost - best.cost, second)
+
+
+def _further(island: Island) -> Iterator[Island]:
+    """Starts that owe nothing to the island's state, the most promising first."""
+    graph = island.graph
+    guess = relaxed(graph, island.state)
+    if guess is not None:
+        yield replace(island, state=guess)
+    if graph.sightings:
+        unseen = replace(
+            island, graph=replace(graph, sightings=()), sighting_age=island.sighting_age[:0]
+        )
+        alone = relaxed(unseen.graph, island.state)
+        if alone is not None:  # none, where only sightings tie the robots
+            for found in _minima([replace(unseen, state=alone)]):
+                yield replace(island, state=found.island.state)
+    if guess is not None and island.settings.robust_c is None:
+        doubting = replace(island.settings, robust_c=1.0, robust_start=WIDE)
+        for found in _minima([replace(island, state=guess, settings=doubting)]):
+            yield replace(island, state=found.island.state)
+
+
+def _at_rest(best: Minimum) -> Minimum:
+    """The minimum after further solutions from where it is, while it has not settled."""
+    for _ in range(MORE_SOLUTIONS):
+        if best.change <= SETTLED_M:
+            break
+        further = minimum(best.island)
+        best = further._replace(iterations=best.iterations + further.iterations)
+    return best
+
+
+def elsewhere(one: Minimum, best: Minimum) -> bool:
+    """Whether a minimum is another map, not one that the best one's covariance allows for.
+
+    With the difference d of the states and the information A at the best one, A alone would raise
+    the cost by dᵀAd on the way from one to the other.
+    """
+    difference = _difference(one.island, best.island)
+    return _quadratic(best.island, difference) > likely_rise()
+
+
+def _difference(one: Island, other: Island) -> Values:
+    difference: Values = one.state - other.state
+    headings = one.graph.headings
+    difference[headings] = [wrapped(float(turn)) for turn in difference[headings]]
+    return difference
+
+
+def _quadratic(island: Island, x: Values) -> float:
+    """xᵀAx with the information A of the island at its state."""
+    values, _ = island.normal_equations
+    pattern = island.graph.pattern
+    entries = pattern.rows, pattern.columns, pattern.value_start
+    return sparse_kernel.quadratic(values, *entries, island.graph.offset, x)
+
+
+def doubts(search: Search) -> list[str]:
+    """What a map's user must know of its minimum, in words; empty where it is the only one."""
+    island, found = search.best.island, []
+    dof = degrees_of_freedom(island)
+    if suspicious(island, search.best.cost):
+        found.append(
+            f"the map does not fit its submaps: chi² {search.best.cost:.1f} with {dof} degrees of "
+            "freedom; it may be a wrong minimum, or the covariances are too small"
+        )
+    if search.best.change == math.inf:
+        found.append("the map has no full solution: it is what the last tick has left")
+    elif search.best.change > SETTLED_M:
+        found.append(
+            f"the map is not settled: after {search.best.iterations} iterations "
+            f"a step is still {search.best.change:.2g} m or rad"
+        )
+    limit = island.settings.alignment_heading_sigma
+    found += [
+        f"{named(stream)} is placed weakly: its heading is known to {np.degrees(sigma):.0f}° at "
+        f"best, {np.degrees(limit):.0f}° needed; the map may be bent by more than its covariance "
+        "says"
+        for stream, sigma in sorted(_heading_sigmas(island).items())
+        if sigma > limit
+    ]
+    with suppress(*UNSOLVABLE):  # a heading that can not be moved bends nothing
+        found += bends(island)
+    if search.second is not None and search.ambiguous:
+        away = _difference(search.second.island, island)
+        points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]
+        farthest = float(np.hypot(away[points], away[points + 1]).max())
+        found.append(
+            f"another map fits about as well: chi² {search.second.cost - search.best.cost:.1f} "
+            f"more, up to {farthest:.1f} m away"
+        )
+    return found
+
+
+def _heading_sigmas(island: Island) -> dict[Stream, float]:
+    """Of each stream the standard deviation [rad] of the heading that is known best."""
+    graph, covariance = island.graph, island.selected_covariance
+    return {
+        stream: 0.0
+        if graph.fixed[list(nodes)].any()
+        else min(
+            float(graph.pattern.diagonal_block(covariance, node)[2, 2]) ** 0.5 for node in nodes
+        )
+        for stream, nodes in graph.streams.items()
+    }

@@ -1,0 +1,109 @@
+"""Where a covariance does not say all: a pose in a curved valley of the cost.
+
+One heading is moved away from its best value, everything else solved for given that: the profile of
+the cost (Bates & Watts 1988, chapter 6). For a quadratic cost its rise is the χ² by which the
+pose's own covariance says that it has moved. After a long way without a landmark that χ² may be ten
+times the rise: the robot may well be where its covariance excludes it, though the minimum is right.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from team.estimation.contribution import Stream, named
+from team.estimation.gaussian import information
+from team.estimation.geometry import compose, inverse, logarithm
+from team.estimation.map_joining.gauss_newton import FULL_AGE, Island, aged, held, joint_marginal
+
+STEPS = (1.0, 2.0, 3.0)
+"""How far a heading is moved, in its standard deviations."""
+ITERATIONS = 4
+STRAIGHT_RAD = 0.1
+"""A heading known so well moves nothing far enough to bend."""
+BENT = 4.0
+"""χ² by the covariance over the rise of the cost: from here on the ellipse is too short by half."""
+UNLIKELY = float(chdtri(1, 1e-3))
+"""Where the cost has risen by more is not looked at: χ² of 1, 99.9 %."""
+
+
+class Bend(NamedTuple):
+    """A place of a pose so far [m] away: the rise of the cost, and χ² by the pose's covariance."""
+
+    distance: float
+    rise: float
+    chi2: float
+
+    @property
+    def ratio(self) -> float:
+        """1 where the cost is quadratic."""
+        return self.chi2 / max(self.rise, 1.0)
+
+
+def walks(island: Island, node: int) -> Iterator[tuple[Island, float]]:
+    """The likely islands with the heading of a pose moved, and by how much their cost is higher.
+
+    None where the heading is known too well for a bend.
+    """
+    _, covariance = joint_marginal(island, [node])
+    sigma = float(np.sqrt(covariance[2, 2]))
+    if sigma < STRAIGHT_RAD:
+        return
+    island = aged(island, FULL_AGE)
+    for sign in (1.0, -1.0):
+        walked = island
+        for before, after in zip((0.0, *STEPS), STEPS, strict=False):
+            by = sign * (after - before) * sigma
+            walked = held(walked, int(island.graph.offset[node]) + 2, by, ITERATIONS)
+            rise = walked.cost - island.cost
+            if not rise <= UNLIKELY:  # nor where the cost is no number
+                break
+            yield walked, rise
+
+
+def ends(island: Island) -> list[tuple[Stream, str, int]]:
+    """Every stream's first and last pose that is not given, with the word for it."""
+    return [
+        (stream, where, nodes[k])
+        for stream, nodes in sorted(island.graph.streams.items())
+        for where, k in (("started", 0), ("ended", -1))
+        if not island.graph.fixed[nodes[k]]
+    ]
+
+
+def bend(island: Island, node: int) -> Bend | None:
+    """Of a pose of an island at its minimum: the likely place that its covariance denies most.
+
+    None where it denies none.
+    """
+    mean, covariance = joint_marginal(island, [node])
+    # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
+    # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.
+    c, s = np.cos(mean[2]), np.sin(mean[2])
+    A = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    metric = information(A @ covariance @ A.T, "a pose")
+    at = int(island.graph.offset[node])
+    found = []
+    for walked, rise in walks(island, node):
+        pose = walked.state[at : at + 3]
+        eta = logarithm(compose(inverse(mean), pose))
+        distance = float(np.hypot(*(pose - mean)[:2]))
+        found.append(Bend(distance, rise, float(eta @ metric @ eta)))
+    worst = max(found, key=lambda each: each.ratio, default=None)
+    return None if worst is None or worst.ratio < BENT else worst
+
+
+def bends(island: Island) -> list[str]:
+    """In words, the bends of the first and the last pose of every stream without a given start."""
+    said = []
+    for stream, where, node in ends(island):
+        found = bend(island, node)
+        given = island.graph.fixed[island.graph.streams[stream][0]]
+        if found is not None and not given:
+            said.append(
+                f"{named(stream)} may have {where} farther off than its covariance says: "
+                f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "
+                f"covariance {found.chi2:.0f}"
+            )
+    return said

@@ -1,0 +1,217 @@
+"""A fold that is total: whatever a tick's members say, they are taken or refused with a reason.
+
+What the numbers of a set allow to be solved is not known before it is tried. So a tick is taken as
+it is; only if that has no solution are its members taken one after the other in canonical order,
+and those left out with which there is none. That depends on the fold before and on the tick's
+members alone, hence on the set (law 2): any order of arrival gives the same refusals.
+
+Of a submap that can not be taken as it is, its motion is tried alone, the marginal of its end pose,
+so that the robot's later submaps keep their place. Where that fails too, the robot's chain ends:
+what lies behind has no place in any frame, and is not in the map. An initial pose that can not be
+taken is taken as unknown; an inter-robot measurement is left out.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+
+from team.estimation.contribution import Contribution, Key, Start, Stream, named
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
+from team.estimation.map_joining.joining import Fold, folded, started
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Tick:
+    """The members that one tick brings, in canonical order.
+
+    contributions: the submaps. sightings: the inter-robot measurements from them.
+    starts: the initial poses of the streams whose first submap is among them.
+    outside: why a submap is refused before it is tried (it lies beyond what is sensible).
+    set_aside: in words, what else was refused before.
+    """
+
+    contributions: Sequence[Contribution]
+    sightings: Sequence[Sighting] = ()
+    starts: Sequence[Start] = ()
+    outside: Mapping[Key, str] = field(default_factory=dict)
+    set_aside: tuple[str, ...] = ()
+
+
+def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
+    """The fold with the tick; `refused` and `set_aside` say what of it is not in the map."""
+    fold = replace(fold, set_aside=(*fold.set_aside, *tick.set_aside))
+    fold, members = _in_reach(fold, tick.contributions, tick.outside)
+    streams = {each.stream for each in members}
+    starts = [start for start in tick.starts if start.stream in streams]
+    sightings = _of_members(tick.sightings, fold)
+    whole = _attempt(fold, members, starts, sightings, settings)
+    if whole is not None:
+        return whole
+    return _OneByOne(fold, settings, {start.stream: start for start in starts}).taken(
+        members, sightings
+    )
+
+
+def refusals(fold: Fold) -> list[str]:
+    """In words: per chain the submap at which it ended and how many lie behind, then the rest."""
+    ended: dict[Stream, list[int]] = {}
+    for _, robot, epoch, sequence in fold.refused:
+        ended.setdefault((robot, epoch), []).append(sequence)
+    words = []
+    for stream in sorted(ended):
+        first, behind = min(ended[stream]), len(ended[stream]) - 1
+        why = next(w for k, w in fold.refused.items() if (*k[1:3], k[3]) == (*stream, first))
+        tail = f"; the {behind} behind it are not in the map either" if behind else ""
+        words.append(f"submap {first} of {named(stream)} refused: {why}{tail}")
+    return [*words, *fold.set_aside]
+
+
+def _in_reach(
+    fold: Fold, contributions: Sequence[Contribution], outside: Mapping[Key, str]
+) -> tuple[Fold, list[Contribution]]:
+    """The submaps to be tried; those outside, and what lies behind a refused one, are refused."""
+    refused = dict(fold.refused)
+    ended = {(robot, epoch) for _, robot, epoch, _ in refused}
+    members = []
+    for each in contributions:
+        why = "the chain ended before it" if each.stream in ended else outside.get(each.key)
+        if why is None:
+            members.append(each)
+        else:
+            refused[each.key] = why
+            ended.add(each.stream)
+    return replace(fold, refused=refused), members
+
+
+def _of_members(sightings: Iterable[Sighting], fold: Fold) -> list[Sighting]:
+    """The inter-robot measurements whose submaps are not refused."""
+    gone = {key[1:] for key in fold.refused}
+    return [each for each in sightings if (*each.stream, each.sequence) not in gone]
+
+
+def _attempt(
+    fold: Fold,
+    members: Sequence[Contribution],
+    starts: Iterable[Start],
+    sightings: Sequence[Sighting],
+    settings: JoinSettings,
+) -> Fold | None:
+    """One tick with these members; None where it has no solution."""
+    for start in starts:
+        fold = started(fold, start)
+    try:
+        with np.errstate(all="ignore"):
+            after = folded(fold, members, settings, sightings)
+    except UNSOLVABLE:
+        return None
+    changed = (
+        island
+        for key, island in after.islands.items()
+        if key not in fold.islands or island.state is not fold.islands[key].state
+    )
+    return after if all(is_solvable(island) for island in changed) else None
+
+
+class _OneByOne:
+    """A tick that has no solution as a whole: grown by what has one, in canonical order."""
+
+    def __init__(self, fold: Fold, settings: JoinSettings, starts: Mapping[Stream, Start]) -> None:
+        self._fold = fold
+        self._settings = settings
+        self._starts = dict(starts)
+        self._members: list[Contribution] = []
+        self._refused = dict(fold.refused)
+        self._set_aside = list(fold.set_aside)
+
+    def taken(self, members: Sequence[Contribution], sightings: Sequence[Sighting]) -> Fold:
+        """The submaps first, then the inter-robot measurements, those that waited among them."""
+        unseen = replace(self._fold, waiting=())
+        self._grow(unseen, members)
+        base = replace(unseen, refused=dict(sorted(self._refused.items())))
+        waiting = [*self._fold.waiting, *_of_members(sightings, base)]
+        candidates = sorted(waiting, key=lambda each: each.key)
+
+        def after(some: Sequence[Sighting]) -> Fold | None:
+            return _attempt(base, self._members, self._of(self._members), some, self._settings)
+
+        kept, bad = _greatest(candidates, lambda some: after(some) is not None)
+        self._set_aside += [
+            f"an inter-robot measurement of {each.teammate} by {named(each.stream)} at "
+            f"{each.stamp_ns * 1e-9:.1f} s refused: with it the map has no solution"
+            for each in bad
+        ]
+        found = after(kept)
+        if found is None:  # none of the members: the fold as it was, with its measurements
+            found = replace(base, waiting=tuple(kept))
+        return replace(found, set_aside=tuple(self._set_aside))
+
+    def _of(self, members: Sequence[Contribution]) -> list[Start]:
+        streams = {each.stream for each in members}
+        return [start for stream, start in self._starts.items() if stream in streams]
+
+    def _solves(self, fold: Fold, members: Sequence[Contribution]) -> bool:
+        return _attempt(fold, members, self._of(members), (), self._settings) is not None
+
+    def _grow(self, fold: Fold, block: Sequence[Contribution]) -> None:
+        """Take a block, or its halves, or refuse the one submap that it is."""
+        ended = {(robot, epoch) for _, robot, epoch, _ in self._refused}
+        for each in block:
+            if each.stream in ended:
+                self._refused[each.key] = "the chain ended before it"
+        block = [each for each in block if each.stream not in ended]
+        if not block:
+            return
+        if self._solves(fold, [*self._members, *block]):
+            self._members += block
+        elif len(block) > 1:
+            half = len(block) // 2
+            self._grow(fold, block[:half])
+            self._grow(fold, block[half:])
+        else:
+            self._grow_by_less(fold, block[0])
+
+    def _grow_by_less(self, fold: Fold, whole: Contribution) -> None:
+        """Of one submap what can be taken: without its initial pose, its motion alone, nothing."""
+        start = self._starts.pop(whole.stream, None) if whole.sequence == 0 else None
+        if start is not None and self._solves(fold, [*self._members, whole]):
+            self._members.append(whole)
+            self._set_aside.append(
+                f"the initial pose of {named(whole.stream)} refused, taken as unknown: "
+                "with it the map has no solution"
+            )
+            return
+        if start is not None:
+            self._starts[whole.stream] = start
+        motion = replace(whole, local=whole.local.motion)
+        if self._solves(fold, [*self._members, motion]):
+            self._members.append(motion)
+            self._set_aside.append(
+                f"of submap {whole.sequence} of {named(whole.stream)} only the motion is in the "
+                "map: with its landmarks it has no solution"
+            )
+            return
+        self._refused[whole.key] = "with it the map has no solution"
+
+
+def _greatest(items: Sequence[T], works: Callable[[Sequence[T]], bool]) -> tuple[list[T], list[T]]:
+    """The items kept one after the other while `works`, by halves; and those that are left out."""
+    kept: list[T] = []
+    bad: list[T] = []
+
+    def add(block: Sequence[T]) -> None:
+        if not block or works([*kept, *block]):
+            kept.extend(block)
+        elif len(block) == 1:
+            bad.extend(block)
+        else:
+            half = len(block) // 2
+            add(block[:half])
+            add(block[half:])
+
+    add(items)
+    return kept, bad

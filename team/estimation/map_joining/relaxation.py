@@ -1,0 +1,147 @@
+"""A first guess of a whole graph that depends on no earlier guess: headings as vectors.
+
+With (c, s) = (cos θ, sin θ) of each pose as two free numbers, what a submap says is linear,
+
+    p − p_s − [[c_s, −s_s], [s_s, c_s]] z = 0,   (c, s)_e − R(z_θ) (c, s)_s = 0,
+
+so least squares over all of it have one minimum, which no long way without a landmark can hide
+(the chordal relaxation: Martinec & Pajdla 2007, Carlone et al. 2015). Headings are read off at the
+end. Weights are the variances of each point, correlations left out: it is a start, not an estimate.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+from team.estimation.map_joining.submap_graph import Graph
+
+Values = Float[np.ndarray, " _"]
+Indices = Int64[np.ndarray, " _"]
+
+
+class _Rows(NamedTuple):
+    """R rows Σ coefficient · number = right, of T terms each, with weights 1/σ."""
+
+    numbers: Int64[np.ndarray, "R T"]
+    coefficients: Float[np.ndarray, "R T"]
+    right: Float[np.ndarray, " R"]
+    weights: Float[np.ndarray, " R"]
+
+
+def relaxed(graph: Graph, state: Values) -> Values | None:
+    """A state of the graph; fixed nodes and biases stay. None where it is not determined."""
+    sizes = np.diff(graph.offset).tolist()
+    at = np.concatenate([[0], np.cumsum([4 if size == 3 else size for size in sizes])])
+    numbers = np.zeros(at[-1])
+    free = np.ones(at[-1], dtype=np.bool_)
+    movable = ~graph.fixed & (np.diff(graph.offset) > 1)
+    for node in np.flatnonzero(~movable):
+        value = state[graph.offset[node] : graph.offset[node + 1]]
+        numbers[at[node] : at[node + 1]] = _lifted(value) if len(value) == 3 else value
+        free[at[node] : at[node + 1]] = False
+    found = _least_squares(list(_rows(graph, at)), numbers, free)
+    if found is None:
+        return None
+    moved = state.copy()
+    for node in np.flatnonzero(movable):
+        value, size = found[at[node] : at[node + 1]], sizes[node]
+        if size == 3:
+            value = np.array([value[0], value[1], math.atan2(value[3], value[2])])
+        moved[graph.offset[node] : graph.offset[node + 1]] = value
+    return moved
+
+
+def _lifted(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
+    return np.array([pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])])
+
+
+def _least_squares(
+    rows: Sequence[_Rows], numbers: Values, free: Bool[np.ndarray, " _"]
+) -> Values | None:
+    """The free numbers that solve the rows best, given the others."""
+    weighted = [each.weights[:, None] * each.coefficients for each in rows]
+    counts = np.repeat([each.numbers.shape[1] for each in rows], [len(r.right) for r in rows])
+    line = np.repeat(np.arange(len(counts)), counts)
+    column = np.concatenate([each.numbers.ravel() for each in rows])
+    values = np.concatenate([each.ravel() for each in weighted])
+    A = csc_array((values, (line, column)), shape=(len(counts), len(numbers)))
+    right = np.concatenate([each.weights * each.right for each in rows])
+    B = A[:, np.flatnonzero(free)]
+    right = right - A[:, np.flatnonzero(~free)] @ numbers[~free]
+    try:
+        factor = splu((B.T @ B).tocsc(), permc_spec="MMD_AT_PLUS_A")
+    except RuntimeError:  # SuperLU's word for a matrix that is exactly singular
+        return None
+    solved = numbers.copy()
+    solved[free] = factor.solve(B.T @ right)
+    return solved if np.isfinite(solved).all() else None
+
+
+def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
+    """What submaps, sightings and priors say; `at`: first of the numbers of each node."""
+    for contribution, nodes, _ in graph.submaps:
+        local, start = contribution.local, int(at[nodes[0]])
+        variances = np.diag(local.covariance)
+        count = 1 + len(local.node_stamps)
+        poses = local.mean[: 3 * count].reshape(-1, 3)
+        spreads = variances[: 3 * count].reshape(-1, 3)
+        points = np.concatenate([poses[:, :2], local.landmarks])
+        spread = np.concatenate([spreads[:, :2], variances[3 * count :].reshape(-1, 2)])
+        yield _points(
+            start, at[nodes[1 : len(points) + 1]], points, 1.0 / np.sqrt(spread.mean(axis=1))
+        )
+        yield _turns(start, at[nodes[1 : count + 1]], poses[:, 2], 1.0 / np.sqrt(spreads[:, 2]))
+    for sighting, observer, teammate in graph.sightings:
+        distance, bearing = sighting.reading.tolist()
+        spread = 0.5 * (sighting.covariance[0, 0] + sighting.covariance[1, 1] * distance**2)
+        point = distance * np.array([[math.cos(bearing), math.sin(bearing)]])
+        weight = np.array([1.0 / math.sqrt(spread)])
+        yield _points(int(at[observer]), at[[teammate]], point, weight)
+    for node, mean, information in graph.priors:
+        if len(mean) == 1:
+            continue
+        numbers = at[node] + np.arange(4)
+        weights = np.sqrt(np.diag(information))[[0, 1, 2, 2]]
+        yield _Rows(numbers[:, None], np.ones((4, 1)), _lifted(mean), weights)
+
+
+def _points(
+    start: int,
+    points: Int64[np.ndarray, " n"],
+    places: Float[np.ndarray, "n 2"],
+    weights: Float[np.ndarray, " n"],
+) -> _Rows:
+    """Points at these places in the frame of a start."""
+    n = len(points)
+    numbers = np.empty((2 * n, 4), dtype=np.int64)
+    numbers[0::2, 0], numbers[1::2, 0] = points, points + 1
+    numbers[0::2, 1], numbers[1::2, 1] = start, start + 1
+    numbers[:, 2:] = start + 2, start + 3
+    coefficients = np.empty((2 * n, 4))
+    coefficients[:, :2] = 1.0, -1.0
+    coefficients[0::2, 2], coefficients[0::2, 3] = -places[:, 0], places[:, 1]
+    coefficients[1::2, 2], coefficients[1::2, 3] = -places[:, 1], -places[:, 0]
+    return _Rows(numbers, coefficients, np.zeros(2 * n), np.repeat(weights, 2))
+
+
+def _turns(
+    start: int,
+    poses: Int64[np.ndarray, " n"],
+    angles: Float[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
+) -> _Rows:
+    """Headings of these poses relative to a start's."""
+    n = len(poses)
+    c, s = np.cos(angles), np.sin(angles)
+    numbers = np.empty((2 * n, 3), dtype=np.int64)
+    numbers[0::2, 0], numbers[1::2, 0] = poses + 2, poses + 3
+    numbers[:, 1:] = start + 2, start + 3
+    coefficients = np.ones((2 * n, 3))
+    coefficients[0::2, 1], coefficients[0::2, 2] = -c, s
+    coefficients[1::2, 1], coefficients[1::2, 2] = -s, -c
+    return _Rows(numbers, coefficients, np.zeros(2 * n), np.repeat(weights, 2))

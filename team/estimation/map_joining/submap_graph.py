@@ -1,0 +1,378 @@
+"""The factor graph of one frame: poses and landmarks, submaps and sightings, priors on starts.
+
+A `Graph` is the structure; it stays while the state moves. Every function returns new values. The
+value of a node that is added is found by composition from the nodes that are there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.config import Bias
+from team.estimation.contribution import Contribution, Start, Stream, named
+from team.estimation.geometry import compose, transformed
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.inter_robot_kernel import Sightings
+from team.estimation.map_joining.joining_kernel import Factors, block_pattern
+from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
+from team.estimation.submap import LocalMap
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+
+
+NONE_IN_COMMON: Mapping[Bias, float] = MappingProxyType({})
+
+
+class Prior(NamedTuple):
+    """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹), never down-weighted."""
+
+    node: int
+    mean: Float[np.ndarray, " k"]
+    information: Float[np.ndarray, "k k"]
+
+
+class Joined(NamedTuple):
+    """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
+
+    common: those of its biases that have a node of the whole team too, which stand last.
+    """
+
+    contribution: Contribution
+    nodes: Indices
+    common: tuple[Bias, ...] = ()
+
+    @property
+    def biases(self) -> tuple[Bias, ...]:
+        """The bias of each row of `sensitivity`."""
+        return (*self.contribution.local.biases, *self.common)
+
+    @property
+    def sensitivity(self) -> Float[np.ndarray, "B _"]:
+        """∂mean/∂b, a row for each bias node: a robot's own error and the team's add."""
+        local = self.contribution.local
+        if not self.common:
+            return local.sensitivity
+        return local.sensitivity[[local.biases.index(bias) for bias in self.biases]]
+
+
+class Met(NamedTuple):
+    """A sighting in the graph, between the pose nodes of the observer and of the teammate."""
+
+    sighting: Sighting
+    observer: int
+    teammate: int
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Nodes in the order in which they came, and what ties them.
+
+    streams:   nodes of each stream: its start, then the end pose of submap 0, 1, …
+    landmarks: node of each landmark id.
+    poses:     node of each further pose, by (stream, stamp).
+    biases:    node of each error that the submaps of a stream share.
+    common:    node of each error that all streams share; these and `biases` have one number.
+    offset:    first number of each node in the state; the last is the state's length.
+    fixed:     nodes that are constants (exact starts, the gauge).
+    submaps, sightings: in the order in which they were taken.
+    """
+
+    streams: Mapping[Stream, tuple[int, ...]]
+    landmarks: Mapping[int, int]
+    poses: Mapping[tuple[Stream, int], int]
+    biases: Mapping[tuple[Stream, Bias], int]
+    offset: Indices
+    fixed: Bool[np.ndarray, " _"]
+    submaps: tuple[Joined, ...]
+    sightings: tuple[Met, ...]
+    priors: tuple[Prior, ...]
+    common: Mapping[Bias, int] = field(default_factory=dict)
+
+    @cached_property
+    def factors(self) -> Factors:
+        """The submaps in flat arrays, for the kernels."""
+        submaps = [each.contribution for each in self.submaps]
+        return Factors(
+            np.concatenate([np.zeros(0, np.int64), *(each.nodes for each in self.submaps)]),
+            _starts([len(each.nodes) for each in self.submaps]),
+            np.concatenate([np.zeros(0), *(each.local.mean for each in submaps)]),
+            _starts([len(each.local.mean) for each in submaps]),
+            np.concatenate([np.zeros(0), *(each.information.ravel() for each in submaps)]),
+            _starts([each.information.size for each in submaps]),
+            np.concatenate([np.zeros(0), *(each.sensitivity.ravel() for each in self.submaps)]),
+            _starts([each.sensitivity.size for each in self.submaps]),
+            np.concatenate([np.zeros((0, 3)), *(_blocks(each.local) for each in submaps)]),
+            _starts([len(each.local.ids) for each in submaps]),
+            np.array([b == "range_scale" for each in self.submaps for b in each.biases], np.bool_),
+            _starts([len(each.biases) for each in self.submaps]),
+        )
+
+    @cached_property
+    def sighting_factors(self) -> Sightings:
+        """The sightings in flat arrays, for the kernels; their entries follow the submaps'."""
+        return Sightings(
+            np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
+            np.array([met.sighting.reading for met in self.sightings]).reshape(-1, 2),
+            np.array([met.sighting.information for met in self.sightings]).reshape(-1, 2, 2),
+            int((np.diff(self.factors.member_start) ** 2).sum()),
+        )
+
+    @cached_property
+    def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
+        factors, pairs = self.factors, self.sighting_factors.nodes
+        members = factors.member_start[-1] + 2 * np.arange(1, len(pairs) + 1)
+        column_start, rows, entry = block_pattern(
+            self.fixed,
+            np.concatenate([factors.member, pairs.ravel()]),
+            np.concatenate([factors.member_start, members]),
+        )
+        return Pattern(np.diff(self.offset), column_start, rows), entry
+
+    @property
+    def pattern(self) -> Pattern:
+        """Blocks of the normal equations: a block variable per node."""
+        return self._pattern_and_entry[0]
+
+    @property
+    def entry(self) -> Indices:
+        """Entry of the pattern for each pair of members of each factor (see `block_pattern`)."""
+        return self._pattern_and_entry[1]
+
+    @cached_property
+    def analysis(self) -> Analysis:
+        """Order of elimination and places in the Cholesky factor."""
+        return analysed(self.pattern)
+
+    @cached_property
+    def dimensions(self) -> Indices:
+        """Numbers in each submap."""
+        dimensions: Indices = np.diff(self.factors.mean_start)
+        return dimensions
+
+    @cached_property
+    def headings(self) -> Indices:
+        """Where the headings lie in the state."""
+        headings: Indices = self.offset[:-1][np.diff(self.offset) == 3] + 2
+        return headings
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers to be estimated."""
+        return int(np.diff(self.offset)[~self.fixed].sum())
+
+    def name(self, node: int) -> str:
+        """What a node is, for messages."""
+        for stream, nodes in self.streams.items():
+            if node == nodes[0]:
+                return f"the start of {named(stream)}"
+            if node in nodes:
+                return f"the end of submap {nodes.index(node) - 1} of {named(stream)}"
+        for (stream, stamp_ns), at in self.poses.items():
+            if node == at:
+                return f"the pose of {named(stream)} at {stamp_ns * 1e-9:g} s"
+        for (stream, bias), at in self.biases.items():
+            if node == at:
+                return f"the bias {bias} of {named(stream)}"
+        for bias, at in self.common.items():
+            if node == at:
+                return f"the bias {bias} of the team"
+        ids = [id_ for id_, at in self.landmarks.items() if at == node]
+        return f"landmark {ids[0]}"
+
+
+EMPTY_GRAPH = Graph({}, {}, {}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), (), ())
+
+
+def _blocks(local: LocalMap) -> Float[np.ndarray, "L 3"]:
+    """Each landmark's own covariance (xx, xy, yy)."""
+    first = len(local.mean) - 2 * len(local.ids)
+    x, y = np.arange(first, len(local.mean), 2), np.arange(first + 1, len(local.mean), 2)
+    P = local.covariance
+    return np.column_stack([P[x, x], P[x, y], P[y, y]])
+
+
+def _starts(lengths: Sequence[int]) -> Indices:
+    """Where pieces of these lengths begin, one behind the other; the last is the end."""
+    return np.cumsum(np.array([0, *lengths], dtype=np.int64))
+
+
+class _Growth:
+    """The nodes that are being added to a graph, with their values; alive inside `extended`."""
+
+    def __init__(self, graph: Graph, state: Values) -> None:
+        self.streams = dict(graph.streams)
+        self.landmarks = dict(graph.landmarks)
+        self.poses = dict(graph.poses)
+        self.biases = dict(graph.biases)
+        self.common = dict(graph.common)
+        self.offset = graph.offset
+        self.state = state
+        self.count = len(graph.fixed)
+        self.values: list[Values] = []
+        self.fixed: list[bool] = []
+
+    def value(self, node: int, size: int) -> Values:
+        before = len(self.offset) - 1
+        if node >= before:
+            return self.values[node - before]
+        return self.state[self.offset[node] : self.offset[node] + size]
+
+    def add(self, value: Values, fixed: bool) -> int:
+        self.values.append(value)
+        self.fixed.append(fixed)
+        self.count += 1
+        return self.count - 1
+
+
+def extended(
+    graph: Graph,
+    state: Values,
+    contributions: Sequence[Contribution],
+    starts: Mapping[Stream, Start],
+    bias_sigma: Mapping[Bias, float],
+    common_bias_sigma: Mapping[Bias, float] = NONE_IN_COMMON,
+) -> tuple[Graph, Values]:
+    """The graph with more submaps, in the given order; a stream without a start begins at 0.
+
+    A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
+    first submap that sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of
+    its frame. A bias is N(0, bias_sigma²), what the team has in common N(0, common_bias_sigma²).
+    """
+    growth = _Growth(graph, state)
+    priors = list(graph.priors)
+    submaps = list(graph.submaps)
+    for contribution in contributions:
+        stream, local = contribution.stream, contribution.local
+        if stream not in growth.streams:
+            start = starts.get(stream, Start(*stream, np.zeros(3)))
+            node = growth.add(start.pose, start.covariance is None)
+            growth.streams[stream] = (node,)
+            if start.information is not None:
+                priors.append(Prior(node, start.pose, start.information))
+        start_node = growth.streams[stream][-1]
+        map_from_start = growth.value(start_node, 3)
+        end_node = growth.add(compose(map_from_start, local.end_pose), fixed=False)
+        growth.streams[stream] = (*growth.streams[stream], end_node)
+        poses = [growth.add(compose(map_from_start, node), fixed=False) for node in local.nodes]
+        for stamp_ns, node in zip(local.node_stamps.tolist(), poses, strict=True):
+            growth.poses[stream, stamp_ns] = node
+        for id_, point in zip(local.ids.tolist(), local.landmarks, strict=True):
+            if id_ not in growth.landmarks:
+                growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
+        seen = [growth.landmarks[id_] for id_ in local.ids.tolist()]
+        for bias in local.biases:
+            if (stream, bias) not in growth.biases:
+                growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
+                certainty = np.array([[bias_sigma[bias] ** -2]])
+                priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
+        common = tuple(bias for bias in local.biases if bias in common_bias_sigma)
+        for bias in common:
+            if bias not in growth.common:
+                growth.common[bias] = growth.add(np.zeros(1), fixed=False)
+                certainty = np.array([[common_bias_sigma[bias] ** -2]])
+                priors.append(Prior(growth.common[bias], np.zeros(1), certainty))
+        errors = [growth.biases[stream, bias] for bias in local.biases]
+        errors += [growth.common[bias] for bias in common]
+        nodes = np.array([start_node, end_node, *poses, *seen, *errors])
+        submaps.append(Joined(contribution, nodes, common))
+    grown = Graph(
+        growth.streams,
+        growth.landmarks,
+        growth.poses,
+        growth.biases,
+        _continued(graph.offset, [len(value) for value in growth.values]),
+        np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
+        tuple(submaps),
+        graph.sightings,
+        tuple(priors),
+        growth.common,
+    )
+    return grown, np.concatenate([state, *growth.values])
+
+
+def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
+    """The robot's pose node at this stamp, of its first epoch that has one; None: there is none."""
+    epochs = sorted(epoch for name, epoch in graph.streams if name == robot)
+    found = (graph.poses.get(((robot, epoch), stamp_ns)) for epoch in epochs)
+    return next((node for node in found if node is not None), None)
+
+
+def met(graph: Graph, sighting: Sighting) -> Met | None:
+    """The sighting between its pose nodes; None while one of them is not in the graph."""
+    observer = graph.poses.get((sighting.stream, sighting.stamp_ns))
+    teammate = pose_node(graph, sighting.teammate, sighting.stamp_ns)
+    return None if observer is None or teammate is None else Met(sighting, observer, teammate)
+
+
+def _continued(starts: Indices, lengths: Sequence[int]) -> Indices:
+    return np.concatenate([starts, starts[-1] + _starts(lengths)[1:]])
+
+
+def merged(
+    main: Graph,
+    state: Values,
+    other: Graph,
+    other_state: Values,
+    main_from_other: Float[np.ndarray, "3"],
+) -> tuple[Graph, Values]:
+    """Both graphs in the main frame; landmarks with equal ids become one, at the main's value.
+
+    What was fixed in the other frame (its gauge) becomes free.
+    """
+    common = {
+        node: main.landmarks[id_] for id_, node in other.landmarks.items() if id_ in main.landmarks
+    }
+    common |= {
+        node: main.common[bias] for bias, node in other.common.items() if bias in main.common
+    }
+    node_of = np.empty(len(other.fixed), dtype=np.int64)
+    values: list[Values] = []
+    for node in range(len(other.fixed)):
+        if node in common:
+            node_of[node] = common[node]
+            continue
+        node_of[node] = len(main.fixed) + len(values)
+        value = other_state[other.offset[node] : other.offset[node + 1]]
+        values.append(_moved(main_from_other, value))
+    streams = {
+        stream: tuple(node_of[list(nodes)].tolist()) for stream, nodes in other.streams.items()
+    }
+    landmarks = {id_: int(node_of[node]) for id_, node in other.landmarks.items()}
+    poses = {key: int(node_of[node]) for key, node in other.poses.items()}
+    sightings = (
+        Met(each, int(node_of[observer]), int(node_of[teammate]))
+        for each, observer, teammate in other.sightings
+    )
+    biases = {key: int(node_of[node]) for key, node in other.biases.items()}
+    of_team = {bias: int(node_of[node]) for bias, node in other.common.items()}
+    priors = (
+        prior._replace(node=int(node_of[prior.node]))
+        for prior in other.priors
+        if len(prior.mean) == 1 and prior.node not in common
+    )
+    graph = Graph(
+        {**main.streams, **streams},
+        {**landmarks, **main.landmarks},
+        {**main.poses, **poses},
+        {**main.biases, **biases},
+        _continued(main.offset, [len(value) for value in values]),
+        np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
+        (*main.submaps, *(each._replace(nodes=node_of[each.nodes]) for each in other.submaps)),
+        (*main.sightings, *sightings),
+        (*main.priors, *priors),
+        {**of_team, **main.common},
+    )
+    return graph, np.concatenate([state, *values])
+
+
+def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:
+    """A node's value in the main frame: a pose, a landmark, or a bias, which has no frame."""
+    if len(value) == 3:
+        return compose(main_from_other, value)
+    return transformed(main_from_other, value) if len(value) == 2 else value

@@ -1,0 +1,1 @@
+"""A sparse Cholesky factorisation with its solves and the entries of the inverse."""

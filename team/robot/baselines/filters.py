@@ -1,0 +1,267 @@
+"""The estimators that keep one state over a whole stream, by name: functions of one shape each."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team import translate
+from team.config import Estimator, RobotConfig, Sensor
+from team.estimation.baselines import (
+    dead_reckoning,
+    ekf_slam,
+    hybrid_thesis,
+    hybrid_thesis_coded,
+    localisation,
+    plain_fastslam,
+)
+from team.estimation.baselines.hybrid_thesis_coded import CodedState
+from team.estimation.baselines.localisation import Localisation
+from team.estimation.baselines.plain_fastslam import PlainFastSlam
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.geometry import tangent
+from team.estimation.hybrid_slam.fastslam import Particles, Proposal
+from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
+from team.estimation.models import Increment
+
+IN_MAP = "in the running map"
+IN_POSE = "in the running pose"
+"""The dispositions of a reading that such an estimator takes."""
+
+
+class KnownMap(NamedTuple):
+    """Landmarks that a robot is told: ids ascending, positions [m] in the team's frame."""
+
+    ids: UInt32[np.ndarray, " L"]
+    landmarks: Float[np.ndarray, "L 2"]
+
+
+NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
+
+
+class Start(NamedTuple):
+    """Where an estimator begins: a pose (None: unknown), its covariance (None: exact), a map."""
+
+    pose: Float[np.ndarray, "3"] | None
+    covariance: Matrix | None
+    known: KnownMap
+
+
+Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray]
+"""The motion since the last epoch; landmark ids, ranges [m] and bearings [rad] at its end."""
+Begun = Callable[[RobotConfig, Start, np.random.Generator], Any]
+Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
+Judged = Callable[[Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray], Innovation]
+
+
+class Filter(NamedTuple):
+    """A recursive estimator over a state of its own.
+
+    looks: it takes landmarks; maps: it has a map of its own. joint: with the covariance between
+    landmarks. absorbed: the state with these landmarks in place of its own. particles: those of a
+    state, for viewers. innovation: of a step's readings, as the state before it predicts them.
+    """
+
+    begun: Begun
+    stepped: Stepped
+    pose: Callable[[Any], PoseGaussian]
+    landmarks: Callable[[Any], LandmarkGaussian]
+    innovation: Judged
+    absorbed: Callable[[Any, np.ndarray, np.ndarray, Matrix], Any] | None = None
+    used: str = IN_MAP
+    looks: bool = True
+    maps: bool = True
+    joint: bool = True
+    particles: Callable[[Any], Particles] | None = None
+
+
+def _random(stepped: Callable[..., Any]) -> Stepped:
+    """The step of an estimator that draws random numbers."""
+
+    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
+        increment, *scan = step
+        return stepped(state, increment, config.sensor, *scan, generator)
+
+    return step
+
+
+def _exact(begun: Callable[..., Any], stepped: Callable[..., Any]) -> tuple[Begun, Stepped]:
+    """Start and step of an estimator that draws none."""
+
+    def start(config: RobotConfig, start: Start, generator: np.random.Generator) -> Any:
+        return _with_start(begun, stepped, start)
+
+    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
+        increment, *scan = step
+        return stepped(state, increment, config.sensor, *scan)
+
+    return start, step
+
+
+def _thesis_begun(
+    config: RobotConfig, start: Start, generator: np.random.Generator
+) -> hybrid_thesis.ThesisState:
+    """The thesis knows the start exactly."""
+    return hybrid_thesis.started(np.zeros(3) if start.pose is None else start.pose)
+
+
+def _thesis_stepped(
+    state: hybrid_thesis.ThesisState,
+    config: RobotConfig,
+    step: Step,
+    generator: np.random.Generator,
+) -> hybrid_thesis.ThesisState:
+    increment, ids, ranges, bearings = step
+    particles = config.front_end.particles
+    return hybrid_thesis.stepped(
+        state, increment, config.sensor, ids, ranges, bearings, particles, generator
+    )
+
+
+def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
+    """The innovation against the particles of a state."""
+    return lambda state, *readings: innovation(particles(state), *readings)
+
+
+def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
+    joint = np.zeros((2 * len(state.ids), 2 * len(state.ids)))
+    for i, block in enumerate(state.covariances):
+        joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
+    return LandmarkGaussian(state.ids, state.landmarks, joint)
+
+
+def _thesis_absorbed(
+    state: hybrid_thesis.ThesisState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
+) -> hybrid_thesis.ThesisState:
+    return hybrid_thesis.absorbed(state, ids, means, translate.blocks_of(covariance))
+
+
+def _coded_begun(config: RobotConfig, start: Start, generator: np.random.Generator) -> CodedState:
+    """The start is known exactly, as in the thesis."""
+    pose = np.zeros(3) if start.pose is None else start.pose
+    return hybrid_thesis_coded.started(pose, config.front_end.particles)
+
+
+def _coded_absorbed(
+    state: CodedState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
+) -> CodedState:
+    return hybrid_thesis_coded.absorbed(state, ids, means, translate.blocks_of(covariance))
+
+
+S = TypeVar("S")
+
+
+def _with_start(
+    begun: Callable[[np.ndarray], S],
+    stepped: Callable[..., S],
+    start: Start,
+    *generator: np.random.Generator,
+) -> S:
+    """The state at a start N(pose, covariance): a first motion by nothing, with that noise.
+
+    The noise is turned into the pose's own axes: C = GᵀPG, G = blkdiag(R(θ), 1).
+    """
+    at = np.zeros(3) if start.pose is None else start.pose
+    state = begun(at)
+    if start.covariance is None:
+        return state
+    G = tangent(at[2])
+    own = G.T @ start.covariance @ G
+    nothing = np.empty(0)
+    still = Increment(np.zeros(3), 0.5 * (own + own.T))
+    return stepped(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
+
+
+def _plain(proposal: Proposal) -> Filter:
+    """FastSLAM over the whole stream, whatever the front end's own proposal is."""
+
+    def begun(config: RobotConfig, start: Start, generator: np.random.Generator) -> PlainFastSlam:
+        front = config.front_end
+
+        def at(pose: np.ndarray) -> PlainFastSlam:
+            return plain_fastslam.begun(pose, front.particles, proposal, front.resample_below)
+
+        return _with_start(at, plain_fastslam.stepped, start, generator)
+
+    return Filter(
+        begun,
+        _random(plain_fastslam.stepped),
+        plain_fastslam.pose_gaussian,
+        plain_fastslam.landmark_gaussian,
+        _of_particles(lambda state: state.particles),
+        particles=lambda state: state.particles,
+    )
+
+
+def _localisation_begun(
+    config: RobotConfig, start: Start, generator: np.random.Generator
+) -> Localisation:
+    """At an unknown start anywhere from where the sensor may see a landmark of the known map.
+
+    That is the map's box widened by the sensor's reach, at most by half the box's longer side.
+    """
+    front, known = config.front_end, start.known
+    landmarks = known.landmarks
+    if start.pose is None and len(landmarks):
+        lowest, highest = landmarks.min(axis=0), landmarks.max(axis=0)
+        reach = min(config.sensor.max_range, 0.5 * float((highest - lowest).max()))
+        state = localisation.begun_anywhere(
+            lowest - reach, highest + reach, front.particles, *known, generator
+        )
+        return replace(state, resample_below=front.resample_below)
+
+    def at(pose: np.ndarray) -> Localisation:
+        state = localisation.begun(pose, front.particles, *known)
+        return replace(state, resample_below=front.resample_below)
+
+    return _with_start(at, localisation.stepped, start, generator)
+
+
+FILTERS: Mapping[Estimator, Filter] = {
+    "dead-reckoning": Filter(
+        *_exact(dead_reckoning.begun, dead_reckoning.stepped),
+        dead_reckoning.pose_gaussian,
+        dead_reckoning.landmark_gaussian,
+        lambda *readings: NOTHING,
+        used=IN_POSE,
+        looks=False,
+        maps=False,
+    ),
+    "localisation": Filter(
+        _localisation_begun,
+        _random(localisation.stepped),
+        localisation.pose_gaussian,
+        lambda state: NO_LANDMARKS,  # it was told its map, so there is nothing to say of one
+        localisation.innovation,
+        used=IN_POSE,
+        maps=False,
+    ),
+    "ekf-slam": Filter(
+        *_exact(ekf_slam.begun, ekf_slam.stepped),
+        ekf_slam.pose_gaussian,
+        ekf_slam.landmark_gaussian,
+        ekf_slam.innovation,
+    ),
+    "fastslam1": _plain("fastslam1"),
+    "fastslam2": _plain("fastslam2"),
+    "hybrid-thesis": Filter(
+        _thesis_begun,
+        _thesis_stepped,
+        lambda state: PoseGaussian(state.pose, state.pose_covariance),
+        _thesis_landmarks,
+        _of_particles(lambda state: hybrid_thesis.reset(state, state.ids, 1)),
+        _thesis_absorbed,
+        joint=False,
+    ),
+    "hybrid-thesis-coded": Filter(
+        _coded_begun,
+        _random(hybrid_thesis_coded.stepped),
+        hybrid_thesis_coded.pose_gaussian,
+        hybrid_thesis_coded.landmark_gaussian,
+        _of_particles(lambda state: state.particles),
+        _coded_absorbed,
+        joint=False,
+    ),
+}

@@ -1,0 +1,135 @@
+"""Rules with feedback: rounds in lockstep, whoever ends early or is lost."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.baselines.feedback_rule import RULES, FeedbackRule
+from central.config import CentralConfig
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.codec import decoded, encoded
+from tests.support import packed, spd
+from tests.teams import of
+
+ROBOTS = ["r1", "r2", "r3"]
+
+
+def rule(name="kalman"):
+    return FeedbackRule(CentralConfig(fusion=name), b"settings")
+
+
+def estimate(robot, number, at=0.0):
+    means = from_floats([at, 1.0, 2.0, 3.0])
+    return m.MapEstimate(
+        1000 * number, robot, 1, number, number, True, from_ids([1, 2]), means, packed(spd(4))
+    )
+
+
+def everyone(_robot, _number):
+    return True
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.permutations(ROBOTS * 3))
+def test_each_round_is_fused_once_in_its_turn_when_nobody_is_missing(order):
+    """A robot's own maps keep their order."""
+    found, out, sent = rule(), [], set()
+    for i, robot in enumerate(order):
+        number = order[: i + 1].count(robot)
+        found.take_map(estimate(robot, number, at=float(robot[1:])))
+        sent.add((robot, number))
+        new = of(found.advance(everyone, ROBOTS), ch.FUSED_MAP)
+        for fused in new:
+            assert all((r, fused.exchange) in sent for r in ROBOTS)
+        out += new
+    assert [fused.exchange for fused in out] == [1, 2, 3]
+    assert [encoded(fused) for fused in out] == _in_order()
+
+
+def _in_order():
+    found, out = rule(), []
+    for number in (1, 2, 3):
+        for robot in ROBOTS:
+            found.take_map(estimate(robot, number, at=float(robot[1:])))
+        out += of(found.advance(everyone, ROBOTS), ch.FUSED_MAP)
+    return [encoded(fused) for fused in out]
+
+
+def test_who_takes_no_part_is_not_waited_for():
+    found = rule()
+    found.take_map(estimate("r1", 1))
+    assert found.advance(everyone, ROBOTS) == []
+    (fused,) = of(found.advance(lambda r, _: r == "r1", ROBOTS), ch.FUSED_MAP)
+    assert [member.robot for member in fused.members] == ["r1"]
+
+
+def test_a_centre_that_was_started_again_goes_on_where_the_robots_are():
+    found = rule()
+    found.take_map(estimate("r1", 7))
+    found.take_map(estimate("r2", 7))
+    assert found.advance(everyone, ROBOTS) == []
+    found.take_map(estimate("r3", 7))
+    (fused,) = of(found.advance(everyone, ROBOTS), ch.FUSED_MAP)
+    assert fused.exchange == 7
+
+
+def test_the_last_map_of_one_who_ended_is_still_fused():
+    found = rule()
+    found.take_map(estimate("r1", 1, at=8.0))
+    found.take_map(estimate("r2", 1))
+    (fused,) = of(found.advance(lambda r, _: r != "r1", ["r1", "r2"]), ch.FUSED_MAP)
+    assert [member.robot for member in fused.members] == ["r1", "r2"]
+    assert translate.landmarks_of(fused)[1][0, 0] > 0.0
+
+
+def test_a_map_for_a_round_that_is_over_is_not_taken():
+    found = rule()
+    for robot in ROBOTS:
+        found.take_map(estimate(robot, 1))
+    found.advance(everyone, ROBOTS)
+    found.take_map(estimate("r1", 1, at=99.0))
+    for robot in ROBOTS:
+        found.take_map(estimate(robot, 2))
+    (fused,) = of(found.advance(everyone, ROBOTS), ch.FUSED_MAP)
+    assert fused.exchange == 2
+
+
+@pytest.mark.parametrize("name", sorted(RULES))
+def test_the_final_map_is_the_last_rounds(name):
+    found = rule(name)
+    for number in (1, 2):
+        for robot in ROBOTS:
+            found.take_map(estimate(robot, number, at=float(number)))
+    last = of(found.advance(everyone, ROBOTS), ch.FUSED_MAP)[-1]
+    (final,) = of(found.conclude(0), ch.FINAL_MAP)
+    assert final.final
+    assert (final.exchange, final.digest, final.means, final.covariance) == (
+        2,
+        last.digest,
+        last.means,
+        last.covariance,
+    )
+    assert ("more than once" in "".join(final.reasons)) == (name != "covariance-intersection")
+    assert decoded(encoded(final)) == final
+    assert np.isfinite(translate.landmarks_of(final)[1]).all()
+
+
+@pytest.mark.parametrize("name", sorted(RULES))
+def test_without_any_map_the_final_one_is_empty(name):
+    (final,) = of(rule(name).conclude(7), ch.FINAL_MAP)
+    assert (final.final, final.ids, final.members) == (True, b"", ())
+    assert decoded(encoded(final)) == final
+
+
+def test_the_digest_names_the_maps_and_every_round_before():
+    digests = set()
+    for first, second in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
+        found = rule()
+        for number, at in ((1, first), (2, second)):
+            found.take_map(estimate("r1", number, at))
+        digests.add(of(found.advance(everyone, ["r1"]), ch.FUSED_MAP)[-1].digest)
+    assert len(digests) == 3

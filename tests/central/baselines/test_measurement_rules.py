@@ -1,0 +1,160 @@
+"""Rules on raw readings: a function of the streams alone, whatever comes when."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.baselines.joint_fastslam_rule import RESAMPLE_BELOW
+from central.config import CentralConfig
+from central.node import CentralNode
+from team import translate
+from team.estimation.baselines import joint_fastslam
+from team.estimation.baselines.robot_step import Turn
+from team.estimation.models import increment_of
+from team.estimation.randomness import generator
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded
+from tests.teams import config, of, published, stream
+
+PARTICLES = 20
+RULES = ["joint-fastslam", "batch"]
+STREAMS = {"r1": stream("r1", 9), "r2": stream("r2", 7, y=1.0)}
+CONFIGS = {name: config(name) for name in STREAMS}
+READINGS = {name: published(each) for name, each in STREAMS.items()}
+LAST_WORDS = [m.Done(0, name, 1, len(each), 0, 0, ()) for name, each in READINGS.items()]
+
+
+def announced(name):
+    return translate.configured(ch.robot_node(name), 0, 0, CONFIGS[name])
+
+
+def end(readings=READINGS):
+    return m.End(0, tuple(m.StreamEnd(n, r[-1].epoch, len(r)) for n, r in readings.items()))
+
+
+def heard(fusion, messages, robots=("r1", "r2")):
+    node = CentralNode(CentralConfig(fusion=fusion, particles=PARTICLES, broadcast_s=4.0), robots)
+    out: list[Outgoing] = []
+    for message in messages:
+        out += node.handle(message, 0)
+    return node, out
+
+
+def everything(readings=READINGS):
+    every = [x for name in readings for x in (announced(name), *readings[name])]
+    return [*every, *LAST_WORDS, end(readings)]
+
+
+def said(out):
+    return [(o.key, encoded(o.message)) for o in out]
+
+
+EXPECTED = {fusion: said(heard(fusion, everything())[1]) for fusion in RULES}
+
+
+@pytest.mark.parametrize("fusion", RULES)
+@settings(deadline=None, max_examples=15)
+@given(st.permutations(range(len(everything()))), st.lists(st.integers(0, 20), max_size=5))
+def test_any_order_of_arrival_and_duplicates_give_the_same_messages(fusion, order, again):
+    messages = everything()
+    _, out = heard(fusion, [messages[i] for i in [*order[:-1], *again, order[-1]]])
+    assert sorted(said(out)) == sorted(EXPECTED[fusion])
+    assert [x for x in said(out) if "robot" not in x[0]][-1] == EXPECTED[fusion][-1]
+
+
+def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_epochs():
+    state = joint_fastslam.begun(
+        {name: np.array([0.0, y, 0.0]) for name, y in (("r1", 0.0), ("r2", 1.0))},
+        PARTICLES,
+        "fastslam1",
+        RESAMPLE_BELOW,
+    )
+    drawn = generator(1, "team", 0, 0)
+    poses = {name: [] for name in STREAMS}
+    for k in range(9):
+        turns = []
+        for name, each in STREAMS.items():
+            told = each.intervals
+            if k >= len(told.end_ns):
+                continue
+            rows = each.landmark_detections.rows(k)
+            seen = (each.landmark_detections.ids, each.landmark_detections.ranges)
+            step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
+            increment = increment_of(CONFIGS[name].motion, *map(float, step))
+            looks = (*(x[rows] for x in seen), each.landmark_detections.bearings[rows])
+            turns.append(Turn(name, increment, CONFIGS[name].sensor, *looks))
+        state = joint_fastslam.stepped(state, turns, drawn)
+        for turn in turns:
+            poses[turn.robot].append(joint_fastslam.pose_gaussian(state, turn.robot).mean)
+    node, out = heard("joint-fastslam", everything())
+    ids, means = translate.landmarks_of(node.final)
+    expected = joint_fastslam.landmark_gaussian(state)
+    np.testing.assert_array_equal(ids, expected.ids)
+    np.testing.assert_array_equal(means, expected.means)
+    covariance = translate.landmark_covariance_of(node.final)
+    np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12)
+    for name in STREAMS:
+        mine = [floats(o.message.pose, "pose") for o in out if o.key == ch.CENTRAL_POSE.key(name)]
+        np.testing.assert_array_equal(mine, poses[name])
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_maps_name_the_last_reading_of_each_robot_in_them(fusion):
+    node, out = heard(fusion, everything())
+    assert len(of(out, ch.FUSED_MAP)) == 2
+    assert [x.sequence for x in node.final.members] == [len(r) - 1 for r in READINGS.values()]
+    digests = {x.digest for x in (*of(out, ch.FUSED_MAP), node.final)}
+    assert len(digests) == 3
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_it_waits_for_every_robots_models_start_and_last_reading(fusion):
+    messages = everything()
+    for last in (announced("r2"), READINGS["r2"][0], READINGS["r1"][5], LAST_WORDS[0], end()):
+        node, out = heard(fusion, (x for x in messages if x != last))
+        assert not node.finished
+        out += node.handle(last, 0)
+        assert node.finished
+        assert sorted(said(out)) == sorted(EXPECTED[fusion])
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_missing_readings_are_asked_for(fusion):
+    node, _ = heard(fusion, (x for x in everything() if x not in READINGS["r1"][4:6]))
+    assert node.wanted() == [m.ReadingsWanted(node.status().stamp_ns, "r1", 1, 4, 5)]
+    for reading in READINGS["r1"][4:6]:
+        node.handle(reading, 0)
+    assert node.finished
+    assert node.wanted() == []
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
+    free = {"r1": READINGS["r1"], "r2": published(stream("r2", 7, y=1.0, known=False))}
+    node, out = heard(fusion, everything(free))
+    assert node.final.reasons == ("r2: its start pose is not known",)
+    assert [x.robot for x in node.final.members] == ["r1"]
+    assert not [o for o in out if o.key == ch.CENTRAL_POSE.key("r2")]
+    both = {name: published(stream(name, 7, known=False)) for name in STREAMS}
+    node, _ = heard(fusion, everything(both))
+    assert node.final.frame == "r1/1"
+    assert node.final.reasons == ("r2: its start pose is not known",)
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_a_stream_that_begins_anew_ends_there(fusion):
+    later = [msgspec.structs.replace(x, epoch=2) for x in READINGS["r2"]]
+    later[0] = m.Start(later[0].stamp_ns, "r2", 2, 0, b"", b"")
+    whole = {"r1": READINGS["r1"], "r2": [*READINGS["r2"][:8], *later]}
+    ends = m.End(0, (m.StreamEnd("r1", 1, len(READINGS["r1"])), m.StreamEnd("r2", 2, len(later))))
+    messages = [x for x in everything(whole) if not isinstance(x, m.End | m.Done)]
+    dones = [LAST_WORDS[0], m.Done(0, "r2", 2, len(later), 0, 0, ())]
+    node, _ = heard(fusion, [*messages, *dones, ends])
+    assert node.finished
+    assert node.final.reasons == ("r2: its stream began anew",)
+    assert node.final.members[1].sequence < 8

@@ -1,0 +1,311 @@
+"""FastSLAM against the exact posterior where the problem is linear, and against its own laws."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from team.config import MotionModel, MotionNoise, Sensor
+from team.estimation.gaussian import NotACovarianceError
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor
+from team.estimation.hybrid_slam.window import moments
+from team.estimation.models import Increment, increment_of
+
+quick = settings(deadline=None, max_examples=60)
+SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.001, bearing_sigma=0.002)
+LANDMARKS = np.array([[60.0, 5.0], [10.0, 70.0], [-40.0, -50.0]])
+IDS = np.array([7, 3, 5], np.uint32)
+STANDING = Increment.identity()
+MOTION = Increment(np.array([1.0, 0.2, 0.1]), np.diag([0.05, 0.03, 0.004]) ** 2)
+RANK_TWO = np.array([[0.05, 0.0], [0.0, 0.03], [0.0, 0.004]])
+
+
+def wrap(angle):
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def observed(state, k):
+    """(range, bearing) of landmark k of a state (x, y, theta, x₁, y₁, …)."""
+    dx, dy = state[3 + 2 * k] - state[0], state[4 + 2 * k] - state[1]
+    return np.array([np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - state[2])])
+
+
+def moved(state, motion):
+    c, s = np.cos(state[2]), np.sin(state[2])
+    x, y = state[:2] + np.array([[c, -s], [s, c]]) @ motion[:2]
+    return np.array([x, y, state[2] + motion[2], *state[3:]])
+
+
+def jacobian(function, at):
+    columns = [
+        (function(at + step) - function(at - step)) / 2e-5 for step in 1e-5 * np.eye(len(at))
+    ]
+    return np.stack(columns, axis=1)
+
+
+def kalman(motions, epochs):
+    """Mean, covariance and log evidence of the joint Gaussian over (pose, landmarks).
+
+    A first sight places its landmark; epochs hold (landmark, reading) pairs.
+    """
+    mean, P, log_evidence, seen = np.zeros(9), np.zeros((9, 9)), 0.0, set()
+    for motion, readings in zip(motions, epochs, strict=True):
+        F = jacobian(lambda state, m=motion.mean: moved(state, m), mean)
+        mean = moved(mean, motion.mean)
+        turn = np.eye(9)[:, :3]
+        c, s = np.cos(mean[2]), np.sin(mean[2])
+        turn[:2, :2] = [[c, -s], [s, c]]
+        P = F @ P @ F.T + turn @ motion.covariance @ turn.T
+        for k, z in readings:
+            if k not in seen:
+                seen.add(k)
+                direction = mean[2] + z[1]
+                mean[3 + 2 * k : 5 + 2 * k] = mean[:2] + z[0] * np.array(
+                    [np.cos(direction), np.sin(direction)]
+                )
+                P[3 + 2 * k, 3 + 2 * k] = P[4 + 2 * k, 4 + 2 * k] = 1e8
+                flat = True
+            else:
+                flat = False
+            H = jacobian(lambda state, k=k: observed(state, k), mean)
+            distance = observed(mean, k)[0]
+            R = np.diag([0.1**2 + (0.001 * distance) ** 2, 0.002**2])
+            S = H @ P @ H.T + R
+            innovation = z - observed(mean, k)
+            innovation[1] = wrap(innovation[1])
+            if not flat:
+                log_evidence -= 0.5 * innovation @ np.linalg.solve(S, innovation)
+                log_evidence -= 0.5 * np.linalg.slogdet(2.0 * np.pi * S)[1]
+            K = np.linalg.solve(S, H @ P).T
+            mean = mean + K @ innovation
+            A = np.eye(9) - K @ H
+            P = A @ P @ A.T + K @ R @ K.T
+    return mean, P, log_evidence
+
+
+def simulated(seed, steps=5, covariance=MOTION.covariance):
+    """Increments and readings of a robot that stands at its first epoch and then moves."""
+    rng = np.random.default_rng(seed)
+    truth = np.concatenate((np.zeros(3), LANDMARKS.ravel()))
+    motions, epochs = [], []
+    for step in range(steps):
+        motion = STANDING if step == 0 else Increment(MOTION.mean, covariance)
+        noise = rng.multivariate_normal(np.zeros(3), motion.covariance, method="svd")
+        truth = moved(moved(truth, motion.mean), noise)
+        readings = []
+        for k in range(3):
+            z = observed(truth, k)
+            sigma = np.array([np.hypot(0.1, 0.001 * z[0]), 0.002])
+            readings.append((k, z + sigma * rng.standard_normal(2)))
+        motions.append(motion)
+        epochs.append(readings)
+    return motions, epochs
+
+
+def filtered(motions, epochs, count, proposal, resample_below=0.5, seed=0):
+    rng = np.random.default_rng(seed)
+    particles, log_evidence, infos = fastslam.at_poses(np.zeros((count, 3))), 0.0, []
+    for motion, readings in zip(motions, epochs, strict=True):
+        z = np.array([reading for _, reading in readings])
+        particles, info = fastslam.propagated_and_updated(
+            particles,
+            motion,
+            SENSOR,
+            IDS[[k for k, _ in readings]],
+            z[:, 0].copy(),
+            z[:, 1].copy(),
+            proposal,
+            resample_below,
+            rng,
+        )
+        log_evidence += info.log_evidence
+        infos.append(info)
+    return particles, log_evidence, infos
+
+
+@pytest.mark.parametrize(("proposal", "count"), [("fastslam2", 5000), ("fastslam1", 20000)])
+@pytest.mark.parametrize("factor", [np.linalg.cholesky(MOTION.covariance), RANK_TWO])
+def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter(proposal, count, factor):
+    motions, epochs = simulated(1, covariance=factor @ factor.T)
+    mean, P, log_evidence = kalman(motions, epochs)
+    particles, found_evidence, _ = filtered(motions, epochs, count, proposal)
+    np.testing.assert_array_equal(particles.ids, IDS)
+    found, spread = moments(
+        particles.poses, np.exp(particles.log_weights), particles.means, particles.covariances
+    )
+    sigma = np.sqrt(np.diag(P))
+    error = found - mean
+    error[2] = wrap(error[2])
+    effective = fastslam.effective_sample_size(particles.log_weights)
+    assert effective > 0.05 * count
+    assert np.abs(error / sigma).max() < 5.0 / np.sqrt(0.2 * effective)
+    assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 0.12
+    assert abs(found_evidence - log_evidence) < 0.2
+
+
+def test_the_second_proposal_keeps_many_more_particles_alive():
+    motions, epochs = simulated(2)
+    thin = [info.effective_sample_size for info in filtered(motions, epochs, 500, "fastslam1")[2]]
+    full = [info.effective_sample_size for info in filtered(motions, epochs, 500, "fastslam2")[2]]
+    assert min(full) > 3.0 * min(thin)
+
+
+def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
+    # The proposal is then the exact posterior of the motion, and p(z) is the same for all.
+    count, rng = 400, np.random.default_rng(8)
+    block = np.array([0.04, 0.03, 0.05])
+    known = fastslam.Particles(
+        np.zeros((count, 3)),
+        np.full(count, -np.log(count)),
+        IDS,
+        np.tile(LANDMARKS, (count, 1, 1)),
+        np.tile(block, (count, 3, 1)),
+    )
+    root = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [0.003, -0.004, 0.006]])
+    truth = moved(np.concatenate((np.zeros(3), LANDMARKS.ravel())), MOTION.mean)
+    shift = np.array([[0.1, -0.2], [0.1, 0.2], [-0.2, 0.1]])
+    z = np.array([observed(truth, k) for k in range(3)]) + shift * [1.0, 0.01]
+    after, info = fastslam.propagated_and_updated(
+        known,
+        Increment(MOTION.mean, root @ root.T),
+        SENSOR,
+        IDS,
+        z[:, 0].copy(),
+        z[:, 1].copy(),
+        "fastslam2",
+        0.5,
+        rng,
+    )
+    assert info.effective_sample_size > (1.0 - 3e-5) * count
+    assert np.std(after.poses[:, 2]) < 0.5 * np.linalg.norm(root[2])
+
+
+def test_without_noise_of_motion_both_proposals_are_the_same():
+    motions, epochs = simulated(3, covariance=np.zeros((3, 3)))
+    one, two = (filtered(motions, epochs, 8, p)[0] for p in ("fastslam1", "fastslam2"))
+    for field in ("poses", "log_weights", "means", "covariances"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
+    np.testing.assert_allclose(one.log_weights, -np.log(8.0), atol=1e-12)
+
+
+def test_an_epoch_of_first_sights_and_one_without_readings_leave_the_weights():
+    _, epochs = simulated(4)
+    particles, _, _ = filtered([MOTION], epochs[1:2], 50, "fastslam2")
+    np.testing.assert_allclose(particles.log_weights, -np.log(50.0), atol=1e-12)
+    after = fastslam.propagated(particles, MOTION, np.random.default_rng(0))
+    np.testing.assert_array_equal(after.means, particles.means)
+    np.testing.assert_array_equal(after.log_weights, particles.log_weights)
+    assert np.ptp(after.poses, axis=0).min() > 0.0
+
+
+def test_a_landmark_at_first_sight_has_the_covariance_of_the_inverse_model():
+    readings = [(0, np.array([50.0, 0.4]))]
+    particles, _, _ = filtered([STANDING], [readings], 4, "fastslam2")
+    G = jacobian(lambda z: np.array([z[0] * np.cos(z[1]), z[0] * np.sin(z[1])]), readings[0][1])
+    expected = G @ np.diag([0.1**2 + 0.05**2, 0.002**2]) @ G.T
+    xx, xy, yy = particles.covariances[0, 0]
+    np.testing.assert_allclose([[xx, xy], [xy, yy]], expected, rtol=1e-7)
+
+
+def test_two_readings_of_one_landmark_in_one_epoch_count_as_two_epochs_without_motion():
+    _, epochs = simulated(5, steps=2)
+    first, second = [(0, epochs[0][0][1])], [(0, epochs[1][0][1])]
+    together = filtered([STANDING], [first + second], 4, "fastslam2")
+    apart = filtered([STANDING, STANDING], [first, second], 4, "fastslam2")
+    np.testing.assert_array_equal(together[0].means, apart[0].means)
+    np.testing.assert_array_equal(together[0].covariances, apart[0].covariances)
+    np.testing.assert_allclose(together[1], apart[1])
+
+
+def test_resampling_happens_before_the_motion_and_never_after_the_readings():
+    motions, epochs = simulated(6)
+    particles, _, infos = filtered(motions, epochs, 200, "fastslam1")
+    thin = [info.effective_sample_size < 100 for info in infos]
+    parents = [info.parents is not None for info in infos]
+    assert any(thin)
+    assert parents == [False, *thin[:-1]]
+    assert thin[-1] == (np.ptp(particles.log_weights) > 0.0)
+
+
+weights = st.lists(st.floats(-30.0, 0.0), min_size=1, max_size=12).map(
+    lambda values: fastslam.normalised(np.array(values))[0]
+)
+
+
+@quick
+@given(weights)
+def test_resampling_is_unbiased_and_never_off_by_one_copy(log_weights):
+    expected = len(log_weights) * np.exp(log_weights)
+    counts = np.array(
+        [
+            np.bincount(fastslam.systematic_parents(log_weights, u), minlength=len(log_weights))
+            for u in (np.arange(500) + 0.5) / 500
+        ]
+    )
+    assert (np.abs(counts - expected) < 1.0 + 1e-9).all()
+    np.testing.assert_allclose(counts.mean(axis=0), expected, atol=0.005)
+
+
+@quick
+@given(weights, st.floats(-1e4, 1e4))
+def test_a_common_factor_of_the_weights_changes_nothing(log_weights, shift):
+    shifted, log_sum = fastslam.normalised(log_weights + shift)
+    np.testing.assert_allclose(shifted, log_weights, atol=1e-9)
+    np.testing.assert_allclose(log_sum, shift, atol=1e-9)
+    assert 1.0 - 1e-12 <= fastslam.effective_sample_size(shifted) <= len(shifted) + 1e-9
+
+
+def bytes_of(value):
+    return [getattr(value, field.name).tobytes() for field in dataclasses.fields(value)]
+
+
+def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
+    motions, epochs = simulated(7)
+    before, _, _ = filtered(motions, epochs, 100, "fastslam2")
+    kept = bytes_of(before)
+    arguments = (before, MOTION, SENSOR, IDS[:2], np.array([40.0, 60.0]), np.array([0.1, 1.0]))
+    once, twice = (
+        fastslam.propagated_and_updated(*arguments, "fastslam2", 1.0, np.random.default_rng(5))[0]
+        for _ in range(2)
+    )
+    assert bytes_of(once) == bytes_of(twice)
+    assert bytes_of(before) == kept
+
+
+@quick
+@given(
+    st.lists(st.floats(-3.0, 3.0), min_size=9, max_size=9),
+    st.integers(0, 3),
+    st.floats(1e-6, 1e3),
+)
+@example([3.6e-165, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0], 1, 610.0)
+def test_a_covariance_of_any_rank_is_the_product_of_its_factor(entries, rank, scale):
+    half = scale * np.array(entries).reshape(3, 3)[:, :rank]
+    covariance = half @ half.T
+    L = semidefinite_factor(covariance)
+    assert (np.triu(L, 1) == 0.0).all()
+    deviation = np.sqrt(np.diag(covariance))
+    assert (np.abs(L @ L.T - covariance) <= 5e-5 * np.outer(deviation, deviation) + 1e-12).all()
+
+
+def test_the_motion_of_a_robot_that_turns_almost_on_the_spot_has_a_factor():
+    motion = MotionModel(
+        forward=MotionNoise(per_s=0.03, per_m=0.04), turn=MotionNoise(per_s=0.02, per_rad=0.05)
+    )
+    for speed, rate in ((4.678630965422314e-05, 0.17615888152099612), (1e-5, 0.5127916521356728)):
+        covariance = increment_of(motion, 1.0, speed, rate).covariance
+        L = semidefinite_factor(covariance)
+        np.testing.assert_allclose(np.diag(L @ L.T), np.diag(covariance), rtol=1e-6)
+
+
+@pytest.mark.parametrize("covariance", [np.diag([1.0, -1.0, 1.0]), np.full((3, 3), np.nan)])
+def test_motion_without_a_covariance_is_refused_by_name(covariance):
+    with pytest.raises(NotACovarianceError, match="the motion"):
+        fastslam.propagated(
+            fastslam.at_poses(np.zeros((4, 3))),
+            Increment(np.zeros(3), covariance),
+            np.random.default_rng(0),
+        )

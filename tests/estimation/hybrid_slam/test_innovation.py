@@ -1,0 +1,177 @@
+"""The innovation of an epoch: what it is, and that it tells right models from wrong ones."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from team.config import MotionModel, MotionNoise, Sensor
+from team.estimation.consistency import chi2_interval
+from team.estimation.geometry import compose, exponential, transformed
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
+from team.estimation.models import Increment, predicted
+from tests.estimation.hybrid_slam.test_window import ACCURATE, COARSE, STEP_M, drive, driven, wrap
+
+SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.02, bearing_sigma=0.03)
+FACTOR = np.array([[0.04, 0.0, 0.0], [0.01, 0.03, 0.0], [-0.01, 0.02, 0.05]])
+INCREMENT = Increment(np.array([0.5, 0.1, 0.2]), FACTOR @ FACTOR.T)
+IDS = np.array([4, 9, 4], np.uint32)
+RANGES, BEARINGS = np.array([5.1, 7.2, 5.3]), np.array([0.3, -1.2, 0.35])
+
+
+def particles(count, spread=0.05):
+    rng = np.random.default_rng(count)
+    roots = rng.normal(0.0, 0.1, (count, 2, 2, 2))
+    P = roots @ roots.transpose(0, 1, 3, 2) + 0.01 * np.eye(2)
+    logs = np.log(rng.uniform(0.5, 1.5, count))
+    return Particles(
+        rng.normal([1.0, 2.0, 3.1], spread, (count, 3)),
+        logs - np.log(np.exp(logs).sum()),
+        np.array([9, 4], np.uint32),
+        np.array([[-0.6, 8.9], [-4.3, 0.4]]) + rng.normal(0.0, spread, (count, 2, 2)),
+        np.stack((P[..., 0, 0], P[..., 0, 1], P[..., 1, 1]), axis=-1),
+    )
+
+
+def by_differences(of, ids, readings):
+    """ν and S of `innovation`'s docstring with every Jacobian by central differences."""
+    slots = [int(np.flatnonzero(of.ids == i)[0]) for i in ids]
+    weights = np.exp(of.log_weights)
+    predictions, covariances = [], []
+    for i in range(len(weights)):
+
+        def told(unknowns, i=i):
+            start = compose(of.poses[i], INCREMENT.mean)
+            pose = compose(start, exponential(unknowns[:3]))
+            landmarks = of.means[i] + unknowns[3:].reshape(-1, 2)
+            return np.array([predicted(pose, landmarks[k]) for k in slots]).ravel()
+
+        P = np.zeros((7, 7))
+        P[:3, :3] = INCREMENT.covariance
+        for slot, (xx, xy, yy) in enumerate(of.covariances[i]):
+            P[3 + 2 * slot : 5 + 2 * slot, 3 + 2 * slot : 5 + 2 * slot] = [[xx, xy], [xy, yy]]
+        steps = 1e-6 * np.eye(7)
+        J = np.stack([(told(h) - told(-h)) / 2e-6 for h in steps], axis=1)
+        z = told(np.zeros(7))
+        per_m = SENSOR.range_sigma_per_m * z[::2]
+        R = np.column_stack((SENSOR.range_sigma**2 + per_m**2, np.full(len(per_m), 0.03**2)))
+        predictions.append(z)
+        covariances.append(J @ P @ J.T + np.diag(R.ravel()))
+    mean = weights @ np.array(predictions)
+    d = np.array(predictions) - mean
+    S = np.einsum("i,ijk->jk", weights, covariances) + (d * weights[:, None]).T @ d
+    error = readings.ravel() - mean
+    error[1::2] = wrap(error[1::2])
+    return error, S
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_it_is_the_error_in_the_metric_of_the_mixtures_prediction(count):
+    of = particles(count)
+    error, S = by_differences(of, IDS, np.column_stack((RANGES, BEARINGS)))
+    found = innovation(of, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
+    assert found.dof == 6
+    assert found.squared == pytest.approx(error @ np.linalg.solve(S, error), rel=1e-3)
+
+
+def test_another_frame_gives_the_same():
+    of, shift = particles(7), np.array([30.0, -20.0, 2.5])
+    c, s = np.cos(shift[2]), np.sin(shift[2])
+    turn = np.array([[c, -s], [s, c]])
+    blocks = of.covariances[..., [0, 1, 1, 2]].reshape(7, 2, 2, 2)
+    turned = turn @ blocks @ turn.T
+    there = dataclasses.replace(
+        of,
+        poses=np.array([compose(shift, pose) for pose in of.poses]),
+        means=np.array([[transformed(shift, p) for p in each] for each in of.means]),
+        covariances=np.stack((turned[..., 0, 0], turned[..., 0, 1], turned[..., 1, 1]), axis=-1),
+    )
+    here = innovation(of, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
+    assert innovation(there, INCREMENT, SENSOR, IDS, RANGES, BEARINGS).squared == pytest.approx(
+        here.squared, rel=1e-9
+    )
+
+
+def test_what_is_seen_for_the_first_time_was_not_predicted():
+    unknown = np.array([5, 6], np.uint32)
+    nothing = innovation(particles(7), INCREMENT, SENSOR, unknown, RANGES[:2], BEARINGS[:2])
+    assert nothing == NOTHING
+    assert nothing.per_dof is None
+    mixed = innovation(
+        particles(7), INCREMENT, SENSOR, np.array([5, 9], np.uint32), RANGES[:2], BEARINGS[:2]
+    )
+    alone = innovation(particles(7), INCREMENT, SENSOR, IDS[1:2], RANGES[1:2], BEARINGS[1:2])
+    assert mixed == alone
+    assert mixed.dof == 2
+
+
+def test_epochs_add_up_and_a_window_has_their_sum():
+    run = drive(3, ACCURATE, steps=6)
+    window, total = driven(run, ACCURATE), NOTHING
+    for steps in range(1, 7):
+        part = dataclasses.replace(run, motions=run.motions[:steps], epochs=run.epochs[:steps])
+        total = driven(part, ACCURATE).innovation
+    assert window.innovation == total
+    assert Innovation(1.5, 2).plus(Innovation(2.5, 6)) == Innovation(4.0, 8)
+    assert Innovation(4.0, 8).per_dof == 0.5
+
+
+def per_dof(sensor, runs=200, told=None, **options):
+    """The mean over seeded windows, and the 99.9 % interval that it lies in if all is right."""
+    found = [
+        driven(drive(s, sensor, steps=6), told or sensor, seed=s, **options) for s in range(runs)
+    ]
+    squared, dof = (sum(w.innovation[k] for w in found) for k in (0, 1))
+    low, high = chi2_interval(dof, 0.999, 1)
+    return low, squared / dof, high
+
+
+@pytest.mark.parametrize(
+    ("sensor", "proposal"),
+    [(COARSE, "fastslam2"), (ACCURATE, "fastslam2"), (ACCURATE, "fastslam1")],
+)
+def test_right_models_have_an_innovation_of_one_per_degree_of_freedom(sensor, proposal):
+    low, found, high = per_dof(sensor, proposal=proposal)
+    assert low < found < high
+
+
+def scaled(sensor, factor):
+    return Sensor(
+        range_sigma=factor * sensor.range_sigma, bearing_sigma=factor * sensor.bearing_sigma
+    )
+
+
+SLUGGISH = MotionModel(
+    kind="turn-then-drive",
+    forward=MotionNoise(per_s=0.5 * STEP_M),
+    turn=MotionNoise(per_s=0.5 * np.deg2rad(3.0)),
+)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "above"),
+    [
+        ({"told": scaled(ACCURATE, 0.9)}, True),
+        ({"told": scaled(ACCURATE, 1.1)}, False),
+        ({"motion": SLUGGISH}, True),
+        ({"twice": True}, False),
+    ],
+    ids=["sensor noise too small", "too large", "motion noise too small", "each reading twice"],
+)
+def test_wrong_models_have_another(wrong, above):
+    low, found, high = per_dof(ACCURATE, **wrong)
+    assert found > high if above else found < low
+
+
+def test_the_particles_that_it_looks_at_are_as_they_were():
+    of = particles(7)
+    before = [getattr(of, f.name).copy() for f in dataclasses.fields(Particles)]
+    innovation(of, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
+    for field, kept in zip(dataclasses.fields(Particles), before, strict=True):
+        np.testing.assert_array_equal(getattr(of, field.name), kept)
+    assert (
+        innovation(fastslam.at_poses(np.zeros((7, 3))), INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
+        == NOTHING
+    )

@@ -1,0 +1,240 @@
+"""The segmenter: motion is neither lost nor counted twice, wherever observations fall into it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team.config import MotionModel, MotionNoise, Sensor
+from team.estimation.hybrid_slam.keyframes import Segmenter
+from team.estimation.models import Increment
+
+SECOND = 1_000_000_000
+WHITE = MotionModel(
+    forward=MotionNoise(per_s=0.05, per_m=0.1),
+    turn=MotionNoise(per_s=0.03, per_m=0.02, per_rad=0.1),
+    final_turn=MotionNoise(per_s=0.01),
+)
+NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
+
+
+def scan(*rows):
+    ids, ranges, bearings = zip(*rows, strict=True)
+    return np.array(ids, np.uint32), np.array(ranges, float), np.array(bearings, float)
+
+
+def total(epochs, rest):
+    motion = Increment.identity()
+    for epoch in epochs:
+        motion = motion.then(epoch.increment)
+    return motion.then(rest)
+
+
+def small_steps(forward, yaw_rate, pieces=20_000):
+    """The mean and covariance of the noisy arc by brute force: many small steps in the plane."""
+    dt = 1.0 / pieces
+    a = 0.05**2 * dt + 0.1**2 * abs(forward) * dt
+    b = (0.03**2 + 0.02**2 * abs(forward) + 0.1**2 * abs(yaw_rate)) * dt
+    heading = yaw_rate * (np.arange(pieces) + 0.5) * dt
+    path = np.cumsum(np.exp(1j * heading)) * forward * dt
+    to_end = path[-1] - path  # a turn at k swings what is left of the way
+    end = np.exp(-1j * yaw_rate)
+    along = np.exp(1j * heading) * end
+    swing = 1j * to_end * end
+    columns = np.zeros((3, 2 * pieces))
+    columns[:2, :pieces] = np.sqrt(a) * np.array([along.real, along.imag])
+    columns[:2, pieces:] = np.sqrt(b) * np.array([swing.real, swing.imag])
+    columns[2, pieces:] = np.sqrt(b)
+    return np.array([path[-1].real, path[-1].imag, yaw_rate]), columns @ columns.T
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.integers(0, SECOND), max_size=6),
+    st.floats(-2.0, 2.0),
+    st.floats(-1.5, 1.5),
+)
+def test_observations_within_an_interval_split_its_mean_exactly(cuts, forward, yaw_rate):
+    split, whole = (Segmenter(WHITE, Sensor(), 0.0) for _ in range(2))
+    for segmenter in (split, whole):
+        segmenter.begin(0)
+    for cut in sorted(cuts):
+        assert split.observe(cut, *NOTHING) is None
+    epochs = split.drive(SECOND, SECOND, forward, yaw_rate)
+    whole.drive(SECOND, SECOND, forward, yaw_rate)
+    assert [epoch.stamp_ns for epoch in epochs] == sorted(cuts)
+    motion, expected = total(epochs, split.cut(SECOND)[1]), whole.cut(SECOND)[1]
+    np.testing.assert_allclose(motion.mean, expected.mean, atol=1e-9)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.integers(0, SECOND), max_size=6), st.floats(-2.0, 2.0))
+def test_splitting_a_straight_interval_keeps_the_covariance_of_white_noise_forward(cuts, forward):
+    only_forward = MotionModel(forward=MotionNoise(per_s=0.05, per_m=0.1))
+    heading = MotionModel(final_turn=MotionNoise(per_s=0.05))
+    for motion, row in ((only_forward, 0), (heading, 2)):
+        segmenter = Segmenter(motion, Sensor(), 0.0)
+        segmenter.begin(0)
+        for cut in sorted(cuts):
+            segmenter.observe(cut, *NOTHING)
+        epochs = segmenter.drive(SECOND, SECOND, forward, 0.0)
+        found = total(epochs, segmenter.cut(SECOND)[1]).covariance
+        density = motion.forward if row == 0 else motion.final_turn
+        expected = density.per_s**2 + density.per_m**2 * abs(forward)
+        assert found[row, row] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("forward", "yaw_rate"), [(1.5, 0.0), (1.5, 0.8), (-1.0, -1.2)])
+def test_the_finer_the_split_the_nearer_to_noise_that_is_white_within_the_interval(
+    forward, yaw_rate
+):
+    """One interval takes its turn noise as one constant; split, it tends to the white limit."""
+    motion = MotionModel(forward=WHITE.forward, turn=WHITE.turn)
+    mean, covariance = small_steps(forward, yaw_rate)
+    errors = []
+    for pieces in (1, 4, 16):
+        segmenter = Segmenter(motion, Sensor(), 0.0)
+        segmenter.begin(0)
+        for k in range(1, pieces):
+            segmenter.observe(k * SECOND // pieces, *NOTHING)
+        epochs = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
+        found = total(epochs, segmenter.cut(SECOND)[1])
+        np.testing.assert_allclose(found.mean, mean, atol=1e-8)
+        errors.append(np.abs(found.covariance - covariance).max())
+    assert errors[0] < 0.2 * np.abs(covariance).max()
+    assert errors[2] < 0.05 * errors[0] + 1e-7
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(st.integers(1, SECOND - 1), min_size=1, max_size=5, unique=True))
+def test_the_motion_does_not_depend_on_how_the_odometry_is_cut(cuts):
+    """Of noise along the way only: the sum of the pieces is the whole to 1e-9, to second order."""
+    motion = MotionModel(
+        forward=MotionNoise(per_s=0.05), final_turn=MotionNoise(per_s=0.0), lateral=MotionNoise()
+    )
+    one, many = (Segmenter(motion, Sensor(), 0.0) for _ in range(2))
+    for segmenter in (one, many):
+        segmenter.begin(0)
+    one.drive(SECOND, SECOND, 1.2, 0.0)
+    ends = [0, *sorted(cuts), SECOND]
+    for begin, end in pairwise(ends):
+        many.drive(end, end - begin, 1.2, 0.0)
+    expected, found = one.cut(SECOND)[1], many.cut(SECOND)[1]
+    np.testing.assert_allclose(found.mean, expected.mean, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-9)
+
+
+def test_an_observation_waits_for_the_odometry_that_covers_it():
+    segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
+    segmenter.begin(0)
+    segmenter.observe(3 * SECOND // 2, *scan((4, 2.0, 0.0)))
+    assert segmenter.drive(SECOND, SECOND, 1.0, 0.0) == []
+    assert segmenter.uncovered == 1
+    (epoch,) = segmenter.drive(2 * SECOND, SECOND, 1.0, 0.0)
+    assert (epoch.stamp_ns, segmenter.uncovered) == (3 * SECOND // 2, 0)
+    np.testing.assert_allclose(epoch.increment.mean, [1.5, 0.0, 0.0], atol=1e-12)
+
+
+def test_an_observation_before_the_odometry_is_taken_where_the_robot_stood():
+    segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
+    assert segmenter.observe(-SECOND, *scan((4, 2.0, 0.0))) is None
+    segmenter.begin(0)
+    (epoch,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    assert epoch.stamp_ns == 0
+    assert not epoch.increment.mean.any()
+
+
+def test_an_observation_of_a_time_that_is_past_is_rejected_with_its_reason():
+    segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
+    segmenter.begin(0)
+    segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    assert segmenter.observe(SECOND - 1, *scan((4, 2.0, 0.0))) == "older than the odometry"
+    assert segmenter.observe(SECOND, *scan((4, 2.0, 0.0))) is None
+
+
+def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
+    sensor = Sensor(min_range=1.0, max_range=9.0, range_offset=0.5, range_scale=2.0)
+    segmenter = Segmenter(MotionModel(), sensor, 0.0)
+    segmenter.begin(0)
+    outside = segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 9.1, 0.0)))
+    assert outside == "outside the sensor's limits"
+    segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 4.5, 0.25)))
+    (epoch,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    assert (epoch.ids.tolist(), epoch.ranges.tolist(), epoch.bearings.tolist()) == (
+        [2],
+        [2.0],
+        [0.25],
+    )
+
+
+def keyframe(scans, forward=0.0, yaw_rate=0.0):
+    """The epoch of one keyframe of 1 s with these (stamp_ns, scan)."""
+    segmenter = Segmenter(MotionModel(), Sensor(), 1.0)
+    segmenter.begin(0)
+    for stamp_ns, rows in scans:
+        segmenter.observe(stamp_ns, *rows)
+    (epoch,) = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
+    return epoch
+
+
+def test_a_keyframe_holds_the_median_of_each_landmark():
+    stamps = [SECOND // 5 * k for k in (1, 2, 3)]
+    ranges, bearings = [4.0, 9.0, 4.2], [0.3, 0.1, -2.0]
+    scans = [
+        (stamp, scan((7, r, b), (3, 2.0, 1.0)))
+        for stamp, r, b in zip(stamps, ranges, bearings, strict=True)
+    ]
+    epoch = keyframe(scans)
+    assert epoch.ids.tolist() == [3, 7]
+    np.testing.assert_allclose(epoch.ranges, [2.0, 4.2])
+    np.testing.assert_allclose(epoch.bearings, [1.0, 0.1], atol=1e-12)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.floats(-2.0, 2.0),
+    st.floats(-1.5, 1.5),
+    st.lists(st.integers(1, SECOND), min_size=1, max_size=5),
+)
+def test_a_keyframes_scans_are_moved_by_the_odometry_to_its_end(forward, yaw_rate, stamps):
+    """Exact readings of one point from anywhere on the arc are one reading from its end."""
+    point = 4.0 + 3.0j
+
+    def seen_at(seconds):
+        turn = yaw_rate * seconds
+        arc = seconds * np.exp(0.5j * turn) * np.sinc(0.5 * turn / np.pi)
+        local = (point - forward * arc) * np.exp(-1j * turn)
+        return abs(local), np.angle(local)
+
+    epoch = keyframe(
+        [(t, scan((7, *seen_at(t * 1e-9)))) for t in sorted(stamps)], forward, yaw_rate
+    )
+    np.testing.assert_allclose([epoch.ranges[0], epoch.bearings[0]], seen_at(1.0), atol=1e-9)
+
+
+def test_the_median_of_bearings_beside_the_cut_at_pi_lies_beside_it_too():
+    scans = [
+        (SECOND // 5 * k, scan((7, 5.0, b)))
+        for k, b in enumerate([np.pi - 0.01, -np.pi + 0.03, -np.pi + 0.01], 1)
+    ]
+    (bearing,) = keyframe(scans).bearings
+    assert bearing == pytest.approx(-np.pi + 0.01, abs=1e-9)
+    (straight_back,) = keyframe([(1, scan((7, 5.0, np.pi)))]).bearings
+    assert straight_back == pytest.approx(np.pi)
+
+
+def test_a_cut_closes_the_keyframe_and_the_next_window_starts_clean():
+    segmenter = Segmenter(MotionModel(), Sensor(), 5.0)
+    segmenter.begin(0)
+    segmenter.observe(SECOND // 2, *scan((7, 5.0, 0.0)))
+    assert segmenter.drive(SECOND, SECOND, 1.0, 0.0) == []
+    (epoch,), rest = segmenter.cut(SECOND)
+    assert (epoch.stamp_ns, epoch.ids.tolist()) == (SECOND, [7])
+    np.testing.assert_allclose(epoch.ranges, [4.5])
+    assert not rest.mean.any()
+    assert segmenter.drive(2 * SECOND, SECOND, 1.0, 0.0) == []
+    epochs, rest = segmenter.cut(2 * SECOND)
+    assert epochs == []
+    np.testing.assert_allclose(rest.mean, [1.0, 0.0, 0.0])

@@ -1,0 +1,174 @@
+"""Pose nodes at the team's times; sightings reach the node nearest to them, and no other."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from team.estimation.hybrid_slam.keyframes import Segmenter
+from team.estimation.hybrid_slam.pose_grid import PoseGrid
+from team.estimation.models import Increment
+from team.robot.member import HybridMember
+from tests.estimation.submap_world import seen_from, wrap
+from tests.teams import config
+
+SECOND = 1_000_000_000
+MOTION = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02))
+FRONT = FrontEnd(node_s=2.0, window_s=7.0, sighting_s=1.0, teammate_speed=0.0)
+
+
+def begun(front=FRONT, sensor=None, keyframe_s=0.0, at_ns=0):
+    grid = PoseGrid(sensor or Sensor(), front)
+    segmenter = Segmenter(MOTION, sensor or Sensor(), keyframe_s, grid)
+    segmenter.begin(at_ns)
+    return grid, segmenter
+
+
+def look(teammate="r2", distance=3.0, bearing=0.5):
+    return (teammate,), np.array([distance]), np.array([bearing])
+
+
+def drive(segmenter, until_s, step_ns=SECOND, forward=0.6, yaw_rate=0.25):
+    epochs, now = [], segmenter.now_ns
+    while now < round(until_s * SECOND):
+        now += step_ns
+        epochs += segmenter.drive(now, step_ns, forward, yaw_rate)
+    return epochs
+
+
+def arc(seconds, forward=0.6, yaw_rate=0.25):
+    """Position and heading on the circle that the robot drives."""
+    angle = yaw_rate * seconds
+    middle = forward / yaw_rate * (np.exp(1j * angle) - 1.0) / 1j
+    return np.array([middle.real, middle.imag, angle])
+
+
+@pytest.mark.parametrize("step_ns", [SECOND, 300_000_000, 7 * SECOND])
+def test_each_grid_time_within_the_window_is_an_epoch_of_its_own(step_ns):
+    _, segmenter = begun(at_ns=500_000_000)
+    nodes = [each.stamp_ns for each in drive(segmenter, 20.0, step_ns) if each.is_node]
+    assert nodes == [2 * SECOND, 4 * SECOND, 6 * SECOND]
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.integers(0, 7 * SECOND - 1), max_size=5), st.sampled_from([0.0, 0.5]))
+def test_no_motion_is_lost_or_counted_twice_at_nodes_and_sightings(stamps, keyframe_s):
+    grid, with_nodes = begun(keyframe_s=keyframe_s)
+    plain = Segmenter(MOTION, Sensor(), keyframe_s)
+    plain.begin(0)
+    scan = (np.array([1], np.uint32), np.array([2.0]), np.array([0.0]))
+    for counter, stamp in enumerate(sorted(stamps)):
+        grid.observe(stamp, counter, look())
+        for segmenter in (with_nodes, plain):
+            segmenter.observe(stamp, *scan)
+    ends = []
+    for segmenter in (with_nodes, plain):
+        epochs = drive(segmenter, 7.0)
+        rest, more = segmenter.cut(7 * SECOND)[::-1]
+        total = Increment.identity()
+        for epoch in (*epochs, *more):
+            total = total.then(epoch.increment)
+        ends.append(total.then(rest))
+        assert sum(len(each.ids) for each in (*epochs, *more)) > 0 or not stamps
+    np.testing.assert_allclose(ends[0].mean, ends[1].mean, atol=1e-9)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.floats(1.01, 2.99), st.floats(0.5, 8.0), st.floats(-3.0, 3.0))
+def test_a_sighting_is_carried_along_the_arc_to_its_node(at_s, distance, bearing):
+    """The teammate stands; from the node it lies where the geometry of the circle says."""
+    grid, segmenter = begun()
+    observer = arc(at_s)
+    point = observer[0] + 1j * observer[1] + distance * np.exp(1j * (observer[2] + bearing))
+    assert grid.observe(round(at_s * SECOND), 5, look("r2", distance, bearing)) is None
+    drive(segmenter, 4.0, 250_000_000)
+    (found,) = grid.sightings()
+    to = seen_from(arc(2.0), point)
+    assert (found.stamp_ns, found.teammate, found.readings) == (2 * SECOND, "r2", (5,))
+    assert found.reading[0] == pytest.approx(abs(to), abs=1e-6)
+    assert wrap(found.reading[1] - np.angle(to)) == pytest.approx(0.0, abs=1e-6)
+    assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+
+
+def test_a_teammate_that_may_move_is_known_less_well_the_farther_its_node_is_in_time():
+    moving = msgspec.structs.replace(FRONT, teammate_speed=0.5)
+    variances = []
+    for at_ns in (2 * SECOND, 2_500_000_000, 3 * SECOND - 1):
+        grid, segmenter = begun(moving)
+        grid.observe(at_ns, 1, look())
+        drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
+        variances.append(grid.sightings()[0].covariance[0, 0])
+    assert variances[1] - variances[0] == pytest.approx(0.25**2, abs=0.01)
+    assert variances[2] - variances[0] == pytest.approx(0.5**2, abs=0.01)
+
+
+def test_looks_at_one_teammate_near_one_node_are_one_sighting_of_the_median():
+    grid, segmenter = begun()
+    for counter, (at_s, distance) in enumerate([(1.6, 3.0), (1.9, 3.1), (2.2, 9.0), (2.4, 3.2)]):
+        grid.observe(round(at_s * SECOND), counter, look("r3", distance))
+    grid.observe(2_300_000_000, 9, look("r2", 5.0))
+    drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
+    first, second = grid.sightings()
+    assert (first.teammate, first.readings, first.reading[0]) == ("r2", (9,), 5.0)
+    assert (second.teammate, second.readings) == ("r3", (0, 1, 2, 3))
+    assert second.reading[0] == pytest.approx(3.15)
+
+
+@pytest.mark.parametrize(
+    ("stamp_s", "near_s"),
+    [(0.9, 1.0), (2.9, 0.5), (7.6, 1.0)],
+)
+def test_a_sighting_without_a_node_near_it_in_the_window_is_rejected(stamp_s, near_s):
+    grid, _ = begun(msgspec.structs.replace(FRONT, sighting_s=near_s))
+    assert grid.observe(round(stamp_s * SECOND), 1, look()) == "no pose node near it"
+
+
+def test_the_sensors_calibration_and_the_markers_offset_are_taken_off():
+    sensor = Sensor(range_offset=0.1, range_scale=2.0, marker_range_offset=0.5, max_range=9.0)
+    grid, segmenter = begun(sensor=sensor)
+    looks = (("r2", "r3", "r4"), np.array([4.1, 9.5, 0.9]), np.zeros(3))
+    assert grid.observe(2 * SECOND, 1, looks) is None
+    drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
+    (found,) = grid.sightings()
+    assert (found.teammate, found.reading[0]) == ("r2", pytest.approx(1.5))
+    assert grid.observe(4 * SECOND, 2, look("r3", 9.5)) == "outside the sensor's limits"
+
+
+def test_a_window_begins_without_the_sightings_of_the_one_before():
+    grid, segmenter = begun()
+    grid.observe(1_500_000_000, 1, look())
+    drive(segmenter, 4.0)
+    grid.observe(5_900_000_000, 2, look())
+    segmenter.begin(4 * SECOND)
+    assert grid.sightings() == ()
+    drive(segmenter, 8.0)
+    assert grid.sightings() == ()
+
+
+def test_a_member_closes_its_windows_with_their_nodes_and_sightings():
+    front = msgspec.structs.replace(config().front_end, node_s=1.5, sighting_s=0.5)
+    member = HybridMember(config(front_end=front), 1)
+    member.start(np.zeros(3), None)
+    closed = []
+    for k in range(1, 7):
+        member.consumed(k)
+        if k > 1:
+            reason = member.sight(k * SECOND - 500_000_000, k, look())
+            assert reason == ("no pose node near it" if k == 4 else None), "its node was the end"
+        window = member.drive(k * SECOND, SECOND, 0.5, 0.1).closed
+        closed += [] if window is None else [window]
+    assert [w.local.node_stamps.tolist() for w in closed] == [
+        [1_500_000_000, 3 * SECOND],
+        [4_500_000_000, 6 * SECOND],
+    ]
+    assert [[(s.stamp_ns, s.readings) for s in w.sightings] for w in closed] == [
+        [(1_500_000_000, (2,)), (3 * SECOND, (3,))],
+        [(4_500_000_000, (5,)), (6 * SECOND, (6,))],
+    ]
+
+
+def test_a_member_without_nodes_does_not_use_sightings():
+    member = HybridMember(config(), 1)
+    assert member.sight(SECOND, 1, look()) == "sightings are not used by this estimator"

@@ -1,0 +1,69 @@
+"""Pose nodes of a window: where the particles were then, matched jointly with where they ended."""
+
+import numpy as np
+
+from team.config import FrontEnd, Sensor
+from team.estimation.hybrid_slam import window as windows
+from team.estimation.models import Increment
+from tests.estimation.submap_world import wrap
+
+STEP = Increment(np.array([0.5, 0.0, 0.2]), np.diag([0.03, 0.01, 0.02]) ** 2)
+NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
+LANDMARKS = {4: (2.0, 1.0), 9: (1.0, -2.0)}
+
+
+def seen():
+    ids = np.array(sorted(LANDMARKS), np.uint32)
+    points = np.array([complex(*LANDMARKS[int(i)]) for i in ids])
+    return ids, np.abs(points), np.angle(points)
+
+
+def driven(marks, particles=200):
+    """Four epochs; landmarks are seen at the first; marked as nodes: those in `marks`."""
+    generator = np.random.default_rng(1)
+    window = windows.opened(FrontEnd(particles=particles), Sensor())
+    for k in range(4):
+        window = windows.advanced(window, STEP, *(seen() if k == 0 else NOTHING), generator)
+        if k in marks:
+            window = windows.marked(window, 1000 * k)
+    return window
+
+
+def test_a_node_is_the_weighted_mean_of_the_particles_of_its_epoch():
+    window = driven({1, 3})
+    local = windows.gaussian(window)
+    weights = np.exp(window.particles.log_weights)
+    assert local.node_stamps.tolist() == [1000, 3000]
+    for node, epoch in zip(local.nodes, (1, 3), strict=True):
+        poses = window.paths[epoch]
+        np.testing.assert_allclose(node[:2], weights @ poses[:, :2])
+        direction = np.angle(weights @ np.exp(1j * poses[:, 2]))
+        np.testing.assert_allclose(wrap(node[2] - direction), 0.0, atol=1e-12)
+
+
+def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
+    window = driven({1, 2})
+    local = windows.gaussian(window)
+    weights = np.exp(window.particles.log_weights)
+    both = np.concatenate([window.particles.poses, window.paths[1], window.paths[2]], axis=1)
+    deviations = both - local.mean[:9]
+    expected = (weights[:, None] * deviations).T @ deviations
+    effective = 1.0 / np.sum(weights**2)
+    expected *= effective / (effective - 5.0)  # what a sample's inverse is too large by
+    expected += np.diag(np.tile(windows.POSE_JITTER, 3))
+    np.testing.assert_allclose(local.covariance[:9, :9], expected, atol=1e-12)
+
+
+def test_marking_nodes_changes_nothing_else_in_the_submap():
+    plain, marked = (windows.gaussian(driven(marks)) for marks in (set(), {0, 2}))
+    bare = marked.without_nodes
+    assert bare.ids.tobytes() == plain.ids.tobytes()
+    assert bare.mean.tobytes() == plain.mean.tobytes()
+    np.testing.assert_allclose(bare.covariance, plain.covariance, rtol=1e-15, atol=1e-18)
+
+
+def test_a_node_at_the_windows_end_is_the_end_pose_up_to_the_jitter():
+    local = windows.gaussian(driven({3}))
+    assert local.nodes[0].tolist() == local.end_pose.tolist()
+    same = local.covariance[:3, :3] - local.covariance[:3, 3:6]
+    np.testing.assert_allclose(same, np.diag(windows.POSE_JITTER), atol=1e-15)

@@ -1,0 +1,314 @@
+"""Biases that a robot's submaps share: columns, factors, and what the centre makes of them."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.world.simulator import simulated
+from sim.world.worlds import SimulatedWorld
+from team import translate
+from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from team.estimation import geometry
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.contribution import Contribution, Start
+from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.sensitivity import BIASES, carried_on, forward_column
+from team.estimation.map_joining import joining, marginals
+from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
+from team.estimation.map_joining.submap_factor import biased_normal
+from team.estimation.models import increment_of
+from team.estimation.randomness import generator
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from tests.estimation.submap_world import local_truth, solved, team, wrap
+from tests.teams import config, driven, of, published
+
+SIGMA = {"bearing": 0.01, "forward_scale": 0.05, "range_scale": 0.01}
+MOTION = MotionModel(
+    "turn-then-drive",
+    MotionNoise(per_s=0.02),
+    MotionNoise(per_s=0.01),
+    calibrated_speed=(0.0, 0.1),
+)
+
+
+# --- the columns of a window ---
+
+
+def window_of(bearing, forward_scale, range_scale, white=1.0):
+    """A robot drives a curve among six landmarks, read without noise but with these errors."""
+    sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01, range_white=white, bearing_white=white)
+    front = FrontEnd(particles=400, resample_below=0.0, biases=BIASES)
+    window, random = windows.opened(front, sensor), generator(1, "r1", 0, 0)
+    landmarks = np.array([[4, 3], [6, -3], [9, 2], [3, -4], [11, -2], [8, 6]], dtype=float)
+    pose = np.zeros(3)
+    for _ in range(8):
+        pose = geometry.compose(pose, increment_of(MOTION, 1.0, 1.0, 0.1).mean)
+        offset = landmarks - pose[:2]
+        ranges = np.hypot(*offset.T)
+        seen = np.flatnonzero(ranges < 8.0)
+        bearings = wrap(np.arctan2(*offset.T[::-1]) - pose[2])[seen]
+        window = windows.advanced(
+            window,
+            increment_of(MOTION, 1.0, 1.0 / (1.0 + forward_scale), 0.1),
+            seen.astype(np.uint32),
+            ranges[seen] * (1.0 + range_scale),
+            bearings + bearing,
+            random,
+            forward_column(MOTION, 1.0, 1.0, 0.1),
+        )
+    return windows.gaussian(window)
+
+
+@pytest.mark.parametrize("white", [1.0, 0.3])
+@pytest.mark.parametrize(
+    ("bias", "size"), [("bearing", 4e-3), ("range_scale", 4e-3), ("forward_scale", 1e-2)]
+)
+def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_readings(bias, size, white):
+    errors = dict.fromkeys(BIASES, 0.0)
+    up, down = (window_of(**(errors | {bias: sign * size}), white=white) for sign in (1.0, -1.0))
+    row = window_of(**errors, white=white).sensitivity[BIASES.index(bias)]
+    answered = -(up.mean - down.mean) / (2.0 * size)
+    assert np.abs(answered - row).max() < 0.15 * np.abs(row).max()
+
+
+def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
+    front = FrontEnd(particles=10, biases=BIASES)
+    window, random = windows.opened(front, Sensor()), generator(1, "r1", 0, 0)
+    motion = msgspec.structs.replace(MOTION, calibrated_speed=(0.5, 2.0))
+    seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
+    step, column = increment_of(motion, 1.0, 1.0, 0.1), forward_column(motion, 1.0, 1.0, 0.1)
+    local = windows.gaussian(windows.advanced(window, step, *seen, random, column))
+    assert local.biases == ("bearing", "range_scale")
+    assert local.sensitivity.shape == (2, 5)
+
+
+def test_columns_change_nothing_else():
+    seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
+    made = []
+    for biases in ((), BIASES):
+        front = FrontEnd(particles=10, biases=biases)
+        window, random = windows.opened(front, Sensor()), generator(1, "r1", 0, 0)
+        step = increment_of(MOTION, 1.0, 1.0, 0.1)
+        made.append(windows.gaussian(windows.advanced(window, step, *seen, random)))
+    assert np.array_equal(made[0].mean, made[1].mean)
+    assert np.array_equal(made[0].covariance, made[1].covariance)
+    assert made[0].biases == ()
+
+
+@settings(deadline=None)
+@given(
+    st.floats(0.2, 2.0),
+    st.floats(-1.0, 1.0),
+    st.sampled_from(["velocity", "turn-then-drive"]),
+    st.floats(-2.0, 2.0),
+)
+def test_a_forward_column_is_what_central_differences_of_two_motions_say(speed, rate, kind, more):
+    motion = msgspec.structs.replace(MOTION, kind=kind)
+
+    def driven_with(scale):
+        first = increment_of(motion, 0.5, scale * speed, rate).mean
+        return geometry.compose(first, increment_of(motion, 0.5, scale * speed, more).mean)
+
+    h = 1e-6
+    step = geometry.between(driven_with(1.0 - h), driven_with(1.0 + h))
+    first = forward_column(motion, 0.5, speed, rate)
+    second = increment_of(motion, 0.5, speed, more).mean
+    column = carried_on(first, second) + forward_column(motion, 0.5, speed, more)
+    np.testing.assert_allclose(column, geometry.logarithm(step) / (2 * h), atol=2e-2 * speed)
+
+
+# --- the factor ---
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32), st.integers(0, 4), st.integers(1, 3))
+def test_the_factor_with_biases_is_what_central_differences_say(seed, count, biases):
+    rng = np.random.default_rng(seed)
+    n = 3 + 2 * count
+    state = rng.normal(0.0, 3.0, 6 + 2 * count + biases)
+    mean, sensitivity = rng.normal(0.0, 3.0, n), rng.normal(size=(biases, n))
+    root = rng.normal(size=(n, n)) + 3.0 * np.eye(n)
+    information = root @ root.T
+
+    def residual(x):
+        points = x[6 : 6 + 2 * count].reshape(-1, 2)
+        r = local_truth(x[:3], x[3:6], points) - mean - x[6 + 2 * count :] @ sensitivity
+        r[2] = wrap(r[2])
+        return r
+
+    h = 1e-6
+    steps = np.array([residual(state + d) - residual(state - d) for d in h * np.eye(len(state))])
+    steps[:, 2] = wrap(steps[:, 2])
+    jacobian = steps.T / (2 * h)
+    at = np.array(
+        [0, 3, *(6 + 2 * k for k in range(count)), *range(len(state) - biases, len(state))]
+    )
+    hessian, gradient, chi2 = biased_normal(state, at, mean, information, sensitivity)
+    r = residual(state)
+    tolerance = {"rtol": 1e-6, "atol": 1e-6 * np.abs(information).max() * 100}
+    assert chi2 == pytest.approx(r @ information @ r)
+    np.testing.assert_allclose(gradient, jacobian.T @ information @ r, **tolerance)
+    np.testing.assert_allclose(hessian, jacobian.T @ information @ jacobian, **tolerance)
+
+
+# --- the centre ---
+
+
+def biased_team(seed):
+    """Submaps whose means are off by a share of each robot's two biases, and the biases."""
+    world = team(seed, robots=2, submaps=6, landmarks=5)
+    rng = np.random.default_rng([seed, 7])
+    errors = {robot: rng.normal(size=2) * (0.01, 0.01) for robot in world.paths}
+    submaps = []
+    for each in world.submaps:
+        local = each.local
+        rows = 20.0 * rng.normal(size=(2, len(local.mean)))
+        rows[:, 2] *= 0.1
+        mean = local.mean - errors[each.robot] @ rows
+        mean[2] = wrap(mean[2])
+        shifted = replace(local, mean=mean, biases=("bearing", "range_scale"), sensitivity=rows)
+        submaps.append(replace(each, local=shifted))
+    return world, submaps, errors
+
+
+def fold_of(world, submaps, options, tick=4, full=converged):
+    fold = joining.EMPTY_FOLD
+    for start in world.starts:
+        fold = started(fold, start)
+    for begin in range(0, len(submaps), tick):
+        fold = folded(fold, submaps[begin : begin + tick], options)
+    return full(fold, options)
+
+
+def without_columns(submaps):
+    return [
+        replace(each, local=replace(each.local, biases=(), sensitivity=np.empty((0, 0))))
+        for each in submaps
+    ]
+
+
+def nees_of_map_and_biases(seeds, *, blind=False):
+    of_map = of_biases = dof = 0.0
+    for seed in seeds:
+        world, submaps, errors = biased_team(seed)
+        options = JoinSettings(bias_sigma=SIGMA)
+        taken = without_columns(submaps) if blind else submaps
+        fold = fold_of(world, taken, options, tick=12, full=solved)
+        found = marginals.landmark_map(fold)
+        of_map += nees((found.means - world.landmarks[found.ids]).ravel(), found.covariance)
+        dof += found.means.size
+        for (robot, _), bias, value, sigma in marginals.bias_estimates(fold):
+            truth = errors[robot][0 if bias == "bearing" else 1]
+            of_biases += ((value - truth) / sigma) ** 2 / (4 * len(seeds))
+    return of_map / dof, of_biases
+
+
+SEEDS = range(200)
+
+
+def test_map_and_biases_are_as_sure_as_they_say_and_without_bias_states_they_are_not():
+    of_map, of_biases = nees_of_map_and_biases(SEEDS)
+    low, high = chi2_interval(10, 0.999, len(SEEDS))
+    assert low < of_map < high
+    low, high = chi2_interval(4, 0.999, len(SEEDS))
+    assert low < of_biases < high
+    mutant, _ = nees_of_map_and_biases(SEEDS[:15], blind=True)
+    assert mutant > 2.0
+
+
+def test_biases_stay_when_islands_merge():
+    world, submaps, _ = biased_team(5)
+    options = JoinSettings(bias_sigma=SIGMA)
+    known = fold_of(world, submaps, options)
+    world.starts = world.starts[:1]
+    fold = fold_of(world, submaps, options)
+    assert len(fold.islands) == 1
+    assert [(b.stream, b.bias) for b in marginals.bias_estimates(fold)] == [
+        (b.stream, b.bias) for b in marginals.bias_estimates(known)
+    ]
+    assert len(fold.main.graph.priors) == len(fold.main.graph.biases) == 4
+    graph = fold.main.graph
+    assert {graph.name(node) for node in graph.biases.values()} == {
+        f"the bias {bias} of {robot} (epoch 0)"
+        for robot in ("r0", "r1")
+        for bias in ("bearing", "range_scale")
+    }
+
+
+def test_the_cost_counts_a_bias_with_its_robot():
+    world, submaps, _ = biased_team(6)
+    fold = fold_of(world, submaps, JoinSettings(bias_sigma=SIGMA))
+    graph, agreement = fold.main.graph, marginals.joint_cost(fold)
+    priors = sum(len(prior.mean) for prior in graph.priors)
+    assert agreement.dof == pytest.approx(graph.dimensions.sum() + priors - graph.unknowns)
+
+
+# --- a simulated team with a biased camera ---
+
+BEARING, RANGE = 0.01, 0.01
+
+
+def camera_team(seed, biases):
+    """Two robots whose cameras are off; their submaps as Contributions, the truth, the starts."""
+    world = SimulatedWorld(
+        steps=60, size_m=25.0, landmark_count=12, visible_from_m=1.0, visible_to_m=10.0
+    )
+    front = FrontEnd(particles=60, window_s=6.0, biases=biases)
+    motion = MotionModel(forward=MotionNoise(per_s=0.02), turn=MotionNoise(per_s=0.01))
+    believed = [
+        config(name, motion=motion, sensor=Sensor(0.05, bearing_sigma=0.01), front_end=front)
+        for name in ("r1", "r2")
+    ]
+    off = [
+        msgspec.structs.replace(
+            each,
+            sensor=msgspec.structs.replace(
+                each.sensor, bearing_offset=sign * BEARING, range_scale=1.0 + sign * RANGE
+            ),
+        )
+        for each, sign in zip(believed, (1.0, -1.0), strict=True)
+    ]
+    streams = simulated(world, off, seed)
+    submaps, starts = [], []
+    for stream, robot in zip(streams.streams, believed, strict=True):
+        sent = of(driven(RobotNode(robot), published(stream)), ch.SUBMAP)
+        submaps += [translate.contribution_of(submap) for submap in sent]
+        starts.append(Start(robot.id, sent[0].epoch, stream.start.pose))
+    return streams, sorted(submaps, key=lambda each: each.key), starts
+
+
+def nees_per_dof(seed, biases, options):
+    streams, submaps, starts = camera_team(seed, biases)
+    fold = joining.EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    fold = converged(folded(fold, submaps, options), options)
+    found = marginals.landmark_map(fold)
+    truth = streams.landmarks[found.ids.astype(int) - 1]
+    error = (found.means - truth).ravel()
+    return nees(error, found.covariance) / len(error), marginals.bias_estimates(fold)
+
+
+def test_a_team_with_biased_cameras_is_consistent_with_bias_states_only():
+    options = JoinSettings(bias_sigma=SIGMA)
+    seeds = range(1, 7)
+    known = [nees_per_dof(seed, ("bearing", "range_scale"), options) for seed in seeds]
+    blind = [nees_per_dof(seed, (), options)[0] for seed in seeds]
+    assert 0.6 < np.mean([value for value, _ in known]) < 1.5
+    assert np.mean(blind) > 2.0
+    for _, estimates in known:
+        for (robot, _), bias, value, sigma in estimates:
+            truth = (BEARING if bias == "bearing" else RANGE) * (1.0 if robot == "r1" else -1.0)
+            assert abs(value - truth) < 4.0 * sigma
+            assert sigma < 0.5 * SIGMA[bias]
+
+
+def test_a_contribution_keeps_its_columns_over_the_wire():
+    _, submaps, _ = camera_team(1, ("bearing",))
+    assert all(isinstance(each, Contribution) for each in submaps)
+    assert all(each.local.sensitivity.shape == (1, len(each.local.mean)) for each in submaps)

@@ -1,0 +1,375 @@
+"""One window becomes one honest Gaussian: against batch least squares, in odd cases, in many runs.
+
+The truth and the readings are made here by a few lines of their own, without the filter's models.
+"""
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from team.estimation.consistency import chi2_interval, nees, state_error
+from team.estimation.gaussian import NotACovarianceError, cholesky_factor
+from team.estimation.hybrid_slam import window as windows
+from team.estimation.models import Increment, increment_of
+from team.estimation.randomness import generator
+
+STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)
+ROBOT = MotionModel(
+    kind="turn-then-drive",
+    forward=MotionNoise(per_s=STEP_M),
+    turn=MotionNoise(per_s=STEP_RAD),
+)
+ACCURATE = Sensor(range_sigma=0.2, bearing_sigma=np.deg2rad(2.0))
+COARSE = Sensor(range_sigma=2.0, bearing_sigma=np.deg2rad(10.0))
+NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
+
+
+def wrap(angle):
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+@dataclasses.dataclass
+class Drive:
+    """What a robot was told to do, what it read, and the truth: (end pose, all landmarks)."""
+
+    motions: list
+    epochs: list
+    truth: np.ndarray
+    landmarks: np.ndarray
+
+
+def drive(seed, sensor, steps=12, noise=1.0):
+    """About 3.5 landmarks in sight, 3 to 20 m away; 0.98 m and up to 9° of turn a step."""
+    rng = np.random.default_rng(seed)
+    landmarks = rng.uniform(-40.0, 40.0, (18, 2))
+    pose, motions, epochs = np.zeros(3), [], []
+    for _ in range(steps):
+        distance, turn = 0.98, rng.uniform(-0.15, 0.15)
+        motions.append((distance, turn))
+        distance += noise * STEP_M * rng.standard_normal()
+        heading = pose[2] + turn + noise * STEP_RAD * rng.standard_normal()
+        x, y = pose[:2] + distance * np.array([np.cos(heading), np.sin(heading)])
+        pose = np.array([x, y, wrap(heading)])
+        offset = landmarks - pose[:2]
+        ranges = np.hypot(offset[:, 0], offset[:, 1])
+        bearings = np.arctan2(offset[:, 1], offset[:, 0]) - heading
+        seen = np.flatnonzero((ranges > 3.0) & (ranges < 20.0))
+        ranges = ranges[seen] + sensor.range_sigma * rng.standard_normal(len(seen))
+        bearings = wrap(bearings[seen] + sensor.bearing_sigma * rng.standard_normal(len(seen)))
+        epochs.append((seen.astype(np.uint32), ranges, bearings))
+    return Drive(motions, epochs, pose, landmarks)
+
+
+def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **front_end):
+    front_end = FrontEnd(particles=particles, **front_end)
+    window, random = windows.opened(front_end, sensor), generator(seed, "r1", 0, 0)
+    for (distance, turn), epoch in zip(run.motions, run.epochs, strict=True):
+        readings = tuple(np.repeat(part, 2) for part in epoch) if twice else epoch
+        window = windows.advanced(
+            window, increment_of(motion, 1.0, distance, turn), *readings, random
+        )
+    return window
+
+
+def bytes_of(window):
+    values = [window.paths, window.epochs, window.ids, window.readings]
+    values += [getattr(window.particles, f.name) for f in dataclasses.fields(window.particles)]
+    return [value.tobytes() for value in values]
+
+
+def batch(run, sensor, ids):
+    """Maximum a posteriori over (noise of every step, landmarks) and its Laplace covariance,
+
+    both of (end pose, landmarks in the order of ids), by scipy's least squares.
+    """
+    steps = len(run.motions)
+
+    def path(noise):
+        pose, poses = np.zeros(3), []
+        for (distance, turn), (far, aside) in zip(run.motions, noise.reshape(-1, 2), strict=True):
+            heading = pose[2] + turn + STEP_RAD * aside
+            reach = distance + STEP_M * far
+            pose = np.array(
+                [pose[0] + reach * np.cos(heading), pose[1] + reach * np.sin(heading), heading]
+            )
+            poses.append(pose)
+        return poses
+
+    def residuals(unknowns):
+        landmarks = unknowns[2 * steps :].reshape(-1, 2)
+        parts = [unknowns[: 2 * steps]]
+        for pose, (seen, ranges, bearings) in zip(
+            path(unknowns[: 2 * steps]), run.epochs, strict=True
+        ):
+            offset = landmarks[np.searchsorted(ids, seen)] - pose[:2]
+            parts.append((ranges - np.hypot(offset[:, 0], offset[:, 1])) / sensor.range_sigma)
+            predicted = np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
+            parts.append(wrap(bearings - predicted) / sensor.bearing_sigma)
+        return np.concatenate(parts)
+
+    def reported(unknowns):
+        return np.concatenate((path(unknowns[: 2 * steps])[-1], unknowns[2 * steps :]))
+
+    start = np.concatenate((np.zeros(2 * steps), run.landmarks[ids].ravel()))
+    found = least_squares(residuals, start, method="lm", xtol=1e-12)
+    J = np.stack(
+        [(reported(found.x + h) - reported(found.x - h)) / 2e-6 for h in 1e-6 * np.eye(len(start))],
+        axis=1,
+    )
+    return reported(found.x), J @ np.linalg.solve(found.jac.T @ found.jac, J.T)
+
+
+def test_a_window_agrees_with_batch_least_squares_over_the_same_readings():
+    sensor = Sensor(range_sigma=0.1, bearing_sigma=0.01)
+    run = drive(11, sensor, steps=8)
+    local = windows.gaussian(driven(run, sensor, particles=4000))
+    mean, P = batch(run, sensor, local.ids)
+    sigma = np.sqrt(np.diag(P))
+    assert np.abs(state_error(local.mean, mean) / sigma).max() < 0.25
+    correlation = (local.covariance - P) / np.outer(sigma, sigma)
+    assert np.abs(correlation).max() < 0.25
+
+
+def submap_errors(sensor, particles, runs, **options):
+    """(NEES, dof) of end pose and landmarks jointly for each of the seeded windows."""
+    results = []
+    for seed in range(runs):
+        run = drive(seed, sensor)
+        local = windows.gaussian(driven(run, sensor, particles, seed, **options))
+        truth = np.concatenate((run.truth, run.landmarks[local.ids].ravel()))
+        error = state_error(local.mean, truth)
+        results.append((nees(error, local.covariance), len(error)))
+    return np.array(results)
+
+
+def ratio(results):
+    return results[:, 0].sum() / results[:, 1].sum()
+
+
+@pytest.mark.parametrize("sensor", [ACCURATE, COARSE], ids=["accurate", "coarse"])
+def test_the_submaps_of_many_particles_are_consistent(sensor):
+    results = submap_errors(sensor, particles=400, runs=200)
+    low, high = chi2_interval(int(results[:, 1].sum()), 0.999, 1)
+    assert low < ratio(results) < high
+
+
+@pytest.mark.parametrize("sensor", [ACCURATE, COARSE], ids=["accurate", "coarse"])
+def test_a_hundred_particles_are_consistent_within_a_tenth_and_two_of_each_reading_are_not(sensor):
+    # Moments of 100 weighted samples leave NEES some 7 % high (1.08 and 1.06 over 1200 windows).
+    honest = submap_errors(sensor, particles=100, runs=300)
+    assert 0.9 < ratio(honest) < 1.1
+    inside = np.mean(honest[:, 0] <= chi2.ppf(0.95, honest[:, 1]))
+    assert 0.88 < inside < 0.98
+    assert ratio(submap_errors(sensor, particles=100, runs=60, twice=True)) > 1.5
+
+
+def test_solving_the_landmarks_again_takes_out_the_bias_of_the_first_reading():
+    with_ekf, again = [], []
+    for seed in range(300):
+        run = drive(seed, COARSE)
+        window = driven(run, COARSE, 100, seed)
+        local = windows.gaussian(window)
+        truth = np.concatenate((run.truth, run.landmarks[local.ids].ravel()))
+        order, particles = np.argsort(window.particles.ids), window.particles
+        mean, P = windows.moments(
+            particles.poses,
+            np.exp(particles.log_weights),
+            particles.means[:, order],
+            particles.covariances[:, order],
+        )
+        P[np.arange(3), np.arange(3)] += windows.POSE_JITTER
+        with_ekf.append(nees(state_error(mean, truth), P))
+        again.append(nees(state_error(local.mean, truth), local.covariance))
+    assert np.mean(again) < 0.98 * np.mean(with_ekf)
+
+
+def test_a_running_pose_is_near_the_windows_and_knows_of_the_sensors_constant_errors():
+    run = drive(3, ACCURATE)
+    white = driven(run, ACCURATE)
+    solved, running = windows.gaussian(white), windows.gaussian(white, running=True)
+    sigma = np.sqrt(np.diag(solved.covariance))
+    assert (running.mean != solved.mean).any()
+    assert np.abs((running.mean - solved.mean) / sigma)[:3].max() < 0.2
+    np.testing.assert_allclose(np.sqrt(np.diag(running.covariance))[:3], sigma[:3], rtol=0.1)
+    constant = driven(run, msgspec.structs.replace(ACCURATE, range_white=0.3))
+    solved, running = windows.gaussian(constant), windows.gaussian(constant, running=True)
+    assert running.mean.tobytes() == solved.mean.tobytes()
+    assert running.covariance.tobytes() == solved.covariance.tobytes()
+
+
+def test_a_submap_reports_its_landmarks_by_id_in_the_frame_of_its_start():
+    sensor = Sensor(range_sigma=1e-3, bearing_sigma=1e-4)
+    run = drive(3, sensor, noise=0.0)
+    precise = MotionModel(
+        kind="turn-then-drive", forward=MotionNoise(1e-3), turn=MotionNoise(per_s=1e-4)
+    )
+    local = windows.gaussian(driven(run, sensor, motion=precise))
+    assert (np.diff(local.ids.astype(int)) > 0).all()
+    assert set(local.ids) == set(np.concatenate([ids for ids, _, _ in run.epochs]))
+    np.testing.assert_allclose(local.landmarks, run.landmarks[local.ids], atol=0.02)
+    np.testing.assert_allclose(local.end_pose, run.truth, atol=0.01)
+
+
+def test_the_same_window_gives_the_same_bytes_and_nothing_changes_it():
+    run = drive(5, ACCURATE)
+    window = driven(run, ACCURATE, seed=9)
+    kept = bytes_of(window)
+    once, twice = windows.gaussian(window), windows.gaussian(window)
+    windows.advanced(
+        window, increment_of(ROBOT, 1.0, 1.0, 0.0), *run.epochs[0], generator(1, "a", 0, 0)
+    )
+    windows.moved(window, increment_of(ROBOT, 1.0, 1.0, 0.0), generator(1, "a", 0, 0))
+    assert bytes_of(window) == kept == bytes_of(driven(run, ACCURATE, seed=9))
+    assert once.mean.tobytes() == twice.mean.tobytes()
+    assert once.covariance.tobytes() == twice.covariance.tobytes()
+    assert bytes_of(driven(run, ACCURATE, seed=10)) != kept
+
+
+def test_a_path_is_that_of_the_particles_own_line_of_descent():
+    run = drive(6, COARSE)
+    window, random = (
+        windows.opened(FrontEnd(particles=60, resample_below=1.0), COARSE),
+        generator(1, "a", 0, 0),
+    )
+    exact = Increment(np.array([0.98, 0.1, 0.05]), np.zeros((3, 3)))
+    for k, epoch in enumerate(run.epochs):
+        motion = DRIVEN if k == 1 else exact
+        window = windows.advanced(window, motion, *epoch, random)
+    assert 1 < len(np.unique(window.paths[1, :, 2])) < 60
+    np.testing.assert_array_equal(window.paths[-1], window.particles.poses)
+    for before, after in zip(window.paths[1:-1], window.paths[2:], strict=True):
+        c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
+        np.testing.assert_allclose(after[:, 0], before[:, 0] + 0.98 * c - 0.1 * s)
+        np.testing.assert_allclose(after[:, 1], before[:, 1] + 0.98 * s + 0.1 * c)
+
+
+def test_motion_to_the_windows_end_moves_the_pose_and_keeps_weights_and_readings():
+    window = driven(drive(7, ACCURATE), ACCURATE, resample_below=0.0)
+    after = windows.moved(window, increment_of(ROBOT, 1.0, 1.0, 0.0), generator(1, "a", 0, 0))
+    np.testing.assert_array_equal(after.particles.log_weights, window.particles.log_weights)
+    assert after.paths.tobytes() == window.paths.tobytes()
+    before, local = windows.gaussian(window), windows.gaussian(after)
+    np.testing.assert_array_equal(local.landmarks, before.landmarks)
+    assert 0.9 < np.hypot(*(local.end_pose - before.end_pose)[:2]) < 1.1
+    assert local.covariance[2, 2] > before.covariance[2, 2]
+
+
+STANDING = Increment.identity()
+GAP = Increment(np.array([3.0, 0.0, 1.0]), np.diag([400.0, 100.0, 25.0]))
+SIGHT = (np.array([4], np.uint32), np.array([8.0]), np.array([0.5]))
+FAR = (np.array([4, 9], np.uint32), np.array([1e6, 5.0]), np.array([3.1, -3.1]))
+ELSEWHERE = (np.array([4], np.uint32), np.array([25.0]), np.array([-2.6]))
+UNDERFOOT = (np.array([4], np.uint32), np.array([1e-9]), np.array([2.0]))
+DRIVEN = increment_of(ROBOT, 1.0, 1.0, 0.1)
+CASES = {
+    "nothing at all": [],
+    "standing without a reading": [(STANDING, NOTHING)],
+    "moving without a reading": [(DRIVEN, NOTHING)] * 5,
+    "one reading from the start": [(STANDING, SIGHT)],
+    "one reading after motion": [(DRIVEN, SIGHT)],
+    "standing before one landmark": [(STANDING, SIGHT)] * 8,
+    "a gap": [(GAP, NOTHING)],
+    "a gap and a reading": [(GAP, SIGHT)],
+    "a reading, a gap and the reading again": [(DRIVEN, SIGHT), (GAP, SIGHT), (DRIVEN, SIGHT)],
+    "a very far landmark": [(DRIVEN, FAR), (DRIVEN, FAR)],
+    "a landmark that jumps": [(DRIVEN, SIGHT), (DRIVEN, ELSEWHERE), (STANDING, ELSEWHERE)],
+    "a landmark underfoot": [(DRIVEN, UNDERFOOT), (STANDING, UNDERFOOT), (DRIVEN, SIGHT)],
+}
+
+
+@pytest.mark.parametrize("particles", [4, 100])
+@pytest.mark.parametrize("case", CASES)
+def test_an_odd_window_still_becomes_a_covariance(case, particles):
+    window, random = (
+        windows.opened(FrontEnd(particles=particles), ACCURATE),
+        generator(2, "a", 0, 0),
+    )
+    for motion, epoch in CASES[case]:
+        window = windows.advanced(window, motion, *epoch, random)
+    local = windows.gaussian(window)
+    assert np.isfinite(local.mean).all()
+    cholesky_factor(local.covariance, case)
+    np.testing.assert_array_equal(local.covariance, local.covariance.T)
+    assert len(local.mean) == 3 + 2 * len({i for _, (ids, _, _) in CASES[case] for i in ids})
+
+
+def test_a_gap_leaves_the_uncertainty_of_its_odometry():
+    window = windows.moved(
+        windows.opened(FrontEnd(particles=4000), ACCURATE), GAP, generator(2, "a", 0, 0)
+    )
+    # A heading that is uniform on the circle has variance π²/3.
+    assert abs(windows.gaussian(window).covariance[2, 2] / (np.pi**2 / 3.0) - 1.0) < 0.05
+
+
+def test_a_landmark_seen_once_from_the_start_is_its_reading_and_its_noise():
+    window = windows.advanced(
+        windows.opened(FrontEnd(), ACCURATE), STANDING, *SIGHT, generator(2, "a", 0, 0)
+    )
+    local = windows.gaussian(window)
+    c, s = np.cos(0.5), np.sin(0.5)
+    np.testing.assert_allclose(local.landmarks, [[8.0 * c, 8.0 * s]])
+    G = np.array([[c, -8.0 * s], [s, 8.0 * c]])
+    R = np.diag([ACCURATE.range_sigma**2, ACCURATE.bearing_sigma**2])
+    np.testing.assert_allclose(local.covariance[3:, 3:], G @ R @ G.T)
+    np.testing.assert_allclose(np.diag(local.covariance)[:3], windows.POSE_JITTER)
+
+
+def test_the_information_of_few_particles_is_right_on_average_and_that_of_their_scatter_is_not():
+    """E[P⁻¹] = Q⁻¹ over many windows; of the bare scatter it is N/(N − 5) = 4/3 of it."""
+    count, runs, sigmas = 20, 600, np.array([0.1, 0.05, 1e-3])
+    motion = Increment(np.array([1.0, 0.0, 0.0]), np.diag(np.square(sigmas)))
+    empty = windows.opened(FrontEnd(particles=count), ACCURATE)
+    information = {"window": 0.0, "scatter": 0.0}
+    for seed in range(runs):
+        window = windows.moved(empty, motion, generator(seed, "a", 0, 0))
+        P = windows.gaussian(window).covariance - np.diag(windows.POSE_JITTER)
+        scatter = np.cov((window.particles.poses / sigmas).T, bias=True)
+        np.testing.assert_allclose(P / np.outer(sigmas, sigmas), 4.0 / 3.0 * scatter, rtol=1e-6)
+        for name, each in (("window", P / np.outer(sigmas, sigmas)), ("scatter", scatter)):
+            information[name] += np.trace(np.linalg.inv(each)) / 3 / runs
+    # The mean of 600 has a sigma of 1.5 %.
+    assert 0.95 < information["window"] < 1.05
+    assert information["scatter"] > 1.25
+
+
+@pytest.mark.parametrize(
+    ("weights", "factor"),
+    [
+        ([0.05] * 20, 20 / 15),
+        ([0.1, 0.1] + [0.05] * 16, 1.0 / (1.0 - 5.0 * 0.06)),
+        ([0.1] * 10, 2.0),
+        ([0.5, 0.5], 2.0),
+        ([1.0], 2.0),
+    ],
+    ids=["twenty equal", "unequal ones count for fewer", "ten", "two", "one"],
+)
+def test_the_scatter_of_particles_is_taken_times_its_sample_factor(weights, factor):
+    assert windows.sample_factor(np.array(weights)) == pytest.approx(factor)
+
+
+def test_headings_about_half_a_turn_have_their_mean_there():
+    back = Increment(np.array([0.0, 0.0, np.pi]), np.diag([0.0, 0.0, 0.01]))
+    window = windows.moved(
+        windows.opened(FrontEnd(particles=1000), ACCURATE), back, generator(3, "a", 0, 0)
+    )
+    local = windows.gaussian(window)
+    assert abs(abs(local.mean[2]) - np.pi) < 0.02
+    assert abs(local.covariance[2, 2] - 0.01) < 0.002
+
+
+@pytest.mark.parametrize("ranges", [(np.nan,), (8.0, np.nan)])
+def test_a_reading_that_is_not_a_number_gives_an_error_that_names_the_matrix(ranges):
+    def taken():
+        window = windows.opened(FrontEnd(), ACCURATE)
+        for z in ranges:
+            scan = SIGHT[0], np.array([z]), SIGHT[2]
+            window = windows.advanced(window, DRIVEN, *scan, generator(2, "a", 0, 0))
+        return windows.gaussian(window)
+
+    with pytest.raises(NotACovarianceError, match="the submap of a window"):
+        taken()

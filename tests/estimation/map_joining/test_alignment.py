@@ -1,0 +1,241 @@
+"""A free stream joins the main frame when its landmarks say where it is, and not before."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.contribution import Start
+from team.estimation.map_joining.alignment import Shared, aligned, procrustes, refusal
+from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from team.estimation.map_joining.marginals import landmark_map, trajectory
+from tests.estimation.submap_world import correlated, seen_from, team, wrap
+
+OPTIONS = JoinSettings(step_tolerance=1e-10)
+
+
+def joined(submaps, starts, tick=2):
+    fold = EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    for begin in range(0, len(submaps), tick):
+        fold = folded(fold, submaps[begin : begin + tick], OPTIONS)
+    return fold
+
+
+def seeing_only(submaps, robot, ids):
+    """The submaps, those of one robot reduced to these landmarks."""
+
+    def reduced(each):
+        index = np.flatnonzero(np.isin(each.local.ids, ids))
+        keep = np.concatenate([np.arange(3), *(3 + 2 * k + np.arange(2) for k in index)])
+        local = replace(
+            each.local,
+            ids=each.local.ids[index],
+            mean=each.local.mean[keep],
+            covariance=each.local.covariance[np.ix_(keep, keep)],
+        )
+        return replace(each, local=local)
+
+    return [reduced(each) if each.robot == robot else each for each in submaps]
+
+
+def pairs(points):
+    return np.column_stack([points.real, points.imag])
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32), st.integers(2, 8))
+def test_procrustes_recovers_an_exact_motion(seed, count):
+    rng = np.random.default_rng(seed)
+    pose = np.array([*rng.normal(0.0, 50.0, 2), rng.uniform(-np.pi, np.pi)])
+    points = rng.normal(0.0, 10.0, (count, 2))
+    in_b = pairs(seen_from(pose, points[:, 0] + 1j * points[:, 1]))
+    found = procrustes(points, in_b, rng.uniform(0.1, 10.0, count))
+    np.testing.assert_allclose(found[:2], pose[:2], atol=1e-9)
+    assert wrap(found[2] - pose[2]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_mirrored_map_is_rotated_and_never_mirrored():
+    rng = np.random.default_rng(1)
+    in_b = rng.normal(0.0, 5.0, (5, 2))
+    found = procrustes(in_b * np.array([1.0, -1.0]), in_b, np.ones(5))
+    c, s = np.cos(found[2]), np.sin(found[2])
+    assert np.linalg.det([[c, -s], [s, c]]) == pytest.approx(1.0)
+
+
+def test_the_alignment_and_its_chi_square_are_consistent():
+    runs, errors, cost = 300, 0.0, 0.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        truth = np.array([20.0, -5.0, 2.0])
+        points = rng.uniform(-20.0, 20.0, (4, 2))
+        there = pairs(seen_from(truth, points[:, 0] + 1j * points[:, 1]))
+        P, Q = correlated(np.full(8, 0.3), rng), correlated(np.full(8, 0.2), rng)
+        noisy_a = points.ravel() + np.linalg.cholesky(P) @ rng.normal(size=8)
+        noisy_b = there.ravel() + np.linalg.cholesky(Q) @ rng.normal(size=8)
+        found = aligned(noisy_a.reshape(-1, 2), P, noisy_b.reshape(-1, 2), Q)
+        error = found.a_from_b - truth
+        error[2] = wrap(error[2])
+        errors += nees(error, found.covariance)
+        cost += found.chi2
+        assert found.dof == 5
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < errors / (3 * runs) < high
+    low, high = chi2_interval(5, 0.999, runs)
+    assert low < cost / (5 * runs) < high
+
+
+@pytest.mark.parametrize("tick", [1, 3, 100])
+def test_an_aligned_stream_ends_where_one_with_a_vague_start_ends(tick):
+    world = team(3, robots=2, submaps=10)
+    vague = Start("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
+    free = converged(joined(world.submaps, world.starts[:1], tick), OPTIONS)
+    known = converged(joined(world.submaps, [world.starts[0], vague], tick), OPTIONS)
+    assert not free.reasons
+    assert len(free.islands) == 1
+    one, other = landmark_map(free), landmark_map(known)
+    sigma = np.sqrt(np.diag(other.covariance)).reshape(-1, 2)
+    assert (np.abs(one.means - other.means) < 0.05 * sigma).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(one.covariance)).reshape(-1, 2), sigma, rtol=0.05)
+    assert np.abs(trajectory(free, "r1", 0).poses[-1] - world.paths["r1"][-1])[:2].max() < 1.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_maps_that_drifted_far_are_merged_and_find_the_same_optimum(seed):
+    world = team(seed, submaps=25, landmarks=18, size=80.0, reach=20.0, sigmas=(0.3, 0.12, 1.2))
+    vague = Start("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
+    free = converged(joined(world.submaps, world.starts[:1]), OPTIONS)
+    known = converged(joined(world.submaps, [world.starts[0], vague]), OPTIONS)
+    assert not free.reasons
+    assert free.main.cost < known.main.cost + 0.1
+
+
+def test_one_shared_landmark_is_not_enough_and_the_fold_says_so():
+    world = team(4, robots=2, submaps=6)
+    fold = joined(seeing_only(world.submaps, "r1", [2]), world.starts[:1])
+    assert fold.reasons == {("r1", 0): "r1 (epoch 0) not joined: 1 shared landmark, 2 needed"}
+    assert len(fold.islands) == 2
+
+
+def test_none_shared_is_said_in_the_plural():
+    world = team(4, robots=2, submaps=6)
+    fold = joined(seeing_only(world.submaps, "r1", []), world.starts[:1])
+    assert list(fold.reasons.values()) == ["r1 (epoch 0) not joined: 0 shared landmarks, 2 needed"]
+
+
+def test_maps_that_disagree_are_not_merged():
+    world = team(4, robots=2, submaps=6)
+
+    def stretched(each):
+        mean = each.local.mean.copy()
+        mean[3:] *= 3.0
+        return replace(each, local=replace(each.local, mean=mean)) if each.robot == "r1" else each
+
+    fold = joined([stretched(each) for each in world.submaps], world.starts[:1])
+    reason = fold.reasons[("r1", 0)]
+    assert "landmarks disagree: chi²" in reason
+    assert "(99.9 %)" in reason
+
+
+def test_landmarks_close_together_do_not_give_a_heading():
+    in_a = np.array([[0.0, 0.0], [0.3, 0.0]])
+    found = aligned(in_a, np.eye(4), in_a + 5.0, np.eye(4))
+    reason = refusal(Shared(2), found, 0.3)
+    assert reason is not None
+    assert "too close together" in reason
+    apart = aligned(10.0 * in_a, 0.01 * np.eye(4), 10.0 * in_a, 0.01 * np.eye(4))
+    assert refusal(Shared(2), apart, 0.3) is None
+
+
+def test_an_island_that_is_not_merged_does_not_disturb_the_main_one():
+    world = team(4, robots=2, submaps=6)
+    apart = seeing_only(world.submaps, "r1", [2])
+    alone = [each for each in apart if each.robot == "r0"]
+    with_it, without = joined(apart, world.starts[:1], 2), joined(alone, world.starts[:1], 1)
+    assert with_it.main.state.tobytes() == without.main.state.tobytes()
+    assert landmark_map(with_it).covariance.tobytes() == landmark_map(without).covariance.tobytes()
+
+
+def test_without_any_start_the_smallest_stream_is_the_gauge_whoever_came_first():
+    world = team(5, robots=2, submaps=8)
+    late = [
+        replace(each, end_ns=each.end_ns + (2500 if each.robot == "r0" else 0))
+        for each in world.submaps
+    ]
+    fold = joined(sorted(late, key=lambda each: each.key), [])
+    assert fold.frame == ("r0", 0)
+    assert not fold.reasons
+    island = fold.main
+    gauge = island.graph.streams[("r0", 0)][0]
+    assert island.graph.fixed[gauge]
+    np.testing.assert_array_equal(island.state[island.graph.offset[gauge] :][:3], np.zeros(3))
+    assert island.graph.fixed.sum() == 1
+
+
+def test_a_free_stream_before_any_with_a_start_joins_the_frame_of_the_start():
+    world = team(6, robots=2, submaps=8)
+    late = [
+        replace(each, end_ns=each.end_ns + (2500 if each.robot == "r1" else 0))
+        for each in world.submaps
+    ]
+    fold = joined(sorted(late, key=lambda each: each.key), world.starts[1:])
+    found = landmark_map(converged(fold, OPTIONS))
+    assert len(fold.islands) == 1
+    assert fold.frame == ("r0", 0)
+    assert np.abs(found.means - world.landmarks[found.ids]).max() < 1.5
+
+
+def test_merging_is_the_same_bytes_each_time():
+    world = team(7, robots=3, submaps=6)
+    one, other = (joined(world.submaps, world.starts[:1]) for _ in range(2))
+    assert one.main.state.tobytes() == other.main.state.tobytes()
+
+
+# --- islands among themselves ---
+
+
+def test_two_free_islands_join_each_other_while_the_main_one_knows_neither():
+    world = team(8, robots=3, submaps=6)
+    apart = seeing_only(world.submaps, "r0", [])
+    fold = converged(joined(apart, world.starts[:1]), OPTIONS)
+    assert fold.frame == ("r0", 0)
+    assert len(fold.islands) == 2
+    assert fold.home[("r1", 0)] == fold.home[("r2", 0)]
+    assert set(fold.reasons) == {("r1", 0)}
+    assert "0 shared landmarks, 2 needed" in fold.reasons[("r1", 0)]
+    (words,) = fold.joined.values()
+    assert words.startswith("r2 (epoch 0) joined: ")
+    assert "per degree of freedom, transform sigma" in words
+    other = fold.island("r2", 0)
+    start = other.graph.streams[("r1", 0)][0]
+    assert other.graph.fixed[start], "the smaller frame stays"
+
+
+def test_with_no_start_known_the_whole_team_is_in_the_frame_of_the_smallest_stream():
+    world = team(9, robots=3, submaps=8)
+    fold = converged(joined(world.submaps, []), OPTIONS)
+    assert (fold.frame, len(fold.islands), len(fold.joined)) == (("r0", 0), 1, 2)
+    found, known = (
+        landmark_map(fold),
+        landmark_map(converged(joined(world.submaps, world.starts), OPTIONS)),
+    )
+    apart = (np.linalg.norm(m[:, None] - m[None], axis=2) for m in (found.means, known.means))
+    np.testing.assert_allclose(*apart, atol=0.6)
+
+
+@settings(deadline=None, max_examples=6)
+@given(st.randoms(use_true_random=False))
+def test_merges_and_their_words_are_the_same_for_every_order_of_arrival(random):
+    world = team(10, robots=3, submaps=5)
+    arrived = list(world.submaps)
+    random.shuffle(arrived)
+    one = joined(world.submaps, [])
+    other = joined(sorted(arrived, key=lambda each: each.key), [])
+    assert one.main.state.tobytes() == other.main.state.tobytes()
+    assert (one.joined, one.reasons) == (other.joined, other.reasons)
+    assert one.joined

@@ -1,0 +1,312 @@
+"""The broadcast prior times the robot's own later submaps is the full join."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.map_joining import conditioning, whole_map
+from team.estimation.map_joining.conditioning import RobotPrior, Shared, followed, pose_now
+from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
+from team.estimation.map_joining.marginals import prior_for, trajectory
+from team.estimation.map_joining.whole_map import without
+from team.estimation.submap import LocalMap
+from tests.estimation.submap_world import solved, team, wrap
+
+OPTIONS = JoinSettings(step_tolerance=1e-11)
+LINEAR = (0.1, 1e-5, 0.2)
+
+
+def joined(submaps, starts, settings=OPTIONS):
+    fold = EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    return solved(folded(fold, submaps, settings), settings)
+
+
+def team_pose(prior, pending, open_window):
+    return pose_now(followed(prior.whole, pending).whole, open_window).pose
+
+
+def later(world, robot, known):
+    """The submaps of the team up to each robot's `known`-th, and this robot's further ones."""
+    before = [each for each in world.submaps if each.sequence < known]
+    after = [each for each in world.submaps if each.robot == robot and each.sequence >= known]
+    return before, after
+
+
+@pytest.mark.parametrize("known", [3, 5, 7])
+@pytest.mark.parametrize("seed", range(3))
+def test_conditioning_equals_the_full_join_in_the_linear_case(seed, known):
+    world = team(seed, submaps=8, sigmas=LINEAR)
+    before, after = later(world, "r1", known)
+    prior = prior_for(joined(before, world.starts), "r1", 0)
+    locals_ = [each.local for each in after]
+    pose, covariance = team_pose(prior, locals_[:-1], locals_[-1])
+    everything = joined(before + after, world.starts)
+    path = trajectory(everything, "r1", 0)
+    sigma = np.sqrt(np.diag(path.covariances[-1]))
+    np.testing.assert_allclose(pose / sigma, path.poses[-1] / sigma, atol=2e-2)
+    np.testing.assert_allclose(
+        covariance / np.outer(sigma, sigma),
+        path.covariances[-1] / np.outer(sigma, sigma),
+        atol=1e-3,
+    )
+
+
+def test_an_open_window_is_one_more_submap():
+    world = team(4, submaps=6, sigmas=LINEAR)
+    before, after = later(world, "r0", 4)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    one, two = (each.local for each in after)
+    closed, spread = team_pose(prior, [one, two], None)
+    running, of_running = team_pose(prior, [one], two)
+    sigma = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose(running / sigma, closed / sigma, atol=1e-3)
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(of_running / scale, spread / scale, atol=1e-3)
+
+
+def one_after_the_other(prior, pending):
+    """The mutant, which was the program: each submap is linearised on the guess before it."""
+    whole = prior.whole
+    for each in pending:
+        whole = whole_map.joined(whole, each)
+    return whole.mean[:3]
+
+
+def test_a_poor_prior_and_later_submaps_give_the_pose_of_the_full_join():
+    """Submaps of 0.5 rad: what the later ones see settles the heading of the earlier ones, too."""
+    away = {"ours": [], "one after the other": []}
+    for seed in range(12):
+        world = team(seed, submaps=8, landmarks=10, size=60.0, reach=20.0, sigmas=(0.3, 0.5, 2.0))
+        before, after = later(world, "r0", 2)
+        prior = prior_for(joined(before, world.starts), "r0", 0)
+        pending = [each.local for each in after]
+        path = trajectory(joined(before + after, world.starts), "r0", 0)
+        poses = {
+            "ours": followed(prior.whole, pending).whole.mean[:3],
+            "one after the other": one_after_the_other(prior, pending),
+        }
+        for name, pose in poses.items():
+            off = pose - path.poses[-1]
+            off[2] = wrap(off[2])
+            away[name].append(nees(off, path.covariances[-1]) / 3)
+    assert max(away["ours"]) < 0.01
+    assert max(away["one after the other"]) > 0.1
+
+
+def overconfident(local, shift):
+    """A submap whose end pose is off by `shift`, and claims to be known three times better."""
+    mean, scale = local.mean.copy(), np.ones(len(local.mean))
+    mean[:3] += shift
+    scale[:3] = 0.3
+    return LocalMap(local.ids, mean, local.covariance * np.outer(scale, scale))
+
+
+@pytest.mark.parametrize("seed", [2, 4, 7])
+def test_after_a_bad_submap_the_landmarks_of_the_next_ones_bring_the_pose_back(seed):
+    """The gate took all that later submaps saw for other landmarks, for as long as the prior held.
+
+    Now what is left of the error is within three sigma two windows later, and it is said.
+    """
+    world = team(seed, submaps=10, landmarks=12)
+    before, after = later(world, "r0", 5)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    bad = overconfident(after[0].local, (1.0, -0.8, 0.1))
+    told = followed(prior.whole, [bad, *(each.local for each in after[1:3])])
+    off = told.whole.mean[:3] - world.paths["r0"][7]
+    off[2] = wrap(off[2])
+    assert told.disputed
+    assert nees(off, told.whole.covariance[:3, :3]) < 16.3
+    assert not any(followed(prior.whole, [e.local for e in after[:n]]).disputed for n in range(4))
+
+
+def test_without_later_submaps_the_prior_itself_is_the_pose():
+    world = team(5, submaps=3)
+    prior = prior_for(joined(world.submaps, world.starts), "r0", 0)
+    pose, covariance = team_pose(prior, [], None)
+    np.testing.assert_array_equal(pose, prior.pose)
+    np.testing.assert_array_equal(covariance, prior.covariance[:3, :3])
+
+
+def test_before_the_first_map_the_pose_is_composed_from_the_exact_start():
+    world = team(6, submaps=1)
+    submap = world.submaps[0]
+    nothing = np.zeros(0, np.uint32)
+    prior = RobotPrior(world.starts[0].pose, nothing, np.zeros((0, 2)), np.zeros((3, 3)))
+    pose, covariance = team_pose(prior, [], submap.local)
+    path = trajectory(joined([submap], world.starts), "r0", 0)
+    np.testing.assert_allclose(pose, path.poses[0], atol=1e-12)
+    np.testing.assert_allclose(covariance, path.covariances[0], atol=1e-12)
+
+
+def test_a_landmark_that_only_the_later_submaps_see_does_no_harm_and_ties_them():
+    prior = RobotPrior(np.zeros(3), np.zeros(0, np.uint32), np.zeros((0, 2)), 1e-4 * np.eye(3))
+    spread = np.diag([1.0, 1.0, 1e-6, 1e-4, 1e-4])
+    ids = np.array([7], np.uint32)
+    first = LocalMap(ids, np.array([1.0, 0.0, 0.0, 3.0, 1.0]), spread)
+    second = LocalMap(ids, np.array([1.5, 0.0, 0.0, 1.0, 1.0]), spread)
+    pose, covariance = team_pose(prior, [first, second], None)
+    assert pose[0] == pytest.approx(2.0 + 1.5, abs=1e-2)
+    assert covariance[0, 0] == pytest.approx(1.0, rel=1e-2)
+
+
+def misread(local, place, shift):
+    """The submap whose landmark at this place was taken for another one, `shift` away."""
+    mean = local.mean.copy()
+    mean[3 + 2 * place : 5 + 2 * place] += shift
+    return LocalMap(local.ids, mean, local.covariance)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_misread_landmark_leaves_the_pose_as_it_is_without_it(seed, monkeypatch):
+    world = team(seed, submaps=6)
+    before, after = later(world, "r0", 4)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    first, second = (each.local for each in after)
+    known = [k for k, id_ in enumerate(second.ids.tolist()) if id_ in prior.ids]
+    place = known[0]
+    expected, covariance = team_pose(prior, [first], without(second, place))
+    wrong = misread(second, place, np.array([4.0, -3.0]))
+    pose, spread = team_pose(prior, [first], wrong)
+    np.testing.assert_array_equal(pose, expected)
+    np.testing.assert_array_equal(spread, covariance)
+    monkeypatch.setattr(conditioning, "GATE", np.inf)
+    trusting, _ = team_pose(prior, [first], wrong)
+    sigma = np.sqrt(np.diag(covariance))
+    assert np.abs((trusting - expected) / sigma).max() > 3.0
+
+
+def test_two_misread_landmarks_in_two_submaps_are_both_left_out():
+    world = team(2, submaps=6)
+    before, after = later(world, "r0", 4)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    good = [each.local for each in after]
+    places = [int(np.flatnonzero(np.isin(each.ids, prior.ids))[-1]) for each in good]
+    bad = [misread(e, k, np.array([2.0, 5.0])) for e, k in zip(good, places, strict=True)]
+    kept = [without(e, k) for e, k in zip(good, places, strict=True)]
+    expected, _ = team_pose(prior, kept[:1], kept[1])
+    pose, _ = team_pose(prior, bad[:1], bad[1])
+    np.testing.assert_array_equal(pose, expected)
+
+
+def test_good_submaps_are_all_used(monkeypatch):
+    for seed in range(20):
+        world = team(seed, submaps=6)
+        before, after = later(world, "r1", 4)
+        prior = prior_for(joined(before, world.starts), "r1", 0)
+        chain = [each.local for each in after]
+        gated = team_pose(prior, chain, None)
+        with monkeypatch.context() as patch:
+            patch.setattr(conditioning, "GATE", np.inf)
+            trusting = team_pose(prior, chain, None)
+        assert gated.mean.tobytes() == trusting.mean.tobytes()
+
+
+def test_the_team_pose_is_consistent_and_counting_a_submap_twice_is_not():
+    runs, honest, twice = 200, 0.0, 0.0
+    for seed in range(runs):
+        world = team(seed, submaps=5)
+        before, after = later(world, "r0", 4)
+        prior = prior_for(joined(before, world.starts), "r0", 0)
+        local = after[0].local
+        halved = LocalMap(local.ids, local.mean, 0.5 * local.covariance)
+        for_each = []
+        for each, p in ((local, 1.0), (halved, 0.5)):
+            told = prior._replace(covariance=p * prior.covariance)
+            pose, covariance = team_pose(told, [], each)
+            error = pose - world.paths["r0"][4]
+            error[2] = wrap(error[2])
+            for_each.append(nees(error, covariance) / 3)
+        honest += for_each[0] / runs
+        twice += for_each[1] / runs
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < honest < high
+    assert twice > high
+
+
+def test_a_submap_is_taken_with_the_variance_of_each_shared_error_that_it_knows():
+    local = team(3, submaps=1).submaps[0].local
+    n, rng = len(local.mean), np.random.default_rng(1)
+    columns = rng.normal(size=(2, n))
+    local = replace(local, biases=("bearing", "range_scale"), sensitivity=columns)
+    shared = Shared(1.5, (("range_scale", 0.2, 0.3), ("bearing", -0.1, 0.05), ("clock", 7.0, 7.0)))
+    taken = shared.taken(local)
+    S, B = columns, np.diag(np.square([0.05, 0.3]))
+    np.testing.assert_allclose(taken.mean, local.mean + S.T @ [-0.1, 0.2])
+    np.testing.assert_allclose(taken.covariance, 1.5 * local.covariance + S.T @ B @ S)
+    np.testing.assert_array_equal(taken.ids, local.ids)
+    assert Shared().taken(local).covariance.tobytes() == local.covariance.tobytes()
+
+
+FACTOR, SIGMA = 2.5, 0.3
+SHARED = JoinSettings(covariance_factor=FACTOR, bias_sigma={"range_scale": SIGMA})
+
+
+def with_shared_error(submap, error, rng):
+    """Errors of FACTOR times the stated covariance, and one that all its robot's submaps have."""
+    local = submap.local
+    n = len(local.mean)
+    column = 0.5 * rng.standard_normal((1, n))
+    column[0, 2] *= 0.1
+    more = np.linalg.cholesky(local.covariance) @ rng.standard_normal(n)
+    mean = local.mean - error * column[0] + np.sqrt(FACTOR - 1.0) * more
+    return replace(
+        submap, local=replace(local, mean=mean, biases=("range_scale",), sensitivity=column)
+    )
+
+
+def test_a_team_pose_takes_later_submaps_as_the_centre_does_or_it_claims_too_much():
+    """The mutant takes them as they are: neither the factor nor the shared error of its prior."""
+    runs, told, untold = 200, 0.0, 0.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        world = team(seed, submaps=6)
+        error = {robot: SIGMA * rng.standard_normal() for robot in ("r0", "r1")}
+        world.submaps = [with_shared_error(each, error[each.robot], rng) for each in world.submaps]
+        before, after = later(world, "r0", 4)
+        prior = prior_for(joined(before, world.starts, SHARED), "r0", 0)
+        for shared in (prior.shared, Shared()):
+            pose, spread = team_pose(prior, [shared.taken(each.local) for each in after], None)
+            off = pose - world.paths["r0"][5]
+            off[2] = wrap(off[2])
+            share = nees(off, spread) / 3 / runs
+            told, untold = (
+                (told + share, untold) if shared is prior.shared else (told, untold + share)
+            )
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < told < high
+    assert untold > high
+
+
+def test_the_team_pose_is_consistent_whatever_the_lag_of_the_last_broadcast():
+    """Broadcasts come late and some not at all; the mutant counts the robot's submaps twice."""
+    runs, honest, twice = 200, 0.0, 0.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        world = team(seed + 1000, submaps=6)
+        known = int(rng.integers(1, 6))  # the windows of r0 in the newest broadcast that it has
+        of_others = int(rng.integers(0, known + 1))  # its teammate's come later still
+        pending = [
+            each.local for each in world.submaps if each.robot == "r0" and each.sequence >= known
+        ]
+        inside = [
+            each
+            for each in world.submaps
+            if each.sequence < (known if each.robot == "r0" else of_others)
+        ]
+        prior = prior_for(joined(inside, world.starts), "r0", 0)
+        for times in (1, 2):
+            told = prior._replace(covariance=prior.covariance / times)
+            again = [LocalMap(x.ids, x.mean, x.covariance / times) for x in pending]
+            pose, spread = team_pose(told, again, None)
+            error = pose - world.paths["r0"][5]
+            error[2] = wrap(error[2])
+            share = nees(error, spread) / 3 / runs
+            honest, twice = (honest + share, twice) if times == 1 else (honest, twice + share)
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < honest < high
+    assert twice > high

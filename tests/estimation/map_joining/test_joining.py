@@ -1,0 +1,432 @@
+"""Joined submaps equal the batch over all raw readings, in any order of arrival, and are honest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import block_diag
+
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.contribution import Contribution, Start
+from team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
+from team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    GapError,
+    LateStartError,
+    NotCanonicalError,
+    converged,
+    folded,
+    lean,
+    started,
+)
+from team.estimation.map_joining.marginals import (
+    joint_cost,
+    landmark_blocks,
+    landmark_map,
+    main_priors,
+    prior_for,
+    trajectory,
+)
+from team.estimation.map_joining.submap_factor import submap_normal
+from team.estimation.submap import LocalMap
+from tests.estimation.submap_world import local_truth, solved, team, wrap
+
+EXACTLY = JoinSettings(step_tolerance=1e-11)
+
+
+def joined(submaps, starts, options=EXACTLY, tick=4):
+    """The fold over the submaps, `tick` at a time."""
+    fold = EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    for begin in range(0, len(submaps), tick):
+        fold = folded(fold, submaps[begin : begin + tick], options)
+    return fold
+
+
+# --- the linear case: a robot that knows its heading, so raw readings and submaps are linear ---
+
+STEPS, POINTS = 12, 3
+HEADING_VARIANCE = 1e-12
+
+
+def raw_readings(seed=5):
+    """Steps (12, 2) and landmarks seen from the end of each step (12, 3, 2), sigma 0.1 and 0.3."""
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(rng.normal(1.0, 0.5, (STEPS, 2)), axis=0)
+    points = rng.uniform(-5.0, 15.0, (POINTS, 2))
+    steps = np.diff(truth, axis=0, prepend=0.0) + rng.normal(0.0, 0.1, (STEPS, 2))
+    sights = points[None] - truth[:, None] + rng.normal(0.0, 0.3, (STEPS, POINTS, 2))
+    return steps, sights
+
+
+def batch(steps, sights):
+    """Least squares over all positions and landmarks: mean and covariance of (last, landmarks)."""
+    n = len(steps)
+    rows, right, weight = [], [], []
+    for axis in range(2):
+        for t in range(n):
+            row = np.zeros((n + POINTS, 2))
+            row[t, axis] = 1.0
+            if t:
+                row[t - 1, axis] = -1.0
+            rows.append(row.ravel())
+            right.append(steps[t, axis])
+            weight.append(1 / 0.1)
+            for j in range(POINTS):
+                row = np.zeros((n + POINTS, 2))
+                row[n + j, axis], row[t, axis] = 1.0, -1.0
+                rows.append(row.ravel())
+                right.append(sights[t, j, axis])
+                weight.append(1 / 0.3)
+    A = np.array(rows) * np.array(weight)[:, None]
+    covariance = np.linalg.inv(A.T @ A)
+    mean = covariance @ (A.T @ (np.array(right) * np.array(weight)))
+    return mean[2 * (n - 1) :], covariance[2 * (n - 1) :, 2 * (n - 1) :]
+
+
+def windows(steps, sights, length):
+    """Submaps of `length` steps each: the batch of the window in the frame of its start."""
+    made = []
+    for k, begin in enumerate(range(0, STEPS, length)):
+        mean, covariance = batch(steps[begin : begin + length], sights[begin : begin + length])
+        full = block_diag(covariance[:2, :2], HEADING_VARIANCE, covariance[2:, 2:])
+        full[3:, :2], full[:2, 3:] = covariance[2:, :2], covariance[:2, 2:]
+        local = LocalMap(np.arange(POINTS, dtype=np.uint32), np.insert(mean, 2, 0.0), full)
+        made.append(Contribution("r0", 0, k, 1000 * (k + 1), local))
+    return made
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4, 6, 12])
+def test_joined_submaps_equal_the_batch_over_all_raw_readings(length):
+    steps, sights = raw_readings()
+    fold = converged(joined(windows(steps, sights, length), [Start("r0", 0, np.zeros(3))]), EXACTLY)
+    mean, covariance = batch(steps, sights)
+    prior = prior_for(fold, "r0", 0)
+    keep = np.delete(np.arange(3 + 2 * POINTS), 2)
+    estimate = np.concatenate([prior.pose, prior.means.ravel()])[keep]
+    np.testing.assert_allclose(estimate, mean, atol=2e-5)
+    np.testing.assert_allclose(prior.covariance[np.ix_(keep, keep)], covariance, atol=1e-8)
+
+
+def test_a_chain_split_into_submaps_and_joined_equals_never_having_split_it():
+    steps, sights = raw_readings(6)
+    start = [Start("r0", 0, np.array([3.0, -2.0, 0.7]))]
+    whole, split = (
+        landmark_map(converged(joined(windows(steps, sights, length), start), EXACTLY))
+        for length in (12, 3)
+    )
+    np.testing.assert_allclose(split.means, whole.means, atol=2e-5)
+    np.testing.assert_allclose(split.covariance, whole.covariance, atol=1e-8)
+
+
+# --- the set decides, not the way it came ---
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.randoms(use_true_random=False))
+def test_every_order_of_arrival_sorted_canonically_gives_the_same_bytes(random):
+    world = team(1, robots=3, submaps=4)
+    arrived = list(world.submaps)
+    random.shuffle(arrived)
+    straight = joined(world.submaps, world.starts)
+    sorted_again = joined(sorted(arrived, key=lambda each: each.key), world.starts[::-1])
+    assert straight.main.state.tobytes() == sorted_again.main.state.tobytes()
+    for one, other in zip(landmark_map(straight), landmark_map(sorted_again), strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def test_taking_submaps_leaves_the_fold_before_as_it_was():
+    world = team(2)
+    before = joined(world.submaps[:8], world.starts)
+    state, blocks = before.main.state.copy(), landmark_blocks(before).covariances.copy()
+    on = folded(before, world.submaps[8:], EXACTLY)
+    again = folded(before, world.submaps[8:], EXACTLY)
+    assert before.main.state.tobytes() == state.tobytes()
+    assert landmark_blocks(before).covariances.tobytes() == blocks.tobytes()
+    assert on.main.state.tobytes() == again.main.state.tobytes()
+
+
+def test_a_lean_fold_goes_on_to_the_same_bytes():
+    world = team(2)
+    before = joined(world.submaps[:8], world.starts)
+    landmark_map(before)
+    on, lean_on = (folded(each, world.submaps[8:], EXACTLY) for each in (before, lean(before)))
+    assert on.main.state.tobytes() == lean_on.main.state.tobytes()
+    assert landmark_map(on).covariance.tobytes() == landmark_map(lean_on).covariance.tobytes()
+    assert "posterior" not in vars(lean(before).main)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
+    world = team(seed, robots=3, submaps=10)
+    one_by_one = converged(joined(world.submaps, world.starts, tick=1), EXACTLY)
+    at_once = converged(joined(world.submaps, world.starts, tick=1000), EXACTLY)
+    assert one_by_one.change < 1e-11
+    np.testing.assert_allclose(
+        landmark_map(one_by_one).means, landmark_map(at_once).means, atol=1e-8
+    )
+
+
+def test_two_iterations_a_tick_come_near_the_full_solution():
+    world = team(3, robots=3, submaps=12)
+    fold = joined(world.submaps, world.starts, tick=3)
+    running, final = landmark_map(fold), landmark_map(converged(fold, EXACTLY))
+    sigma = np.sqrt(np.diag(final.covariance)).reshape(-1, 2)
+    assert (np.abs(running.means - final.means) < 0.1 * sigma).all()
+
+
+def test_a_missing_submap_is_an_error_that_names_it():
+    world = team(4, robots=1)
+    with pytest.raises(GapError, match=r"r0 \(epoch 0\): submap 3 came, 2 is next"):
+        joined([*world.submaps[:2], world.submaps[3]], world.starts)
+
+
+def test_a_submap_out_of_the_canonical_order_is_an_error():
+    world = team(4)
+    with pytest.raises(NotCanonicalError, match="out of order"):
+        joined([world.submaps[1], world.submaps[0]], world.starts)
+    fold = joined(world.submaps[:4], world.starts)
+    with pytest.raises(NotCanonicalError):
+        folded(fold, world.submaps[3:4], EXACTLY)
+
+
+def test_a_start_after_the_first_submap_is_an_error():
+    world = team(4)
+    with pytest.raises(LateStartError, match=r"r1 \(epoch 0\)"):
+        started(joined(world.submaps[:2], world.starts), world.starts[1])
+
+
+# --- the mathematics of one factor ---
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32), st.integers(0, 4))
+def test_the_factor_is_what_central_differences_of_its_residual_say(seed, count):
+    rng = np.random.default_rng(seed)
+    state = rng.normal(0.0, 3.0, 6 + 2 * count)
+    mean = rng.normal(0.0, 3.0, 3 + 2 * count)
+    root = rng.normal(size=(len(mean), len(mean))) + 3.0 * np.eye(len(mean))
+    information = root @ root.T
+
+    def residual(x):
+        r = local_truth(x[:3], x[3:6], x[6:].reshape(-1, 2)) - mean
+        r[2] = wrap(r[2])
+        return r
+
+    h = 1e-6
+    columns = [(residual(state + d) - residual(state - d)) for d in h * np.eye(len(state))]
+    jacobian = np.array(columns).T / (2 * h)
+    jacobian[2] = 0.0
+    jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
+    at = np.array([0, 3, *(6 + 2 * k for k in range(count))])
+    hessian, gradient, chi2 = submap_normal(state, at, mean, information)
+    r = residual(state)
+    tolerance = {"rtol": 1e-6, "atol": 1e-6 * np.abs(information).max() * 100}
+    assert chi2 == pytest.approx(r @ information @ r)
+    np.testing.assert_allclose(gradient, jacobian.T @ information @ r, **tolerance)
+    np.testing.assert_allclose(hessian, jacobian.T @ information @ jacobian, **tolerance)
+
+
+def test_the_kernels_gradient_is_the_slope_of_the_cost_that_is_minimised():
+    world = team(7, submaps=3)
+    starts = [replace(start, covariance=0.1 * np.eye(3)) for start in world.starts]
+    island = joined(world.submaps, starts, JoinSettings(robust_c=1.0)).main
+    gradient = island.normal_equations[1]
+    for k in range(0, len(island.state), 5):
+        shift = 1e-6 * np.eye(len(island.state))[k]
+        up, down = (replace(island, state=island.state + s * shift).cost for s in (1, -1))
+        assert (up - down) / 4e-6 == pytest.approx(gradient[k], rel=1e-4, abs=1e-4)
+
+
+# --- consistency ---
+
+RUNS = 200
+
+
+def consistency(options):
+    """Mean map NEES per degree of freedom and mean joint cost per degree of freedom."""
+    errors = cost = dof = joint = 0.0
+    for seed in range(RUNS):
+        world = team(seed, robots=2, submaps=5, landmarks=4)
+        fold = solved(joined(world.submaps, world.starts, options, tick=10), options)
+        found = landmark_map(fold)
+        truth = world.landmarks[found.ids]
+        errors += nees((found.means - truth).ravel(), found.covariance)
+        dof += found.means.size
+        agreement = joint_cost(fold)
+        cost += agreement.chi2
+        joint += agreement.dof
+    return errors / dof, round(dof), cost / joint, round(joint)
+
+
+def test_map_and_joint_cost_are_consistent_and_a_submap_counted_twice_is_not():
+    ratio, dof, cost, joint = consistency(JoinSettings())
+    low, high = chi2_interval(dof, 0.999, 1)
+    assert low < ratio < high
+    least, most = chi2_interval(joint, 0.999, 1)
+    assert least < cost < most
+    twice, _, _, _ = consistency(JoinSettings(covariance_factor=0.5))
+    assert twice > high
+
+
+def test_the_redundancies_of_submaps_and_priors_add_up_to_the_joint_degrees_of_freedom():
+    world = team(8, robots=3)
+    starts = [world.starts[0], *(replace(s, covariance=np.eye(3)) for s in world.starts[1:])]
+    fold = converged(joined(world.submaps, starts), EXACTLY)
+    agreement, graph = joint_cost(fold), fold.main.graph
+    assert agreement.dof == pytest.approx(graph.dimensions.sum() + 6 - graph.unknowns)
+    assert sum(dof for _, dof in agreement.robots.values()) == pytest.approx(agreement.dof)
+    assert sum(chi2 for chi2, _ in agreement.robots.values()) == pytest.approx(agreement.chi2)
+    assert [each.sequence for each in agreement.submaps] == [c.sequence for c in world.submaps]
+
+
+@pytest.mark.parametrize("gate", [13.8, np.inf], ids=["landmarks by themselves", "as a whole"])
+def test_with_a_robust_loss_the_redundancies_add_up_too_since_each_counts_with_its_weight(gate):
+    """Σ (dim − w tr(JᵀP⁻¹J Σ)) = Σ dim − unknowns: Σ is the inverse of Σ w JᵀP⁻¹J."""
+    world = team(11, robots=2, submaps=10)
+    options = JoinSettings(robust_c=1.0, landmark_gate=gate, step_tolerance=1e-9)
+    fold = converged(joined(with_outlier(world, 15), world.starts, options), options)
+    costs, graph = joint_cost(fold).submaps, fold.main.graph
+    assert min(each.weight for each in costs) < 0.3
+    redundancy = sum(each.dof for each in costs)
+    assert redundancy == pytest.approx(graph.dimensions.sum() - graph.unknowns)
+    unweighted = sum(
+        (size - each.dof) / each.weight for each, size in zip(costs, graph.dimensions, strict=True)
+    )
+    assert unweighted > graph.unknowns + 1.0, "the mutant, which takes all as believed"
+
+
+# --- marginals ---
+
+
+def test_blocks_and_trajectory_are_the_blocks_of_the_joint_covariances():
+    world = team(9, robots=2)
+    fold = joined(world.submaps, world.starts)
+    whole, blocks = landmark_map(fold), landmark_blocks(fold)
+    for k, block in enumerate(blocks.covariances):
+        span = slice(2 * k, 2 * k + 2)
+        np.testing.assert_allclose(block, whole.covariance[span, span], rtol=1e-9)
+    prior, path = prior_for(fold, "r1", 0), trajectory(fold, "r1", 0)
+    np.testing.assert_allclose(
+        path.covariances[-1], prior.covariance[:3, :3], rtol=1e-9, atol=1e-15
+    )
+    np.testing.assert_array_equal(path.poses[-1], prior.pose)
+    np.testing.assert_allclose(prior.covariance[3:, 3:], whole.covariance, rtol=1e-9)
+
+
+def test_a_prior_for_some_landmarks_is_the_marginal_of_the_prior_for_all():
+    fold = joined(*(lambda world: (world.submaps, world.starts))(team(9)))
+    everything = prior_for(fold, "r0", 0)
+    some = prior_for(fold, "r0", 0, everything.ids[[1, 3]].tolist())
+    keep = np.array([0, 1, 2, 5, 6, 9, 10])
+    np.testing.assert_allclose(
+        some.covariance, everything.covariance[np.ix_(keep, keep)], rtol=1e-9
+    )
+
+
+def test_the_priors_of_all_streams_together_are_the_priors_of_each():
+    world = team(9, robots=3)
+    fold = joined(world.submaps, world.starts)
+    together = main_priors(fold, sorted(fold.main.graph.streams))
+    assert sorted(together) == [("r0", 0), ("r1", 0), ("r2", 0)]
+    for (robot, epoch), prior in together.items():
+        for one, other in zip(prior[:4], prior_for(fold, robot, epoch)[:4], strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+
+
+def test_of_many_landmarks_a_prior_has_the_nearest():
+    world = team(9, robots=3)
+    fold = joined(world.submaps, world.starts)
+    streams = [("r0", 0), ("r2", 0)]
+    few = main_priors(fold, streams, most=4)
+    assert sorted(few) == streams
+    for robot, epoch in streams:
+        prior, everything = few[robot, epoch], prior_for(fold, robot, epoch)
+        distance = np.linalg.norm(everything.means - everything.pose[:2], axis=1)
+        assert set(prior.ids) == set(everything.ids[np.argsort(distance)[:4]])
+        same = prior_for(fold, robot, epoch, prior.ids.tolist())
+        for one, other in zip(prior[:4], same[:4], strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+
+
+def test_a_known_start_stays_exactly_where_it_is():
+    world = team(9, robots=2)
+    island = converged(joined(world.submaps, world.starts), EXACTLY).main
+    for start in world.starts:
+        begin = island.graph.offset[island.graph.streams[start.stream][0]]
+        assert island.state[begin : begin + 3].tobytes() == start.pose.tobytes()
+
+
+def test_an_uncertain_start_is_composed_with_the_submap_that_leaves_it():
+    start = Start("r0", 0, np.array([1.0, 2.0, 0.5]), np.diag([0.04, 0.09, 0.01]))
+    local = LocalMap(
+        np.zeros(0, np.uint32), np.array([2.0, 0.0, 0.1]), np.diag([0.01, 0.01, 0.001])
+    )
+    path = trajectory(joined([Contribution("r0", 0, 0, 10, local)], [start]), "r0", 0)
+    c, s = np.cos(0.5), np.sin(0.5)
+    J = np.array([[1, 0, -2 * s], [0, 1, 2 * c], [0, 0, 1]])
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    expected = J @ start.covariance @ J.T + R @ local.covariance @ R.T
+    np.testing.assert_allclose(path.poses[0], [1 + 2 * c, 2 + 2 * s, 0.6], atol=1e-12)
+    np.testing.assert_allclose(path.covariances[0], expected, atol=1e-12)
+
+
+def test_a_graph_without_a_gauge_names_a_node_that_is_not_determined():
+    world = team(10, robots=1)
+    island = joined(world.submaps, world.starts).main
+    graph = replace(island.graph, fixed=np.zeros_like(island.graph.fixed))
+    with pytest.raises(NotDeterminedError, match=r"r0 \(epoch 0\)|landmark"):
+        _ = replace(island, graph=graph).posterior
+
+
+# --- outliers ---
+
+
+def with_outlier(world, k):
+    """The k-th submap sees everything three times as far away as it is."""
+    bad = world.submaps[k]
+    mean = bad.local.mean.copy()
+    mean[3:] *= 3.0
+    return [
+        *world.submaps[:k],
+        replace(bad, local=replace(bad.local, mean=mean)),
+        *world.submaps[k + 1 :],
+    ]
+
+
+@pytest.mark.parametrize("tick", [1, 40])
+def test_one_wrong_submap_in_forty_moves_the_map_much_unless_the_loss_is_robust(tick):
+    world = team(11, robots=2, submaps=20)
+    submaps = with_outlier(world, 15)
+
+    def moved(options):
+        clean, wrong = (
+            landmark_map(converged(joined(each, world.starts, options, tick), options))
+            for each in (world.submaps, submaps)
+        )
+        sigma = np.sqrt(np.diag(clean.covariance)).reshape(-1, 2)
+        return np.sqrt(np.mean(((wrong.means - clean.means) / sigma) ** 2))
+
+    assert moved(JoinSettings()) > 2.0
+    assert moved(JoinSettings(robust_c=1.0)) < 0.3
+
+
+def test_the_wrong_submap_is_the_one_with_the_small_weight_and_the_large_cost():
+    world = team(11, robots=2, submaps=20)
+    options = JoinSettings(robust_c=1.0)
+    fold = converged(joined(with_outlier(world, 15), world.starts, options), options)
+    costs = joint_cost(fold).submaps
+    assert min(range(40), key=lambda k: costs[k].weight) == 15
+    assert costs[15].chi2 > 10.0 * costs[15].dof
+
+
+def test_a_true_loop_closure_is_not_taken_for_an_outlier():
+    world = team(12, robots=1, submaps=30, landmarks=8, reach=6.0, sigmas=(0.1, 0.1, 0.05))
+    options = JoinSettings(robust_c=1.0)
+    plain = landmark_map(converged(joined(world.submaps, world.starts, tick=1), EXACTLY))
+    robust = landmark_map(converged(joined(world.submaps, world.starts, options, 1), options))
+    sigma = np.sqrt(np.diag(plain.covariance)).reshape(-1, 2)
+    assert (np.abs(robust.means - plain.means) < 1.5 * sigma).all()

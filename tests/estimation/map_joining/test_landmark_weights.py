@@ -1,0 +1,185 @@
+"""A landmark that was mistaken for another is discounted by itself; the chain of poses holds."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from team.estimation.map_joining import joining, joining_kernel
+from team.estimation.map_joining.gauss_newton import LEAST_WEIGHT
+from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
+from team.estimation.map_joining.marginals import joint_cost, landmark_map
+from tests.estimation.submap_world import seen_from, solved, team
+
+ROBUST = JoinSettings(robust_c=2.0)
+WHOLE = replace(ROBUST, landmark_gate=math.inf)
+"""The mutant: a submap is believed or doubted as a whole."""
+
+
+def mistaken(world, seed, share=0.3):
+    """In some submaps of r0 two landmarks that it sees are exchanged."""
+    rng = np.random.default_rng([seed, 3])
+    submaps = []
+    for each in world.submaps:
+        local = each.local
+        if each.robot == "r0" and len(local.ids) >= 3 and rng.random() < share:
+            order = np.arange(len(local.mean))
+            a, b = 3, len(local.mean) - 2
+            order[[a, a + 1, b, b + 1]] = [b, b + 1, a, a + 1]
+            local = replace(local, mean=local.mean[order])
+        submaps.append(replace(each, local=local))
+    return submaps
+
+
+def fold_of(world, submaps, options, full=converged):
+    fold = joining.EMPTY_FOLD
+    for start in world.starts:
+        fold = started(fold, start)
+    for begin in range(0, len(submaps), 4):
+        fold = folded(fold, submaps[begin : begin + 4], options)
+    return full(fold, options)
+
+
+def errors_of(world, fold):
+    """RMSE of the landmarks and of r0's path [m]."""
+    found = landmark_map(fold)
+    graph, state = fold.main.graph, fold.main.state
+    ends = np.array([state[graph.offset[k] :][:2] for k in graph.streams["r0", 0][1:]])
+    of_map = np.mean(np.sum((found.means - world.landmarks[found.ids]) ** 2, axis=1))
+    of_path = np.mean(np.sum((ends - world.paths["r0"][:, :2]) ** 2, axis=1))
+    return np.sqrt([of_map, of_path])
+
+
+def rms_over(seeds, options, *, wrong):
+    found = []
+    for seed in seeds:
+        world = team(seed, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
+        submaps = mistaken(world, seed) if wrong else world.submaps
+        found.append(errors_of(world, fold_of(world, submaps, options, solved)))
+    return np.sqrt(np.mean(np.square(found), axis=0))
+
+
+def test_a_landmark_mistaken_for_another_leaves_chain_and_map_as_accurate_as_they_were():
+    seeds = range(20)
+    clean = rms_over(seeds, ROBUST, wrong=False)
+    apart = rms_over(seeds, ROBUST, wrong=True)
+    whole = rms_over(seeds, WHOLE, wrong=True)
+    assert (apart < 1.2 * clean).all()
+    assert whole[1] > 1.3 * clean[1]
+
+
+def test_only_what_was_mistaken_is_discounted():
+    world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
+    submaps = mistaken(world, 4)
+    island = fold_of(world, submaps, ROBUST).main
+    starts = island.graph.factors.block_start
+    for f, joined in enumerate(island.graph.submaps):
+        of = next(each for each in submaps if each.key == joined.contribution.key)
+        true = next(each for each in world.submaps if each.key == of.key)
+        wrong = (of.local.landmarks != true.local.landmarks).any(axis=1)
+        weight = island.landmark_weight[starts[f] : starts[f + 1]]
+        assert (weight[wrong] < 0.2).all()
+        assert (weight[~wrong] > 0.5).all()
+    assert (island.landmark_weight == 1.0).mean() > 0.85
+
+
+def test_beyond_its_gate_a_landmark_counts_by_the_gate_over_its_chi_square():
+    """w = min(1, g/rᵀP⁻¹r), r between what the submap says of it and where it is from there."""
+    world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
+    island = fold_of(world, mistaken(world, 4), ROBUST, solved).main
+    graph, state, expected = island.graph, island.state, []
+    for joined in graph.submaps:
+        local = joined.contribution.local
+        for k, id_ in enumerate(local.ids.tolist()):
+            at, start = graph.offset[graph.landmarks[id_]], graph.offset[joined.nodes[0]]
+            place = seen_from(state[start : start + 3], state[at] + 1j * state[at + 1])
+            r = np.array([place.real, place.imag]) - local.landmarks[k]
+            block = local.covariance[3 + 2 * k : 5 + 2 * k, 3 + 2 * k : 5 + 2 * k]
+            expected.append(min(1.0, ROBUST.landmark_gate / (r @ np.linalg.solve(block, r))))
+    np.testing.assert_allclose(island.landmark_weight, expected, rtol=1e-6)
+    assert min(expected) < 0.2
+    far = state.copy()
+    far[graph.offset[min(graph.landmarks.values())]] += 1e6
+    assert replace(island, state=far).landmark_weight.min() == LEAST_WEIGHT
+
+
+def test_without_a_robust_loss_every_landmark_counts():
+    world = team(4)
+    island = fold_of(world, mistaken(world, 4), JoinSettings()).main
+    assert (island.landmark_weight == 1.0).all()
+    assert island.factors is island.graph.factors
+
+
+def test_a_discounted_landmark_counts_as_if_its_own_error_were_larger():
+    world = team(2)
+    graph = fold_of(world, world.submaps, JoinSettings()).main.graph
+    factors, rng = graph.factors, np.random.default_rng(1)
+    weight = np.where(rng.random(len(factors.block)) < 0.4, rng.uniform(0.01, 1.0), 1.0)
+    information = joining_kernel.discounted_information(factors, weight)
+    for f, joined in enumerate(graph.submaps):
+        local = joined.contribution.local
+        P, first = local.covariance.copy(), factors.block_start[f]
+        for k in range(len(local.ids)):
+            at = slice(3 + 2 * k, 5 + 2 * k)
+            P[at, at] /= weight[first + k]
+        begin, end = factors.information_start[f : f + 2]
+        found = information[begin:end].reshape(P.shape)
+        np.testing.assert_allclose(found @ P, np.eye(len(P)), atol=1e-8)
+
+
+def test_a_factor_on_all_covariances_is_the_same_as_covariances_that_are_so_much_larger():
+    """Gates, weights, cost and redundancy too: the mutant's gate knows nothing of the factor."""
+    world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
+    submaps = mistaken(world, 4)
+    larger = [
+        replace(each, local=replace(each.local, covariance=6.0 * each.local.covariance))
+        for each in submaps
+    ]
+    exactly = replace(ROBUST, step_tolerance=1e-11)
+    told = fold_of(world, submaps, replace(exactly, covariance_factor=6.0))
+    meant = fold_of(world, larger, exactly)
+    weight = meant.main.landmark_weight
+    assert (weight < 0.5).any()
+    np.testing.assert_allclose(told.main.landmark_weight, weight, rtol=1e-6)
+    unscaled = replace(told.main, settings=exactly).landmark_weight
+    assert (unscaled[weight < 0.5] < 0.3 * weight[weight < 0.5]).all(), "the factor matters"
+    np.testing.assert_allclose(told.main.state, meant.main.state, atol=1e-6)
+    for name in ("dimensions", "chi2", "whole_chi2", "counted_chi2", "weight", "cost"):
+        np.testing.assert_allclose(
+            getattr(told.main, name), getattr(meant.main, name), rtol=1e-5, atol=1e-9, err_msg=name
+        )
+    found, expected = landmark_map(told), landmark_map(meant)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-5, atol=1e-9)
+    one, other = joint_cost(told), joint_cost(meant)
+    assert one.dof == pytest.approx(other.dof, rel=1e-6)
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-5)
+
+
+def test_the_cost_of_an_iteration_falls_with_the_robust_cost():
+    world = team(5, robots=2, submaps=12, landmarks=10)
+    island = fold_of(world, mistaken(world, 5), ROBUST).main
+    assert (island.landmark_weight < 1.0).any()
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        state = island.state + 1e-3 * rng.normal(size=len(island.state))
+        state[island.graph.fixed.repeat(np.diff(island.graph.offset))] = island.state[
+            island.graph.fixed.repeat(np.diff(island.graph.offset))
+        ]
+        change = replace(island, state=state).cost - island.cost
+        assert change == pytest.approx(
+            island.quadratic(state) - island.quadratic(island.state), rel=0.3, abs=0.05
+        )
+
+
+def test_the_joint_cost_leaves_out_what_is_discounted_and_no_more():
+    ratios = []
+    for wrong in (True, False):
+        chi2 = dof = 0.0
+        for seed in range(10):
+            world = team(seed, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
+            submaps = mistaken(world, seed) if wrong else world.submaps
+            agreement = joint_cost(fold_of(world, submaps, ROBUST, solved))
+            chi2, dof = chi2 + agreement.chi2, dof + agreement.dof
+        ratios.append(chi2 / dof)
+    assert ratios[0] == pytest.approx(ratios[1], rel=0.12)

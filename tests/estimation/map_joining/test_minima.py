@@ -1,0 +1,221 @@
+"""Wrong minima are found out: by a start that needs no guess, by the cost, by a second place."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team.estimation.contribution import Contribution, Start
+from team.estimation.map_joining import gauss_newton, minima
+from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from team.estimation.map_joining.minima import (
+    Search,
+    doubts,
+    minimum,
+    searched,
+    suspicious,
+    widened,
+)
+from team.estimation.map_joining.relaxation import relaxed
+from team.estimation.submap import LocalMap
+from tests.estimation.sighting_world import joined_with, meeting, mirrored
+from tests.estimation.submap_world import team, wrap
+
+OPTIONS = JoinSettings()
+
+
+def island_of(world, sightings=()):
+    return joined_with(world.submaps, world.starts, sightings, OPTIONS, 1000).main
+
+
+def thrown(island, seed):
+    """The same island with every unknown anywhere."""
+    rng = np.random.default_rng(seed)
+    free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
+    state = np.where(free, rng.uniform(-30.0, 30.0, len(free)), island.state)
+    state[island.graph.headings] = wrap(state[island.graph.headings])
+    return replace(island, state=state)
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 2**32))
+def test_the_relaxation_of_exact_submaps_is_the_truth_whatever_the_guess(seed):
+    world = team(seed % 50, robots=2, submaps=5, sigmas=(1e-7, 1e-7, 1e-7))
+    island = island_of(world)
+    found = relaxed(island.graph, thrown(island, seed).state)
+    for robot, path in world.paths.items():
+        for node, pose in zip(island.graph.streams[robot, 0][1:], path, strict=True):
+            begin = island.graph.offset[node]
+            error = found[begin : begin + 3] - pose
+            np.testing.assert_allclose([*error[:2], wrap(error[2])], 0.0, atol=1e-3)
+
+
+def test_the_relaxation_takes_sightings_and_priors():
+    world = meeting(2, robots=2, submaps=3, sigmas=(1e-4, 1e-4))
+    exact = [replace(s, covariance=1e-8 * np.eye(3)) for s in world.starts]
+    island = joined_with(world.submaps, exact, world.sightings, OPTIONS, 1000).main
+    solved = minimum(island).island.state
+    found = relaxed(island.graph, thrown(island, 3).state)
+    points = island.graph.offset[:-1]
+    away = np.hypot(*(found - solved)[np.array([points, points + 1])])
+    assert away.max() < 1.0
+
+
+def test_a_search_leaves_the_wrong_minimum_that_gauss_newton_stays_in():
+    wrong = 0
+    for seed in range(8):
+        sparse = {"size": 60.0, "reach": 15.0, "sigmas": (0.3, 0.15, 1.0)}
+        island = island_of(team(seed, robots=1, submaps=20, landmarks=3, **sparse))
+        right = searched([island]).best.cost
+        lost = thrown(island, seed)
+        alone = minimum(lost).cost
+        wrong += alone > right + 1.0
+        search = searched([lost])
+        assert search.best.cost < right + 0.1
+        assert search.gained == pytest.approx(alone - search.best.cost)
+        assert doubts(search) == []
+    assert wrong >= 2, "the mutant without a search is often lost"
+
+
+def test_a_cost_that_the_degrees_of_freedom_do_not_allow_is_said():
+    world = team(3, robots=2, submaps=8)
+    bad = world.submaps[9]
+    mean = bad.local.mean.copy()
+    mean[3:] *= 3.0
+    spoilt = [
+        replace(each, local=replace(each.local, mean=mean)) if each is bad else each
+        for each in world.submaps
+    ]
+    fold = EMPTY_FOLD
+    for start in world.starts:
+        fold = started(fold, start)
+    clean, told = (
+        converged(folded(fold, submaps, OPTIONS), OPTIONS) for submaps in (world.submaps, spoilt)
+    )
+    assert clean.doubts == ()
+    (text,) = told.doubts
+    assert "the map does not fit its submaps: chi²" in text
+    assert suspicious(told.main, told.main.cost)
+
+
+@pytest.mark.parametrize("seed", [1, 12])
+def test_a_long_curved_valley_is_gone_along_to_its_end(seed, monkeypatch):
+    far = {"size": 100.0, "reach": 20.0, "sigmas": (0.02, 0.3, 3.0)}
+    island = island_of(team(seed, robots=1, submaps=30, landmarks=3, **far))
+    island = replace(island, state=relaxed(island.graph, island.state))
+    found = minimum(island)
+    assert found.iterations < 25
+    assert found.change < OPTIONS.step_tolerance
+    monkeypatch.setattr(gauss_newton, "SHARES", (1.0,))
+    creeping = minimum(island)
+    assert creeping.iterations == OPTIONS.max_iterations, "the mutant damps at once"
+    assert creeping.cost > found.cost + 10.0
+
+
+def test_a_map_that_is_not_settled_is_said(monkeypatch):
+    monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
+    island = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
+    hasty = replace(island, settings=replace(OPTIONS, max_iterations=1))
+    assert any("is not settled: after 1 iterations" in text for text in doubts(searched([hasty])))
+
+
+def test_a_solution_that_is_stuck_is_told_from_one_that_has_converged(monkeypatch):
+    lost = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
+    monkeypatch.setattr(gauss_newton, "SHARES", (1.0,))
+    monkeypatch.setattr(gauss_newton, "MOST_DAMPING", gauss_newton.LEAST_DAMPING)
+    stuck = minimum(lost)
+    assert stuck.iterations < OPTIONS.max_iterations
+    assert stuck.change > 1.0, "the mutant says 0"
+    assert any("is not settled" in text for text in doubts(Search(stuck, 0.0, None)))
+
+
+def test_what_has_not_settled_is_solved_on(monkeypatch):
+    far = {"size": 100.0, "reach": 20.0, "sigmas": (0.02, 0.3, 3.0)}
+    island = island_of(team(1, robots=1, submaps=30, landmarks=3, **far))
+    state = relaxed(island.graph, island.state)
+    hasty = replace(island, state=state, settings=replace(OPTIONS, max_iterations=6))
+    assert minimum(hasty).change > minima.SETTLED_M
+    assert searched([hasty]).best.change <= minima.SETTLED_M
+    monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
+    assert searched([hasty]).best.change > minima.SETTLED_M, "the mutant leaves it"
+
+
+@pytest.mark.parametrize(("landmark_sigma", "said"), [(6.0, True), (0.2, False)])
+def test_a_robot_whose_heading_no_landmark_gives_is_said(landmark_sigma, said):
+    world = team(4, robots=2, submaps=3, landmarks=4, sigmas=(0.1, 0.02, landmark_sigma))
+    wide = np.diag([100.0, 100.0, 9.0])
+    starts = [world.starts[0], replace(world.starts[1], covariance=wide)]
+    island = joined_with(world.submaps, starts, (), OPTIONS).main
+    found = [text for text in doubts(searched([island])) if "is placed weakly" in text]
+    assert [text.split(" is ")[0] for text in found] == ["r1 (epoch 0)"] * said
+
+
+def test_a_second_place_that_fits_as_well_is_found_and_said():
+    search = searched(mirrored(30.0, OPTIONS))
+    assert search.second is not None
+    assert search.ambiguous
+    (text,) = doubts(search)
+    assert "another map fits about as well" in text
+
+
+def test_a_place_that_the_readings_exclude_is_no_second_place():
+    search = searched(mirrored(0.02, OPTIONS))
+    assert not search.ambiguous
+    assert doubts(search) == []
+
+
+def hinged(apart, turn=0.1, sigma=0.8):
+    """r1 passes one landmark, turns by `turn` ± `sigma` [rad], and passes the other one 10 m on.
+
+    How far the two lie apart [m], r0 knows: r1 has turned by so much to the left or to the right.
+    """
+    near, point = [0.05, 0.05, 0.02], [0.05, 0.05]
+    said = [
+        ("r0", 0, [1.0, 0.0, 0.0, 0.0, 0.0, apart, 0.0], [*near, *point, *point], [0, 1]),
+        ("r1", 0, [5.0, 0.0, 0.0, 0.0, 0.0], [*near, *point], [0]),
+        ("r1", 1, [0.1, 0.0, turn], [0.05, 0.05, sigma], []),
+        ("r1", 2, [9.0, 0.0, 0.0, 10.0, 0.0], [*near, *point], [1]),
+    ]
+    submaps = [
+        Contribution(robot, 0, k, 1000 * (k + 1), LocalMap(np.array(ids, np.uint32), mean, P))
+        for robot, k, mean, P, ids in (
+            (robot, k, np.array(mean), np.diag(sigmas) ** 2, ids)
+            for robot, k, mean, sigmas, ids in said
+        )
+    ]
+    fold = started(EMPTY_FOLD, Start("r0", 0, np.zeros(3)))
+    return folded(fold, sorted(submaps, key=lambda each: each.key), OPTIONS)
+
+
+@pytest.mark.parametrize("apart", [9.0, 13.0])
+def test_a_chain_that_may_be_folded_to_the_other_side_is_said(apart):
+    fold = hinged(apart)
+    assert not searched([fold.main]).ambiguous, "the mutant that does not mirror sees one map"
+    wider = widened(searched([fold.main]))
+    assert wider.ambiguous
+    turns = [
+        each.state[each.graph.offset[each.graph.streams["r1", 0][2]] + 2]
+        - each.state[each.graph.offset[each.graph.streams["r1", 0][1]] + 2]
+        for each in (wider.best.island, wider.second.island)
+    ]
+    cosine = (apart**2 - 5.0**2 - 10.0**2) / (2.0 * 5.0 * 10.0)
+    np.testing.assert_allclose(np.cos(turns), cosine, atol=0.1)
+    assert turns[0] * turns[1] < 0.0
+    (text,) = converged(fold, OPTIONS).doubts
+    assert "another map fits about as well" in text
+
+
+def test_a_chain_that_is_known_to_turn_left_is_not_said():
+    assert converged(hinged(13.0, turn=1.1, sigma=0.2), OPTIONS).doubts == ()
+
+
+def test_the_lower_one_of_two_sides_is_the_map():
+    fold = hinged(13.0, turn=0.8, sigma=0.8)
+    lower = widened(searched([fold.main]))
+    other = Search(lower.second, 0.0, None)
+    found = widened(other)
+    assert found.best.cost == pytest.approx(lower.best.cost)
+    assert found.gained == pytest.approx(lower.second.cost - lower.best.cost)

@@ -1,0 +1,102 @@
+"""Where a covariance denies what the cost allows: a robot that drove long before a landmark."""
+
+import numpy as np
+import pytest
+
+from sim.evaluation.errors import Path, pose_errors
+from team.estimation.contribution import Contribution, Start
+from team.estimation.map_joining import nonlinearity as bends
+from team.estimation.map_joining.gauss_newton import JoinSettings, held, joint_marginal
+from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from team.estimation.map_joining.minima import doubts, minimum, searched
+from team.estimation.map_joining.nonlinearity import bend
+from team.estimation.submap import LocalMap
+from tests.estimation.submap_world import drawn, local_truth
+
+OPTIONS = JoinSettings()
+LANDMARKS = np.array([[0.0, 0.0], [8.0, 0.0], [3.0, 7.0]])
+
+
+def latecomer(blind, seed=0, turn=0.09):
+    """r0 sees three landmarks from a known start; r1 drives `blind` submaps of 10 m before it does.
+
+    turn: of each submap's end [rad].
+    """
+    rng = np.random.default_rng(seed)
+    fold = started(EMPTY_FOLD, Start("r0", 0, np.zeros(3)))
+    submaps = [seeing("r0", 0, np.zeros(3), rng)]
+    for k in range(blind):
+        truth = np.array([10.0, 0.0, 0.0])
+        covariance = np.diag([0.1, 0.3, turn]) ** 2
+        local = LocalMap(np.zeros(0, np.uint32), drawn(truth, covariance, rng), covariance)
+        submaps.append(Contribution("r1", 0, k, 1000 * (k + 1), local))
+    submaps.append(seeing("r1", blind, np.array([-3.0, 2.0, 0.3]), rng))
+    ordered = sorted(submaps, key=lambda each: each.key)
+    return converged(folded(fold, ordered, OPTIONS), OPTIONS)
+
+
+def seeing(robot, sequence, pose, rng):
+    truth = local_truth(pose, pose + np.array([1.0, 0.0, 0.0]), LANDMARKS)
+    covariance = np.diag([0.1, 0.1, 0.02, *[0.1] * 6]) ** 2
+    local = LocalMap(np.arange(3, dtype=np.uint32), drawn(truth, covariance, rng), covariance)
+    return Contribution(robot, 0, sequence, 1000 * (sequence + 1), local)
+
+
+def start_node(fold):
+    return fold.main.graph.streams["r1", 0][0]
+
+
+def test_a_number_is_held_where_the_rest_has_the_least_cost():
+    fold = latecomer(blind=10)
+    island = minimum(fold.main).island
+    at = int(island.graph.offset[start_node(fold)]) + 2
+    found = held(island, at, 0.3, 12)
+    assert found.state[at] - island.state[at] == pytest.approx(0.3)
+    gradient = found.normal_equations[1]
+    assert abs(gradient[at]) > 0.1
+    others = np.delete(gradient, at)
+    scale = np.sqrt(np.delete(found.normal_equations[0][found.graph.pattern.diagonal], at))
+    assert np.abs(others / scale).max() < 1e-3, "no other number could lower the cost"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_start_of_a_robot_that_drove_long_without_a_landmark_is_said(seed):
+    fold = latecomer(blind=14, seed=seed)
+    found = bend(fold.main, start_node(fold))
+    assert found.ratio > bends.BENT
+    assert found.rise < bends.UNLIKELY
+    assert any("r1 (epoch 0) may have started farther off" in text for text in fold.doubts)
+
+
+@pytest.mark.parametrize(("blind", "least", "most"), [(14, 4, 24), (1, 0, 0)])
+def test_a_bent_ellipse_is_exceeded_and_another_one_is_not(blind, least, most):
+    """How often the true start lies beyond the 99.9 % of the motion's χ², in 24 worlds."""
+    ahead = 10.0 * blind * np.exp(0.3j)
+    truth = np.array([[-3.0 - ahead.real, 2.0 - ahead.imag, 0.3]])
+    beyond = 0
+    for seed in range(24):
+        fold = latecomer(blind, seed)
+        mean, covariance = joint_marginal(fold.main, [start_node(fold)])
+        stamp = np.zeros(1, np.int64)
+        error = pose_errors(Path(stamp, mean[None]), covariance[None], Path(stamp, truth))
+        beyond += error.motion_nees[0] > 16.27
+    assert least <= beyond <= most
+
+
+def test_a_robot_that_sees_landmarks_soon_is_not_said(monkeypatch):
+    fold = latecomer(blind=1)
+    assert fold.doubts == ()
+    monkeypatch.setattr(bends, "STRAIGHT_RAD", 0.0)
+    assert bend(fold.main, start_node(fold)) is None, "nor is it bent"
+
+
+def test_a_straight_valley_is_no_bend_however_wide():
+    wide = Start("r1", 0, np.zeros(3), np.diag([4.0, 4.0, 0.25]))
+    fold = started(started(EMPTY_FOLD, Start("r0", 0, np.zeros(3))), wide)
+    rng = np.random.default_rng(1)
+    submaps = [seeing("r0", 0, np.zeros(3), rng)]
+    fold = folded(fold, submaps, OPTIONS)
+    local = LocalMap(np.zeros(0, np.uint32), np.zeros(3), 1e-4 * np.eye(3))
+    fold = folded(fold, [Contribution("r1", 0, 0, 2000, local)], OPTIONS)
+    assert bend(fold.main, start_node(fold)) is None
+    assert not [text for text in doubts(searched([fold.main])) if "farther off" in text]

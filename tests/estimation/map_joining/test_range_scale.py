@@ -1,0 +1,192 @@
+"""The scale of the ranges: noise at the joined map's ranges, and an error that all robots share."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.contribution import Contribution, Start
+from team.estimation.gaussian import packed, unpacked
+from team.estimation.geometry import compose
+from team.estimation.map_joining import joining_kernel as kernel
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
+from team.estimation.submap import LocalMap
+from tests.estimation.submap_world import local_truth
+
+OWN, COMMON = 0.03, 0.1
+SIGMA = {"range_scale": OWN}
+SHARE = 0.1
+"""Of a range: the standard deviation of its error in one submap."""
+LANDMARKS = np.array([[4.0, 3.0], [6.0, -3.0], [9.0, 2.0], [3.0, -4.0], [11.0, -2.0]])
+
+
+def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01):
+    """Robots on known ways whose ranges are wrong in proportion; each says what it measured.
+
+    own, common: standard deviations of the robots' errors; way: of each submap's end pose [m].
+    Contributions, starts, and the true error of each robot's scale.
+    """
+    random = np.random.default_rng(seed)
+    shared = common * random.standard_normal()
+    made, starts, errors = [], [], {}
+    for r in range(robots):
+        robot, pose = f"r{r}", np.array([0.0, 2.0 * r - 1.0, 0.0])
+        starts.append(Start(robot, 0, pose))
+        errors[robot] = shared + own * random.standard_normal()
+        for k in range(submaps):
+            end = compose(pose, np.array([0.6, 0.0, 0.1 * (-1) ** k]))
+            truth = local_truth(pose, end, LANDMARKS)
+            spread = [way, way, 0.005]
+            mean = truth + np.concatenate([spread * random.standard_normal(3), np.zeros(10)])
+            middle = truth[:2] / 2.0
+            covariance = np.diag(np.append(np.square(spread), np.zeros(10)))
+            for at in range(3, 13, 2):
+                off = truth[at : at + 2] - middle
+                angle = np.arctan2(off[1], off[0]) + 0.01 * random.standard_normal()
+                # The scale multiplies what is there; the noise of the measurement adds to it.
+                share = 1.0 + errors[robot] + SHARE * random.standard_normal()
+                ahead = np.array([np.cos(angle), np.sin(angle)])
+                distance = np.hypot(*off) * share
+                mean[at : at + 2] = middle + distance * ahead
+                turn = np.column_stack([ahead, [-ahead[1], ahead[0]]])
+                seen = turn @ np.diag([(SHARE * distance) ** 2, (0.01 * distance) ** 2]) @ turn.T
+                covariance[at : at + 2, at : at + 2] = seen
+            column = np.zeros((1, 13))
+            column[0, 3:] = (np.tile(middle, 5) - mean[3:]).ravel()
+            local = LocalMap(
+                np.arange(1, 6, dtype=np.uint32),
+                mean,
+                unpacked(packed(covariance), 13),
+                biases=("range_scale",),
+                sensitivity=column,
+            )
+            made.append(Contribution(robot, 0, k, 1000 * (k + 1), local))
+            pose = end
+    return sorted(made, key=lambda each: each.key), starts, errors
+
+
+def fold_of(submaps, starts, options):
+    fold = EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    return converged(folded(fold, submaps, options), options)
+
+
+# --- noise at the joined map's ranges ---
+
+
+def test_at_joined_ranges_landmarks_and_their_columns_are_taken_times_the_ratio_of_distances():
+    submaps, starts, _ = carts(1, robots=1, submaps=2)
+    island = fold_of(submaps, starts, JoinSettings(bias_sigma=SIGMA)).main
+    graph, factors = island.graph, island.graph.factors
+    scaled = kernel.with_joined_ranges(island.state, graph.offset, factors)
+    for f, each in enumerate(graph.submaps):
+        local, at = each.contribution.local, graph.offset[each.nodes]
+        start = island.state[at[0] : at[0] + 3]
+        middle = local.end_pose[:2] / 2.0
+        seen_from = compose(start, np.append(middle, 0.0))[:2]
+        T = np.ones(13)
+        for k, landmark in enumerate(local.landmarks):
+            joined = island.state[at[2 + k] : at[2 + k] + 2]
+            q = np.hypot(*(joined - seen_from)) / np.hypot(*(landmark - middle))
+            T[3 + 2 * k : 5 + 2 * k] = q
+        begin = factors.information_start[f]
+        metric = scaled.information[begin : begin + 169].reshape(13, 13)
+        np.testing.assert_allclose(
+            metric, np.linalg.inv(local.covariance * np.outer(T, T)), rtol=1e-9, atol=1e-9
+        )
+        begin = factors.sensitivity_start[f]
+        column = scaled.sensitivity[begin : begin + 13]
+        np.testing.assert_allclose(column, local.sensitivity[0] * T)
+    np.testing.assert_array_equal(factors.information, graph.factors.information)
+
+
+def test_an_outlier_does_not_grow_with_its_distance():
+    submaps, starts, _ = carts(2, robots=1, submaps=1)
+    island = fold_of(submaps, starts, JoinSettings(bias_sigma=SIGMA)).main
+    factors = island.graph.factors
+    far = island.state.copy()
+    far[island.graph.offset[island.graph.landmarks[1]]] += 1000.0
+    scaled = kernel.with_joined_ranges(far, island.graph.offset, factors)
+    np.testing.assert_allclose(scaled.block[0], kernel.LARGEST_RATIO**2 * factors.block[0])
+
+
+SEEDS = range(200)
+
+
+def scale_errors(seeds, *, joined_ranges):
+    """(estimate − truth)/sigma of each robot's scale."""
+    found = []
+    for seed in seeds:
+        submaps, starts, errors = carts(seed, robots=1, submaps=20)
+        options = JoinSettings(bias_sigma=SIGMA, joined_ranges=joined_ranges)
+        estimates = marginals.bias_estimates(fold_of(submaps, starts, options))
+        found += [(each.value - errors[each.stream[0]]) / each.sigma for each in estimates]
+    return np.array(found)
+
+
+def test_the_scale_of_ranges_is_unbiased_at_joined_ranges_and_at_the_measured_ones_it_is_not():
+    unbiased = scale_errors(SEEDS, joined_ranges=True)
+    low, high = chi2_interval(1, 0.999, len(unbiased))
+    assert low < np.mean(unbiased**2) < high
+    assert abs(np.mean(unbiased)) < 3.3 / np.sqrt(len(unbiased))
+    mutant = scale_errors(SEEDS[:80], joined_ranges=False)
+    assert abs(np.mean(mutant)) > 3.3 / np.sqrt(len(mutant))
+
+
+# --- what all robots have in common ---
+
+
+def nees_of_maps(seeds, common_bias_sigma):
+    options = JoinSettings(
+        bias_sigma={"range_scale": 0.1 * OWN},
+        common_bias_sigma=common_bias_sigma,
+        joined_ranges=True,
+    )
+    total = 0.0
+    for seed in seeds:
+        submaps, starts, _ = carts(seed, submaps=4, own=0.1 * OWN, common=COMMON, way=0.05)
+        found = marginals.landmark_map(fold_of(submaps, starts, options))
+        total += nees((found.means - LANDMARKS).ravel(), found.covariance)
+    return total / len(seeds)
+
+
+def test_a_map_with_a_common_error_is_as_sure_as_it_says_only_where_the_team_has_a_state_of_it():
+    low, high = chi2_interval(10, 0.999, len(SEEDS))
+    assert low < nees_of_maps(SEEDS, {"range_scale": COMMON}) / 10.0 < high
+    assert nees_of_maps(SEEDS[:50], {}) / 10.0 > 1.3
+
+
+def test_what_a_robot_is_told_of_its_scale_is_its_own_error_and_the_teams():
+    submaps, starts, _ = carts(3, common=COMMON)
+    common = {"range_scale": COMMON}
+    fold = fold_of(submaps, starts, JoinSettings(bias_sigma=SIGMA, common_bias_sigma=common))
+    island = fold.main
+    node = island.graph.common["range_scale"]
+    assert island.graph.name(node) == "the bias range_scale of the team"
+    of_team = island.state[island.graph.offset[node]]
+    for each in marginals.bias_estimates(fold):
+        own = island.state[island.graph.offset[island.graph.biases[each.stream, "range_scale"]]]
+        assert each.value == pytest.approx(own + of_team, rel=1e-12)
+        assert each.sigma < np.hypot(OWN, COMMON)
+
+
+def test_islands_that_merge_have_one_common_error_and_its_prior_counts_once():
+    submaps, starts, _ = carts(4, common=COMMON)
+    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"range_scale": COMMON})
+    fold = fold_of(submaps, starts[:1], options)
+    graph, agreement = fold.main.graph, marginals.joint_cost(fold)
+    assert len(fold.islands) == len(graph.common) == 1
+    assert len(graph.priors) == 3
+    priors = sum(len(prior.mean) for prior in graph.priors)
+    assert agreement.dof == pytest.approx(graph.dimensions.sum() + priors - graph.unknowns)
+
+
+def test_a_bias_that_no_submap_has_makes_no_state():
+    submaps, starts, _ = carts(5)
+    none = {"biases": (), "sensitivity": np.empty((0, 0))}
+    plain = [replace(each, local=replace(each.local, **none)) for each in submaps]
+    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"range_scale": COMMON})
+    assert not fold_of(plain, starts, options).main.graph.common

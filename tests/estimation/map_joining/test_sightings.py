@@ -1,0 +1,283 @@
+"""Sightings of teammates are factors between pose nodes: honest, once, and a tie between frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team.config import Sensor
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.geometry import compose, exponential, inverse, transformed
+from team.estimation.inter_robot import Carried, carried_back, carried_on, point_seen, reduced
+from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.inter_robot_kernel import sighting_residual
+from team.estimation.map_joining.joining import converged
+from team.estimation.map_joining.marginals import joint_cost, landmark_map, trajectory
+from team.estimation.models import Increment
+from team.estimation.submap import LocalMap
+from tests.estimation.sighting_world import joined_with, meeting
+from tests.estimation.submap_world import seen_from, solved, wrap
+
+EXACTLY = JoinSettings(step_tolerance=1e-11)
+poses = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1)).map(np.array)
+
+
+def residual(observer, teammate, reading):
+    to = seen_from(observer, teammate[0] + 1j * teammate[1])
+    return np.array([reading[0] - abs(to), wrap(reading[1] - np.angle(to))])
+
+
+@settings(deadline=None, max_examples=60)
+@given(poses, poses, st.floats(0.1, 30.0), st.floats(-3.1, 3.1))
+def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distance, bearing):
+    if np.hypot(*(b - a)[:2]) < 0.1:
+        return
+    reading = np.array([distance, bearing])
+    r, jacobian = sighting_residual(a, b, reading)
+    np.testing.assert_allclose(wrap(r - residual(a, b, reading)), 0.0, atol=1e-9)
+    h = 1e-6
+    both = np.concatenate([a, b])
+    for k, shift in enumerate(h * np.eye(6)):
+        up, down = (residual((both + s)[:3], (both + s)[3:], reading) for s in (shift, -shift))
+        difference = np.array([(up - down)[0], wrap((up - down)[1])]) / (2.0 * h)
+        np.testing.assert_allclose(jacobian[:, k], difference, rtol=1e-4, atol=1e-4)
+
+
+def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised():
+    world = meeting(3, robots=3, submaps=2)
+    island = joined_with(
+        world.submaps, world.starts, world.sightings, JoinSettings(robust_c=1.0)
+    ).main
+    assert len(island.graph.sightings) == len(world.sightings) == 12
+    gradient = island.normal_equations[1]
+    for k in range(0, len(island.state), 4):
+        shift = 1e-6 * np.eye(len(island.state))[k]
+        up, down = (replace(island, state=island.state + s * shift).cost for s in (1, -1))
+        expected = (
+            0.0
+            if island.graph.fixed[np.searchsorted(island.graph.offset, k, "right") - 1]
+            else (up - down) / 4e-6
+        )
+        assert gradient[k] == pytest.approx(expected, rel=1e-3, abs=1e-3)
+        if expected:
+            # The parabola that an iteration lowers touches the robust cost here.
+            up, down = (island.quadratic(island.state + s * shift) for s in (1, -1))
+            assert (up - down) / 4e-6 == pytest.approx(expected, rel=1e-3, abs=1e-3)
+
+
+def test_pose_nodes_without_sightings_change_nothing_in_the_map():
+    world = meeting(4, robots=3)
+    bare = [replace(each, local=each.local.without_nodes) for each in world.submaps]
+    with_nodes, without = (
+        landmark_map(converged(joined_with(each, world.starts, [], EXACTLY), EXACTLY))
+        for each in (world.submaps, bare)
+    )
+    np.testing.assert_allclose(with_nodes.means, without.means, atol=1e-7)
+    np.testing.assert_allclose(with_nodes.covariance, without.covariance, atol=1e-9)
+
+
+def test_a_submap_without_its_nodes_is_the_marginal():
+    local = meeting(4).submaps[0].local
+    n = len(local.mean)
+    kept = [0, 1, 2, *range(6, n)]
+    bare = local.without_nodes
+    assert bare.node_stamps.size == 0
+    assert bare.mean.tolist() == local.mean[kept].tolist()
+    assert bare.covariance.tolist() == local.covariance[np.ix_(kept, kept)].tolist()
+    assert bare.landmarks.tolist() == local.landmarks.tolist()
+    assert local.nodes.tolist() == [local.mean[3:6].tolist()]
+    assert bare.without_nodes is bare
+
+
+# --- consistency ---
+
+RUNS = 200
+
+
+def consistency(change):
+    """Mean NEES of map and last poses, mean joint cost; each per degree of freedom, with it."""
+    errors = cost = 0.0
+    dof = joint = 0.0
+    for seed in range(RUNS):
+        world = meeting(seed, robots=2, submaps=3, landmarks=2, reach=7.0)
+        sightings = [replace(each, covariance=change * each.covariance) for each in world.sightings]
+        fold = joined_with(world.submaps, world.starts, sightings, JoinSettings(), 100)
+        fold = solved(fold, JoinSettings())
+        found = landmark_map(fold)
+        truth = world.landmarks[found.ids]
+        if len(found.ids):
+            errors += nees((found.means - truth).ravel(), found.covariance)
+            dof += found.means.size
+        agreement = joint_cost(fold)
+        cost += agreement.chi2
+        joint += agreement.dof
+    return errors / dof, round(dof), cost / joint, round(joint)
+
+
+def test_a_map_with_sightings_is_consistent_and_one_that_counts_each_fourfold_is_not():
+    ratio, dof, cost, joint = consistency(1.0)
+    low, high = chi2_interval(dof, 0.999, 1)
+    assert low < ratio < high
+    least, most = chi2_interval(joint, 0.999, 1)
+    assert least < cost < most
+    _, _, cost_of_mutant, _ = consistency(0.25)
+    assert cost_of_mutant > most
+
+
+def test_sightings_shrink_the_trajectories_covariance_and_their_redundancy_counts():
+    world = meeting(5, robots=3)
+    plain, seen = (
+        converged(joined_with(world.submaps, world.starts, s, EXACTLY), EXACTLY)
+        for s in ([], world.sightings)
+    )
+    for robot in ("r0", "r1", "r2"):
+        before, after = (trajectory(fold, robot, 0).covariances[-1] for fold in (plain, seen))
+        assert np.linalg.eigvalsh(before - after).min() > 0.0
+    agreement, graph = joint_cost(seen), seen.main.graph
+    redundancy = graph.dimensions.sum() + 2 * len(world.sightings) - graph.unknowns
+    assert agreement.dof == pytest.approx(redundancy)
+    assert sum(chi2 for chi2, _ in agreement.robots.values()) == pytest.approx(agreement.chi2)
+
+
+# --- the set decides ---
+
+
+def test_a_sighting_waits_until_the_teammates_node_is_there():
+    world = meeting(6)
+    late = [each for each in world.submaps if each.robot == "r0" or each.sequence < 3]
+    fold = joined_with(late, world.starts, world.sightings, EXACTLY)
+    assert len(fold.main.graph.sightings) == 6
+    assert {(each.robot, each.teammate) for each in fold.waiting} == {("r0", "r1")}
+    assert [each.stamp_ns for each in fold.waiting] == [3500, 4500, 5500]
+
+
+def test_the_fold_without_a_robot_does_not_know_that_it_was_seen():
+    world = meeting(7, robots=3)
+    submaps = [each for each in world.submaps if each.robot != "r2"]
+    starts = world.starts[:2]
+    of_others = [s for s in world.sightings if "r2" not in (s.robot, s.teammate)]
+    by_others = [s for s in world.sightings if s.robot != "r2"]
+    options = JoinSettings(robust_c=1.0)
+    without, withdrawn = (
+        converged(joined_with(submaps, starts, each, options), options)
+        for each in (of_others, by_others)
+    )
+    assert without.main.state.tobytes() == withdrawn.main.state.tobytes()
+    for one, other in zip(landmark_map(without), landmark_map(withdrawn), strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def test_one_sighting_that_is_garbage_does_not_bend_the_robust_map():
+    world = meeting(8, robots=3)
+    options = JoinSettings(robust_c=1.0)
+    wrong = replace(world.sightings[4], reading=np.array([25.0, 2.0]))
+    clean, spoilt = (
+        landmark_map(converged(joined_with(world.submaps, world.starts, s, options), options))
+        for s in (world.sightings, [*world.sightings[:4], wrong, *world.sightings[5:]])
+    )
+    sigma = np.sqrt(np.diag(clean.covariance)).reshape(-1, 2)
+    assert (np.abs(clean.means - spoilt.means) < 0.5 * sigma).all()
+
+
+# --- free islands ---
+
+
+def strangers(seed, count):
+    """Two robots without a common landmark; r1's start is unknown; the first sightings of each."""
+    world = meeting(seed, submaps=6)
+    submaps = [
+        each
+        if each.robot == "r0"
+        else replace(each, local=replace(each.local, ids=each.local.ids + 100))
+        for each in world.submaps
+    ]
+    return submaps, world.starts[:1], world.sightings[:count], world
+
+
+def test_two_islands_without_a_common_landmark_are_joined_by_a_sighting_and_its_reverse():
+    for seed in range(4):
+        submaps, starts, sightings, world = strangers(seed, 2)
+        assert {s.robot for s in sightings} == {"r0", "r1"}
+        fold = converged(joined_with(submaps, starts, sightings, EXACTLY), EXACTLY)
+        assert fold.reasons == {}
+        assert fold.waiting == ()
+        found = landmark_map(fold)
+        truth = world.landmarks[found.ids % 100]
+        assert nees((found.means - truth).ravel(), found.covariance) < 3.0 * found.means.size
+        assert {stream[0] for stream in fold.main.graph.streams} == {"r0", "r1"}
+
+
+def test_one_sighting_does_not_join_two_islands_and_the_fold_says_why():
+    submaps, starts, sightings, _ = strangers(0, 1)
+    fold = converged(joined_with(submaps, starts, sightings, EXACTLY), EXACTLY)
+    assert fold.reasons == {
+        ("r1", 0): "r1 (epoch 0) not joined: 0 shared landmarks and 1 sighting, 2 needed"
+    }
+
+
+def test_sightings_that_contradict_each_other_join_nothing():
+    submaps, starts, sightings, _ = strangers(1, 6)
+    turned = [
+        replace(s, reading=np.array([s.reading[0], wrap(s.reading[1] + 0.9 * k)]))
+        for k, s in enumerate(sightings)
+    ]
+    fold = converged(joined_with(submaps, starts, turned, EXACTLY), EXACTLY)
+    (reason,) = fold.reasons.values()
+    assert "0 shared landmarks and 6 sightings disagree" in reason
+
+
+def test_islands_with_sightings_become_the_same_map_as_with_known_starts():
+    submaps, _, sightings, world = strangers(2, 12)
+    free = converged(joined_with(submaps, world.starts[:1], sightings, EXACTLY), EXACTLY)
+    vague = [world.starts[0], replace(world.starts[1], covariance=1e6 * np.eye(3))]
+    known = converged(joined_with(submaps, vague, sightings, EXACTLY), EXACTLY)
+    np.testing.assert_allclose(landmark_map(free).means, landmark_map(known).means, atol=1e-3)
+
+
+# --- carrying a sighting to its node ---
+
+MOTION = Increment(np.array([0.4, 0.1, 0.3]), np.diag([0.02, 0.01, 0.015]) ** 2)
+
+
+@pytest.mark.parametrize("back", [True, False])
+def test_a_carried_point_has_the_mean_and_covariance_of_samples(back):
+    rng = np.random.default_rng(1)
+    sensor = Sensor(range_sigma=0.05, bearing_sigma=0.02, marker_sigma=0.03)
+    seen = point_seen(sensor, 2.5, 0.8, 0.04)
+    carried = (carried_back if back else carried_on)(seen, MOTION)
+    samples = []
+    for _ in range(20_000):
+        xi = np.sqrt(np.diag(MOTION.covariance)) * rng.normal(size=3)
+        moved = compose(MOTION.mean, exponential(xi))
+        distance, bearing = 2.5 + 0.05 * rng.normal(), 0.8 + 0.02 * rng.normal()
+        point = distance * np.exp(1j * bearing) + 0.05 * (rng.normal() + 1j * rng.normal())
+        to = moved if back else inverse(moved)
+        samples.append(transformed(to, np.array([point.real, point.imag])))
+    np.testing.assert_allclose(carried.point, np.mean(samples, axis=0), atol=2e-3)
+    spread = np.cov(np.array(samples).T)
+    np.testing.assert_allclose(carried.covariance, spread, atol=0.06 * np.trace(spread))
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.floats(0.2, 20.0), st.floats(-3.14, 3.14), st.floats(0.0, 0.3))
+def test_looks_about_one_direction_reduce_to_their_middle_on_the_circle(distance, bearing, spread):
+    looks = [
+        Carried(
+            np.array([np.cos(bearing + a), np.sin(bearing + a)]) * (distance + a), 0.01 * np.eye(2)
+        )
+        for a in (-spread, 0.0, spread)
+    ]
+    looks = [look for look in looks if np.hypot(*look.point) > 0.0]
+    reading, covariance = reduced(looks)
+    if distance > spread:
+        assert reading[0] == pytest.approx(distance)
+        assert wrap(reading[1] - bearing) == pytest.approx(0.0, abs=1e-9)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+
+
+def test_a_submap_needs_no_nodes():
+    local = LocalMap(np.empty(0, np.uint32), np.zeros(3), np.eye(3))
+    assert local.nodes.shape == (0, 3)
+    assert local.landmarks.shape == (0, 2)

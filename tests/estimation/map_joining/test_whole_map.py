@@ -1,0 +1,106 @@
+"""One robot's Gaussian back end equals least squares where all is linear; what absorbing does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from team.estimation.map_joining.marginals import prior_for
+from team.estimation.map_joining.whole_map import absorbed, begun, joined
+from tests.estimation.submap_world import correlated, team
+
+LINEAR = (0.1, 1e-5, 0.2)
+
+
+def whole_of(world, count=None):
+    whole = begun(world.starts[0].pose, world.starts[0].covariance)
+    for each in world.submaps[:count]:
+        whole = joined(whole, each.local)
+    return whole
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("covariance", [None, np.diag([0.2, 0.1, 1e-10])])
+def test_joining_one_after_the_other_equals_the_joint_solution_in_the_linear_case(seed, covariance):
+    world = team(seed, robots=1, submaps=6, sigmas=LINEAR)
+    world.starts[0] = replace(world.starts[0], covariance=covariance)
+    settings = JoinSettings(step_tolerance=1e-11)
+    fold = converged(
+        folded(started(EMPTY_FOLD, world.starts[0]), world.submaps, settings), settings
+    )
+    expected = prior_for(fold, "r0", 0)
+    found = whole_of(world)
+    sigma = np.sqrt(np.diag(expected.covariance))
+    mean = np.concatenate([expected.pose, expected.means.ravel()])
+    np.testing.assert_array_equal(found.ids, expected.ids)
+    np.testing.assert_allclose(found.mean / sigma, mean / sigma, atol=2e-2)
+    relative = np.outer(sigma, sigma)
+    np.testing.assert_allclose(
+        found.covariance / relative, expected.covariance / relative, atol=1e-3
+    )
+
+
+def test_the_first_local_map_is_composed_onto_the_start():
+    world = team(4, robots=1, submaps=1)
+    whole, local = whole_of(world), world.submaps[0].local
+    x, y, heading = world.starts[0].pose
+    points = (x + 1j * y) + np.exp(1j * heading) * (local.landmarks @ np.array([1.0, 1j]))
+    np.testing.assert_allclose(whole.mean[3::2] + 1j * whole.mean[4::2], points)
+    np.testing.assert_array_equal(whole.ids, local.ids)
+
+
+def test_ids_stay_ascending_when_new_landmarks_lie_between_known_ones():
+    world = team(5, robots=1, submaps=8, landmarks=30, reach=5.0)
+    whole = whole_of(world)
+    assert (np.diff(whole.ids.astype(int)) > 0).all()
+    assert len(whole.ids) > len(world.submaps[0].local.ids)
+    assert np.abs(whole.mean[3:].reshape(-1, 2) - world.landmarks[whole.ids]).max() < 2.0
+
+
+def test_joining_leaves_its_inputs_as_they_were():
+    world = team(5, robots=1, submaps=3)
+    before = whole_of(world, 2)
+    bytes_before = before.mean.tobytes(), before.covariance.tobytes()
+    joined(before, world.submaps[2].local)
+    assert (before.mean.tobytes(), before.covariance.tobytes()) == bytes_before
+
+
+def test_absorbing_its_own_marginal_changes_nothing():
+    whole = whole_of(team(6, robots=1, submaps=5))
+    again = absorbed(whole, whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:])
+    np.testing.assert_array_equal(again.ids, whole.ids)
+    np.testing.assert_allclose(again.mean, whole.mean, rtol=1e-12)
+    np.testing.assert_allclose(again.covariance, whole.covariance, rtol=1e-9, atol=1e-14)
+
+
+def test_the_pose_follows_the_absorbed_landmarks_by_regression():
+    whole = whole_of(team(7, robots=1, submaps=5))
+    ids = whole.ids[1:3]
+    P_ll = whole.covariance[5:9, 5:9]
+    P_pl = whole.covariance[:3, 5:9]
+    told, spread = whole.mean[5:9] + 0.1, 0.25 * P_ll
+    after = absorbed(whole, ids, told.reshape(-1, 2), spread)
+    gain = P_pl @ np.linalg.inv(P_ll)
+    np.testing.assert_allclose(after.mean[:3], whole.mean[:3] + gain @ np.full(4, 0.1))
+    expected = whole.covariance[:3, :3] - gain @ (P_ll - spread) @ gain.T
+    np.testing.assert_allclose(after.covariance[:3, :3], expected, rtol=1e-9)
+    np.testing.assert_allclose(after.covariance[5:9, 5:9], spread, rtol=1e-12)
+    np.testing.assert_allclose(after.covariance[:3, 5:9], gain @ spread, rtol=1e-9)
+
+
+def test_absorbing_adds_unknown_landmarks_and_keeps_their_ties():
+    whole = whole_of(team(8, robots=1, submaps=3))
+    rng = np.random.default_rng(1)
+    known = int(whole.ids[0])
+    ids = np.array([known, 900], np.uint32)
+    told = np.array([whole.mean[3:5], [7.0, 8.0]])
+    spread = correlated(np.full(4, 0.3), rng)
+    after = absorbed(whole, ids, told, spread)
+    assert after.ids[-1] == 900
+    np.testing.assert_array_equal(after.mean[-2:], [7.0, 8.0])
+    np.testing.assert_allclose(after.covariance[-2:, 3:5], spread[2:, :2])
+    gain = whole.covariance[:3, 3:5] @ np.linalg.inv(whole.covariance[3:5, 3:5])
+    np.testing.assert_allclose(after.covariance[:3, -2:], gain @ spread[:2, 2:], atol=1e-12)
+    assert np.linalg.eigvalsh(after.covariance)[0] > 0.0
