@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2 as chi_squared
 
 from team.config import Bias
-from team.estimation.consistency import Scale, covariance_scale
+from team.estimation.consistency import Scale, chi2_quantile, covariance_scale
 from team.estimation.map_joining.marginals import Agreement, BiasEstimate, SubmapCost
 
 WARN = 1.1
@@ -175,4 +174,4 @@ def _worst(agreement: Agreement) -> list[str]:
 
 @lru_cache(maxsize=4096)
 def _bound(dof: float, quantile: float) -> float:
-    return float(chi_squared.ppf(quantile, dof)) / dof
+    return float(chi2_quantile(quantile, dof)) / dof

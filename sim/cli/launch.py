@@ -94,9 +94,6 @@ def launch(
 
     Every robot, the world, the central computer, the recorder and the router are processes.
     """
-    from sim.launch.launch import Plan
-    from sim.launch.launch import launch as launched
-    from sim.launch.live import shown
     from sim.scenario.source import with_present_robots
 
     pace = parsed_speed(speed)
@@ -120,6 +117,10 @@ def launch(
     log = record or folder / "log.mcap"
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
+    from sim.launch.launch import LaunchError, Plan
+    from sim.launch.launch import launch as launched
+    from sim.launch.live import shown
+
     _prepare(resolved)
     door = listen if keys is None else over_tls(listen)
     plan = Plan(
@@ -134,6 +135,8 @@ def launch(
         try:
             with shown(f"{resolved.name}, seed {resolved.seed}") as show:
                 outcome = launched(plan, show)
+        except LaunchError as error:
+            fail(str(error), FAILED)
         except KeyboardInterrupt:
             kept = f"; {log} holds what was recorded" if log.exists() else ""
             fail(f"interrupted: every process of the team was ended{kept}", FAILED)

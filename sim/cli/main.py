@@ -47,8 +47,23 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
 
 def main() -> None:
     """Run a command; what a user did wrong ends with 2, what failed with 1, without a traceback."""
+    try:
+        app()
+    except Exception as error:
+        told = _told(error)
+        if told is None:
+            raise
+        status, text = told
+        typer.secho(f"error: {text}", fg="red", err=True)
+        sys.exit(status)
+
+
+def _told(error: Exception) -> tuple[int, str] | None:
+    """The exit status for an error that was foreseen and what to say of it; None: it was not.
+
+    What may be raised is imported when it has been: a router needs no SciPy.
+    """
     from sim.datasets.tables import DatasetError
-    from sim.launch.launch import LaunchError
     from sim.scenario.checks import ScenarioError
     from team.keys.roster import KeysError
     from team.recording.reader import LogError
@@ -56,15 +71,10 @@ def main() -> None:
     from team.shell import FaultyRunError
     from team.wire.bus import BusError
 
-    try:
-        app()
-    except (ScenarioError, DatasetError, LogError, BusError, KeysError) as error:
-        typer.secho(f"error: {error}", fg="red", err=True)
-        sys.exit(WRONG_USE)
-    except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-        text = f"error: {error.filename}: {error.strerror}; give another path"
-        typer.secho(text, fg="red", err=True)
-        sys.exit(WRONG_USE)
-    except (LaunchError, RecorderError, FaultyRunError, OSError) as error:
-        typer.secho(f"error: {error}", fg="red", err=True)
-        sys.exit(FAILED)
+    if isinstance(error, ScenarioError | DatasetError | LogError | BusError | KeysError):
+        return WRONG_USE, str(error)
+    if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
+        return WRONG_USE, f"{error.filename}: {error.strerror}; give another path"
+    if isinstance(error, RecorderError | FaultyRunError | OSError):
+        return FAILED, str(error)
+    return None

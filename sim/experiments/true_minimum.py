@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
 
 from central.tick_fold import TickFold
 from sim.evaluation.errors import Path, interpolated
@@ -22,6 +21,7 @@ from sim.evaluation.evaluation import Evaluation
 from sim.experiments.plain_cost import PlainCost
 from sim.rerun.log import Recorded
 from team import translate
+from team.estimation.consistency import chi2_quantile
 from team.estimation.map_joining.gauss_newton import Island
 from team.estimation.map_joining.joining import Fold, converged
 from team.wire import messages as m
@@ -59,7 +59,7 @@ class TrueMinimum(NamedTuple):
     @property
     def excluded(self) -> bool:
         """Whether the submaps exclude the truth with 99.9 %."""
-        return self.rise > float(chi2.ppf(LIKELY, self.dof))
+        return self.rise > float(chi2_quantile(LIKELY, self.dof))
 
 
 def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | None:
@@ -117,7 +117,7 @@ def judged(
     away = ends.state - island.state
     away[graph.headings] = np.angle(np.exp(1j * away[graph.headings]))
     whitened = cost.jacobian(island.state) @ away[cost.free]
-    place = float(chi2.ppf(LIKELY, 3))
+    place = float(chi2_quantile(LIKELY, 3))
     other = ends.at_rest and whitened @ whitened > place and ends.cost - ours < place
     firsts = {nodes[1] for nodes in graph.streams.values()}
     held = sorted(({*graph.landmarks.values()} | firsts) & known)

@@ -9,11 +9,10 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt32
-from scipy.stats import chi2
 
 from sim.evaluation.errors import BAND, Path, interpolated
 from team import translate
-from team.estimation.consistency import state_error
+from team.estimation.consistency import chi2_quantile, state_error
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
@@ -39,7 +38,7 @@ class Tally:
         """So many more, each of `dof` degrees of freedom."""
         self.nees_per_dof += float(nees.sum()) / dof
         self.count += len(nees)
-        self.inside += int(np.count_nonzero(nees <= chi2.ppf(BAND, dof)))
+        self.inside += int(np.count_nonzero(nees <= chi2_quantile(BAND, dof)))
 
     @property
     def mean(self) -> float | None:

@@ -18,9 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from team.config import Bias
+from team.estimation.consistency import chi2_quantile
 from team.estimation.contribution import Contribution
 from team.estimation.gaussian import PoseGaussian
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
@@ -30,7 +31,7 @@ from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 from team.estimation.map_joining.whole_map import WholeMap, end_pose, without
 from team.estimation.submap import LocalMap
 
-GATE = float(chi2.ppf(0.9999, 2))
+GATE = float(chi2_quantile(0.9999, 2))
 """χ² beyond which what a submap says of a landmark is taken for another landmark's: some twenty are
 tested for each pose, and a good one that is left out costs little."""
 CONTRADICTED = 1e-6
@@ -159,7 +160,7 @@ def _degrees(island: Island) -> int:
 
 def _most(dof: int) -> float:
     """The cost beyond which a map and submaps contradict each other."""
-    return float(chi2.isf(CONTRADICTED, dof)) if dof > 0 else math.inf
+    return float(chdtri(dof, CONTRADICTED)) if dof > 0 else math.inf
 
 
 def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
