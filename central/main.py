@@ -77,6 +77,7 @@ class CentralShell:
             digest = final.digest.hex()
             _LOG.info("final map of %d landmarks, set %s", len(ids(final.ids, "ids")), digest)
         self._leave_last()
+        self._shell.wait_for_recorder(lambda: False)
         self._shell.end(final)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
@@ -179,6 +180,6 @@ class CentralShell:
         """Robots and world leave at the final map; whoever missed it may still ask for it."""
         deadline = time.monotonic() + FAREWELL_S
         while not self._stop.is_set() and time.monotonic() < deadline:
-            self._patient(self._bus.receive(WAIT_S))
+            self._shell.note(self._patient(self._bus.receive(WAIT_S)))
             if not any(n == "world" or n.startswith("robot/") for n in self._alive):
                 return

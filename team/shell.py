@@ -7,8 +7,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -17,9 +17,9 @@ import msgspec
 from team.containment import Boundary
 from team.the_end import TheEnd
 from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
-from team.wire.channels import FAULT, STATUS, Channel
-from team.wire.codec import encoded
-from team.wire.messages import FusedMap, Message, Status, tag_of
+from team.wire.channels import ALIVE, FAULT, STATUS, Channel
+from team.wire.codec import WireError, decoded, encoded
+from team.wire.messages import FusedMap, Liveliness, Message, Status, tag_of
 
 STATUS_S = 0.5
 """Wall time between two statuses of a node."""
@@ -27,11 +27,17 @@ REMIND_S = 10.0
 """Wall time between two lines of a node that waits."""
 WAIT_S = 0.05
 """How long a shell waits for input before it looks at its other duties."""
+RECORDER_S = 10.0
+"""A process leaves this long after its end, though the recorder still lacks something of it."""
+BACK_S = 1.5
+"""A recorder that is back fetches from the publishers' caches what it has missed."""
+RECORDER = "recorder"
 PARENT = "TEAMSLAM_PARENT"
 """Environment variable: the process without which this one must not live."""
 LAST_S = 20
 """A process that was told to stop is ended by SIGALRM after this many seconds."""
 T = TypeVar("T")
+Take = Callable[[Sequence[Sample]], None]
 _LOG = logging.getLogger("teamslam")
 _PR_SET_PDEATHSIG = 1
 
@@ -84,6 +90,8 @@ class Shell:
         self.boundary = Boundary(name)
         self.notes: Callable[[], tuple[str, ...]] = tuple
         self.the_end = TheEnd(bus, name)
+        self._recorder_is_there: bool | None = None
+        self._recorder_since = 0.0
         self._messages = 0
         self._bytes = 0
         self._since = time.monotonic()
@@ -115,6 +123,7 @@ class Shell:
     def take(self, samples: Iterable[Sample]) -> None:
         """Decode at the door, hand to the node, publish its answer; a long queue is no silence."""
         for sample in samples:
+            self._note_recorder(sample)
             self.publish(self.boundary.take(self.node, sample))
             if self._begun:
                 self.report()
@@ -158,6 +167,38 @@ class Shell:
     def look_for_the_end(self) -> None:
         """Ask the router now and then for a final map that this node has missed."""
         self.take(self.the_end.missed())
+
+    def note(self, samples: Iterable[Sample]) -> None:
+        """Note who records, where nothing else of what arrives matters any more."""
+        for sample in samples:
+            self._note_recorder(sample)
+
+    def _note_recorder(self, sample: Sample) -> None:
+        if sample.key == ALIVE.key(RECORDER):
+            with suppress(WireError):
+                there = decoded(sample.payload, Liveliness).alive
+                came_back = there and self._recorder_is_there is False
+                self._recorder_since = time.monotonic() if came_back else self._recorder_since
+                self._recorder_is_there = there
+
+    def wait_for_recorder(self, lacks: Callable[[], bool], take: Take | None = None) -> None:
+        """Stay, at most RECORDER_S, while a recorder that was there is away or lacks something.
+
+        What a process has published it alone can give again. lacks: whether it does by its own
+        word. take: takes what arrives meanwhile; without it nothing but the recorder matters.
+        """
+        deadline = time.monotonic() + RECORDER_S
+        while self._recorder_is_there is not None and not self._stop.is_set():
+            now = time.monotonic()
+            settled = self._recorder_is_there and now - self._recorder_since >= BACK_S
+            if (settled and not lacks()) or now >= deadline:
+                break
+            samples = self.bus.receive(WAIT_S)
+            self.note(samples)
+            if take is not None:
+                take(samples)
+        if self._recorder_is_there is not None and lacks() and not self._stop.is_set():
+            _LOG.warning("the recorder lacks something of this process")
 
     def sample_of(self, out: Outgoing) -> Sample:
         """A message to this node itself, as if it had come over the bus."""

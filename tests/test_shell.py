@@ -2,13 +2,14 @@
 
 import logging
 import threading
+from collections.abc import Callable
 
 import pytest
 
 from team import shell
-from team.shell import Shell
+from team.shell import BACK_S, RECORDER, RECORDER_S, Shell
 from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 
 
 class Waiting:
@@ -43,3 +44,43 @@ def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(
         said.append(len(caplog.messages))
     assert caplog.messages == ["waiting for robot/r2"] * 2, "after 10 s and 20 s"
     assert said.index(1) == 10
+
+
+class Slow(MemoryBus):
+    """A bus on which a look takes a while: `clock` goes on, and things happen at their times."""
+
+    def __init__(self, network: MemoryNetwork, clock: list[float]) -> None:
+        super().__init__(network)
+        self._clock = clock
+        self.at: dict[float, Callable[[], None]] = {}
+
+    def receive(self, timeout_s: float = 0.0) -> list[Sample]:
+        self._clock[0] += 0.5
+        for due in [t for t in self.at if t <= self._clock[0]]:
+            self.at.pop(due)()
+        return super().receive(timeout_s)
+
+
+@pytest.mark.parametrize("case", ["nobody records", "all is there", "lacks", "away", "back"])
+def test_a_process_stays_while_who_records_may_still_ask_for_something(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a recorder, or with one that has everything, it leaves at once."""
+    clock = [100.0]
+    monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
+    network = MemoryNetwork()
+    bus, recorder = Slow(network, clock), MemoryBus(network)
+    if case != "nobody records":
+        recorder.declare_alive(RECORDER)
+    bus.watch_alive(RECORDER)
+    turning = Shell(bus, Waiting(), "robot/r1", threading.Event())
+    if case == "away":
+        recorder.close()
+    if case == "back":
+        recorder.close()
+        bus.at[102.0] = lambda: MemoryBus(network).declare_alive(RECORDER)
+    turning.take(MemoryBus.receive(bus))
+    turning.wait_for_recorder(lambda: case == "lacks" and clock[0] < 104.0)
+    stayed = clock[0] - 100.0
+    expected = {"lacks": 4.0, "away": RECORDER_S, "back": 2.0 + BACK_S}
+    assert stayed == expected.get(case, 0.0)

@@ -17,8 +17,6 @@ from team.wire.bus import Bus
 
 PACE_S = 0.002
 """Wait when there is nothing to publish: the clock or the credit must move first."""
-RECORDER_S = 10.0
-"""The source leaves this long after the final map, though the recorder still lacks something."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -65,18 +63,9 @@ def run_world(
         shell.look_for_the_end()
         shell.report()
     shell.report(last=True)
-    _wait_for_recorder(shell, node, stop)
+    shell.wait_for_recorder(lambda: node.unrecorded > 0, shell.take)
     _LOG.info("published %d readings", int(node.status().figures["readings"]))
     shell.end(node.final)
-
-
-def _wait_for_recorder(shell: Shell, node: WorldNode, stop: threading.Event) -> None:
-    """Who records may still ask for what it missed; so the source stays until it has everything."""
-    deadline = time.monotonic() + RECORDER_S
-    while node.unrecorded > 0 and not stop.is_set() and time.monotonic() < deadline:
-        shell.take(shell.bus.receive(PACE_S))
-    if node.unrecorded > 0 and not stop.is_set():
-        _LOG.warning("the recorder lacks %d readings", node.unrecorded)
 
 
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:

@@ -141,6 +141,15 @@ class Inventory:
             case _:
                 pass
 
+    def counts(self) -> dict[tuple[str, int], tuple[int, int]]:
+        """How many measurements and submaps there are of each incarnation (robot, epoch)."""
+        found: dict[tuple[str, int], tuple[int, int]] = {}
+        for (kind, robot, epoch), each in self.streams.items():
+            measurements, submaps = found.get((robot, epoch), (0, 0))
+            own = (each.count, submaps) if kind == "measurements" else (measurements, each.count)
+            found[robot, epoch] = own
+        return found
+
     @property
     def gaps(self) -> dict[Stream, int]:
         """The first number that is missing of each stream that is not whole."""

@@ -75,7 +75,7 @@ class RecordLoop:
         self._retry_s = 0.0
         self._inventory = Inventory() if inventory is None else inventory
         self._patience: Patience[Stream] = Patience()
-        self._reported: dict[Stream, int] = {}
+        self._reported: dict[tuple[str, int], tuple[int, int]] = {}
         self._missing = set(expected)
         self._alive: set[str] = set()
         self._newest_ns = 0
@@ -101,19 +101,21 @@ class RecordLoop:
     def take(self, samples: list[Sample]) -> None:
         """Write these samples; report progress of robots that are due, of all when there are none.
 
+        A new submap is reported at once: its robot does not leave before it is in the log.
+
         Progress is credit: while the writing thread is far behind, nothing is reported.
         """
         noted = [(sample, self._noted(sample)) for sample in samples]
         self._write([said for sample, said in noted if self._inventory.news(sample)])
         if self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND:
             return
-        for stream, found in self._inventory.streams.items():
-            new = found.count - self._reported.get(stream, 0)
-            if stream.kind == "measurements" and new >= (PROGRESS_EVERY if samples else 1):
-                said = (stream.robot, stream.epoch, found.count, 0)
-                progress = Progress(self._newest_ns, NODE, *said)
-                self._bus.publish(Outgoing(RECORDER_PROGRESS, stream.robot, progress))
-                self._reported[stream] = found.count
+        every = PROGRESS_EVERY if samples else 1
+        for (robot, epoch), (measurements, submaps) in self._inventory.counts().items():
+            before = self._reported.get((robot, epoch), (0, 0))
+            if measurements - before[0] >= every or submaps > before[1]:
+                progress = Progress(self._newest_ns, NODE, robot, epoch, measurements, submaps)
+                self._bus.publish(Outgoing(RECORDER_PROGRESS, robot, progress))
+                self._reported[robot, epoch] = (measurements, submaps)
 
     def _write(self, samples: list[Sample]) -> None:
         """To the log, if it can be written: the run goes on without it."""

@@ -3,14 +3,17 @@
 import logging
 import threading
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 
 from team.config import Exchange, RobotConfig
 from team.containment import reply_of
 from team.robot.node import RobotNode
-from team.shell import Shell
+from team.shell import RECORDER, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Sample
+from team.wire.codec import WireError, decoded
 
 GAP_PATIENCE_S = 0.5
 """A reading that is missing for so long is asked for at its source."""
@@ -53,13 +56,30 @@ class RobotShell:
         for channel in self.node.overhears:
             self._bus.subscribe(channel)
         self._bus.watch_alive("central")
+        self._bus.watch_alive(RECORDER)
         self._shell.answer(ch.SENT, name, lambda request: self.node.answer_submaps(request))
         self._shell.look_for_the_end()
         if not self.node.finished and self._resume():
             self._catch_up()
         self._shell.run(self._mend)
         _LOG.info("%d submaps from %d readings", self.node.submaps, self.node.next_reading)
+        self._await_recorder()
         self._shell.end(self.node.final)
+
+    def _await_recorder(self) -> None:
+        """Stay until who records has every submap: it can ask nobody else for them."""
+        recorded: dict[int, int] = {}
+
+        def take(samples: Sequence[Sample]) -> None:
+            for sample in samples:
+                if sample.key == ch.RECORDER_PROGRESS.key(self.node.robot):
+                    with suppress(WireError):
+                        said = decoded(sample.payload, m.Progress)
+                        recorded[said.epoch] = max(recorded.get(said.epoch, 0), said.submaps)
+
+        self._bus.subscribe(ch.RECORDER_PROGRESS, self.node.robot)
+        own = self.node.epoch, self.node.submaps
+        self._shell.wait_for_recorder(lambda: recorded.get(own[0], 0) < own[1], take)
 
     def _be_the_only_one(self) -> None:
         """Return when no other process is this robot."""

@@ -75,6 +75,20 @@ def test_a_new_epoch_counts_from_zero(path: Path) -> None:
     ]
 
 
+def test_a_submap_is_told_at_once_so_that_its_robot_does_not_leave_before(path: Path) -> None:
+    network = MemoryNetwork()
+    robot, bus = MemoryBus(network), MemoryBus(network)
+    robot.subscribe(c.RECORDER_PROGRESS)
+    with Recorder(path, "t", {}) as recorder:
+        loop = RecordLoop(bus, recorder, ())
+        for sequence in (0, 1):
+            robot.publish(Outgoing(c.SUBMAP, "alpha", submap(sequence, "alpha")))
+            loop.take(bus.receive())
+            (told,) = messages_of(robot.receive(), c.RECORDER_PROGRESS)
+            assert isinstance(told, m.Progress)
+            assert (told.readings, told.submaps) == (0, sequence + 1)
+
+
 def test_unsound_payloads_are_recorded_as_they_came(path: Path) -> None:
     network = MemoryNetwork()
     world, bus = MemoryBus(network), MemoryBus(network)
