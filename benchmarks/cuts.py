@@ -28,8 +28,8 @@ from pathlib import Path
 from kills import PROGRAM, final_in, lacking
 
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load
+from sim.scenarios.source import streams_of
 from team.wire.channels import FINAL_MAP
 
 NET = "10.213.77"

@@ -34,8 +34,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from kills import PROGRAM, children, final_in
 
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load
+from sim.scenarios.source import streams_of
 from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
 from team.keys.roster import nodes_of

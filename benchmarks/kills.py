@@ -23,8 +23,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load
+from sim.scenarios.source import streams_of
 from team.recording.reader import LogError, open_log
 from team.wire import messages as m
 from team.wire.bus import opened

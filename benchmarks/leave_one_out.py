@@ -15,9 +15,9 @@ import msgspec
 from sim.calibration.calibrate import calibrated
 from sim.calibration.scenario import scenario_toml
 from sim.calibration.source import readings_of
-from sim.experiments.accuracy_utias import set_figures
-from sim.experiments.team_runs import Figures, team_run
-from sim.scenario.scenario import load
+from sim.scenarios.scenario import load
+from sim.studies.experiments.accuracy_utias import set_figures
+from sim.studies.experiments.team_runs import Figures, team_run
 
 SHOWN = ("aligned", "shape_nees", "coverage", "raw", "nees", "trajectory_raw")
 

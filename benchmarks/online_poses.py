@@ -18,10 +18,10 @@ from typing import Any
 
 from scipy.stats import chi2
 
-from sim.evaluation.evaluation import evaluate
+from central.desk.evaluation.evaluation import evaluate
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import load, with_options
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
 from team.config import Exchange, RobotConfig
 from team.robot.node import RobotNode
 from team.wire import channels as ch

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.scenario.scenario import dumps, load, with_options
+from sim.scenarios.scenario import dumps, load, with_options
 from team.recording.check import checked
 from team.recording.reader import open_log
 from team.wire import channels as ch

@@ -16,7 +16,7 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from sim.rerun.verification import verify
+from central.desk.verification.verification import verify
 from team.recording.reader import open_log
 
 LEAST = 20.0

@@ -26,8 +26,8 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from sim.scenario.scenario import dumps, load, with_options
-from sim.world.worlds import SimulatedWorld
+from sim.scenarios.scenario import dumps, load, with_options
+from sim.world.config import SimulatedWorld
 
 EVERY_S = 5.0
 """Wall time between two looks."""

@@ -26,8 +26,8 @@ import scipy
 from threadpoolctl import threadpool_info
 
 from sim.in_memory.team import final_map, run_team
-from sim.scenario.scenario import Scenario, load, with_options
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.source import streams_of
 from team.pairs import PAIRS
 from team.wire import messages as m
 from team.wire.bus import Sample, opened

@@ -10,6 +10,7 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.node import CentralNode
+from sim.publisher.node import WorldNode, expected_nodes
 from sim.world.streams import (
     Detections,
     Intervals,
@@ -18,7 +19,6 @@ from sim.world.streams import (
     WorldStreams,
     robot_stream,
 )
-from sim.world_node.node import WorldNode, expected_nodes
 from team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.pairs import NEEDS_MAP
 from team.robot.node import RobotNode

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from central.desk.evaluation.evaluation import evaluate
+from central.desk.verification.verification import verify
 from central.join_rule import JoinRule
 from central.main import CentralShell
 from central.node import CentralNode
-from sim.evaluation.evaluation import evaluate
 from sim.in_memory.team import final_map
-from sim.rerun.verification import verify
 from team.containment import Boundary
 from team.recording.recorder import Recorder
 from team.recording.shell import RecordLoop

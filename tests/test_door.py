@@ -5,7 +5,7 @@ import pytest
 
 from central.config import CentralConfig
 from central.node import CentralNode
-from sim.world_node.node import WorldNode
+from sim.publisher.node import WorldNode
 from team import translate
 from team.config import RobotConfig
 from team.containment import Boundary, Handler

@@ -14,15 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import sim.world_node.node
+import sim.publisher.node
 import team.robot.pace
 from central.config import CentralConfig
 from central.node import CentralNode
 from sim.datasets.utias_writer import write_utias
 from sim.in_memory.team import final_map, run_team
-from sim.scenario.scenario import load, with_options
-from sim.scenario.source import streams_of
-from sim.world_node.node import WorldNode
+from sim.publisher.node import WorldNode
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
 from team import translate
 from team.pairs import PAIRS
 from team.robot.node import RobotNode
@@ -45,8 +45,8 @@ def team_of(streams, rng, **options):
 @pytest.fixture
 def scarce(monkeypatch):
     """Little credit and small portions, so that everybody waits for somebody."""
-    monkeypatch.setattr(sim.world_node.node, "CREDIT_READINGS", 16)
-    monkeypatch.setattr(sim.world_node.node, "BATCH", 5)
+    monkeypatch.setattr(sim.publisher.node, "CREDIT_READINGS", 16)
+    monkeypatch.setattr(sim.publisher.node, "BATCH", 5)
     monkeypatch.setattr(team.robot.pace, "PROGRESS_READINGS", 4)
     monkeypatch.setattr(team.robot.pace, "CREDIT_SUBMAPS", 1)
 
@@ -313,7 +313,7 @@ def reached_from(module: str) -> set[str]:
     return seen
 
 
-@pytest.mark.parametrize("module", ["team.robot.node", "central.node", "sim.world_node.node"])
+@pytest.mark.parametrize("module", ["team.robot.node", "central.node", "sim.publisher.node"])
 def test_a_node_reaches_no_clock_no_socket_and_no_file(module):
     reached = reached_from(module)
     assert "team.wire.messages" in reached

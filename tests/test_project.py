@@ -132,7 +132,9 @@ def test_the_wheel_holds_the_three_packages_their_scenarios_and_nothing_else(
     }
     assert shipped == expected
     assert {f"{package}/py.typed" for package in PACKAGES} <= shipped
-    assert {f"sim/scenarios/{n}.toml" for n in ("thesis", "thesis-b", "waypoints")} <= shipped
+    assert {
+        f"sim/scenarios/builtin/{n}.toml" for n in ("thesis", "thesis-b", "waypoints")
+    } <= shipped
 
 
 def test_the_wheel_installs_the_command_and_carries_the_licence(wheel: zipfile.ZipFile) -> None:

@@ -6,10 +6,10 @@ import msgspec
 import pytest
 
 from central.config import CentralConfig
-from sim.rerun.ledger import ledger
-from sim.rerun.log import recorded
-from sim.rerun.verification import verify
-from sim.scenario.source import streams_of
+from central.desk.ledger import ledger
+from central.desk.verification.recorded import recorded
+from central.desk.verification.verification import verify
+from sim.scenarios.source import streams_of
 from team.robot.node import IN_SIGHTING, RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m

@@ -20,14 +20,14 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.calibration import motion as motion
 from sim.calibration import sensor as sensor
 from sim.calibration.consistency import covariance_factor
 from sim.calibration.data import Reference, references, true_paths
 from sim.calibration.figures import CalibrationError, Figure, jackknifed
 from sim.calibration.join import JoinedTeam, config_of, joined_team
-from sim.evaluation.errors import TRUTH_GAP_NS, Path
-from sim.scenario.scenario import Scenario
+from sim.scenarios.scenario import Scenario
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.map_joining.joining import Fold

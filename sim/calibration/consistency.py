@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from central.config import CentralConfig
+from central.desk.evaluation.errors import map_errors, moved, rigid_alignment
 from central.tick_fold import join_settings
 from sim.calibration.figures import Figure
-from sim.evaluation.errors import map_errors, moved, rigid_alignment
 from team.estimation.contribution import Start, Stream
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled

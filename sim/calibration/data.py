@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from sim.evaluation.errors import Path, on_circle
+from central.desk.evaluation.errors import Path, on_circle
 from sim.world.streams import Detections, Intervals, RobotStream, WorldStreams
 
 LARGEST_TURN_RAD = 0.35

@@ -7,9 +7,9 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
+from central.desk.evaluation.errors import Path, on_circle
 from central.tick_fold import join_settings
-from sim.evaluation.errors import Path, on_circle
-from sim.scenario.scenario import Scenario
+from sim.scenarios.scenario import Scenario
 from sim.world.streams import (
     OBSERVATIONS,
     ODOMETRY,

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
+from central.desk.evaluation.errors import on_circle
 from sim.calibration.data import Reference, poses_at, sinc
 from sim.calibration.figures import CalibrationError, huber
-from sim.evaluation.errors import on_circle
 
 SPAN_S = 10.0
 """Errors are taken over so long: those of one command are correlated for seconds."""

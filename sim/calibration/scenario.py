@@ -7,7 +7,7 @@ import msgspec
 from central.config import CentralConfig
 from sim.calibration.calibrate import Calibration, nested
 from sim.calibration.figures import Figure
-from sim.scenario.scenario import Scenario, builtin_names
+from sim.scenarios.scenario import Scenario, builtin_names
 from team.config import MotionModel, Sensor
 
 

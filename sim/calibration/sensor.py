@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.optimize import least_squares, minimize
 
+from central.desk.evaluation.errors import on_circle
 from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import CalibrationError, huber
-from sim.evaluation.errors import on_circle
 
 LEAST_READINGS = 100
 ROUNDS = 4

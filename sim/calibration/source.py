@@ -8,8 +8,8 @@ import numpy as np
 
 from sim.datasets.tables import opened as opened_set
 from sim.datasets.utias_log import present_robots
-from sim.scenario.scenario import Scenario, ScenarioError, load, loads, with_options
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import Scenario, ScenarioError, load, loads, with_options
+from sim.scenarios.source import streams_of
 from sim.world.streams import (
     Detections,
     Intervals,

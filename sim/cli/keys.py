@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from sim.cli.options import WRONG_USE, Robots, fail, scenario_of
-from sim.scenario.scenario import with_options
+from sim.scenarios.scenario import with_options
 
 app = typer.Typer()
 

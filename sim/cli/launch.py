@@ -30,7 +30,7 @@ from sim.cli.options import (
     scenario_of,
 )
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
-from sim.scenario.scenario import Scenario, doubts, with_options
+from sim.scenarios.scenario import Scenario, doubts, with_options
 
 if TYPE_CHECKING:
     from sim.launch.launch import Outcome
@@ -94,7 +94,7 @@ def launch(
 
     Every robot, the world, the central computer, the recorder and the router are processes.
     """
-    from sim.scenario.source import with_present_robots
+    from sim.scenarios.source import with_present_robots
 
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
@@ -152,13 +152,13 @@ def scenarios(
     ] = None,
 ) -> None:
     """List the built-in scenarios, or show one."""
-    from sim.scenario.scenario import builtin_names, load
+    from sim.scenarios.scenario import builtin_names, load
 
     if show is not None:
         if show not in builtin_names():
             known = ", ".join(builtin_names())
             fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
-        text = files("sim.scenarios").joinpath(f"{show}.toml").read_text("utf-8")
+        text = files("sim.scenarios.builtin").joinpath(f"{show}.toml").read_text("utf-8")
         typer.echo(text, nl=False)
         return
     for name in builtin_names():
@@ -178,8 +178,8 @@ def _keep_showing(url: str, log: Path) -> None:
 
 def _check_world(scenario: Scenario) -> None:
     """A data set that can not be read is found before any process starts."""
-    from sim.scenario.source import streams_of
-    from sim.world.worlds import UtiasWorld
+    from sim.scenarios.source import streams_of
+    from sim.world.config import UtiasWorld
 
     if isinstance(scenario.world, UtiasWorld):
         streams_of(scenario)
@@ -239,11 +239,11 @@ def _conclude(
     """Evaluate the log, print the result, write the report; end with 1 if anything failed."""
     from rich.console import Console
 
-    from sim.evaluation.evaluation import evaluate, to_json, with_holes
-    from sim.evaluation.history import history
-    from sim.report.page import write_report
-    from sim.report.run import Run, nis_line, run_figures
-    from sim.report.tables import summary_tables
+    from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
+    from central.desk.evaluation.history import history
+    from central.desk.report.page import write_report
+    from central.desk.report.run import Run, nis_line, run_figures
+    from central.desk.report.tables import summary_tables
     from team.recording.reader import LogError, open_log
 
     console = Console()

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.logs import repair
 from sim.cli.options import FAILED, WRONG_USE, counted, fail, refuse_existing
+from sim.cli.recorded import repair
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -161,7 +161,7 @@ def export(
     channels: ChannelNames = None,
 ) -> None:
     """Write a log as tables, its paths for evo, or its readings and truth as a UTIAS data set."""
-    from sim.export.log import export_tum, export_utias
+    from sim.recorded.utias_set import export_tum, export_utias
     from team.recording.reader import open_log
 
     opened = open_log(log)

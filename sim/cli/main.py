@@ -10,15 +10,15 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
 from sim.cli.calibrate import app as calibrate_commands  # noqa: E402
-from sim.cli.experiment import app as experiment_commands  # noqa: E402
 from sim.cli.keys import app as key_commands  # noqa: E402
 from sim.cli.launch import app as launch_commands  # noqa: E402
 from sim.cli.log import app as log_tools  # noqa: E402
-from sim.cli.logs import app as log_commands  # noqa: E402
 from sim.cli.nodes import app as node_commands  # noqa: E402
 from sim.cli.options import FAILED, WRONG_USE  # noqa: E402
+from sim.cli.recorded import app as log_commands  # noqa: E402
 from sim.cli.rerun import app as rerun_commands  # noqa: E402
 from sim.cli.view import app as view_commands  # noqa: E402
+from sim.studies.experiment_command import app as experiment_commands  # noqa: E402
 
 app = typer.Typer(
     help="Multi-robot SLAM as real processes over Zenoh.",
@@ -64,7 +64,7 @@ def _told(error: Exception) -> tuple[int, str] | None:
     What may be raised is imported when it has been: a router needs no SciPy.
     """
     from sim.datasets.tables import DatasetError
-    from sim.scenario.checks import ScenarioError
+    from sim.scenarios.checks import ScenarioError
     from team.keys.roster import KeysError
     from team.recording.reader import LogError
     from team.recording.recorder import RecorderError

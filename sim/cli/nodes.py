@@ -30,7 +30,7 @@ from sim.cli.options import (
     refuse_open_door,
     scenario_of,
 )
-from sim.scenario.scenario import Scenario, doubts, with_options
+from sim.scenarios.scenario import Scenario, doubts, with_options
 from team.wire.arrays import ids
 
 _LOG = logging.getLogger("teamslam")
@@ -84,8 +84,8 @@ def world(
     dataset: Dataset = None,
 ) -> None:
     """The world: a simulator or a data set that publishes every robot's readings."""
-    from sim.scenario.source import streams_of
-    from sim.world_node.main import run_world
+    from sim.publisher.main import run_world
+    from sim.scenarios.source import streams_of
     from team.shell import process
 
     pace = parsed_speed(speed)
@@ -185,7 +185,7 @@ def record(
     Started again while the team still runs it goes on in a further part, and asks for what it has
     missed; at the end the parts are joined.
     """
-    from sim.scenario.scenario import dumps
+    from sim.scenarios.scenario import dumps
     from team.recording.parts import check_continues, join, next_part
     from team.recording.provenance import provenance
     from team.recording.reader import LogError

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
 import typer
 
-from sim.scenario.checks import ScenarioError
-from sim.scenario.scenario import Scenario, load, loads
+from sim.scenarios.checks import ScenarioError
+from sim.scenarios.scenario import Scenario, load, loads
 from team.config import Estimator, FusionRule
 
 if TYPE_CHECKING:

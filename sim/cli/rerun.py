@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sim.cli.options import FAILED, WRONG_USE, EstimatorOption, FusionOption, fail
-from sim.rerun.changes import Changes
+from sim.recorded.changes import Changes
 
 if TYPE_CHECKING:
-    from sim.rerun.verification import Verification
+    from central.desk.verification.verification import Verification
 
 app = typer.Typer()
 
@@ -127,7 +127,7 @@ def _partition(text: str) -> tuple[tuple[str, ...], tuple[float, float]]:
 
 
 def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
-    from sim.rerun.noise import KINDS
+    from sim.recorded.noise import KINDS
 
     factors: dict[str, float] = {}
     for text in asked:
@@ -152,15 +152,15 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from rich.table import Table
     from rich.text import Text
 
-    from sim.evaluation.evaluation import evaluate, to_json
-    from sim.rerun.changed_run import changed_run
-    from sim.rerun.comparison import (
+    from central.desk.evaluation.evaluation import evaluate, to_json
+    from central.desk.side_by_side import (
         comparison_picture,
         comparison_rows,
         largest_move_m,
         same_final_map,
     )
-    from sim.rerun.log import RerunError
+    from central.desk.verification.recorded import RerunError
+    from sim.recorded.changed_run import changed_run
     from team.recording.reader import open_log
 
     log = open_log(path)
@@ -197,8 +197,8 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
 
 
 def _verify(path: Path, json_file: Path | None) -> None:
-    from sim.rerun.log import RerunError
-    from sim.rerun.verification import verify
+    from central.desk.verification.recorded import RerunError
+    from central.desk.verification.verification import verify
     from team.recording.reader import open_log
 
     log = open_log(path)
@@ -234,7 +234,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
         if row.first is not None:
             console.print(f"{row.channel}: {row.first}", highlight=False, markup=False)
     if result.other_platform:
-        from sim.rerun.compare import RELATIVE
+        from central.desk.verification.differences import RELATIVE
 
         differing = ", ".join(result.other_platform)
         note = f"another platform ({differing}): numbers compared within {RELATIVE:g}, not bits"
@@ -259,8 +259,8 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from sim.rerun.ledger import ledger
-    from sim.rerun.log import RerunError, recorded
+    from central.desk.ledger import ledger
+    from central.desk.verification.recorded import RerunError, recorded
     from team.recording.reader import open_log
 
     try:

@@ -23,7 +23,7 @@ from sim.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from sim.view.session import Shown
+    from central.desk.view.session import Shown
     from team.recording.reader import Log
 
 _LOG = logging.getLogger("teamslam")
@@ -46,7 +46,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
 
     The recorder stores it beside the team's own messages. Ends after the final map.
     """
-    from sim.view.viewer import run_viewer
+    from central.desk.view.viewer import run_viewer
     from team.shell import process
 
     resolved = scenario_of(scenario)
@@ -108,7 +108,7 @@ def shown_on_page(
     log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
 ) -> Iterator["Shown"]:
     """Serve a log, say where, and open the page if that is wished or natural."""
-    from sim.view.session import session
+    from central.desk.view.session import session
 
     with session(log, host, port, foxglove_port, growing=growing) as shown:
         typer.echo(f"page      {shown.url}")
@@ -127,8 +127,8 @@ def _has_display() -> bool:
 
 
 def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
-    from sim.view.export import export_views
-    from sim.view.layout import layout as layout_of
+    from central.desk.view.export import export_views
+    from central.desk.view.layout import layout as layout_of
     from team.wire.channels import ROBOT_CONFIG
 
     for path in (export, layout):

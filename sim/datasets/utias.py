@@ -16,8 +16,8 @@ from sim.datasets.errata import erratum_of
 from sim.datasets.tables import EXPECTED, DatasetError, File, opened, optional_table, table
 from sim.datasets.utias_log import Log, log_of, present_robots
 from sim.datasets.utias_rows import start_pose
+from sim.world.config import UtiasWorld, starts_unknown
 from sim.world.streams import RobotStream, StartPose, WorldStreams, grouped, robot_stream
-from sim.world.worlds import UtiasWorld, starts_unknown
 from team.config import RobotConfig
 
 ROBOTS = 5

@@ -7,10 +7,10 @@ from typing import Protocol, runtime_checkable
 from central.config import CentralConfig
 from central.node import CentralNode
 from sim.in_memory.links import Conditions, Link
-from sim.scenario.scenario import Scenario
-from sim.scenario.source import tells_map
+from sim.publisher.node import WorldNode, expected_nodes
+from sim.scenarios.scenario import Scenario
+from sim.scenarios.source import tells_map
 from sim.world.streams import WorldStreams
-from sim.world_node.node import WorldNode, expected_nodes
 from team import translate
 from team.config import Exchange, RobotConfig
 from team.containment import Boundary

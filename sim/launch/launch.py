@@ -10,7 +10,7 @@ from pathlib import Path
 from sim.launch.supervision import failure, supervise
 from sim.launch.supervisor import Ended, Supervised, end_all
 from sim.launch.watch import Watch
-from sim.scenario.scenario import Scenario, dumps
+from sim.scenarios.scenario import Scenario, dumps
 from team.keys.credentials import credentials_of
 from team.wire import channels as ch
 from team.wire.bus import BusError

@@ -12,7 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from sim.evaluation.events import without_figures
+from central.desk.evaluation.events import without_figures
 from sim.launch.truth import LiveErrors
 from sim.launch.watch import Watch
 from team.wire import messages as m

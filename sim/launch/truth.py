@@ -1,6 +1,6 @@
 """How honest a team is while it runs: its poses and its map against the truth, as they come.
 
-An evaluation like `sim.evaluation` of what has arrived so far; without a truth it stays empty.
+An evaluation like `central.desk.evaluation` of what has arrived so far; without a truth it stays empty.
 """
 
 from collections import deque
@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.evaluation.errors import BAND, Path, interpolated
+from central.desk.evaluation.errors import BAND, Path, interpolated
 from team import translate
 from team.estimation.consistency import chi2_quantile, state_error
 from team.wire import channels as ch

@@ -3,9 +3,9 @@
 import msgspec
 
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import load, with_options
-from sim.scenario.source import streams_of
-from sim.world.worlds import SimulatedWorld
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from sim.world.config import SimulatedWorld
 
 _STEPS = 48
 """So many seconds that robots take maps with submaps of theirs that are not in them."""

@@ -1,1 +1,1 @@
-"""The built-in scenarios: one TOML file each."""
+"""Scenarios: what a user writes, what processes hand on, and the streams that come of it."""

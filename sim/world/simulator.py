@@ -13,8 +13,9 @@ from math import atan2, hypot
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sim.world.garbage import spoilt
+from sim.world.config import SimulatedWorld, starts_unknown
 from sim.world.odometry import slip, told
+from sim.world.outliers import spoilt
 from sim.world.paths import Drive, Limits, Pose, Step, driven, followed
 from sim.world.sensing import Visible, persistent, readings, visible
 from sim.world.streams import (
@@ -26,7 +27,6 @@ from sim.world.streams import (
     grouped,
     robot_stream,
 )
-from sim.world.worlds import SimulatedWorld, starts_unknown
 from team.config import RobotConfig, Sensor
 
 

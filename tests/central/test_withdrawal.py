@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from central.config import CentralConfig
+from central.desk.ledger import ledger
+from central.desk.verification.recorded import recorded
+from central.desk.verification.verification import verify
 from central.join_rule import JoinRule
 from central.tick_fold import TickFold
 from central.withdrawal import convicted, disagreement
 from sim.in_memory.team import final_map, run_team
-from sim.rerun.ledger import ledger
-from sim.rerun.log import recorded
-from sim.rerun.verification import verify
-from sim.scenario.scenario import Scenario, with_options
+from sim.scenarios.scenario import Scenario, with_options
+from sim.world.config import GarbageKind, SimulatedWorld
 from sim.world.simulator import simulated
-from sim.world.worlds import GarbageKind, SimulatedWorld
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.map_joining.joining import converged

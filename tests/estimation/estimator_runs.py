@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.scenario import scenario
+from sim.scenarios import scenario
 from sim.world.simulator import simulated
 from team.estimation.models import Increment, corrected, increment_of
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.scenario.scenario import load, with_options
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig
 from team.estimation.consistency import chi2_interval, nees

@@ -5,9 +5,9 @@ import random
 import msgspec
 import pytest
 
+from central.desk.verification.verification import verify
 from sim.in_memory.team import final_map, run_team
-from sim.rerun.verification import verify
-from sim.scenario.scenario import Scenario, ScenarioError, dumps, loads
+from sim.scenarios.scenario import Scenario, ScenarioError, dumps, loads
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m

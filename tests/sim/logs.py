@@ -6,11 +6,11 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from sim.scenario.scenario import Scenario, with_options
+from sim.publisher.node import WorldNode
+from sim.scenarios.scenario import Scenario, with_options
+from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
-from sim.world.worlds import SimulatedWorld
-from sim.world_node.node import WorldNode
 from team import translate
 from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from team.wire import channels as ch

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import Scenario, load, with_options
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.source import streams_of
 from team.recording.provenance import provenance
 from team.recording.reader import Log, open_log
 from team.recording.recorder import Recorder

@@ -4,8 +4,8 @@ import hashlib
 from pathlib import Path
 
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import load, with_options
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
 from team.wire.channels import FINAL_MAP
 
 STEPS = 60

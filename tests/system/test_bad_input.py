@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from sim.datasets.utias_writer import write_utias
-from sim.scenario.scenario import load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load
+from sim.scenarios.source import streams_of
 from team.recording.reader import open_log
 from tests.support import ROOT
 from tests.system.conftest import Launched

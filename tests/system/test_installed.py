@@ -6,7 +6,7 @@ import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
 
-from sim.scenario.scenario import builtin_names
+from sim.scenarios.scenario import builtin_names
 from team.recording.reader import open_log
 from tests.support import ROOT
 from tests.system.processes import Processes

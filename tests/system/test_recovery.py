@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.scenario.scenario import load
+from sim.scenarios.scenario import load
 from team.recording.reader import open_log
 from team.wire import channels as ch
 from team.wire import messages as m

@@ -8,8 +8,8 @@ from central.baselines import batch_rule
 from central.baselines.batch_rule import taken_as_white
 from central.config import CentralConfig
 from central.node import CentralNode
-from sim.limit.limit import batch_map
-from sim.scenario.scenario import load, with_options
+from sim.scenarios.scenario import load, with_options
+from sim.studies.batch_reference.reference import batch_map
 from team import translate
 from team.config import FrontEnd, RobotConfig, Sensor
 from team.wire import channels as ch

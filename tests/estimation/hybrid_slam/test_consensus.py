@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg.lapack import dpotrf
 
-from sim.scenario.scenario import load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load
+from sim.scenarios.source import streams_of
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.geometry import compose

@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.evaluation.evaluation import evaluate
+from central.desk.evaluation.evaluation import evaluate
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import Scenario, load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import Scenario, load
+from sim.scenarios.source import streams_of
 from sim.world.streams import RobotStream
 from team.config import RobotConfig
 from team.robot.node import RobotNode

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
-from sim.world.worlds import SimulatedWorld
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation import geometry

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.evaluation.errors import Path, pose_errors
+from central.desk.evaluation.errors import Path, pose_errors
 from team.estimation.contribution import Contribution, Start
 from team.estimation.map_joining import nonlinearity as bends
 from team.estimation.map_joining.gauss_newton import JoinSettings, held, joint_marginal

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from central.desk.evaluation.errors import Path, on_circle
 from sim.calibration import join
 from sim.calibration.calibrate import Calibration, calibrated, with_figures
 from sim.calibration.data import Reference, poses_at
@@ -23,8 +24,8 @@ from sim.calibration.sensor import fit_sensor
 from sim.calibration.source import world_of
 from sim.cli.main import app
 from sim.datasets.utias_writer import write_utias
-from sim.evaluation.errors import Path, on_circle
-from sim.scenario.scenario import Scenario, load, with_options
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.world.config import SimulatedWorld
 from sim.world.streams import (
     Detections,
     Intervals,
@@ -33,7 +34,6 @@ from sim.world.streams import (
     grouped,
     robot_stream,
 )
-from sim.world.worlds import SimulatedWorld
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.robot.member import Driven, HybridMember
 from team.wire.bus import opened

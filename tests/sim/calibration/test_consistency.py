@@ -11,7 +11,7 @@ from central.tick_fold import join_settings
 from sim.calibration.calibrate import Calibration
 from sim.calibration.consistency import covariance_factor, disagreements
 from sim.calibration.scenario import scenario_toml
-from sim.scenario.scenario import load
+from sim.scenarios.scenario import load
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from central.desk.evaluation.evaluation import MapResult, evaluate
 from central.monitor import miscalibrations
-from sim.evaluation.evaluation import MapResult, evaluate
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import Scenario, with_options
+from sim.scenarios.scenario import Scenario, with_options
+from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
-from sim.world.worlds import SimulatedWorld
 from team.config import Bias, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.map_joining.marginals import BiasEstimate
 

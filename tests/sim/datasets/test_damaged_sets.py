@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from central.desk.evaluation.evaluation import Evaluation, evaluate
 from sim.datasets.utias_writer import write_utias
-from sim.evaluation.evaluation import Evaluation, evaluate
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import Scenario, dumps, load, loads, with_options
-from sim.scenario.source import streams_of, with_present_robots
+from sim.scenarios.scenario import Scenario, dumps, load, loads, with_options
+from sim.scenarios.source import streams_of, with_present_robots
+from sim.world.config import SimulatedWorld, UtiasWorld
 from sim.world.streams import WorldStreams
-from sim.world.worlds import SimulatedWorld, UtiasWorld
 
 STEPS = 25
 

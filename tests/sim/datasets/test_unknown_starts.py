@@ -5,13 +5,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from sim.evaluation.evaluation import evaluate
-from sim.experiments.accuracy_starts import WRONG_CHI2, unknown_starts
-from sim.experiments.team_runs import Figures, team_figures
+from central.desk.evaluation.evaluation import evaluate
 from sim.in_memory.team import run_team
-from sim.scenario.scenario import Scenario, load, with_options
-from sim.scenario.source import streams_of
-from sim.world.worlds import UtiasWorld
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.source import streams_of
+from sim.studies.experiments.accuracy_starts import WRONG_CHI2, unknown_starts
+from sim.studies.experiments.team_runs import Figures, team_figures
+from sim.world.config import UtiasWorld
 
 SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
 

@@ -16,11 +16,11 @@ from sim.datasets.tables import DatasetError
 from sim.datasets.utias import utias
 from sim.datasets.utias_rows import start_pose
 from sim.datasets.utias_writer import landmark_shift, write_utias
-from sim.scenario.scenario import load, with_options
-from sim.scenario.source import streams_of
+from sim.publisher.node import WorldNode
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from sim.world.config import UtiasWorld
 from sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
-from sim.world.worlds import UtiasWorld
-from sim.world_node.node import WorldNode
 from team.config import RobotConfig
 from team.wire import messages as m
 

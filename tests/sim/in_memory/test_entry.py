@@ -42,8 +42,8 @@ import threadpoolctl
 [numpys] = {pool["num_threads"] for pool in threadpoolctl.threadpool_info()}
 
 from sim.in_memory.team import final_map, run_team
-from sim.scenario.scenario import load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load
+from sim.scenarios.source import streams_of
 from team.wire import channels as ch
 
 team = load(sys.argv[1])

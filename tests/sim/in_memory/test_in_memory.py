@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from sim.in_memory.team import final_map, run_team
-from sim.scenario.scenario import load, with_options
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
 from team import translate
 from team.pairs import PAIRS
 from team.wire import channels as ch

@@ -7,12 +7,12 @@ from scipy.stats import chi2
 
 from central.baselines.team_keyframes import TeamEpochs
 from sim.in_memory.team import final_map, run_team
-from sim.scenario.scenario import Scenario, load
-from sim.scenario.source import streams_of
+from sim.scenarios.scenario import Scenario, load
+from sim.scenarios.source import streams_of
+from sim.world.config import SimulatedWorld
 from sim.world.odometry import told
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
-from sim.world.worlds import SimulatedWorld
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.geometry import compose, inverse, logarithm
 from team.estimation.models import increment_of

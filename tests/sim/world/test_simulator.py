@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, kstest
 
-from sim.scenario.scenario import Scenario, load, with_options
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.world.config import SimulatedWorld
 from sim.world.paths import Limits, driven, followed, moved, wrapped
 from sim.world.simulator import simulated
 from sim.world.streams import (
@@ -20,7 +21,6 @@ from sim.world.streams import (
     WorldStreams,
     grouped,
 )
-from sim.world.worlds import SimulatedWorld
 from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 
 angles = st.floats(-np.pi, np.pi)

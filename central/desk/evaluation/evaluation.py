@@ -1,0 +1,411 @@
+"""What a run was worth: every figure from the samples of its log alone, against the truth in it.
+
+A figure that can not be computed (no truth, no such message) is None. Errors are in metres and
+radians; NEES is per degree of freedom, 1 where the covariance is right.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt32
+
+from central.desk.evaluation.errors import (
+    MapErrors,
+    Path,
+    PoseErrors,
+    distance_rmse,
+    interpolated,
+    map_errors,
+    moved,
+    pose_errors,
+    rigid_alignment,
+)
+from central.desk.evaluation.log import Collected, Traffic, collected
+from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
+from sim.scenarios.checks import ScenarioError
+from sim.scenarios.scenario import Scenario, loads
+from team import translate
+from team.estimation.gaussian import Matrix
+from team.pairs import PAIRS
+from team.recording.check import holes
+from team.recording.reader import Log
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+
+UPLINK = {
+    "submap": (ch.SUBMAP, ch.SIGHTING_FACTOR),
+    "own/map": (ch.OWN_MAP,),
+    "readings": ch.SENSORS,
+}
+"""The channels of each name in `PAIRS`."""
+
+
+@dataclass(frozen=True)
+class MapResult:
+    """The final map: L landmarks by id, their joint covariance (blocks only unless `joint`).
+
+    truth: the true positions, rows without truth zero; known: which rows have it. errors: of those.
+    payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
+    covariance_scale: how many times the submaps' covariances ought to be taken; None: not known.
+    withdrawn: the robots that the map goes without. lost: those that are not wholly in it.
+    """
+
+    rule: str
+    digest: str
+    payload_sha256: str
+    frame: str
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Matrix
+    joint: bool
+    truth: Float[np.ndarray, "L 2"]
+    known: Bool[np.ndarray, " L"]
+    errors: MapErrors | None
+    cost_per_dof: float | None
+    reasons: tuple[str, ...]
+    joined: tuple[str, ...] = ()
+    withdrawn: tuple[str, ...] = ()
+    covariance_scale: float | None = None
+    lost: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RobotResult:
+    """One robot: its stream, what became of it, and its poses against the truth.
+
+    smoothed: the final map's poses at the ends of the submaps. online: what the robot said when it
+    was there, given the team's map (`online_channel`: "team/pose"), or from its own readings alone
+    where it never had that. aligned_rmse_m: of the smoothed positions after the rigid motion that
+    aligns the map (`alignment`: "map"), or else their own ("trajectory"); online_aligned_rmse_m: of
+    the online ones after the map's. own_map: of the robot's last own map, as it lies.
+    """
+
+    consumption: Consumption
+    uplink_bytes: int | None
+    truth: Path
+    smoothed_path: Path
+    smoothed: PoseErrors | None
+    online_path: Path
+    online: PoseErrors | None
+    online_channel: str | None
+    final_pose_nees_per_dof: float | None
+    aligned_rmse_m: float | None
+    alignment: str | None
+    online_aligned_rmse_m: float | None
+    own_map: MapErrors | None = None
+
+    @property
+    def uplink_bytes_per_step(self) -> float | None:
+        """Bytes on the channel that the rule consumes, per odometry interval."""
+        steps = self.consumption.steps
+        return None if self.uplink_bytes is None or not steps else self.uplink_bytes / steps
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A run: its scenario (None: the log does not say), its map, its robots and its traffic.
+
+    true_landmarks: all of them, seen or not. notes: what the world had to say of its data, and what
+    each node set aside. faults: how many messages were.
+    unsound: samples that are no sound message.
+    """
+
+    scenario: Scenario | None
+    map: MapResult | None
+    robots: Mapping[str, RobotResult]
+    true_landmarks: Float[np.ndarray, "T 2"]
+    channels: Mapping[str, Traffic]
+    notes: tuple[str, ...]
+    unsound: int
+    cost_by_robot: Mapping[str, float]
+    faults: int = 0
+    scale_by_robot: Mapping[str, float] = field(default_factory=dict)
+
+
+def evaluate(samples: Iterable[Sample]) -> Evaluation:
+    """The figures of one run, from its log's samples in the order of the log."""
+    log = collected(samples)
+    scenario = _scenario(log)
+    truth = log.sound(log.last(ch.TRUTH_LANDMARKS))
+    ids, positions = (
+        translate.landmarks_of(truth)
+        if isinstance(truth, m.TruthLandmarks)
+        else (np.empty(0, np.uint32), np.empty((0, 2)))
+    )
+    fused = _map_result(log, ids, positions)
+    uplink = None if scenario is None else UPLINK[PAIRS[scenario.estimator, scenario.fusion]]
+    robots = {
+        robot: _robot_result(
+            robot_log(log, robot),
+            consumption(log, robot),
+            _bytes(log, uplink, robot),
+            fused,
+            _own_map(log, robot, ids, positions),
+        )
+        for robot in log.robots
+    }
+    end = log.sound(log.last(ch.END))
+    faults = log.faults()
+    return Evaluation(
+        scenario,
+        fused,
+        robots,
+        positions,
+        {key: log.traffic[key] for key in sorted(log.traffic)},
+        (*(end.notes if isinstance(end, m.End) else ()), *_lost(fused), *_set_aside(faults)),
+        log.unsound,
+        _by_robot(log, "joint_cost_per_dof."),
+        len(faults),
+        _by_robot(log, "covariance_scale."),
+    )
+
+
+def _lost(fused: MapResult | None) -> list[str]:
+    """Of whom the final map has not all that it was to have."""
+    lost = () if fused is None else fused.lost
+    return [f"the final map is provisional: {robot} lost, and not wholly in it" for robot in lost]
+
+
+def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
+    """What each node set aside, and the first that raised, in words."""
+    by_node: dict[str, list[m.Fault]] = {}
+    for fault in faults:
+        by_node.setdefault(fault.node, []).append(fault)
+    return [
+        f"{node} set {len(found)} messages aside; the first, {found[0].origin}, raised "
+        f"{found[0].error} at {found[0].place}: {found[0].text}"
+        for node, found in sorted(by_node.items())
+    ]
+
+
+def _by_robot(log: Collected, name: str) -> dict[str, float]:
+    """The centre's last word on each robot's figure of this name."""
+    status = log.sound(log.latest.get(ch.STATUS.key("central")))
+    if not isinstance(status, m.Status):
+        return {}
+    return {k.removeprefix(name): v for k, v in status.figures.items() if k.startswith(name)}
+
+
+def with_holes(evaluation: Evaluation, log: Log) -> Evaluation:
+    """The evaluation with a note for everything that its log lacks."""
+    lost = tuple(f"the log is not whole, {finding}" for finding in holes(log))
+    return replace(evaluation, notes=(*evaluation.notes, *lost))
+
+
+def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The figures under the names that machines read; `extra` is laid over them."""
+    scenario, fused = evaluation.scenario, evaluation.map
+    errors = None if fused is None else fused.errors
+    shape = None if errors is None else errors.shape
+    figures = {
+        "scenario": None if scenario is None else scenario.name,
+        "seed": None if scenario is None else scenario.seed,
+        "estimator": None if scenario is None else scenario.estimator,
+        "fusion": None if scenario is None else scenario.fusion,
+        "landmarks": None if fused is None else len(fused.ids),
+        "landmarks_with_truth": None if errors is None else errors.count,
+        "landmark_rmse_m": None if errors is None else errors.rmse_m,
+        "landmark_rmse_aligned_m": None if errors is None else errors.aligned_rmse_m,
+        "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
+        "map_nees_band": None if errors is None else list(errors.band),
+        "map_nees_in_band": None if errors is None else errors.in_band,
+        "shape_nees_per_landmark": None if shape is None else shape.nees_per_landmark,
+        "shape_coverage_95": None if shape is None else shape.coverage,
+        "landmark_coverage_95": None if errors is None else errors.coverage,
+        "map_covariance": None if fused is None else "joint" if fused.joint else "blocks",
+        "joint_cost_per_dof": None if fused is None else fused.cost_per_dof,
+        "joint_cost_per_dof_by_robot": dict(evaluation.cost_by_robot),
+        "covariance_scale": None if fused is None else fused.covariance_scale,
+        "covariance_scale_by_robot": dict(evaluation.scale_by_robot),
+        "final_map_digest": None if fused is None else fused.digest,
+        "final_map_sha256": None if fused is None else fused.payload_sha256,
+        "final_map_frame": None if fused is None else fused.frame,
+        "not_joined": [] if fused is None else list(fused.reasons),
+        "joined": [] if fused is None else list(fused.joined),
+        "withdrawn": [] if fused is None else list(fused.withdrawn),
+        "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},
+        "channels": {
+            key: {"messages": traffic.messages, "bytes": traffic.bytes}
+            for key, traffic in evaluation.channels.items()
+        },
+        "unsound_messages": evaluation.unsound,
+        "notes": list(evaluation.notes),
+        "faults": evaluation.faults,
+    }
+    return figures | dict(extra or {})
+
+
+def _robot_json(robot: RobotResult) -> dict[str, Any]:
+    used, smoothed, online = robot.consumption, robot.smoothed, robot.online
+    own = robot.own_map
+    return {
+        "steps": used.steps,
+        "readings_published": used.published,
+        "readings_consumed": used.consumed,
+        "readings_used_once": used.each_once,
+        "ledger": dict(used.ledger),
+        "submaps": used.submaps,
+        "position_rmse_m": None if smoothed is None else smoothed.position_rmse_m,
+        "heading_rmse_rad": None if smoothed is None else smoothed.heading_rmse_rad,
+        "pose_nees_per_dof": None if smoothed is None else smoothed.nees_per_dof,
+        "pose_coverage_95": None if smoothed is None else smoothed.coverage,
+        "final_pose_nees_per_dof": robot.final_pose_nees_per_dof,
+        "position_rmse_aligned_m": robot.aligned_rmse_m,
+        "aligned_by": robot.alignment,
+        "online_position_rmse_m": None if online is None else online.position_rmse_m,
+        "online_heading_rmse_rad": None if online is None else online.heading_rmse_rad,
+        "online_pose_nees_per_dof": None if online is None else online.nees_per_dof,
+        "online_pose_coverage_95": None if online is None else online.coverage,
+        "online_position_rmse_aligned_m": robot.online_aligned_rmse_m,
+        "online_channel": robot.online_channel,
+        "own_map_landmarks": None if own is None else own.count,
+        "own_map_rmse_m": None if own is None else own.rmse_m,
+        "own_map_rmse_aligned_m": None if own is None else own.aligned_rmse_m,
+        "own_map_nees_per_dof": None if own is None else own.nees_per_dof,
+        "own_map_nees_in_band": None if own is None else own.in_band,
+        "uplink_bytes": robot.uplink_bytes,
+        "uplink_bytes_per_step": robot.uplink_bytes_per_step,
+    }
+
+
+def _scenario(log: Collected) -> Scenario | None:
+    message = log.sound(log.last(ch.WORLD_CONFIG))
+    if not isinstance(message, m.Configured):
+        return None
+    try:
+        return loads(message.configuration)
+    except ScenarioError:
+        return None
+
+
+def _bytes(log: Collected, uplink: tuple[ch.Channel, ...] | None, robot: str) -> int | None:
+    if uplink is None:
+        return None
+    keys = [channel.key(robot) for channel in uplink]
+    return sum(log.traffic[key].bytes for key in keys if key in log.traffic)
+
+
+def _map_result(
+    log: Collected, true_ids: UInt32[np.ndarray, " T"], positions: Float[np.ndarray, "T 2"]
+) -> MapResult | None:
+    sample = log.last(ch.FINAL_MAP)
+    message = log.sound(sample)
+    if sample is None or not isinstance(message, m.FusedMap):
+        return None
+    ids, means = translate.landmarks_of(message)
+    covariance = translate.landmark_covariance_of(message)
+    truth, known = _truth_of(ids, true_ids, positions)
+    return MapResult(
+        rule=message.rule,
+        digest=message.digest.hex(),
+        payload_sha256=hashlib.sha256(sample.payload).hexdigest(),
+        frame=message.frame,
+        ids=ids,
+        means=means,
+        covariance=covariance,
+        joint=message.joint,
+        truth=truth,
+        known=known,
+        errors=_errors(means, covariance, truth, known),
+        cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
+        reasons=message.reasons,
+        joined=message.joined,
+        withdrawn=message.withdrawn,
+        covariance_scale=message.covariance_scale or None,
+        lost=message.lost,
+    )
+
+
+def _own_map(
+    log: Collected,
+    robot: str,
+    true_ids: UInt32[np.ndarray, " T"],
+    positions: Float[np.ndarray, "T 2"],
+) -> MapErrors | None:
+    """The errors of the robot's last own map."""
+    message = log.sound(log.latest.get(ch.OWN_MAP.key(robot)))
+    if not isinstance(message, m.MapEstimate):
+        return None
+    ids, means = translate.landmarks_of(message)
+    truth, known = _truth_of(ids, true_ids, positions)
+    return _errors(means, translate.landmark_covariance_of(message), truth, known)
+
+
+def _truth_of(
+    ids: UInt32[np.ndarray, " L"],
+    true_ids: UInt32[np.ndarray, " T"],
+    positions: Float[np.ndarray, "T 2"],
+) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
+    """The true positions of these landmarks, zero where there is none; where there is one."""
+    truth = np.zeros((len(ids), 2))
+    known = np.isin(ids, true_ids)
+    truth[known] = positions[np.searchsorted(true_ids, ids[known])]
+    return truth, known
+
+
+def _errors(
+    means: Float[np.ndarray, "L 2"],
+    covariance: Matrix,
+    truth: Float[np.ndarray, "L 2"],
+    known: Bool[np.ndarray, " L"],
+) -> MapErrors | None:
+    """The errors of the landmarks with truth, if there are any."""
+    rows = np.flatnonzero(np.repeat(known, 2))
+    if not known.any():
+        return None
+    return map_errors(means[known], covariance[np.ix_(rows, rows)], truth[known])
+
+
+def _robot_result(
+    log: RobotLog,
+    used: Consumption,
+    uplink_bytes: int | None,
+    fused: MapResult | None,
+    own_map: MapErrors | None,
+) -> RobotResult:
+    smoothed = pose_errors(log.smoothed, log.smoothed_covariances, log.truth)
+    ends_known = smoothed is not None and smoothed.stamps_ns[-1] == log.smoothed.stamps_ns[-1]
+    aligned, alignment = _aligned(log, fused)
+    map_motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
+    return RobotResult(
+        used,
+        uplink_bytes,
+        log.truth,
+        log.smoothed,
+        smoothed,
+        log.online,
+        pose_errors(log.online, log.online_covariances, log.truth),
+        log.online_channel,
+        float(smoothed.nees[-1]) / 3.0 if smoothed is not None and ends_known else None,
+        aligned,
+        alignment,
+        None if map_motion is None else _moved_rmse(map_motion, log.online, log.truth),
+        own_map,
+    )
+
+
+def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> float | None:
+    """RMSE of a path's positions after a rigid motion, where the truth is known."""
+    true_poses, known = interpolated(truth, path.stamps_ns)
+    if not known.any():
+        return None
+    return distance_rmse(moved(motion, path.poses[known, :2]), true_poses[known, :2])
+
+
+def _aligned(log: RobotLog, fused: MapResult | None) -> tuple[float | None, str | None]:
+    """RMSE of the smoothed positions after a rigid motion, and which."""
+    truth, known = interpolated(log.truth, log.smoothed.stamps_ns)
+    if not known.any():
+        return None, None
+    places, true_places = log.smoothed.poses[known, :2], truth[known, :2]
+    motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
+    name = "map"
+    if motion is None:
+        motion, name = rigid_alignment(true_places, places), "trajectory"
+    if motion is None:
+        return None, None
+    return distance_rmse(moved(motion, places), true_places), name

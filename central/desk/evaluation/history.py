@@ -1,0 +1,277 @@
+"""A run over its team time: honesty, traffic, latency and events, from one pass over its log.
+
+`central.desk.evaluation` says what a run was worth in the end; this is how it came to that. Nothing is kept
+of a message but the numbers that are shown: some tens of bytes a message.
+"""
+
+from array import array
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from central.desk.evaluation.events import Event, EventLog
+from central.desk.evaluation.log import head_of
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.codec import WireError
+
+_NO_SPAN = (2**63 - 1, -(2**63))
+_LOOKED_AT = (
+    ch.START, ch.SUBMAP, ch.FUSED_MAP, ch.FINAL_MAP, ch.INNOVATION, ch.TRUTH_LANDMARKS, ch.STATUS,
+    ch.ALIVE, ch.ROBOT_CONFIG, ch.ROBOT_DONE, ch.END,
+)  # fmt: skip
+_COST = "joint_cost_per_dof."
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values over team time [ns], ascending; equal times in the order of the log."""
+
+    stamps_ns: Int64[np.ndarray, " n"]
+    values: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Σ νᵀ S⁻¹ ν of one robot's windows and their degrees of freedom, at the windows' ends."""
+
+    stamps_ns: Int64[np.ndarray, " n"]
+    squared: Float[np.ndarray, " n"]
+    dof: Int64[np.ndarray, " n"]
+
+    @property
+    def per_dof(self) -> float | None:
+        """Over the whole run; None where nothing was predicted."""
+        total = int(self.dof.sum())
+        return float(self.squared.sum()) / total if total else None
+
+
+@dataclass(frozen=True)
+class Latencies:
+    """Of one robot's submaps that some map used: wall time [s] from a reading to the first map.
+
+    stamps_ns: team time of the submap's end. first, last: from its first and its last reading's
+    publication to the map's. A reading waits for its window to close, so `first` is the longer.
+    """
+
+    stamps_ns: Int64[np.ndarray, " n"]
+    first_s: Float[np.ndarray, " n"]
+    last_s: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """One key's messages: team time [ns] and payload bytes of each."""
+
+    stamps_ns: Int64[np.ndarray, " n"]
+    sizes: Int64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class History:
+    """What happened in a run, by team time.
+
+    start_ns, end_ns: the span of the readings, of everything where there are none. map_nees: of
+    every fused map, NEES per dof of its landmarks in their own blocks; empty without truth.
+    map_cost: of every fused map; robot_cost: as the centre's status gave it.
+    """
+
+    start_ns: int
+    end_ns: int
+    innovations: Mapping[str, Innovations]
+    map_nees: Series
+    map_cost: Series
+    robot_cost: Mapping[str, Series]
+    latencies: Mapping[str, Latencies]
+    traffic: Mapping[str, Traffic]
+    events: tuple[Event, ...]
+
+    def seconds(self, stamps_ns: Int64[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Team time since the first reading [s]; what was before is at its beginning."""
+        elapsed: Float[np.ndarray, " n"] = np.maximum(stamps_ns - self.start_ns, 0) * 1e-9
+        return elapsed
+
+
+@dataclass
+class _Column:
+    """Growing pairs of a stamp and a number."""
+
+    stamps: "array[int]" = field(default_factory=lambda: array("q"))
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def take(self, stamp_ns: int, value: float) -> None:
+        self.stamps.append(stamp_ns)
+        self.values.append(value)
+
+    @property
+    def series(self) -> Series:
+        stamps = np.array(self.stamps, np.int64)
+        order = np.argsort(stamps, kind="stable")
+        return Series(stamps[order], np.array(self.values, np.float64)[order])
+
+
+class _Clocks:
+    """The wall clocks [ns] of a stream's readings, 16 bytes each; one out of order is left out."""
+
+    def __init__(self) -> None:
+        self._readings = array("q")
+        self._clocks = array("q")
+
+    def take(self, reading: int, wall_ns: int) -> None:
+        """Of one reading."""
+        if abs(reading) < 2**63 and (not self._readings or reading > self._readings[-1]):
+            self._readings.append(reading)
+            self._clocks.append(min(wall_ns, 2**63 - 1))
+
+    def of(self, reading: int) -> int | None:
+        """None where it is not known."""
+        k = bisect_left(self._readings, reading)
+        known = k < len(self._readings) and self._readings[k] == reading
+        return self._clocks[k] if known else None
+
+
+@dataclass
+class _Submap:
+    """A submap that no map has used yet: who waits for it."""
+
+    end_ns: int
+    first_reading: int
+    last_reading: int
+
+
+@dataclass
+class _Gathering:
+    """The pass over a log."""
+
+    traffic: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
+    innovations: dict[str, list[m.Innovation]] = field(default_factory=lambda: defaultdict(list))
+    map_nees: _Column = field(default_factory=_Column)
+    map_cost: _Column = field(default_factory=_Column)
+    robot_cost: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
+    events: EventLog = field(default_factory=EventLog)
+    published: dict[tuple[str, int], _Clocks] = field(default_factory=lambda: defaultdict(_Clocks))
+    unused: dict[tuple[str, int], dict[int, _Submap]] = field(
+        default_factory=lambda: defaultdict(dict)
+    )
+    latencies: dict[str, list[tuple[int, float, float]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    true_ids: UInt32[np.ndarray, " T"] = field(default_factory=lambda: np.empty(0, np.uint32))
+    positions: Float[np.ndarray, "T 2"] = field(default_factory=lambda: np.empty((0, 2)))
+    span: tuple[int, int] = _NO_SPAN
+
+    def take(self, sample: Sample, channel: ch.Channel | None) -> None:
+        self.traffic[sample.key].take(sample.stamp_ns, float(len(sample.payload)))
+        if channel in ch.SENSORS:
+            self._take_reading(sample)
+        if channel not in _LOOKED_AT:
+            return
+        try:
+            _, name, message = opened(sample)
+        except WireError:
+            return  # the evaluation counts it
+        self.events.take(channel, name, message)
+        match message:
+            case m.Submap():
+                interval = _Submap(message.stamp_ns, message.first_reading, message.last_reading)
+                self.unused[message.robot, message.epoch][message.sequence] = interval
+            case m.FusedMap():
+                self._take_map(message, sample.wall_ns)
+            case m.Innovation():
+                self.innovations[message.robot].append(message)
+            case m.TruthLandmarks():
+                self.true_ids, self.positions = translate.landmarks_of(message)
+            case m.Status() if name == "central":
+                for figure, value in message.figures.items():
+                    if figure.startswith(_COST):
+                        robot = figure.removeprefix(_COST)
+                        self.robot_cost[robot].take(message.stamp_ns, value)
+            case _:
+                pass
+
+    def _take_reading(self, sample: Sample) -> None:
+        reading = head_of(sample)
+        if reading is None:
+            return
+        self.published[reading.robot, reading.epoch].take(reading.reading, sample.wall_ns)
+        self.span = (min(self.span[0], sample.stamp_ns), max(self.span[1], sample.stamp_ns))
+
+    def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
+        if fused.dof > 0:
+            self.map_cost.take(fused.stamp_ns, fused.chi2 / fused.dof)
+        self._judge(fused)
+        for member in fused.members:
+            waiting = self.unused[member.robot, member.epoch]
+            for sequence in [k for k in waiting if k <= member.sequence]:
+                submap = waiting.pop(sequence)
+                self._arrived(member.robot, member.epoch, submap, wall_ns)
+
+    def _judge(self, fused: m.FusedMap) -> None:
+        ids, means = translate.landmarks_of(fused)
+        known = np.isin(ids, self.true_ids)
+        if not known.any():
+            return
+        errors = means[known] - self.positions[np.searchsorted(self.true_ids, ids[known])]
+        blocks = translate.landmark_blocks_of(fused)[known]
+        solved = np.linalg.solve(blocks, errors[:, :, np.newaxis])[:, :, 0]
+        nees = np.einsum("ki,ki->k", errors, solved)
+        self.map_nees.take(fused.stamp_ns, float(nees.mean()) / 2.0)
+
+    def _arrived(self, robot: str, epoch: int, submap: _Submap, wall_ns: int) -> None:
+        clocks = self.published[robot, epoch]
+        first_ns, last_ns = clocks.of(submap.first_reading), clocks.of(submap.last_reading)
+        if first_ns is None or last_ns is None:
+            return  # a part of a log: the reading was published before it
+        first, last = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
+        self.latencies[robot].append((submap.end_ns, first, last))
+
+
+def history(samples: Iterable[Sample]) -> History:
+    """The history of one run, from its log's samples in the order of the log."""
+    found = _Gathering()
+    rows: dict[str, ch.Channel | None] = {}
+    for sample in samples:
+        if sample.key not in rows:
+            known = ch.channel_of(sample.key)
+            rows[sample.key] = None if known is None else known[0]
+        found.take(sample, rows[sample.key])
+    stamps = [column.stamps for column in found.traffic.values()]
+    span = found.span
+    if span == _NO_SPAN:
+        span = (min(map(min, stamps), default=0), max(map(max, stamps), default=0))
+    return History(
+        span[0],
+        span[1],
+        {robot: _innovations(of) for robot, of in sorted(found.innovations.items())},
+        found.map_nees.series,
+        found.map_cost.series,
+        {robot: column.series for robot, column in sorted(found.robot_cost.items())},
+        {robot: _latencies(of) for robot, of in sorted(found.latencies.items())},
+        {
+            key: Traffic(series.stamps_ns, series.values.astype(np.int64))
+            for key, series in ((k, found.traffic[k].series) for k in sorted(found.traffic))
+        },
+        found.events.events,
+    )
+
+
+def _innovations(of: list[m.Innovation]) -> Innovations:
+    """By window, each once: a robot that was resumed says some of them again."""
+    once = {(each.epoch, each.sequence): each for each in of}
+    kept = [once[name] for name in sorted(once)]
+    return Innovations(
+        np.array([each.stamp_ns for each in kept], np.int64),
+        np.array([each.squared for each in kept]),
+        np.array([each.dof for each in kept], np.int64),
+    )
+
+
+def _latencies(of: list[tuple[int, float, float]]) -> Latencies:
+    stamps, first, last = zip(*of, strict=True)
+    return Latencies(np.array(stamps, np.int64), np.array(first), np.array(last))

@@ -1,0 +1,122 @@
+"""One robot in a log: its poses and its truth, and what became of its readings."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.errors import Path
+from central.desk.evaluation.log import Collected
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+
+
+@dataclass(frozen=True)
+class RobotLog:
+    """A robot's paths with their covariances, and the truth; each may be empty.
+
+    online_channel: "team/pose", else "central/pose", else "own/pose", or None.
+    """
+
+    truth: Path
+    smoothed: Path
+    smoothed_covariances: Float[np.ndarray, "K 3 3"]
+    online: Path
+    online_covariances: Float[np.ndarray, "O 3 3"]
+    online_channel: str | None
+
+
+@dataclass(frozen=True)
+class Consumption:
+    """Readings on the robot's sensor channels, and what the robot says became of them.
+
+    steps: odometry intervals. published: distinct readings. consumed, ledger: the robot's last
+    word, None and empty where it never said that it was done. each_once: no reading lies in two
+    submaps, and the ledger adds up to what was consumed.
+    """
+
+    steps: int
+    published: int
+    consumed: int | None
+    submaps: int
+    ledger: Mapping[str, int]
+    each_once: bool | None
+
+
+def robot_log(log: Collected, robot: str) -> RobotLog:
+    """The paths of one robot."""
+    trajectories = [t for t in log.messages(ch.TRAJECTORY, robot) if isinstance(t, m.Trajectory)]
+    truths = [t for t in log.messages(ch.TRUTH, robot) if isinstance(t, m.Truth)]
+    smoothed, smoothed_covariances = _stacked(
+        [translate.trajectory_of(t) for t in trajectories],
+        [floats(t.covariances, "covariances") for t in trajectories],
+    )
+    online_channel = next(
+        (c for c in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE) if log.kept.get(c.key(robot))),
+        None,
+    )
+    poses = [] if online_channel is None else log.messages(online_channel, robot)
+    estimates = [p for p in poses if isinstance(p, m.PoseEstimate)]
+    online, online_covariances = _stacked(
+        [(np.array([p.stamp_ns]), floats(p.pose, "pose").reshape(1, 3)) for p in estimates],
+        [floats(p.covariance, "covariance") for p in estimates],
+    )
+    return RobotLog(
+        _stacked([translate.trajectory_of(t) for t in truths], [])[0],
+        smoothed,
+        smoothed_covariances,
+        online,
+        online_covariances,
+        None if online_channel is None else _short(online_channel),
+    )
+
+
+def consumption(log: Collected, robot: str) -> Consumption:
+    """What became of one robot's readings."""
+    dones = {d.epoch: d for d in log.messages(ch.ROBOT_DONE, robot) if isinstance(d, m.Done)}
+    submaps = {
+        (s.epoch, s.sequence): s for s in log.messages(ch.SUBMAP, robot) if isinstance(s, m.Submap)
+    }
+    ledger: dict[str, int] = {}
+    for epoch in sorted(dones):
+        for entry in dones[epoch].ledger:
+            ledger[entry.disposition] = ledger.get(entry.disposition, 0) + entry.readings
+    readings = log.readings.get(robot)
+    consumed = sum(d.readings for d in dones.values()) if dones else None
+    return Consumption(
+        0 if readings is None else len(readings.odometry),
+        0 if readings is None else len(readings.all),
+        consumed,
+        len(submaps),
+        ledger,
+        None
+        if consumed is None
+        else sum(ledger.values()) == consumed
+        and _disjoint([submaps[name] for name in sorted(submaps)]),
+    )
+
+
+def _disjoint(submaps: Sequence[m.Submap]) -> bool:
+    """Whether no reading lies in two of the submaps, which are in order."""
+    return all(a.epoch != b.epoch or a.last_reading < b.first_reading for a, b in pairwise(submaps))
+
+
+def _short(channel: ch.Channel) -> str:
+    return channel.template.removeprefix("robot/{robot}/").removesuffix("/{robot}")
+
+
+def _stacked(
+    parts: Sequence[tuple[np.ndarray, np.ndarray]], covariances: Sequence[np.ndarray]
+) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
+    """The parts as one path by stamp, the last of equal stamps; covariances likewise."""
+    stamps = np.concatenate([np.empty(0, np.int64), *(stamps for stamps, _ in parts)])
+    poses = np.concatenate([np.empty((0, 3)), *(poses for _, poses in parts)])
+    order = np.argsort(stamps, kind="stable")
+    last = np.flatnonzero(np.append(np.diff(stamps[order]) != 0, [True] * (len(stamps) > 0)))
+    kept = order[last]
+    flat = np.concatenate([np.empty(0), *covariances]).reshape(-1, 3, 3)
+    return Path(stamps[kept], poses[kept]), flat[kept] if len(flat) else flat

@@ -1,0 +1,76 @@
+"""Absolute and relative errors of a path, with the definitions that evo and the field use.
+
+Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012. `evo_ape` and
+`evo_rpe` give the same figures for the files that `central.desk.export.tum` writes.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.errors import (
+    Path,
+    distance_rmse,
+    interpolated,
+    moved,
+    on_circle,
+    rigid_alignment,
+    rms,
+)
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """RMS over the poses that have truth; angles in radians; alignment is rigid, without scale.
+
+    ape_m, ape_rad: pose against true pose, as the path lies (evo: -r trans_part, angle_rad).
+    ape_aligned_m, ape_aligned_rad: after the motion that aligns the positions best (evo: -a); None
+    where it is not determined. rpe_m, rpe_rad: the motion from each pose to the next one against
+    the true one (evo: --delta 1 --delta_unit f); no alignment changes it; None below two poses.
+    """
+
+    poses: int
+    ape_m: float
+    ape_rad: float
+    ape_aligned_m: float | None
+    ape_aligned_rad: float | None
+    rpe_m: float | None
+    rpe_rad: float | None
+
+    def to_json(self) -> dict[str, float | int | None]:
+        """By name."""
+        return asdict(self)
+
+
+def associated(path: Path, truth: Path) -> tuple[Path, Path]:
+    """The poses of the path that have truth, and the true poses at the same stamps."""
+    poses, known = interpolated(truth, path.stamps_ns)
+    stamps = path.stamps_ns[known]
+    return Path(stamps, path.poses[known]), Path(stamps, poses[known])
+
+
+def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
+    """The errors of a path; None where no pose of it has truth."""
+    estimate, true = (each.poses for each in associated(path, truth))
+    if not len(estimate):
+        return None
+    turned = on_circle(estimate[:, 2] - true[:, 2])
+    motion = rigid_alignment(true[:, :2], estimate[:, :2])
+    relative = _relative(_relative(true[:-1], true[1:]), _relative(estimate[:-1], estimate[1:]))
+    return TrajectoryErrors(
+        len(estimate),
+        distance_rmse(estimate[:, :2], true[:, :2]),
+        rms(turned),
+        None if motion is None else distance_rmse(moved(motion, estimate[:, :2]), true[:, :2]),
+        None if motion is None else rms(on_circle(turned + motion[2])),
+        rms(np.hypot(relative[:, 0], relative[:, 1])) if len(relative) else None,
+        rms(relative[:, 2]) if len(relative) else None,
+    )
+
+
+def _relative(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """a⁻¹ ∘ b of each row."""
+    dx, dy = (b[:, :2] - a[:, :2]).T
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    return np.column_stack((c * dx + s * dy, c * dy - s * dx, on_circle(b[:, 2] - a[:, 2])))

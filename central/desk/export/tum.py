@@ -1,0 +1,48 @@
+"""Paths as files of the TUM format, which evo and most tools for trajectories read.
+
+One pose a line, `timestamp tx ty tz qx qy qz qw`: seconds, metres, a unit quaternion.
+https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+"""
+
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from central.desk.evaluation.errors import Path
+from central.desk.evaluation.evaluation import Evaluation
+from central.desk.evaluation.trajectories import associated
+
+KINDS = ("smoothed", "online")
+
+
+def write_tum(path: Path, file: FilePath) -> None:
+    """A planar path: z = 0, rotations about z; stamps to the nanosecond, poses in full."""
+    half = 0.5 * path.poses[:, 2]
+    with file.open("w", encoding="ascii", newline="\n") as lines:
+        lines.write("# timestamp tx ty tz qx qy qz qw\n")
+        for stamp, (x, y, _), qz, qw in zip(
+            path.stamps_ns.tolist(), path.poses, np.sin(half), np.cos(half), strict=True
+        ):
+            sign, (seconds, rest) = "-" * (stamp < 0), divmod(abs(stamp), 10**9)
+            lines.write(f"{sign}{seconds}.{rest:09d} {x:.17g} {y:.17g} 0 0 0 {qz:.17g} {qw:.17g}\n")
+
+
+def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePath]:
+    """Every robot's paths that are there, in the folder; what was written.
+
+    r1.smoothed.tum, r1.online.tum, r1.truth.tum; where there is truth, r1.smoothed.truth.tum and
+    r1.online.truth.tum are the true poses at the stamps of the path, for tools that compare pose
+    with pose.
+    """
+    written = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, robot in evaluation.robots.items():
+        paths = {"truth": robot.truth}
+        for kind, path in zip(KINDS, (robot.smoothed_path, robot.online_path), strict=True):
+            paths[kind] = path
+            paths[f"{kind}.truth"] = associated(path, robot.truth)[1]
+        for kind, path in paths.items():
+            if len(path.stamps_ns):
+                written.append(folder / f"{name}.{kind}.tum")
+                write_tum(path, written[-1])
+    return written

@@ -1,0 +1,222 @@
+"""The ledger of a log: every reading has exactly one disposition (law 1), every submap its maps.
+
+A submap names its interval of readings, a map its version vector. Which readings of an interval a
+robot rejected, and why, its node says when it consumes the recorded readings again. Of readings
+behind a robot's last submap those that it had consumed are open, the others lost.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from central.desk.verification.recorded import Recorded, RerunError, Stream
+from central.desk.verification.robot import dispositions
+from team.robot.node import IN_SIGHTING
+from team.wire import channels as ch
+from team.wire import messages as m
+
+IN_SUBMAP = "in a submap"
+OPEN = "open"
+LOST = "lost"
+MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
+"""Readings that are missing need memory too: so many, or so many times those that are there."""
+SubmapName = tuple[str, int, int]
+"""(robot, epoch, sequence)."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What became of one reading; `submap`: the sequence of the submap whose interval holds it."""
+
+    disposition: str
+    submap: int | None
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Every reading's entry by stream and counter, every submap's maps, and what is wrong.
+
+    maps: the digests of the maps that used a submap, in the order of the log. withdrawn: the robots
+    that the last map goes without; what is in their submaps is in no map any more.
+    """
+
+    entries: Mapping[Stream, tuple[Entry, ...]]
+    maps: Mapping[SubmapName, tuple[str, ...]]
+    offenders: tuple[str, ...]
+    withdrawn: tuple[str, ...] = ()
+
+    @property
+    def readings(self) -> int:
+        """The readings of all robots."""
+        return sum(len(entries) for entries in self.entries.values())
+
+    def totals(self, robot: str | None = None) -> dict[str, int]:
+        """Readings by disposition, of one robot or of all."""
+        counts = Counter(
+            entry.disposition
+            for (name, _), entries in sorted(self.entries.items())
+            if robot in (None, name)
+            for entry in entries
+        )
+        return dict(sorted(counts.items()))
+
+    def statement(self) -> str:
+        """The proof in one sentence."""
+        parts = ", ".join(f"{count:,} {name}" for name, count in self.totals().items())
+        said = f"each of {self.readings:,} readings has exactly one disposition: {parts}"
+        gone = sum(self.totals(robot).get(IN_SUBMAP, 0) for robot in self.withdrawn)
+        if not self.withdrawn:
+            return said
+        return (
+            f"{said}; {gone:,} of those in submaps are withdrawn with {', '.join(self.withdrawn)}"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Totals, offenders, and of each submap how many readings and which maps."""
+        held = Counter(
+            (*stream, entry.submap)
+            for stream, entries in self.entries.items()
+            for entry in entries
+            if entry.submap is not None
+        )
+        robots = sorted({robot for robot, _ in self.entries})
+        return {
+            "readings": self.readings,
+            "dispositions": self.totals(),
+            "robots": {robot: self.totals(robot) for robot in robots},
+            "submaps": [
+                {"robot": n[0], "epoch": n[1], "sequence": n[2], "readings": held[n], "maps": maps}
+                for n, maps in sorted(self.maps.items())
+            ],
+            "withdrawn": self.withdrawn,
+            "offenders": self.offenders,
+        }
+
+
+def ledger(log: Recorded) -> Ledger:
+    """The ledger of a log; raises RerunError where a robot's configuration is missing."""
+    offenders = [f"{_named(r)} is in the log twice, and not the same" for r in log.contradicted]
+    streams = sorted(log.readings.keys() | log.submaps().keys())
+    entries = {}
+    for stream in streams:
+        intervals, wrong = _intervals(log, stream)
+        entries[stream], more = _entries(log, stream, intervals)
+        offenders += [*wrong, *more, *_contradictions(log, stream, entries[stream])]
+    maps, unknown = _maps(log)
+    return Ledger(entries, maps, (*offenders, *unknown), _withdrawn(log))
+
+
+def _withdrawn(log: Recorded) -> tuple[str, ...]:
+    """By the last map's word."""
+    last = next(iter(reversed((*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)))), None)
+    return last.withdrawn if isinstance(last, m.FusedMap) else ()
+
+
+def _named(reading: m.Reading) -> str:
+    return f"reading {reading.reading} of {reading.robot}, epoch {reading.epoch}"
+
+
+def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
+    """The stream's submaps by sequence, each once; which of them contradict one another."""
+    robot, epoch = stream
+    found: dict[int, m.Submap] = {}
+    wrong = []
+    for submap in log.of(ch.SUBMAP):
+        if not isinstance(submap, m.Submap) or (submap.robot, submap.epoch) != stream:
+            continue
+        if found.setdefault(submap.sequence, submap) != submap:
+            name = f"submap {submap.sequence} of {robot}, epoch {epoch}"
+            wrong.append(f"{name} is in the log twice, and not the same")
+    return [found[k] for k in sorted(found)], wrong
+
+
+def _entries(
+    log: Recorded, stream: Stream, submaps: list[m.Submap]
+) -> tuple[tuple[Entry, ...], list[str]]:
+    """The entry of every reading that there is or should be; the offenders among them."""
+    robot, epoch = stream
+    readings = log.readings.get(stream, {})
+    count = max(log.published.get(stream, 0), max(readings, default=-1) + 1)
+    if count > max(MOST_LOST, MOST_LOST_SHARE * len(readings)):
+        raise RerunError(
+            f"{count:,} readings of {robot}, epoch {epoch}, are spoken of, "
+            f"{len(readings):,} are in the log: not believed"
+        )
+    holder: list[int | None] = [None] * count
+    wrong = []
+    for submap in submaps:
+        for counter in range(submap.first_reading, submap.last_reading + 1):
+            if counter >= count:
+                name = f"submap {submap.sequence} of {robot}, epoch {epoch}"
+                wrong.append(f"{name} uses reading {counter}, which the log does not have")
+                break
+            if holder[counter] is not None:
+                wrong.append(
+                    f"reading {counter} of {robot}, epoch {epoch} is in two submaps: "
+                    f"{holder[counter]} and {submap.sequence}"
+                )
+            holder[counter] = submap.sequence
+    said = dispositions(log, robot, epoch)
+    last = max((s.last_reading for s in submaps), default=-1)
+    consumed = log.reported.get(stream, 0)
+    entries = []
+    for counter in range(count):
+        name = f"reading {counter} of {robot}, epoch {epoch}"
+        held = counter in readings and holder[counter] is not None
+        disposition = said.get(counter, IN_SUBMAP if held else LOST)
+        if counter not in readings and holder[counter] is not None:
+            wrong.append(f"{name} is in submap {holder[counter]}, but not in the log")
+        elif disposition in (IN_SUBMAP, IN_SIGHTING) and holder[counter] is None:
+            if counter < last:
+                wrong.append(f"{name} is behind its submaps and in none of them")
+            disposition = OPEN if counter < consumed else LOST
+        entries.append(Entry(disposition, holder[counter]))
+    return tuple(entries), wrong
+
+
+def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -> Iterator[str]:
+    """Where a robot's last word on an epoch differs from what the log gives.
+
+    A robot that was resumed counts all readings before as in submaps, so its sum only can differ.
+    """
+    for done in log.of(ch.ROBOT_DONE):
+        if not isinstance(done, m.Done) or (done.robot, done.epoch) != stream:
+            continue
+        told = {d.disposition: d.readings for d in done.ledger}
+        if sum(told.values()) != done.readings:
+            yield f"{done.robot}, epoch {done.epoch}: {done.readings} readings, {told} dispositions"
+        resumed = "start pose" not in told
+        found = Counter(entry.disposition for entry in entries[: done.readings])
+        if not resumed and dict(found) != told:
+            yield f"{done.robot}, epoch {done.epoch} says {told}, the log gives {dict(found)}"
+
+
+def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
+    """Which maps used each submap; which use one that is not there, or one twice."""
+    users: dict[SubmapName, list[str]] = {
+        (s.robot, s.epoch, s.sequence): [] for s in log.of(ch.SUBMAP) if isinstance(s, m.Submap)
+    }
+    wrong = []
+    for fused in (*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)):
+        if not isinstance(fused, m.FusedMap) or fused.rule != "join":
+            continue
+        digest = fused.digest.hex()
+        streams = Counter((x.robot, x.epoch) for x in fused.members)
+        wrong += [
+            f"map {digest} counts {s[0]}, epoch {s[1]} twice" for s, n in streams.items() if n > 1
+        ]
+        wrong += [
+            f"map {digest} uses submaps of {robot}, which it says is withdrawn"
+            for robot, _ in streams
+            if robot in fused.withdrawn
+        ]
+        for member in fused.members:
+            for sequence in range(member.sequence + 1):
+                name = (member.robot, member.epoch, sequence)
+                if name not in users:
+                    what = f"submap {sequence} of {member.robot}, epoch {member.epoch}"
+                    wrong.append(f"map {digest} uses {what}, which is not in the log")
+                    break
+                users[name].append(digest)
+    return {name: tuple(digests) for name, digests in users.items()}, wrong

@@ -1,0 +1,275 @@
+"""Pictures of a run: the map with its uncertainty, and the robots' errors within their bounds."""
+
+from collections.abc import Sequence
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.errors import Path
+from central.desk.evaluation.evaluation import Evaluation, RobotResult
+
+if (
+    TYPE_CHECKING
+):  # Matplotlib takes half a second to import: a run that draws nothing has no use for it
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ROBOT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+"""Told apart by colour-blind people too (Okabe & Ito 2008); the seventh robot takes the first."""
+TRUTH_COLOUR = "#7a7a7a"
+MAP_COLOUR = "#111111"
+ELLIPSE_CHI2 = 5.991
+"""95 % of a Gaussian in the plane lie within this squared Mahalanobis distance."""
+DRAWN_ROBOTS = 12
+"""Rows of the error picture at the most."""
+DRAWN_POINTS = 4000
+"""Of one line; longer paths are thinned."""
+DRAWN_BARS = 60
+"""Smoothed poses with a bar, evenly among all; more would hide the online ones."""
+LABELLED_LANDMARKS = 60
+DPI = 120
+
+
+def map_picture(evaluation: Evaluation, path: FilePath) -> bool:
+    """Landmarks with 95 % ellipses, the truth, the paths; False where there is nothing to draw."""
+    if evaluation.map is None and not evaluation.robots:
+        return False
+    figure, axes = new_figure(9.0, 9.0, 1, 1)
+    axis = axes[0][0]
+    for i, (name, robot) in enumerate(evaluation.robots.items()):
+        _draw_paths(axis, name, robot, ROBOT_COLOURS[i % len(ROBOT_COLOURS)], first=i == 0)
+    _draw_landmarks(axis, evaluation)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    axis.grid(color="#e4e4e4", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.set_title("\n".join(_title(evaluation)), fontsize=12)
+    if any(len(robot.smoothed_path.stamps_ns) for robot in evaluation.robots.values()):
+        axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
+    axis.plot([], [], color=TRUTH_COLOUR, marker="s", markersize=9, linestyle="", label="starts")
+    handles, _ = axis.get_legend_handles_labels()
+    axis.legend(
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.07),
+        ncols=min(4, -(-len(handles) // 2)),
+        frameon=False,
+        fontsize=10,
+    )
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
+    """Errors of x, y and heading over team time with ±3σ; False where no robot has truth."""
+    shown = {n: r for n, r in evaluation.robots.items() if r.online or r.smoothed}
+    names = list(shown)[:DRAWN_ROBOTS]
+    if not names:
+        return False
+    start_ns = min(_first_ns(shown[name]) for name in names)
+    figure, axes = new_figure(13.0, 1.0 + 2.3 * len(names), len(names), 3)
+    for row, name in enumerate(names):
+        colour = ROBOT_COLOURS[row % len(ROBOT_COLOURS)]
+        _draw_errors(axes[row], shown[name], colour, start_ns)
+        axes[row][0].set_ylabel(f"{name}\nerror [m]")
+        axes[row][2].set_ylabel("error [°]")
+    for axis, title in zip(axes[0], ("x", "y", "heading"), strict=True):
+        axis.set_title(title, fontsize=11)
+    for axis in axes[-1]:
+        axis.set_xlabel("team time [s]")
+    left_out = len(shown) - len(names)
+    more = f" · {left_out} more robots are not drawn" if left_out else ""
+    figure.suptitle(f"{_heading(evaluation)}: pose errors and what the robots believe{more}")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=10)
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def new_figure(
+    width: float, height: float, rows: int, columns: int
+) -> "tuple[Figure, list[list[Axes]]]":
+    """A figure on Agg without pyplot's global state, with its axes by row and column."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=columns > 1)
+    return figure, [list(row) for row in grid]
+
+
+def _draw_paths(axis: "Axes", name: str, robot: RobotResult, colour: str, *, first: bool) -> None:
+    """The true path thin, a square at its start; the smoothed ends of submaps, or else online."""
+    truth, smoothed = _thinned(robot.truth), robot.smoothed_path
+    known = truth if len(truth.stamps_ns) else smoothed
+    if len(truth.stamps_ns):
+        x, y, _ = truth.poses.T
+        label = "true paths" if first else None
+        axis.plot(x, y, color=TRUTH_COLOUR, linewidth=0.7, label=label, zorder=1)
+    if len(known.stamps_ns):
+        x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
+        axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
+    if len(smoothed.stamps_ns):
+        x, y, _ = smoothed.poses.T
+        axis.plot(x, y, color=colour, linewidth=0.8, alpha=0.6, zorder=2)
+        axis.plot(x, y, color=colour, linestyle="", marker="o", markersize=4.5, zorder=3)
+        axis.plot([], [], color=colour, marker="o", label=name)
+    else:
+        x, y, _ = _thinned(robot.online_path).poses.T
+        axis.plot(x, y, color=colour, linewidth=1.0, zorder=3, label=f"{name}, online")
+
+
+def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
+    from matplotlib.patches import Ellipse
+
+    truth, fused = evaluation.true_landmarks, evaluation.map
+    if len(truth):
+        axis.plot(
+            *truth.T, linestyle="", marker="x", markersize=8, markeredgewidth=1.6,
+            color="#C00000", label="true landmarks", zorder=6,
+        )  # fmt: skip
+    if fused is None or not len(fused.ids):
+        return
+    axis.plot(
+        *fused.means.T, linestyle="", marker=".", markersize=6, color=MAP_COLOUR,
+        label="landmarks of the map, 95 % ellipses", zorder=7,
+    )  # fmt: skip
+    for k, mean in enumerate(fused.means):
+        block = fused.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        width, height, turn_deg = ellipse_of(block)
+        axis.add_patch(
+            Ellipse(
+                (float(mean[0]), float(mean[1])),
+                width,
+                height,
+                angle=turn_deg,
+                fill=False,
+                edgecolor=MAP_COLOUR,
+                linewidth=1.1,
+                zorder=7,
+            )
+        )
+    if len(fused.ids) <= LABELLED_LANDMARKS:
+        for landmark, mean, offset in zip(
+            fused.ids, fused.means, label_offsets(fused.means), strict=True
+        ):
+            axis.annotate(
+                str(landmark),
+                (float(mean[0]), float(mean[1])),
+                xytext=(float(offset[0]), float(offset[1])),
+                textcoords="offset points",
+                ha="center",
+                va="center",
+                fontsize=9,
+                color=MAP_COLOUR,
+                zorder=8,
+            )
+
+
+def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
+    """Where each point's label goes [points of type]: away from its neighbours.
+
+    Neighbours are the points within a twentieth of the map's extent; alone, to the upper right.
+    """
+    reach = max(float(np.ptp(points, axis=0).max()) / 20.0, 1e-9)
+    offsets = np.empty_like(points)
+    for i, point in enumerate(points):
+        near = np.hypot(*(points - point).T) <= reach
+        away = point - points[near].mean(axis=0)
+        length = float(np.hypot(*away))
+        offsets[i] = 18.0 * away / length if length > 0.0 else (11.0, 9.0)
+    return offsets
+
+
+def ellipse_of(covariance: Float[np.ndarray, "2 2"]) -> tuple[float, float, float]:
+    """Full axes [m] and the first one's direction [°] of the 95 % ellipse of a 2 × 2 covariance."""
+    variances, directions = np.linalg.eigh(covariance)
+    width, height = 2.0 * np.sqrt(ELLIPSE_CHI2 * variances[::-1])
+    turn = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+    return float(width), float(height), float(turn)
+
+
+def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_ns: int) -> None:
+    scales = (1.0, 1.0, 180.0 / np.pi)
+    for k, (axis, scale) in enumerate(zip(axes, scales, strict=True)):
+        axis.axhline(0.0, color="#bbbbbb", linewidth=0.7)
+        axis.grid(color="#eeeeee", linewidth=0.6)
+        axis.set_axisbelow(True)
+        shown, largest = [np.empty(0)], 0.0
+        if robot.online is not None:
+            kept = thinning(len(robot.online.stamps_ns))
+            time_s = (robot.online.stamps_ns[kept] - start_ns) * 1e-9
+            bound = 3.0 * scale * robot.online.sigmas[kept, k]
+            error = scale * robot.online.errors[kept, k]
+            label = f"online ({robot.online_channel})"
+            axis.fill_between(
+                time_s, -bound, bound, color=colour, alpha=0.18, linewidth=0.0, label="±3σ online"
+            )
+            axis.plot(time_s, error, color=colour, linewidth=0.9, label=label)
+            shown.append(scale * np.abs(robot.online.errors[:, k]))
+            largest = float(np.quantile(bound, 0.98))
+        if robot.smoothed is not None:
+            every = slice(None, None, -(-len(robot.smoothed.stamps_ns) // DRAWN_BARS))
+            time_s = (robot.smoothed.stamps_ns[every] - start_ns) * 1e-9
+            error = scale * robot.smoothed.errors[every, k]
+            sigma = scale * robot.smoothed.sigmas[every, k]
+            axis.errorbar(
+                time_s, error, 3.0 * sigma, color=MAP_COLOUR, linestyle="", marker=".",
+                markersize=3, elinewidth=0.6, label="smoothed, ±3σ",
+            )  # fmt: skip
+            shown.append(scale * np.abs(robot.smoothed.errors[:, k]))
+            largest = max(largest, float(np.quantile(3 * sigma, 0.98)))
+        _fit(axis, np.concatenate(shown), largest)
+
+
+def _fit(axis: "Axes", errors: Float[np.ndarray, " n"], bound: float) -> None:
+    """The axis ends where all but one error in 500 lie within; it says how many do not."""
+    most = float(errors.max(initial=0.0))
+    limit = 1.1 * max(bound, float(np.quantile(errors, 0.998)) if len(errors) else 0.0)
+    if most <= 1.5 * limit:
+        limit = max(limit, 1.1 * most)
+    if limit <= 0.0:
+        return
+    axis.set_ylim(-limit, limit)
+    beyond = int(np.count_nonzero(errors > limit))
+    if beyond:
+        text = f"{beyond} beyond, up to {most:.3g}"
+        axis.text(0.99, 0.97, text, transform=axis.transAxes, ha="right", va="top", fontsize=8)
+
+
+def _first_ns(robot: RobotResult) -> int:
+    stamps = [e.stamps_ns[0] for e in (robot.online, robot.smoothed) if e is not None]
+    return int(min(stamps + list(robot.truth.stamps_ns[:1])))
+
+
+def _thinned(path: Path) -> Path:
+    kept = thinning(len(path.stamps_ns))
+    return Path(path.stamps_ns[kept], path.poses[kept])
+
+
+def thinning(count: int) -> slice:
+    """Every so many of a line's points, so that about DRAWN_POINTS are drawn at the most."""
+    return slice(None, None, max(1, count // DRAWN_POINTS))
+
+
+def _heading(evaluation: Evaluation) -> str:
+    scenario = evaluation.scenario
+    return "a run" if scenario is None else f"{scenario.name}, seed {scenario.seed}"
+
+
+def _title(evaluation: Evaluation) -> list[str]:
+    """Scenario and seed; estimator, rule and errors."""
+    scenario, fused = evaluation.scenario, evaluation.map
+    second = [] if scenario is None else [f"{scenario.estimator} + {scenario.fusion}"]
+    if fused is None:
+        second.append("no final map")
+    elif fused.errors is not None:
+        errors = fused.errors
+        text = f"landmark RMSE {errors.rmse_m:.3g} m"
+        if errors.aligned_rmse_m is not None:
+            text += f" ({errors.aligned_rmse_m:.3g} m aligned)"
+        second += [text, f"NEES/dof {errors.nees_per_dof:.3g}"]
+    return [_heading(evaluation), " · ".join(second)]

@@ -1,0 +1,293 @@
+"""Pictures of a run over its team time: honesty, traffic, latency, events."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from central.desk.evaluation.evaluation import Evaluation
+from central.desk.evaluation.history import History, Traffic
+from central.desk.pictures.run import DPI, MAP_COLOUR, ROBOT_COLOURS, new_figure, thinning
+from team.estimation.consistency import chi2_interval
+from team.wire import channels as ch
+from team.wire.channels import channel_of
+
+if TYPE_CHECKING:  # as in central.desk.pictures.run: Matplotlib is slow to import
+    from matplotlib.axes import Axes
+
+BINS = 40
+"""Stretches of team time in which values are put together."""
+BAND = 0.95
+BAND_COLOUR = "#d9ead3"
+WARN, FAIL = 1.1, 1.3
+"""The levels of the centre's consistency monitor."""
+LOGARITHMIC_FROM = 12.0
+"""A NEES beyond this needs a logarithmic axis to be seen at all."""
+SHOWN_KEYS = 8
+EVENT_STYLES = {
+    "came": ("o", "#009E73"), "lost": ("X", "#C00000"), "restarted": ("^", "#E69F00"),
+    "map": ("D", "#0072B2"), "warning": ("v", "#D55E00"), "ended": ("s", "#7a7a7a"),
+}  # fmt: skip
+
+
+def binned(
+    history: History, stamps_ns: Int64[np.ndarray, " n"], *values: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " b"], list[Float[np.ndarray, " b"]]]:
+    """Sums of each of the values in the BINS stretches of the run; those without any left out.
+
+    Returns the stretches' middles [s] and the sums; what lies outside of the run counts to its end.
+    """
+    edges = np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
+    where = np.clip(np.searchsorted(edges, history.seconds(stamps_ns), "right") - 1, 0, BINS - 1)
+    filled = np.bincount(where, minlength=BINS) > 0
+    sums = [np.bincount(where, weights=v, minlength=BINS)[filled] for v in values]
+    return (0.5 * (edges[1:] + edges[:-1]))[filled], sums
+
+
+def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
+    """NEES of poses and map, NIS, joint cost, each per degree of freedom over team time.
+
+    Panels without values are left out; False where there is none at all.
+    """
+    panels = [
+        draw
+        for draw, is_there in (
+            (_draw_nees, any(r.online for r in evaluation.robots.values())
+             or len(history.map_nees.values) > 0),
+            (_draw_nis, any(i.per_dof is not None for i in history.innovations.values())),
+            (_draw_cost, len(history.map_cost.values) > 0),
+        )
+        if is_there
+    ]  # fmt: skip
+    if not panels:
+        return False
+    figure, axes = new_figure(9.0, 0.6 + 2.9 * len(panels), len(panels), 1)
+    for (axis,), draw in zip(axes, panels, strict=True):
+        axis.sharex(axes[0][0])
+        draw(axis, evaluation, history)
+        axis.grid(color="#eeeeee", linewidth=0.6)
+        axis.set_axisbelow(True)
+        axis.legend(loc="upper left", fontsize=8, ncols=4, framealpha=0.85)
+    axes[-1][0].set_xlabel("team time [s]")
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
+    low, high = chi2_interval(3, BAND, 1)
+    axis.axhspan(low, high, color=BAND_COLOUR, zorder=0, label="95 % of single poses")
+    axis.axhline(1.0, color="#888888", linewidth=0.8)
+    largest = 0.0
+    for k, (name, robot) in enumerate(evaluation.robots.items()):
+        if robot.online is None:
+            continue
+        centres, (sums, counts) = binned(
+            history,
+            robot.online.stamps_ns,
+            robot.online.nees / 3.0,
+            np.ones(len(robot.online.nees)),
+        )
+        axis.plot(centres, sums / counts, color=_colour(k), linewidth=1.2, label=name)
+        largest = max(largest, float((sums / counts).max()))
+    nees = history.map_nees
+    if len(nees.values):
+        seconds = history.seconds(nees.stamps_ns)
+        axis.plot(seconds, nees.values, color=MAP_COLOUR, linewidth=1.4, label="map's landmarks")
+        largest = max(largest, float(nees.values.max()))
+    _scale(axis, max(largest, high))
+    axis.set_ylabel("NEES per dof")
+    axis.set_title("Errors in units of the covariance that goes with them: 1 is right", fontsize=10)
+
+
+def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
+    largest, lows, highs = 0.0, [], []
+    for k, (name, of) in enumerate(history.innovations.items()):
+        centres, (squared, dof) = binned(
+            history, of.stamps_ns, of.squared, of.dof.astype(np.float64)
+        )
+        told: Bool[np.ndarray, " b"] = dof > 0
+        if not told.any():
+            continue
+        values = squared[told] / dof[told]
+        axis.plot(centres[told], values, color=_colour(k), linewidth=1.2, label=name)
+        largest = max(largest, float(values.max()))
+        low, high = chi2_interval(int(np.median(dof[told])), BAND, 1)
+        lows.append(low)
+        highs.append(high)
+    if lows:
+        axis.axhspan(
+            float(np.median(lows)), float(np.median(highs)), color=BAND_COLOUR, zorder=0,
+            label="95 % of points",
+        )  # fmt: skip
+    axis.axhline(1.0, color="#888888", linewidth=0.8)
+    _scale(axis, max(largest, *highs, 1.5))
+    axis.set_ylabel("NIS per dof")
+    axis.set_title("Readings against what the particles expected: needs no truth", fontsize=10)
+
+
+def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
+    axis.axhline(1.0, color="#888888", linewidth=0.8)
+    for level, colour, name in ((WARN, "#E69F00", "warns"), (FAIL, "#C00000", "fails")):
+        axis.axhline(
+            level, color=colour, linewidth=0.9, linestyle="--", label=f"{name} above {level}"
+        )
+    largest = FAIL
+    for k, (name, of) in enumerate(history.robot_cost.items()):
+        axis.plot(
+            history.seconds(of.stamps_ns), of.values, color=_colour(k), linewidth=1.0,
+            marker=".", markersize=3, label=name,
+        )  # fmt: skip
+        largest = max(largest, float(of.values.max(initial=0.0)))
+    cost = history.map_cost
+    seconds = history.seconds(cost.stamps_ns)
+    axis.plot(seconds, cost.values, color=MAP_COLOUR, linewidth=1.4, label="team")
+    _scale(axis, max(largest, float(cost.values.max())))
+    axis.set_ylabel("joint cost per dof")
+    axis.set_title("How well the submaps agree: the centre's monitor, needs no truth", fontsize=10)
+
+
+def _scale(axis: "Axes", largest: float) -> None:
+    if largest > LOGARITHMIC_FROM:
+        axis.set_yscale("symlog", linthresh=2.0)
+        axis.set_ylim(0.0, 1.5 * largest)
+    else:
+        axis.set_ylim(0.0, 1.25 * largest)
+
+
+def traffic_picture(history: History, path: FilePath) -> bool:
+    """Payload bytes per second of team time: by channel, and what each robot says."""
+    if not history.traffic:
+        return False
+    figure, axes = new_figure(9.0, 6.6, 2, 1)
+    by_channel: dict[str, list[Traffic]] = {}
+    by_robot: dict[str, list[Traffic]] = {}
+    for key, traffic in history.traffic.items():
+        by_channel.setdefault(channel_name(key), []).append(traffic)
+        if (robot := speaker(key)) is not None:
+            by_robot.setdefault(robot, []).append(traffic)
+    largest = sorted(by_channel, key=lambda name: -_bytes(by_channel[name]))
+    shown = {name: by_channel[name] for name in largest[:SHOWN_KEYS]}
+    rest = [t for name in largest[SHOWN_KEYS:] for t in by_channel[name]]
+    if rest:
+        shown[f"{len(largest) - SHOWN_KEYS} more"] = rest
+    for axis, groups, title in (
+        (axes[0][0], shown, "by channel"),
+        (axes[1][0], by_robot, "what each robot's node says (its sensors' readings are not in it)"),
+    ):
+        _draw_rates(axis, history, groups)
+        axis.set_title(title, fontsize=10)
+        axis.set_ylabel("payload [B/s]")
+    axes[-1][0].set_xlabel("team time [s]")
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Traffic]]) -> None:
+    width_s = max((history.end_ns - history.start_ns) * 1e-9, 1e-9) / BINS
+    for k, (name, parts) in enumerate(groups.items()):
+        stamps = np.concatenate([part.stamps_ns for part in parts])
+        sizes = np.concatenate([part.sizes for part in parts]).astype(np.float64)
+        centres, (total,) = binned(history, stamps, sizes)
+        style = "-" if k < len(ROBOT_COLOURS) else "--"
+        axis.plot(
+            centres, total / width_s, color=_colour(k), linestyle=style, linewidth=1.2, label=name
+        )
+    _log_scale(axis)
+    axis.grid(color="#eeeeee", linewidth=0.6)
+    axis.set_axisbelow(True)
+    if groups:
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+
+
+def _log_scale(axis: "Axes") -> None:
+    """A logarithmic scale with plain numbers; between powers of ten only where there is one."""
+    from matplotlib.ticker import NullFormatter
+
+    axis.set_yscale("log")
+    low, high = axis.get_ylim()
+    axis.yaxis.set_major_formatter("{x:,g}")
+    axis.yaxis.set_minor_formatter("{x:,g}" if high < 20.0 * low else NullFormatter())
+
+
+def latency_picture(history: History, path: FilePath) -> bool:
+    """Wall time from a submap's first and last reading to the first map that used it."""
+    if not history.latencies:
+        return False
+    figure, axes = new_figure(9.0, 3.6, 1, 1)
+    axis = axes[0][0]
+    for k, (name, of) in enumerate(history.latencies.items()):
+        kept = thinning(len(of.stamps_ns))
+        seconds = history.seconds(of.stamps_ns[kept])
+        axis.plot(
+            seconds, of.last_s[kept], color=_colour(k), linewidth=0.8, marker="o", markersize=3,
+            label=name,
+        )  # fmt: skip
+        axis.plot(seconds, of.first_s[kept], color=_colour(k), linewidth=0.8, linestyle=":")
+    axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last reading")
+    axis.plot([], [], color="#555555", linestyle=":", label="from its first reading")
+    if all((of.last_s > 0.0).all() for of in history.latencies.values()):
+        _log_scale(axis)  # clocks of two machines may disagree
+    axis.set_xlabel("end of the submap, team time [s]")
+    axis.set_ylabel("wall time to the map [s]")
+    axis.grid(color="#eeeeee", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def timeline_picture(history: History, path: FilePath) -> bool:
+    """A row for each node, a mark for each of its events."""
+    nodes = list(dict.fromkeys(event.node for event in history.events))
+    if not nodes:
+        return False
+    nodes = sorted(nodes, key=lambda node: (node in ("world", "central", "recorder"), node))
+    figure, axes = new_figure(9.0, 1.3 + 0.34 * len(nodes), 1, 1)
+    axis = axes[0][0]
+    for row in range(len(nodes)):
+        axis.axhline(row, color="#e0e0e0", linewidth=1.0, zorder=0)
+    for kind, (marker, colour) in EVENT_STYLES.items():
+        events = [event for event in history.events if event.kind == kind]
+        if events:
+            stamps = np.array([event.stamp_ns for event in events], np.int64)
+            rows = [nodes.index(event.node) for event in events]
+            axis.plot(
+                history.seconds(stamps), rows, linestyle="", marker=marker, color=colour,
+                markersize=7, alpha=0.85, label=kind,
+            )  # fmt: skip
+    axis.set_yticks(range(len(nodes)), nodes)
+    axis.set_ylim(len(nodes) - 0.5, -0.5)
+    axis.set_xlabel("team time [s]")
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def channel_name(key: str) -> str:
+    """The name of a key's channel; a viewer's keys together."""
+    found = channel_of(key)
+    if found is not None:
+        return found[0].name
+    return "view" if key.startswith("view/") else "other"
+
+
+def speaker(key: str) -> str | None:
+    """The robot whose node publishes on this key; None of what others say, its sensors too."""
+    found = channel_of(key)
+    if found is None or found[0] in ch.SENSORS:
+        return None
+    channel, name = found
+    if channel.template.startswith("robot/{robot}/"):
+        return name
+    kind, _, robot = name.partition("/")
+    return robot if kind == "robot" else None
+
+
+def _bytes(parts: Sequence[Traffic]) -> int:
+    return sum(int(part.sizes.sum()) for part in parts)
+
+
+def _colour(k: int) -> str:
+    return ROBOT_COLOURS[k % len(ROBOT_COLOURS)]

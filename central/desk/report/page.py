@@ -1,0 +1,332 @@
+"""The report as a folder: one page that needs nothing beside it, its pictures, the figures."""
+
+import base64
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from math import degrees
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.export.tum import write_trajectories
+from central.desk.pictures.run import error_picture, map_picture
+from central.desk.pictures.time import (
+    consistency_picture,
+    latency_picture,
+    timeline_picture,
+    traffic_picture,
+)
+from central.desk.report.run import Run
+from central.desk.report.tables import (
+    OWN_HEADINGS,
+    OWN_NOTE,
+    PATH_HEADINGS,
+    PATH_NOTE,
+    ROBOT_HEADINGS,
+    own_rows,
+    path_row,
+    robot_note,
+    robot_row,
+    shown,
+    team_rows,
+    title_of,
+    unfused,
+)
+
+LISTED_EVENTS = 200
+"""Events in the page's table; report.json has them all."""
+NIS_NOTE = (
+    "NIS lies below 1 where a robot's sensor is configured with errors that last within a window "
+    "(range_white, bearing_white): the particles take every error for a new one."
+)
+_ORIGIN = ("commit", "seed", "command", "python")
+"""What of a log's metadata comes first."""
+
+_STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1b1b1b; max-width: 62rem; margin: 0 auto;
+  padding: 1rem; }
+h1 { font-size: 1.5rem; line-height: 1.25; } h2 { font-size: 1.2rem; margin: 2rem 0 .5rem; }
+nav { font-size: .9rem; } nav a { margin-right: .8rem; white-space: nowrap; display: inline-block; }
+a { color: #0b5ea8; }
+table { border-collapse: collapse; margin: .5rem 0 1rem; display: block; overflow-x: auto;
+  font-variant-numeric: tabular-nums; }
+th, td { text-align: right; padding: .25rem .6rem; border-bottom: 1px solid #ddd;
+  vertical-align: top; white-space: pre-line; }
+th:first-child, td:first-child, table.words td, table.words th {
+  text-align: left; }
+table.words td:first-child { white-space: nowrap; }
+figure { margin: 1rem 0; overflow-x: auto; }
+img { width: 100%; height: auto; } img.wide { min-width: 34rem; }
+p.note { color: #555; font-size: .9rem; } .good { color: #1c6e2c; } .bad { color: #b00020; }
+details { margin: 1rem 0; } summary { cursor: pointer; font-weight: 600; }
+pre { overflow-x: auto; background: #f6f6f6; padding: .6rem; font-size: .85rem; }
+@media (max-width: 40rem) {
+  body { padding: .6rem; font-size: 15px; } td, th { padding: .2rem .4rem; }
+}
+"""
+
+
+def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
+    """Write report.html, report.json, pictures and trajectories into the folder; what was written.
+
+    figures: those of the evaluation and of the run. A picture that has nothing to show is left out.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    evaluation, history = run.evaluation, run.history
+    map_png, errors_png, consistency_png, traffic_png, latency_png, timeline_png = (
+        directory / f"{name}.png"
+        for name in ("map", "errors", "consistency", "traffic", "latency", "timeline")
+    )
+    drawn = {
+        map_png: map_picture(evaluation, map_png),
+        errors_png: error_picture(evaluation, errors_png),
+        consistency_png: consistency_picture(evaluation, history, consistency_png),
+        traffic_png: traffic_picture(history, traffic_png),
+        latency_png: latency_picture(history, latency_png),
+        timeline_png: timeline_picture(history, timeline_png),
+    }
+    pictures = {path.stem: path for path, there in drawn.items() if there}
+    data = directory / "report.json"
+    data.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    page = directory / "report.html"
+    page.write_text(_page(run, pictures), encoding="utf-8")
+    trajectories = directory / "trajectories"
+    paths = write_trajectories(evaluation, trajectories)
+    return [page, data, *pictures.values(), *([trajectories] if paths else [])]
+
+
+def _page(run: Run, pictures: Mapping[str, Path]) -> str:
+    title = escape(title_of(run.evaluation))
+    sections = [
+        ("Map", [_image(pictures, "map", wide=False), *_own_maps(run)]),
+        ("Robots", _robots(run, pictures)),
+        ("Honesty", _honesty(run, pictures)),
+        ("Paths", _paths(run)),
+        ("Readings", _readings(run)),
+        ("Events", _events(run, pictures)),
+        ("Latency", _latency(run, pictures)),
+        ("Traffic", _traffic(run, pictures)),
+        ("Origin", _origin(run)),
+    ]
+    there = [(name, "\n".join(filter(None, parts))) for name, parts in sections]
+    there = [(name, text) for name, text in there if text]
+    links = "".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in there)
+    body = "\n".join(f'<h2 id="{name.lower()}">{name}</h2>\n{text}' for name, text in there)
+    return (
+        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}</title>\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<style>{_STYLE}</style>\n<h1>{title}</h1>\n<nav>{links}</nav>\n"
+        f"{_table((), team_rows(run.evaluation), words=True)}\n{_notes(run)}\n{body}\n</html>\n"
+    )
+
+
+def _notes(run: Run) -> str:
+    return "\n".join(f"<p>{escape(note)}</p>" for note in run.evaluation.notes)
+
+
+def _own_maps(run: Run) -> list[str]:
+    """Where there is no fused map: each robot's own."""
+    if not unfused(run.evaluation):
+        return []
+    return [_table(OWN_HEADINGS, own_rows(run.evaluation)), _note(OWN_NOTE)]
+
+
+def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+    rows = [robot_row(name, robot) for name, robot in run.evaluation.robots.items()]
+    if not rows:
+        return []
+    return [
+        _table(ROBOT_HEADINGS, rows),
+        _note(robot_note(run.evaluation)),
+        _image(pictures, "errors"),
+    ]
+
+
+def _honesty(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+    """Whether the covariances are true: with truth NEES and coverage, without it NIS and cost."""
+    innovations, cost = run.history.innovations, run.evaluation.cost_by_robot
+    scale = run.evaluation.scale_by_robot
+    rows = []
+    for name in sorted(run.evaluation.robots.keys() | innovations.keys() | cost.keys()):
+        robot, of = run.evaluation.robots.get(name), innovations.get(name)
+        online = None if robot is None else robot.online
+        rows.append(
+            (
+                name,
+                shown(None if of is None else of.per_dof, ".3f", ""),
+                "–" if of is None else f"{int(of.dof.sum()):,}",
+                shown(cost.get(name), ".3f", ""),
+                shown(scale.get(name), ".2f", ""),
+                shown(None if online is None else online.nees_per_dof, ".3g", ""),
+                shown(None if online is None else online.coverage, ".0%", ""),
+            )
+        )
+    told = [row for row in rows if any(cell != "–" for cell in row[1:])]
+    if not told and "consistency" not in pictures:
+        return []
+    headings = (
+        "robot",
+        "NIS\n/dof",
+        "its\ndof",
+        "joint cost\n/dof",
+        "covariance\nscale",
+        "online\nNEES/dof",
+        "in\n95 %",
+    )
+    return [_table(headings, told), _note(NIS_NOTE), _image(pictures, "consistency")]
+
+
+def _paths(run: Run) -> list[str]:
+    rows = [path_row(name, robot) for name, robot in run.evaluation.robots.items()]
+    if all(cell == "–" for row in rows for cell in row[1:]):
+        return []
+    absolute = [
+        (
+            name, kind, f"{errors.poses:,}",
+            shown(errors.ape_m, ".3f", ""), shown(errors.ape_aligned_m, ".3f", ""),
+            _degrees(errors.ape_aligned_rad), shown(errors.rpe_m, ".3f", ""),
+            _degrees(errors.rpe_rad),
+        )
+        for name, of in run.trajectories().items()
+        for kind, errors in of.items()
+    ]  # fmt: skip
+    headings = (
+        "robot", "path", "poses", "APE\n[m]", "APE moved\n[m]", "APE moved\n[°]", "RPE\n[m]",
+        "RPE\n[°]",
+    )  # fmt: skip
+    note = (
+        "RMS with evo's definitions; moved: after the rigid motion that aligns the path itself; "
+        "RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
+        "evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum gives the same."
+    )
+    return [_table(PATH_HEADINGS, rows), _note(PATH_NOTE), _table(headings, absolute), _note(note)]
+
+
+def _readings(run: Run) -> list[str]:
+    ledger = run.ledger
+    if ledger is None:
+        told = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
+        said = [_dispositions(told)] if any(told.values()) else []
+        return [*said, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
+    robots = sorted({robot for robot, _ in ledger.entries})
+    used = sum(1 for maps in ledger.maps.values() if maps)
+    kind, verdict = ("good", ledger.statement())
+    if ledger.offenders:
+        kind = "bad"
+        verdict = f"{len(ledger.offenders)} offenders: {'; '.join(ledger.offenders[:5])}"
+    return [
+        f'<p class="{kind}">Ledger: {escape(verdict)}.</p>',
+        _dispositions({robot: ledger.totals(robot) for robot in robots}),
+        _note(f"{len(ledger.maps)} submaps, {used} of them in a map"),
+    ]
+
+
+def _dispositions(told: Mapping[str, Mapping[str, int]]) -> str:
+    """A row for each disposition, a column for each robot."""
+    rows = []
+    for disposition in sorted(set().union(*told.values())):
+        counts = [of.get(disposition, 0) for of in told.values()]
+        rows.append((disposition, *(f"{count:,}" for count in (*counts, sum(counts)))))
+    return _table(("disposition", *told, "all"), rows)
+
+
+def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+    events = run.history.events
+    if not events:
+        return []
+    rows = [
+        ("before" if s < 0.0 else f"{s:.1f} s", event.node, event.text)
+        for event in events[:LISTED_EVENTS]
+        for s in ((event.stamp_ns - run.history.start_ns) * 1e-9,)
+    ]
+    more = len(events) - len(rows)
+    left = _note(f"{more} more in report.json") if more else ""
+    return [_image(pictures, "timeline"), _table(("", "who", "what"), rows, words=True), left]
+
+
+def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+    latency = run.history.latencies
+    if not latency:
+        return []
+    rows = []
+    for name, of in latency.items():
+        cells = [
+            f"{_quantile(v, q):.3g}" for v in (of.last_s, of.first_s) for q in (0.5, 0.95, 1.0)
+        ]
+        rows.append((name, f"{len(of.last_s):,}", *cells))
+    headings = (
+        "robot", "submaps", "last\nmedian", "last\n95 %", "last\nmax", "first\nmedian",
+        "first\n95 %", "first\nmax",
+    )  # fmt: skip
+    note = (
+        "Wall time [s] from the publication of a submap's last and first reading to that of the "
+        "first map that used it, by the publishers' clocks."
+    )
+    return [_table(headings, rows), _note(note), _image(pictures, "latency")]
+
+
+def _traffic(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+    span_s = (run.history.end_ns - run.history.start_ns) * 1e-9
+    rows = [
+        (key, f"{t.messages:,}", f"{t.bytes:,}", f"{t.bytes / span_s:,.1f}" if span_s > 0 else "–")
+        for key, t in run.evaluation.channels.items()
+    ]
+    if not rows:
+        return []
+    table = _table(("key", "messages", "bytes", "B/s"), rows)
+    summary = f"<summary>Every key ({len(rows)})</summary>"
+    return [_image(pictures, "traffic"), f"<details>{summary}{table}</details>"]
+
+
+def _origin(run: Run) -> list[str]:
+    """The log's metadata; what is long is folded away."""
+    short = {k: v for k, v in run.provenance.items() if len(v) <= 80}
+    first = [(k, short[k]) for k in _ORIGIN if k in short]
+    rest = [(k, v) for k, v in sorted(short.items()) if k not in _ORIGIN]
+    folded = [
+        f"<details><summary>{escape(k)}</summary><pre>{escape(_indented(v))}</pre></details>"
+        for k, v in sorted(run.provenance.items())
+        if k not in short
+    ]
+    return [_table((), [*first, *rest], words=True) if short else "", *folded]
+
+
+def _indented(text: str) -> str:
+    try:
+        return json.dumps(json.loads(text), indent=2, ensure_ascii=False)
+    except ValueError:
+        return text
+
+
+def _image(pictures: Mapping[str, Path], name: str, *, wide: bool = True) -> str:
+    if name not in pictures:
+        return ""
+    data = base64.b64encode(pictures[name].read_bytes()).decode()
+    kind = ' class="wide"' if wide else ""
+    return f'<figure><img{kind} alt="{name}" src="data:image/png;base64,{data}"></figure>'
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, words: bool = False) -> str:
+    head = "".join(f"<th>{escape(heading)}</th>" for heading in headings)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>\n" for row in rows
+    )
+    opening = '<table class="words">' if words else "<table>"
+    return f"{opening}\n<tr>{head}</tr>\n{body}</table>" if head else f"{opening}\n{body}</table>"
+
+
+def _quantile(values: Float[np.ndarray, " n"], share: float) -> float:
+    return float(np.quantile(values, share))
+
+
+def _degrees(angle_rad: float | None) -> str:
+    return shown(None if angle_rad is None else degrees(angle_rad), ".2f", "")

@@ -1,0 +1,85 @@
+"""Everything that a report says of a run, and its figures for machines."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from central.desk.evaluation.evaluation import Evaluation
+from central.desk.evaluation.history import History
+from central.desk.evaluation.trajectories import TrajectoryErrors, trajectory_errors
+from central.desk.ledger import Ledger
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as its log tells it.
+
+    provenance: the log's metadata. ledger: what `verify-ledger` finds, None where it was not asked
+    or where the log lacks what it needs: `no_ledger` says which.
+    """
+
+    evaluation: Evaluation
+    history: History
+    provenance: Mapping[str, str]
+    ledger: Ledger | None = None
+    no_ledger: str = "not asked for; `teamslam verify-ledger LOG` proves it"
+
+    def trajectories(self) -> dict[str, dict[str, TrajectoryErrors]]:
+        """By robot and by kind of path ("smoothed", "online"); those that have truth."""
+        found: dict[str, dict[str, TrajectoryErrors]] = {}
+        for name, robot in self.evaluation.robots.items():
+            for kind, path in (("smoothed", robot.smoothed_path), ("online", robot.online_path)):
+                errors = trajectory_errors(path, robot.truth)
+                if errors is not None:
+                    found.setdefault(name, {})[kind] = errors
+        return found
+
+
+def nis_line(run: Run) -> str | None:
+    """NIS per degree of freedom of every robot in one line; None where nothing was predicted."""
+    told = {name: of.per_dof for name, of in run.history.innovations.items()}
+    parts = [f"{name} {value:.2f}" for name, value in told.items() if value is not None]
+    return f"NIS per dof: {', '.join(parts)}" if parts else None
+
+
+def run_figures(run: Run) -> dict[str, Any]:
+    """What a report adds to an evaluation's figures; angles in radians, times in seconds."""
+    history, ledger = run.history, run.ledger
+    span_s = (history.end_ns - history.start_ns) * 1e-9
+    return {
+        "team_time_s": span_s,
+        "nis_per_dof": {robot: of.per_dof for robot, of in history.innovations.items()},
+        "nis_dof": {robot: int(of.dof.sum()) for robot, of in history.innovations.items()},
+        "latency_s": {
+            robot: {"last_reading": _spread(of.last_s), "first_reading": _spread(of.first_s)}
+            for robot, of in history.latencies.items()
+        },
+        "bytes_per_s": {
+            key: float(of.sizes.sum()) / span_s if span_s > 0.0 else None
+            for key, of in history.traffic.items()
+        },
+        "trajectories": {
+            robot: {kind: errors.to_json() for kind, errors in of.items()}
+            for robot, of in run.trajectories().items()
+        },
+        "events": [
+            {"team_time_s": s, "node": event.node, "kind": event.kind, "text": event.text}
+            for event in history.events
+            for s in ((event.stamp_ns - history.start_ns) * 1e-9,)
+        ],
+        "ledger": None
+        if ledger is None
+        else {
+            "readings": ledger.readings,
+            "dispositions": ledger.totals(),
+            "offenders": list(ledger.offenders),
+        },
+        "provenance": dict(run.provenance),
+    }
+
+
+def _spread(values: np.ndarray) -> dict[str, float]:
+    median, most, largest = np.quantile(values, (0.5, 0.95, 1.0)).tolist()
+    return {"median": median, "p95": most, "max": largest}

@@ -1,0 +1,195 @@
+"""The tables of a report, for a terminal and for the page: what a run was worth, in words."""
+
+from collections.abc import Sequence
+from math import degrees
+
+from rich.table import Table
+from rich.text import Text
+
+from central.desk.evaluation.evaluation import Evaluation, RobotResult
+
+ABSURD_NEES = 1000
+"""Beyond this a NEES per dof is over-confident by any measure."""
+_COUNT_AGAIN = ("kalman", "kalman-per-axis")
+Rows = Sequence[tuple[str, str]]
+
+
+def summary_tables(evaluation: Evaluation) -> list[Table]:
+    """The team's figures, and a row for each robot; 80 columns wide at the most."""
+    team = Table(title=Text(title_of(evaluation)), show_header=False)
+    for name, value in team_rows(evaluation):
+        team.add_row(Text(name), Text(value))
+    robots = Table(caption=robot_note(evaluation))
+    for heading in ROBOT_HEADINGS:
+        robots.add_column(Text(heading), justify="left" if heading == "robot" else "right")
+    for name, robot in evaluation.robots.items():
+        robots.add_row(*(Text(cell) for cell in robot_row(name, robot)))
+    if unfused(evaluation):
+        own = Table(caption=OWN_NOTE)
+        for heading in OWN_HEADINGS:
+            own.add_column(Text(heading), justify="left" if heading == "robot" else "right")
+        for row in own_rows(evaluation):
+            own.add_row(*(Text(cell) for cell in row))
+        return [team, robots, own]
+    if all(robot.smoothed is None for robot in evaluation.robots.values()):
+        return [team, robots]
+    paths = Table(caption=PATH_NOTE)
+    for heading in PATH_HEADINGS:
+        paths.add_column(Text(heading), justify="left" if heading == "robot" else "right")
+    for name, robot in evaluation.robots.items():
+        paths.add_row(*(Text(cell) for cell in path_row(name, robot)))
+    return [team, robots, paths]
+
+
+def title_of(evaluation: Evaluation) -> str:
+    """Scenario, seed, estimator and rule."""
+    scenario = evaluation.scenario
+    if scenario is None:
+        return "a run whose scenario is not known"
+    return f"{scenario.name}, seed {scenario.seed}: {scenario.estimator} + {scenario.fusion}"
+
+
+def team_rows(evaluation: Evaluation) -> Rows:
+    """The team's figures: name and value."""
+    fused = evaluation.map
+    if fused is None:
+        return [("final map", "none: the run did not come to its end")]
+    errors = fused.errors
+    if not len(fused.ids) and fused.reasons:
+        return [("final map", f"empty: {'; '.join(fused.reasons)}")]
+    rows = [("landmarks", str(len(fused.ids)))]
+    if errors is None:
+        rows.append(("landmark errors", "can not be computed: no true landmarks"))
+    else:
+        low, high = errors.band
+        kind = "joint" if fused.joint else "blocks only"
+        verdict = "in" if errors.in_band else "outside"
+        rows += [
+            ("landmark RMSE", f"{errors.rmse_m:.3f} m"),
+            ("after rigid alignment", shown(errors.aligned_rmse_m, ".3f", " m")),
+            (
+                "map NEES per dof",
+                _absurd(evaluation)
+                if errors.nees_per_dof > ABSURD_NEES
+                else f"{errors.nees_per_dof:.4g}, {verdict} 95 % of {low:.2f}…{high:.2f} ({kind})",
+            ),
+        ]
+        shape = errors.shape
+        if shape is not None:
+            nees = f"{shape.nees_per_landmark:.2f}, 2 is right; {shape.coverage:.0%} within 95 %"
+            rows.append(("shape NEES/landmark", nees))
+        rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
+    rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
+    rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
+    rows += [("joined", words) for words in fused.joined]
+    rows += [("note", words) for words in fused.reasons]
+    meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]
+    if meetings:
+        rows.append(("rendezvous", f"{sum(meetings)} times a robot sent what it held or was to"))
+    rows.append(("final map, its set", f"{fused.digest}, frame {fused.frame or '–'}"))
+    if evaluation.unsound:
+        rows.append(("unsound messages", str(evaluation.unsound)))
+    return rows
+
+
+def _absurd(evaluation: Evaluation) -> str:
+    """The digits of a NEES of 1e18 say nothing to people; why it is so large does."""
+    scenario = evaluation.scenario
+    again = scenario is not None and scenario.fusion in _COUNT_AGAIN
+    why = " (rule counts readings again)" if again else ""
+    return f"> {ABSURD_NEES}: over-confident{why}"
+
+
+def robot_note(evaluation: Evaluation) -> str:
+    """What has to be known to read the robots' rows."""
+    online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
+    star = ", * of online ones" if online else ""
+    return f"a step is one odometry interval; errors of smoothed poses{star}"
+
+
+ROBOT_HEADINGS = (
+    "robot", "steps", "readings\naccounted\nfor/sent", "sub-\nmaps", "position\nRMSE [m]",
+    "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
+)  # fmt: skip
+
+
+def robot_row(name: str, robot: RobotResult) -> tuple[str, ...]:
+    """The cells under ROBOT_HEADINGS."""
+    used = robot.consumption
+    errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
+    readings = f"all {used.published}"
+    if used.consumed != used.published:
+        readings = f"{'–' if used.consumed is None else used.consumed}/{used.published}"
+    return (
+        name,
+        str(used.steps),
+        readings,
+        str(used.submaps),
+        shown(None if errors is None else errors.position_rmse_m, ".3f", mark),
+        shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
+        shown(None if errors is None else errors.nees_per_dof, ".3g", mark),
+        shown(robot.uplink_bytes_per_step, ".1f", ""),
+    )
+
+
+PATH_HEADINGS = (
+    "robot", "path\n[m]", "moved\n[m]", "NEES\n/dof", "in\n95 %",
+    "online\n[m]", "moved\n[m]", "NEES\n/dof", "in\n95 %",
+)  # fmt: skip
+PATH_NOTE = "position RMSE of the smoothed path and online; moved: as the map to align it"
+
+
+def path_row(name: str, robot: RobotResult) -> tuple[str, ...]:
+    """Position errors, NEES and coverage of the smoothed and of the online path."""
+    cells = [name]
+    for errors, aligned in (
+        (robot.smoothed, robot.aligned_rmse_m),
+        (robot.online, robot.online_aligned_rmse_m),
+    ):
+        cells += [
+            shown(None if errors is None else errors.position_rmse_m, ".3f", ""),
+            shown(aligned, ".3f", ""),
+            shown(None if errors is None else errors.nees_per_dof, ".3g", ""),
+            shown(None if errors is None else errors.coverage, ".0%", ""),
+        ]
+    return tuple(cells)
+
+
+OWN_HEADINGS = (
+    "robot", "land-\nmarks", "RMSE\n[m]", "moved\n[m]", "NEES\n/dof", "95 % of it", "in\n95 %",
+)  # fmt: skip
+OWN_NOTE = "each robot's own last map; moved: to align it"
+
+
+def unfused(evaluation: Evaluation) -> bool:
+    """Whether only the robots have maps, and each its own."""
+    empty = evaluation.map is not None and not len(evaluation.map.ids)
+    return empty and any(robot.own_map is not None for robot in evaluation.robots.values())
+
+
+def own_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """Errors, NEES with its band, and coverage of every robot's own map."""
+    rows = []
+    for name, robot in evaluation.robots.items():
+        own = robot.own_map
+        if own is None:
+            rows.append((name, *["–"] * (len(OWN_HEADINGS) - 1)))
+            continue
+        low, high = own.band
+        rows.append(
+            (
+                name,
+                str(own.count),
+                f"{own.rmse_m:.3f}",
+                shown(own.aligned_rmse_m, ".3f", ""),
+                f"{own.nees_per_dof:.4g}",
+                f"{low:.2f}…{high:.2f}",
+                f"{own.coverage:.0%}",
+            )
+        )
+    return rows
+
+
+def shown(value: float | None, form: str, unit: str) -> str:
+    """The number with its unit, a dash where there is none."""
+    return "–" if value is None else f"{value:{form}}{unit}"

@@ -1,0 +1,134 @@
+"""A recorded run beside the same readings under other conditions: figures, and one picture."""
+
+from collections.abc import Callable
+from math import degrees
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
+from central.desk.pictures.run import DPI, ellipse_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+RECORDED_COLOUR = "#0072B2"
+CHANGED_COLOUR = "#D55E00"
+TRUTH_COLOUR = "#7a7a7a"
+Row = tuple[str, str, str]
+
+
+def comparison_rows(recorded: Evaluation, changed: Evaluation) -> list[Row]:
+    """(figure, recorded, recomputed), "–" where there is none."""
+    of_the_team: tuple[tuple[str, Callable[[Evaluation], str]], ...] = (
+        ("rule", lambda e: "–" if e.map is None else e.map.rule),
+        ("landmarks in the final map", lambda e: "–" if e.map is None else f"{len(e.map.ids)}"),
+        ("landmark RMSE [m]", lambda e: _of_errors(e.map, "rmse_m", ".4f")),
+        ("… after rigid alignment [m]", lambda e: _of_errors(e.map, "aligned_rmse_m", ".4f")),
+        ("map NEES per dof", lambda e: _of_errors(e.map, "nees_per_dof", ".4g")),
+        (
+            "joint cost per dof",
+            lambda e: _shown(None if e.map is None else e.map.cost_per_dof, ".4g"),
+        ),
+        ("maps broadcast", lambda e: str(_messages(e, "central/map"))),
+        ("final map, its bytes", lambda e: "–" if e.map is None else e.map.payload_sha256[:16]),
+    )
+    rows = [(name, of(recorded), of(changed)) for name, of in of_the_team]
+    for name in sorted(recorded.robots.keys() | changed.robots.keys()):
+        a, b = recorded.robots.get(name), changed.robots.get(name)
+        rows.append((f"{name}: online position RMSE [m]", _online(a), _online(b)))
+        rows.append((f"{name}: smoothed position RMSE [m]", _smoothed(a), _smoothed(b)))
+        rows.append((f"{name}: heading RMSE, smoothed [°]", _heading(a), _heading(b)))
+        rows.append((f"{name}: uplink [bytes/step]", _uplink(a), _uplink(b)))
+    return rows
+
+
+def same_final_map(recorded: Evaluation, changed: Evaluation) -> bool:
+    """Whether both ended with a map, and with the same bytes."""
+    a, b = recorded.map, changed.map
+    return a is not None and b is not None and a.payload_sha256 == b.payload_sha256
+
+
+def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
+    """The largest distance between a landmark's two positions; None without a common landmark."""
+    if recorded.map is None or changed.map is None:
+        return None
+    _, a, b = np.intersect1d(recorded.map.ids, changed.map.ids, return_indices=True)
+    moves = recorded.map.means[a] - changed.map.means[b]
+    return float(np.hypot(*moves.T).max()) if len(moves) else None
+
+
+def comparison_picture(recorded: Evaluation, changed: Evaluation, path: Path) -> bool:
+    """Both final maps with 95 % ellipses over the truth; False where there is neither."""
+    if recorded.map is None and changed.map is None:
+        return False
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 9.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    truth = recorded.true_landmarks
+    if len(truth):
+        axis.plot(*truth.T, "x", color=TRUTH_COLOUR, markersize=8, label="true landmarks")
+    if recorded.map is not None:
+        _draw(axis, recorded.map, RECORDED_COLOUR, "recorded", ".")
+    if changed.map is not None:
+        _draw(axis, changed.map, CHANGED_COLOUR, "recomputed", "+")
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    axis.grid(color="#e4e4e4", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.set_title("Final maps with 95 % ellipses", fontsize=12)
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3, frameon=False)
+    figure.savefig(path, dpi=DPI)
+    return True
+
+
+def _draw(axis: "Axes", fused: MapResult, colour: str, label: str, marker: str) -> None:
+    from matplotlib.patches import Ellipse
+
+    axis.plot(
+        *fused.means.T, marker, color=colour, markersize=8, markerfacecolor="none", label=label
+    )
+    for k, mean in enumerate(fused.means):
+        block = fused.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        width, height, turn_deg = ellipse_of(block)
+        centre = (float(mean[0]), float(mean[1]))
+        ellipse = Ellipse(centre, width, height, angle=turn_deg, fill=False, edgecolor=colour)
+        axis.add_patch(ellipse)
+
+
+def _of_errors(fused: MapResult | None, name: str, form: str) -> str:
+    errors = None if fused is None else fused.errors
+    return _shown(None if errors is None else getattr(errors, name), form)
+
+
+def _messages(evaluation: Evaluation, key: str) -> int:
+    traffic = evaluation.channels.get(key)
+    return 0 if traffic is None else traffic.messages
+
+
+def _online(robot: RobotResult | None) -> str:
+    errors = None if robot is None else robot.online
+    return _shown(None if errors is None else errors.position_rmse_m, ".4f")
+
+
+def _smoothed(robot: RobotResult | None) -> str:
+    errors = None if robot is None else robot.smoothed
+    return _shown(None if errors is None else errors.position_rmse_m, ".4f")
+
+
+def _heading(robot: RobotResult | None) -> str:
+    errors = None if robot is None else robot.smoothed
+    return _shown(None if errors is None else degrees(errors.heading_rmse_rad), ".3f")
+
+
+def _uplink(robot: RobotResult | None) -> str:
+    return _shown(None if robot is None else robot.uplink_bytes_per_step, ".1f")
+
+
+def _shown(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)

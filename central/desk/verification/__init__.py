@@ -1,0 +1,1 @@
+"""A log computed again, message by message, and compared with what was recorded."""

@@ -1,0 +1,217 @@
+"""One robot's messages again: its node over its recorded readings."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import takewhile
+
+import msgspec
+
+from central.desk.verification.recorded import Identity, Recorded, identity
+from team.config import RobotConfig
+from team.containment import Boundary
+from team.estimation.hybrid_slam.pose_grid import NO_NODE
+from team.pairs import FEEDBACK
+from team.robot.member import HybridMember
+from team.robot.node import LATE, RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+PosesSaid = Mapping[tuple[int, int], Sequence[m.Prior | None]]
+"""By (epoch, stamp): the priors that the recorded poses name; None: none of them."""
+
+
+class RetoldRobot(RobotNode):
+    """The robot's node, but its poses are those of the log: same stamps, from the named priors.
+
+    Which prior a running pose found depends on what had arrived, so the pose names it. The
+    configuration keeps the digest under which it was announced.
+    """
+
+    def __init__(self, config: RobotConfig, digest: bytes, said: PosesSaid) -> None:
+        super().__init__(config)
+        self._boundary = Boundary(ch.robot_node(config.id))
+        self._announcement = msgspec.structs.replace(self._announcement, digest=digest)
+        self._said = said
+
+    def _poses(self, stamp_ns: int | None) -> list[Outgoing]:
+        if stamp_ns is None:
+            return []
+        out: list[Outgoing] = []
+        for prior in self._said.get((self._epoch, stamp_ns), ()):
+            self._pose_ns, self._prior = None, prior
+            out += super()._poses(stamp_ns)
+        return out
+
+    def given(self, message: m.Message) -> list[Outgoing]:
+        """Handle a message as the shell did: one that raises is set aside."""
+        return self._boundary.give(self, message)
+
+    def took(self, message: m.Message) -> Counter[str]:
+        """Take a reading or the end; the dispositions that it gave, how many of each."""
+        before = Counter[str]() if isinstance(message, m.Start) else Counter(self._ledger)
+        self.given(message)
+        return self._ledger - before
+
+
+Born = Callable[[], RetoldRobot]
+
+
+def retold_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
+    """Every message that the robot's readings give, under the names of its inputs."""
+    config, digest = log.robot_config(robot)
+    said = _poses_said(log, robot)
+
+    def born() -> RetoldRobot:
+        node = RetoldRobot(config, digest, said)
+        if log.known_map is not None:
+            node.given(log.known_map)
+        return node
+
+    lives = _in_lockstep if config.fusion in FEEDBACK else _alone
+    found: dict[Identity, m.Message] = {}
+    for out in lives(log, robot, born):
+        found.setdefault(identity(out.key, out.message), out.message)
+    return found
+
+
+def _poses_said(log: Recorded, robot: str) -> PosesSaid:
+    priors = {p.digest: p for p in log.of(ch.PRIOR) if isinstance(p, m.Prior) and p.robot == robot}
+    said: dict[tuple[int, int], list[m.Prior | None]] = {}
+    for channel in (ch.TEAM_POSE, ch.OWN_POSE):
+        for pose in log.of(channel):
+            if not isinstance(pose, m.PoseEstimate) or pose.robot != robot:
+                continue
+            wanted = said.setdefault((pose.epoch, pose.stamp_ns), [])
+            prior = priors.get(pose.map_digest)
+            if prior not in wanted if prior is not None else not wanted:
+                wanted.append(prior)
+    return said
+
+
+def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
+    """Without feedback nothing from outside matters: each epoch by itself, each life that ended.
+
+    A `Done` names the life that it closes: up to which reading, over how many steps. A life that
+    began after a submap is computed from there, as a resumed robot does. Where a reading is not in
+    the log, the computation goes on behind the next recorded submap.
+    """
+    for epoch in log.epochs(robot):
+        readings = log.readings[(robot, epoch)]
+        chain = _chain(log, robot, epoch)
+        dones = _dones(log, robot, epoch)
+        lives = [(_first_of(done, chain, readings), done.readings) for done in dones]
+        if not any(first == 0 for first, _ in lives):
+            yield from _life(born, readings, chain, 0, None)
+        for first, until in lives:
+            yield from _life(born, readings, chain, first, until)
+
+
+def _dones(log: Recorded, robot: str, epoch: int) -> list[m.Done]:
+    said = (d for d in log.of(ch.ROBOT_DONE) if isinstance(d, m.Done))
+    return [d for d in said if (d.robot, d.epoch) == (robot, epoch)]
+
+
+def _chain(log: Recorded, robot: str, epoch: int) -> list[m.Submap]:
+    found = log.submaps().get((robot, epoch), {})
+    return [found[k] for k in takewhile(found.__contains__, range(len(found)))]
+
+
+def _first_of(done: m.Done, chain: Sequence[m.Submap], readings: Mapping[int, m.Reading]) -> int:
+    """The first reading of the life that ended so, by its steps."""
+    steps = 0
+    begins = {0, *(submap.last_reading + 1 for submap in chain)}
+    for counter in range(min(done.readings, max(readings) + 1), -1, -1):
+        steps += counter < done.readings and isinstance(readings.get(counter), m.Odometry)
+        if counter in begins and steps == done.steps:
+            return counter
+    return 0
+
+
+def _life(
+    born: Born,
+    readings: Mapping[int, m.Reading],
+    chain: Sequence[m.Submap],
+    first: int,
+    until: int | None,
+) -> Iterator[Outgoing]:
+    """The messages of a life from reading `first` on; it ends before reading `until`, if it did."""
+    start = readings.get(0)
+    if not isinstance(start, m.Start):
+        return
+    last = max(readings) + 1 if until is None else until
+    while True:
+        node = born()
+        if first:
+            node.resume(start, [s for s in chain if s.last_reading < first])
+        counter = first
+        while counter < last and counter in readings:
+            yield from node.given(readings[counter])
+            counter += 1
+        if counter == last and until is not None:
+            end = m.StreamEnd(start.robot, start.epoch, until)
+            yield from node.given(m.End(0, (end,)))
+        behind = (s.last_reading + 1 for s in chain if counter <= s.last_reading < last)
+        following = next((b for b in behind if b in readings), None)
+        if counter >= last or following is None:
+            return
+        first = following
+
+
+def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
+    """Under a rule with feedback a robot waits for each round's map: it is the recorded one.
+
+    A round that has no map in the log had no centre: the robot went on without it.
+    """
+    fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
+    node = born()
+    epochs = log.epochs(robot)
+    inputs: list[m.Message] = [
+        log.readings[(robot, epoch)][counter]
+        for epoch in epochs
+        for counter in sorted(log.readings[(robot, epoch)])
+    ]
+    if any(isinstance(d, m.Done) and d.robot == robot for d in log.of(ch.ROBOT_DONE)):
+        end = m.StreamEnd(robot, epochs[-1], len(log.readings[(robot, epochs[-1])]))
+        inputs.append(m.End(0, (end,)))
+    inputs.reverse()
+    while inputs:
+        out = node.given(inputs.pop())
+        yield from out
+        for each in out:
+            if isinstance(each.message, m.MapEstimate):
+                centre = m.Liveliness(0, "central", each.message.exchange in fused)
+                inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
+
+
+def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
+    """What the robot's node does with each reading of an epoch that it consumed, in its own words.
+
+    Without a centre nothing holds it up. Scans that no odometry covers and sightings whose pose
+    node did not come are known at the end only.
+    """
+    config, digest = log.robot_config(robot)
+    node = RetoldRobot(config, digest, {})
+    if log.known_map is not None:
+        node.given(log.known_map)
+    node.given(m.Liveliness(0, "central", False))
+    readings = log.readings.get((robot, epoch), {})
+    done = max((d.readings for d in _dones(log, robot, epoch)), default=None)
+    said: dict[int, str] = {}
+    for counter in takewhile(readings.__contains__, range(len(readings) if done is None else done)):
+        took = node.took(readings[counter])
+        if LATE in took:  # an odometry interval that ends a window, and scans that it leaves behind
+            scans = [n for n in said if isinstance(readings[n], m.Observations)]
+            scans = [n for n in scans if not said[n].startswith("rejected")]
+            said |= dict.fromkeys(scans[-took.pop(LATE) :], LATE)
+            said[counter] = HybridMember.used
+        else:
+            said[counter] = next(iter(took), "lost")
+    if said and done is not None:
+        end = m.StreamEnd(robot, epoch, len(said))
+        for reason, count in node.took(m.End(0, (end,))).items():
+            kind = m.Sightings if reason == f"rejected: {NO_NODE}" else m.Observations
+            taken = [n for n in said if isinstance(readings[n], kind)]
+            taken = [n for n in taken if not said[n].startswith("rejected")]
+            said |= dict.fromkeys(taken[-count:], reason)
+    return said

@@ -1,0 +1,187 @@
+"""Verification: every recomputable message of a log, computed again and compared.
+
+A log's order is the recorder's, not a node's, so no run is played again: each message is computed
+from the inputs that it names. Submaps, own maps and own poses come from the readings and the
+configuration alone; a team pose from the prior whose digest it names; a fused map, its priors,
+the trajectories and the final map from the recorded submaps of the map's version vector; what a
+rule with feedback exchanged from the recorded maps of the round. So one wrong message shows by
+itself, and what followed from it is right again.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from central.desk.verification.centre import retold_centre
+from central.desk.verification.differences import first_difference
+from central.desk.verification.recorded import Identity, Recorded, Said, identity, recorded
+from central.desk.verification.robot import retold_robot
+from team.recording.provenance import provenance
+from team.recording.reader import Log
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import encoded
+
+PLATFORM = (
+    "kernels", "cpu.name", "cpu.features", "blas",
+    "version.numpy", "version.scipy", "version.numba", "version.llvmlite",
+)  # fmt: skip
+"""The metadata that have to be equal for equal bits."""
+CHECKED = (
+    ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE, ch.ROBOT_DONE,
+    ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
+    ch.CENTRAL_POSE,
+)  # fmt: skip
+"""Causes before what follows from them."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A recorded message that is not what its inputs give; `counter` is its publisher's."""
+
+    key: str
+    stamp_ns: int
+    counter: int
+    names: str
+    field: str
+    recorded: str
+    recomputed: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.key} at {self.stamp_ns * 1e-9:.3f} s, counter {self.counter} ({self.names}): "
+            f"{self.field} is {self.recorded} in the log, {self.recomputed} when computed again"
+        )
+
+
+@dataclass(frozen=True)
+class ChannelResult:
+    """One channel: messages in the log, equal to the last bit, equal within the tolerance only.
+
+    first: the first that differs by more. Whatever is in neither count differs.
+    """
+
+    channel: str
+    messages: int
+    equal: int
+    close: int
+    first: Difference | None
+
+    @property
+    def different(self) -> int:
+        """Messages that are not what their inputs give."""
+        return self.messages - self.equal - self.close
+
+
+@dataclass(frozen=True)
+class Verification:
+    """A log that was computed again.
+
+    other_platform: the metadata in which this platform is not the log's; with any, numbers are
+    compared within a tolerance. span_s: team time from the first reading to the last.
+    """
+
+    channels: tuple[ChannelResult, ...]
+    other_platform: tuple[str, ...]
+    readings: int
+    span_s: float
+    unsound: int
+
+    @property
+    def first(self) -> Difference | None:
+        """The first difference, causes before what follows from them."""
+        return next((c.first for c in self.channels if c.first is not None), None)
+
+    @property
+    def messages(self) -> int:
+        """Messages that were compared."""
+        return sum(c.messages for c in self.channels)
+
+
+def verify(log: Log) -> Verification:
+    """Compute a log again and compare; raises RerunError, LogError."""
+    here = provenance()
+    other = tuple(name for name in PLATFORM if log.metadata.get(name) != here[name])
+    found = recorded(log)
+    retold: dict[Identity, m.Message] = {}
+    for robot in found.robots:
+        retold |= retold_robot(found, robot)
+    retold |= retold_centre(found)
+    results = []
+    for channel in CHECKED:
+        said = [each for each in found.said if each.channel is channel]
+        if said:
+            results.append(_compared(channel.name, said, retold, found, exact=not other))
+    stamps = [r.stamp_ns for stream in found.readings.values() for r in stream.values()]
+    span_s = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
+    return Verification(tuple(results), other, len(stamps), span_s, found.unsound)
+
+
+def _compared(
+    name: str,
+    said: list[Said],
+    retold: Mapping[Identity, m.Message],
+    log: Recorded,
+    *,
+    exact: bool,
+) -> ChannelResult:
+    equal = close = 0
+    differences = []
+    for each in said:
+        again = retold.get(identity(each.sample.key, each.message))
+        if again is not None and encoded(again) == each.sample.payload:
+            equal += 1
+            continue
+        difference = _difference(each, again, log, exact=exact)
+        if difference is None:
+            close += 1
+        else:
+            differences.append(difference)
+    first = min(differences, key=lambda d: (d.stamp_ns, d.key), default=None)
+    return ChannelResult(name, len(said), equal, close, first)
+
+
+def _difference(
+    said: Said, again: m.Message | None, log: Recorded, *, exact: bool
+) -> Difference | None:
+    if again is None:
+        field, there, here = "the message", "there", _lacking(said.message, log)
+    else:
+        found = first_difference(said.message, again, exact=exact)
+        if found is None:
+            if not exact:
+                return None
+            field, there, here = "the encoding", "another", "the program's"
+        else:
+            field, there, here = found.field, found.recorded, found.recomputed
+    sample = said.sample
+    return Difference(
+        sample.key, sample.stamp_ns, sample.counter, _names(said.message), field, there, here
+    )
+
+
+def _names(message: m.Message) -> str:
+    epoch, sequence = getattr(message, "epoch", None), getattr(message, "sequence", None)
+    if isinstance(message, m.FusedMap):
+        return f"map {message.digest.hex()}"
+    named = "" if sequence is None else f", sequence {sequence}"
+    return f"epoch {epoch}{named}"
+
+
+def _lacking(message: m.Message, log: Recorded) -> str:
+    """Why nothing came out for a message: an input that is not in the log, if that is it."""
+    match message:
+        case m.Submap():
+            readings = log.readings.get((message.robot, message.epoch), {})
+            wanted = range(message.first_reading, message.last_reading + 1)
+            gone = next((str(n) for n in wanted if n not in readings), None)
+            return "no such window" if gone is None else f"reading {gone} is not in the log: none"
+        case m.PoseEstimate() if any(message.map_digest):
+            priors = {p.digest for p in log.of(ch.PRIOR) if isinstance(p, m.Prior)}
+            known = message.map_digest in priors
+            return "none" if known else f"no prior {message.map_digest.hex()} in the log: none"
+        case m.Prior() | m.Trajectory():
+            return f"no map of the set {message.digest.hex()} gives one: none"
+        case m.FusedMap():
+            return "not every submap or map that it names is in the log: none"
+        case _:
+            return "none"

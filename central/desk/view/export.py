@@ -1,0 +1,65 @@
+"""The views of a log that was recorded: what a viewer would have published, in their order."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from central.desk.view.node import ViewerNode
+from team.recording.reader import Log
+from team.recording.recorder import Recorder
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.codec import WireError
+
+_HEARD = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
+
+
+def heard(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
+    """What a viewer hears in a sample; None in what is not for it, or not sound."""
+    found = ch.channel_of(sample.key)
+    if found is None or found[0].name not in _HEARD:
+        return None
+    try:
+        channel, _, message = opened(sample)
+    except WireError:
+        return None  # no node would have let it in
+    return channel, message
+
+
+class Viewing:
+    """A viewer over samples: what arrives goes to the node, what it says comes out as samples."""
+
+    def __init__(self) -> None:
+        self.node = ViewerNode()
+        self._counters: dict[str, int] = {}
+
+    def take(self, sample: Sample, said: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
+        """The views that a sample and what was heard in it bring, with counters of their own."""
+        out = []
+        for shown in [] if said is None else self.node.handle(*said):
+            counter = self._counters.get(shown.key, 0)
+            self._counters[shown.key] = counter + 1
+            out.append(Sample(shown.key, shown.payload, shown.stamp_ns, sample.wall_ns, counter))
+        return out
+
+
+def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
+    """The samples, and behind each the views that it brings; earlier views are left out."""
+    viewing = Viewing()
+    for sample in samples:
+        if ch.VIEW.owner(sample.key) is None:
+            yield sample
+            yield from viewing.take(sample, heard(sample))
+
+
+def export_views(log: Log, out: Path) -> int:
+    """Write a log with its views to a new log `out`; how many messages it has.
+
+    Raises `LogError` for a damaged log, `RecorderError` when `out` exists.
+    """
+    count = 0
+    with Recorder(out, log.team, log.metadata) as recorder:
+        for sample in with_views(log.samples()):
+            recorder.write([sample])
+            count += 1
+    return count

@@ -1,0 +1,247 @@
+"""Foxglove's messages from what is to be drawn: the one module that imports its encoders.
+
+z is height: the plane of the map is z = 0. Directions are turns about z, (0, 0, sin θ/2, cos θ/2).
+"""
+
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from foxglove import messages as fox
+from jaxtyping import Float
+
+from central.desk.view.drawn import Landmarks, ellipses
+from team.wire.views import MAP_FRAME
+
+Shade = tuple[str, float]
+"""A colour as #rrggbb, and its opacity."""
+TRUTH: Shade = ("#8a93a3", 0.9)
+LANDMARK: Shade = ("#f5b83d", 1.0)
+_FLAT_M = 0.002
+_LEAST_M = 0.01
+"""A flat or a needle of an ellipse is drawn at least so thick and wide."""
+
+
+def stamp(stamp_ns: int) -> fox.Timestamp:
+    """A team time as Foxglove's; before zero it is zero."""
+    at = max(stamp_ns, 0)
+    return fox.Timestamp(at // 1_000_000_000, at % 1_000_000_000)
+
+
+def scene(entities: Iterable[fox.SceneEntity]) -> bytes:
+    """A scene update; an entity takes the place of the earlier one with its name."""
+    return bytes(fox.SceneUpdate(entities=list(entities)).encode())
+
+
+def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> fox.SceneEntity:
+    """The team's landmarks: a dot, the 95 % ellipse, the number."""
+    major, minor, direction = ellipses(landmarks.blocks)
+    dots, names = [], []
+    for i, ((x, y), name) in enumerate(
+        zip(landmarks.means.tolist(), landmarks.ids.tolist(), strict=True)
+    ):
+        at = _pose(x, y, float(direction[i]))
+        width, depth = 2.0 * max(major[i], _LEAST_M), 2.0 * max(minor[i], _LEAST_M)
+        dots.append(_disc(at, width, depth, (LANDMARK[0], 0.25)))
+        dots.append(_disc(_pose(x, y, 0.0, _FLAT_M), 0.3 * size_m, 0.3 * size_m, LANDMARK))
+        names.append(_label(x, y + 0.5 * size_m, str(name), LANDMARK))
+    return _entity(stamp_ns, "landmarks", cylinders=dots, texts=names)
+
+
+def true_landmarks_entity(
+    stamp_ns: int, truth: Iterable[tuple[float, float]], size_m: float
+) -> fox.SceneEntity:
+    """The true landmarks, as small squares."""
+    edge = fox.Vector3(x=0.25 * size_m, y=0.25 * size_m, z=_FLAT_M)
+    cubes = [
+        fox.CubePrimitive(pose=_pose(x, y, 0.0), size=edge, color=_colour(TRUTH)) for x, y in truth
+    ]
+    return _entity(stamp_ns, "true landmarks", cubes=cubes)
+
+
+def robot_entity(
+    stamp_ns: int,
+    name: str,
+    pose: Float[np.ndarray, "3"],
+    covariance: Float[np.ndarray, "3 3"],
+    trail: Sequence[tuple[float, float]],
+    colour: str,
+    size_m: float,
+    *,
+    lost: bool,
+) -> fox.SceneEntity:
+    """A robot: an arrow, the 95 % ellipse of its position, its name, where it just was."""
+    x, y, theta = (float(v) for v in pose)
+    P = np.array([[covariance[0, 0], covariance[0, 1], covariance[1, 1]]])
+    (major,), (minor,), (direction,) = ellipses(P)
+    shade = (colour, 0.35 if lost else 1.0)
+    disc = _disc(
+        _pose(x, y, float(direction)),
+        2.0 * max(major, _LEAST_M),
+        2.0 * max(minor, _LEAST_M),
+        (colour, 0.2),
+    )
+    return _entity(
+        stamp_ns,
+        f"robot {name}",
+        arrows=[_arrow(_pose(x, y, theta), size_m, shade)],
+        cylinders=[disc],
+        lines=[_line([*trail, (x, y)], (colour, 0.9), 3.0)],
+        texts=[_label(x, y - 0.8 * size_m, f"{name} (lost)" if lost else name, shade)],
+        metadata=[fox.KeyValuePair(key="robot", value=name)],
+    )
+
+
+def true_robot_entity(
+    stamp_ns: int, name: str, pose: Float[np.ndarray, "3"], size_m: float
+) -> fox.SceneEntity:
+    """Where a robot truly is."""
+    x, y, theta = (float(v) for v in pose)
+    arrow = _arrow(_pose(x, y, theta), 0.8 * size_m, (TRUTH[0], 0.6))
+    return _entity(stamp_ns, f"true robot {name}", arrows=[arrow])
+
+
+def path_entity(
+    stamp_ns: int, name: str, points: Sequence[tuple[float, float]], shade: Shade, pixels: float
+) -> fox.SceneEntity:
+    """A path as a line, so many pixels wide."""
+    return _entity(stamp_ns, name, lines=[_line(points, shade, pixels)])
+
+
+def transforms(stamp_ns: int, poses: Iterable[tuple[str, Float[np.ndarray, "3"]]]) -> bytes:
+    """map_from_robot of each robot."""
+    found = []
+    for name, pose in poses:
+        x, y, theta = (float(v) for v in pose)
+        found.append(
+            fox.FrameTransform(
+                timestamp=stamp(stamp_ns),
+                parent_frame_id=MAP_FRAME,
+                child_frame_id=f"robot/{name}",
+                translation=fox.Vector3(x=x, y=y, z=0.0),
+                rotation=_turn(theta),
+            )
+        )
+    return bytes(fox.FrameTransforms(transforms=found).encode())
+
+
+def pose_in_map(stamp_ns: int, pose: Float[np.ndarray, "3"]) -> bytes:
+    """A pose in the frame of the map."""
+    x, y, theta = (float(v) for v in pose)
+    found = fox.PoseInFrame(timestamp=stamp(stamp_ns), frame_id=MAP_FRAME, pose=_pose(x, y, theta))
+    return bytes(found.encode())
+
+
+def cloud(
+    stamp_ns: int,
+    points: Float[np.ndarray, "n 2"],
+    values: Float[np.ndarray, " n"],
+    name: Literal["id", "weight"],
+) -> bytes:
+    """Points of the plane with one value each, as float32."""
+    packed = np.zeros((len(points), 4), "<f4")
+    packed[:, :2] = points
+    packed[:, 3] = values
+    kind = fox.PackedElementFieldNumericType.Float32
+    fields = [
+        fox.PackedElementField(name=each, offset=4 * i, type=kind)
+        for i, each in enumerate(("x", "y", "z", name))
+    ]
+    found = fox.PointCloud(
+        timestamp=stamp(stamp_ns),
+        frame_id=MAP_FRAME,
+        pose=_pose(0.0, 0.0, 0.0),
+        point_stride=16,
+        fields=fields,
+        data=packed.tobytes(),
+    )
+    return bytes(found.encode())
+
+
+def log_line(stamp_ns: int, name: str, text: str, *, warns: bool) -> bytes:
+    """A line of a log."""
+    level = fox.LogLevel.Warning if warns else fox.LogLevel.Info
+    found = fox.Log(timestamp=stamp(stamp_ns), level=level, message=text, name=name)
+    return bytes(found.encode())
+
+
+def _entity(
+    stamp_ns: int,
+    name: str,
+    *,
+    arrows: list[fox.ArrowPrimitive] | None = None,
+    cubes: list[fox.CubePrimitive] | None = None,
+    cylinders: list[fox.CylinderPrimitive] | None = None,
+    lines: list[fox.LinePrimitive] | None = None,
+    texts: list[fox.TextPrimitive] | None = None,
+    metadata: list[fox.KeyValuePair] | None = None,
+) -> fox.SceneEntity:
+    return fox.SceneEntity(
+        timestamp=stamp(stamp_ns),
+        frame_id=MAP_FRAME,
+        id=name,
+        arrows=arrows,
+        cubes=cubes,
+        cylinders=cylinders,
+        lines=lines,
+        texts=texts,
+        metadata=metadata,
+    )
+
+
+def _arrow(pose: fox.Pose, size_m: float, shade: Shade) -> fox.ArrowPrimitive:
+    return fox.ArrowPrimitive(
+        pose=pose,
+        shaft_length=0.6 * size_m,
+        shaft_diameter=0.25 * size_m,
+        head_length=0.5 * size_m,
+        head_diameter=0.6 * size_m,
+        color=_colour(shade),
+    )
+
+
+def _disc(pose: fox.Pose, width: float, depth: float, shade: Shade) -> fox.CylinderPrimitive:
+    return fox.CylinderPrimitive(
+        pose=pose,
+        size=fox.Vector3(x=width, y=depth, z=_FLAT_M),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=_colour(shade),
+    )
+
+
+def _line(points: Iterable[tuple[float, float]], shade: Shade, pixels: float) -> fox.LinePrimitive:
+    return fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineStrip,
+        pose=_pose(0.0, 0.0, 0.0),
+        thickness=pixels,
+        scale_invariant=True,
+        points=[fox.Point3(x=x, y=y, z=0.0) for x, y in points],
+        color=_colour(shade),
+    )
+
+
+def _label(x: float, y: float, text: str, shade: Shade) -> fox.TextPrimitive:
+    return fox.TextPrimitive(
+        pose=_pose(x, y, 0.0),
+        billboard=True,
+        font_size=12.0,
+        scale_invariant=True,
+        color=_colour(shade),
+        text=text,
+    )
+
+
+def _pose(x: float, y: float, theta: float, z: float = 0.0) -> fox.Pose:
+    return fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=_turn(theta))
+
+
+def _turn(theta: float) -> fox.Quaternion:
+    return fox.Quaternion(x=0.0, y=0.0, z=float(np.sin(0.5 * theta)), w=float(np.cos(0.5 * theta)))
+
+
+@lru_cache(maxsize=256)
+def _colour(shade: Shade) -> fox.Color:
+    r, g, b = (int(shade[0][i : i + 2], 16) / 255.0 for i in (1, 3, 5))
+    return fox.Color(r=r, g=g, b=b, a=shade[1])

@@ -1,0 +1,350 @@
+"""The viewer's node: the team's messages in, views out; no I/O, no clock.
+
+It hears the truth as an evaluator does, and nobody who estimates hears it: no node of a team
+subscribes to a view.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.errors import PoseErrors
+from central.desk.view import foxglove_scene as fox
+from central.desk.view.drawn import Landmarks, Track, colour_of, in_order, landmarks_of
+from central.desk.view.errors import RunningErrors, map_fit
+from central.desk.view.events import Chronicle, Event
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire import views
+from team.wire.arrays import floats, ids
+from team.wire.channels import Channel
+
+PERIOD_NS = 1_000_000_000
+"""Team time between two views of what moves."""
+PATHS_EVERY = 10
+"""Whole paths come with every tenth view."""
+TRAIL_NS = 15_000_000_000
+"""So much of its path goes with a robot; the rest comes with the whole paths."""
+LAG_NS = 30_000_000_000
+"""A robot that is further behind the fastest is not waited for."""
+MOST_PERIODS = 60
+"""Views at the most for one message; of a longer jump in time the earlier part is left out."""
+FORGET_NS = 10_000_000_000
+"""An estimate waits so long for its truth."""
+_MARKS_ACROSS = 45.0
+"""Robots are drawn so large that as many fit across what is known of the place."""
+
+
+class Shown(NamedTuple):
+    """One view to be published: its relative key, team time and payload."""
+
+    key: str
+    stamp_ns: int
+    payload: bytes
+
+
+@dataclass
+class _Robot:
+    """What is known of one robot; the team's pose of it goes before its own.
+
+    coming: estimates that the view's time has not reached. reached_ns: how far the robot is.
+    """
+
+    coming: deque[m.PoseEstimate] = field(default_factory=deque)
+    by_team: bool = False
+    reached_ns: int | None = None
+    estimate: m.PoseEstimate | None = None
+    errors: RunningErrors = field(default_factory=RunningErrors)
+    last_error: tuple[Float[np.ndarray, "3"], float] | None = None
+    track: Track = field(default_factory=Track)
+    true_track: Track = field(default_factory=Track)
+    smoothed: list[tuple[float, float]] = field(default_factory=list)
+    cloud: m.ParticleCloud | None = None
+    lost: bool = False
+    done: bool = False
+    status: dict[str, float] = field(default_factory=dict)
+
+    def pose(self) -> Float[np.ndarray, "3"]:
+        """(x [m], y [m], theta [rad]); call where there is an estimate."""
+        assert self.estimate is not None
+        return floats(self.estimate.pose, "pose").astype(np.float64)
+
+    def covariance(self) -> Float[np.ndarray, "3 3"]:
+        """Of the pose."""
+        assert self.estimate is not None
+        return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
+
+    def go_to(self, now_ns: int) -> None:
+        """The estimates up to this time are taken."""
+        while self.coming and self.coming[0].stamp_ns <= now_ns:
+            self.estimate = self.coming.popleft()
+            x, y, _ = self.pose().tolist()
+            self.track.take(self.estimate.stamp_ns, x, y)
+            self.errors.take_pose(self.estimate)
+        self.note(self.errors.known())
+        true = self.errors.truth_at(now_ns)
+        if true is not None:
+            self.true_track.take(now_ns, float(true[0]), float(true[1]))
+        self.errors.forget(now_ns - FORGET_NS)
+
+    def note(self, errors: PoseErrors | None) -> None:
+        """The newest error stands until the next."""
+        if errors is not None:
+            self.last_error = (errors.errors[-1], float(errors.nees[-1]) / 3.0)
+
+
+class ViewerNode:
+    """One viewer of a team: `handle` until `finished`.
+
+    The view's time is that of the slowest robot at work, so that all are seen where they were at
+    one time, however far the others have run ahead; nobody is waited for beyond LAG_NS.
+    """
+
+    listens = (
+        ch.START, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.OWN_POSE, ch.TEAM_POSE, ch.PARTICLES,
+        ch.ROBOT_DONE, ch.FUSED_MAP, ch.FINAL_MAP, ch.TRAJECTORY, ch.WITHDRAWAL, ch.END,
+        ch.STATUS,
+    )  # fmt: skip
+
+    def __init__(self, period_ns: int = PERIOD_NS) -> None:
+        self._period_ns = period_ns
+        self._robots: dict[str, _Robot] = {}
+        self._maps: deque[m.FusedMap] = deque()
+        self._landmarks: Landmarks | None = None
+        self._truth: dict[int, tuple[float, float]] = {}
+        self._map_is_new = False
+        self._status: dict[str, float] = {}
+        self._chronicle = Chronicle()
+        self._now_ns: int | None = None
+        self._turn = 0
+        self._reach = (math.inf, math.inf, -math.inf, -math.inf)
+        self.finished = False
+
+    @property
+    def now_ns(self) -> int:
+        """The team time of the last view; 0 before there was one."""
+        return 0 if self._now_ns is None else self._now_ns
+
+    def handle(self, channel: Channel, message: m.Message) -> list[Shown]:
+        """Take one message of a channel; the views that are due, one per period of team time."""
+        out = [_logged(event) for event in self._chronicle.take(message, self.now_ns)]
+        self._take(channel, message)
+        reached = self._reached_ns()
+        if reached is None:
+            return out
+        begin = reached if self._now_ns is None else self._now_ns + self._period_ns
+        begin = max(begin, reached - MOST_PERIODS * self._period_ns)
+        for now_ns in range(begin, reached + 1, self._period_ns):
+            out += self._views(now_ns)
+        if channel is ch.FINAL_MAP and not self.finished:
+            self.finished = True
+            newest = [r.reached_ns for r in self._robots.values() if r.reached_ns is not None]
+            out += self._views(max(newest), last=True)
+        return out
+
+    def _reached_ns(self) -> int | None:
+        """How far the team is; None before anybody has moved."""
+        marks = {n: r.reached_ns for n, r in self._robots.items() if r.reached_ns is not None}
+        if not marks:
+            return None
+        newest = max(marks.values())
+        at_work = [
+            at for n, at in marks.items() if not (self._robots[n].lost or self._robots[n].done)
+        ]
+        return max(min(at_work, default=newest), newest - LAG_NS)
+
+    def _take(self, channel: Channel, message: m.Message) -> None:
+        match message:
+            case m.PoseEstimate():
+                self._take_pose(message, by_team=channel is ch.TEAM_POSE)
+            case m.Truth():
+                self._of(message.robot).errors.take_truth(message)
+            case m.TruthLandmarks():
+                places = floats(message.positions, "positions").reshape(-1, 2)
+                names = ids(message.ids, "ids").tolist()
+                self._truth = {n: (x, y) for n, (x, y) in zip(names, places.tolist(), strict=True)}
+                self._extend(places)
+                self._map_is_new = True
+            case m.FusedMap():
+                self._maps.append(message)
+            case m.ParticleCloud():
+                self._of(message.robot).cloud = message
+            case m.Trajectory():
+                poses = floats(message.poses, "poses").reshape(-1, 3)
+                self._of(message.robot).smoothed = [(x, y) for x, y, _ in poses.tolist()]
+            case m.Done():
+                self._of(message.robot).done = True
+            case m.Status():
+                self._take_status(message)
+            case m.Liveliness() if message.node.startswith("robot/"):
+                self._of(message.node.removeprefix("robot/")).lost = not message.alive
+            case _:
+                pass
+
+    def _in_order(self) -> list[tuple[str, _Robot]]:
+        return [(name, self._robots[name]) for name in in_order(self._robots)]
+
+    def _of(self, robot: str) -> _Robot:
+        return self._robots.setdefault(robot, _Robot())
+
+    def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
+        robot = self._of(message.robot)
+        if by_team and not robot.by_team:
+            robot.by_team = True
+            robot.coming = deque(p for p in robot.coming if p.stamp_ns < message.stamp_ns)
+        if by_team is robot.by_team:
+            robot.coming.append(message)
+            before = robot.reached_ns
+            robot.reached_ns = message.stamp_ns if before is None else max(before, message.stamp_ns)
+
+    def _take_status(self, message: m.Status) -> None:
+        if message.node == "central":
+            self._status = message.figures
+        elif message.node.startswith("robot/"):
+            robot = self._of(message.node.removeprefix("robot/"))
+            robot.status = message.figures
+            if robot.reached_ns is not None:  # a robot that sees nothing says nothing else
+                robot.reached_ns = max(robot.reached_ns, message.stamp_ns)
+
+    def _extend(self, points: Float[np.ndarray, "n 2"]) -> None:
+        if len(points):
+            low, high = points.min(axis=0), points.max(axis=0)
+            left, bottom, right, top = self._reach
+            self._reach = (
+                min(left, low[0]), min(bottom, low[1]), max(right, high[0]), max(top, high[1]),
+            )  # fmt: skip
+
+    def _size_m(self) -> float:
+        """How large a robot is drawn: 1, 2 or 5 times a power of ten, so that it rarely changes."""
+        left, bottom, right, top = self._reach
+        across = max(right - left, top - bottom) / _MARKS_ACROSS
+        if not across > 0.0 or not math.isfinite(across):
+            return 1.0
+        power = 10.0 ** math.floor(math.log10(across))
+        return power * next((step for step in (5.0, 2.0) if across >= step * power), 1.0)
+
+    def _views(self, now_ns: int, *, last: bool = False) -> list[Shown]:
+        self._go_to(now_ns, last=last)
+        size = self._size_m()
+        seen = {n: r for n, r in self._in_order() if r.estimate is not None}
+        out = self._of_map(now_ns, size) if self._map_is_new else []
+        self._map_is_new = False
+        out.append(Shown(views.ROBOTS.key(), now_ns, self._scene(now_ns, size)))
+        poses = [(name, robot.pose()) for name, robot in seen.items()]
+        out.append(Shown(views.TRANSFORMS.key(), now_ns, fox.transforms(now_ns, poses)))
+        for name, robot in seen.items():
+            pose = fox.pose_in_map(now_ns, robot.pose())
+            out.append(Shown(views.POSE.key(name), now_ns, pose))
+            figures = msgspec.json.encode(_figures(robot, now_ns))
+            out.append(Shown(views.ROBOT.key(name), now_ns, figures))
+        out += self._clouds(now_ns)
+        out.append(Shown(views.TEAM.key(), now_ns, msgspec.json.encode(self._team(now_ns))))
+        if last or self._turn % PATHS_EVERY == 0:
+            out.append(Shown(views.PATHS.key(), now_ns, self._paths(now_ns)))
+        self._turn += 1
+        return out
+
+    def _go_to(self, now_ns: int, *, last: bool) -> None:
+        """Everything is as it was at this time; at the last view, the final map is there, too."""
+        self._now_ns = now_ns
+        while self._maps and (last or self._maps[0].stamp_ns <= now_ns):
+            self._landmarks = landmarks_of(self._maps.popleft())
+            self._extend(self._landmarks.means)
+            self._map_is_new = True
+        for robot in self._robots.values():
+            robot.go_to(now_ns)
+            if robot.estimate is not None:
+                self._extend(robot.pose()[np.newaxis, :2])
+
+    def _of_map(self, now_ns: int, size_m: float) -> list[Shown]:
+        out = []
+        entities = []
+        if self._truth:
+            entities.append(fox.true_landmarks_entity(now_ns, self._truth.values(), size_m))
+        if self._landmarks is not None:
+            entities.append(fox.landmarks_entity(now_ns, self._landmarks, size_m))
+            names = self._landmarks.ids.astype(np.float64)
+            points = fox.cloud(now_ns, self._landmarks.means, names, "id")
+            out.append(Shown(views.LANDMARKS.key(), now_ns, points))
+        return [*out, Shown(views.MAP.key(), now_ns, fox.scene(entities))]
+
+    def _scene(self, now_ns: int, size_m: float) -> bytes:
+        entities = []
+        for number, (name, robot) in enumerate(self._in_order()):
+            true = robot.errors.truth_at(now_ns)
+            if true is not None:
+                entities.append(fox.true_robot_entity(now_ns, name, true, size_m))
+            if robot.estimate is not None:
+                trail = robot.track.since(now_ns - TRAIL_NS)
+                entities.append(
+                    fox.robot_entity(
+                        now_ns, name, robot.pose(), robot.covariance(), trail,
+                        colour_of(number), size_m, lost=robot.lost,
+                    )
+                )  # fmt: skip
+        return fox.scene(entities)
+
+    def _paths(self, now_ns: int) -> bytes:
+        entities = []
+        for number, (name, robot) in enumerate(self._in_order()):
+            colour = colour_of(number)
+            for what, points, shade, pixels in (
+                ("true path", robot.true_track.points, (fox.TRUTH[0], 0.5), 1.0),
+                ("path", robot.track.points, (colour, 0.5), 1.5),
+                ("smoothed path", robot.smoothed, (colour, 1.0), 2.5),
+            ):
+                if len(points) > 1:
+                    named = f"{what} {name}"
+                    entities.append(fox.path_entity(now_ns, named, points, shade, pixels))
+        return fox.scene(entities)
+
+    def _clouds(self, now_ns: int) -> list[Shown]:
+        out = []
+        for name, robot in self._in_order():
+            if robot.cloud is not None:
+                points = floats(robot.cloud.poses, "poses").astype(np.float64).reshape(-1, 3)
+                weights = floats(robot.cloud.weights, "weights").astype(np.float64)
+                payload = fox.cloud(now_ns, points[:, :2], weights, "weight")
+                out.append(Shown(views.PARTICLES.key(name), now_ns, payload))
+                robot.cloud = None
+        return out
+
+    def _team(self, now_ns: int) -> views.TeamFigures:
+        fit = None if self._landmarks is None else map_fit(self._landmarks, self._truth)
+        return views.TeamFigures(
+            now_ns * 1e-9,
+            0 if self._landmarks is None else len(self._landmarks.ids),
+            sum(not robot.lost for robot in self._robots.values()),
+            msgspec.UNSET if fit is None else fit.rmse_m,
+            msgspec.UNSET if fit is None else fit.nees_per_dof,
+            self._status,
+        )
+
+
+def _logged(event: Event) -> Shown:
+    warns = event.kind in ("lost", "refused", "warning", "withdrawn")
+    line = fox.log_line(event.stamp_ns, event.node, event.text, warns=warns)
+    return Shown(views.LOG.key(), event.stamp_ns, line)
+
+
+def _figures(robot: _Robot, now_ns: int) -> views.RobotFigures:
+    x, y, heading = robot.pose().tolist()
+    to_x, to_y, to_heading = (3.0 * np.sqrt(np.diagonal(robot.covariance()))).tolist()
+    figures = views.RobotFigures(
+        now_ns * 1e-9, x, y, heading, to_x, to_y, to_heading, status=robot.status
+    )
+    if robot.last_error is None:
+        return figures
+    (ex, ey, turned), nees = robot.last_error
+    return msgspec.structs.replace(
+        figures,
+        error_x_m=float(ex),
+        error_y_m=float(ey),
+        error_heading_rad=float(turned),
+        nees_per_dof=nees,
+    )

@@ -1,0 +1,225 @@
+"""What the page is told: one frame per piece of news, as JSON, in the order of the log.
+
+t: seconds of team time since the first reading. Poses and errors come as rows of numbers, maps and
+particles as base64 of little-endian float32 and uint32. Frames, by `k`:
+
+hello: team, title, colours, live. now: how far all robots at work are. pose: rows x, y, heading,
+xx, xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of
+freedom. truth: rows x, y, heading. truth_map, map, cloud, path: what they are called. fig: a node's
+figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been read.
+"""
+
+import base64
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from central.desk.view.drawn import PALETTE, landmarks_of
+from central.desk.view.errors import RunningErrors, map_fit
+from central.desk.view.events import Chronicle
+from central.desk.view.node import FORGET_NS
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats, ids, stamps
+from team.wire.bus import Sample
+
+SPACING_NS = 100_000_000
+"""Between two poses, of truth and of estimates, that the page gets."""
+MAP_SPACING_NS = 1_000_000_000
+"""Between two maps that the page gets."""
+_BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
+
+
+def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
+    """What the page is called: scenario, seed, file."""
+    try:
+        scenario = str(json.loads(metadata.get("scenario", "{}"))["name"])
+    except (ValueError, KeyError, TypeError):
+        scenario = team
+    seed = f", seed {metadata['seed']}" if "seed" in metadata else ""
+    return f"{scenario}{seed} · {name}"
+
+
+@dataclass
+class _Stream:
+    """One robot's poses on their way to the page."""
+
+    errors: RunningErrors = field(default_factory=RunningErrors)
+    by_team: bool = False
+    pose_ns: int | None = None
+    truth_ns: int | None = None
+    rows: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
+
+    def add(self, kind: str, t: float, row: list[float]) -> None:
+        times, values = self.rows.setdefault(kind, ([], []))
+        times.append(t)
+        values += row
+
+
+class PageFrames:
+    """Samples in, frames out: `take` them, `flush` what is ready."""
+
+    def __init__(self) -> None:
+        self._out: list[str] = []
+        self._origin_ns: int | None = None
+        self._streams: dict[str, _Stream] = defaultdict(_Stream)
+        self._traffic: dict[tuple[str, int], list[int]] = {}
+        self._chronicle = Chronicle()
+        self._truth: dict[int, tuple[float, float]] = {}
+        self._map_ns: int | None = None
+        self._figures_s: dict[str, int] = {}
+        self._newest_ns = 0
+
+    def hello(self, team: str, metadata: Mapping[str, str], name: str, *, live: bool) -> None:
+        """The first frame; live: the log is being recorded."""
+        title = title_of(team, metadata, name)
+        self._say("hello", team=team, title=title, colours=PALETTE, live=live)
+
+    def take(self, sample: Sample, said: tuple[ch.Channel, m.Message] | None) -> None:
+        """Take one sample of the log, and what a viewer hears in it."""
+        found = ch.channel_of(sample.key)
+        channel = "" if found is None else found[0].name
+        if self._origin_ns is None and channel in _BEGIN:
+            self._origin_ns = sample.stamp_ns
+        place = (sample.key, int(self._t(sample.stamp_ns)))
+        counted = self._traffic.setdefault(place, [0, 0])
+        counted[0] += 1
+        counted[1] += len(sample.payload)
+        if said is not None:
+            self._take(*said)
+
+    def flush(self, now_ns: int | None = None) -> list[str]:
+        """The frames since the last time; now_ns: how far the robots are."""
+        for robot, stream in self._streams.items():
+            self._tell_errors(stream)
+            for kind, (times, values) in stream.rows.items():
+                self._say(kind, r=robot, t=times, v=values)
+            stream.rows = {}
+        if self._traffic:
+            rows = [[key, t, *counted] for (key, t), counted in sorted(self._traffic.items())]
+            self._traffic = {}
+            self._say("bytes", v=rows)
+        if now_ns is not None:
+            self._say("now", t=self._t(now_ns))
+        out, self._out = self._out, []
+        return out
+
+    def end(self, notes: Sequence[str] = (), *, complete: bool) -> list[str]:
+        """The last frames: there is nothing more; notes: what was wrong with the log."""
+        out = self.flush(self._newest_ns)
+        for note in notes:
+            self._say("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
+        self._say("eof", complete=complete)
+        return out + self.flush()
+
+    def _say(self, kind: str, **fields: object) -> None:
+        self._out.append(json.dumps({"k": kind, **fields}, separators=(",", ":")))
+
+    def _t(self, stamp_ns: int) -> float:
+        """Seconds since the first reading; 0 for what was said before it."""
+        if self._origin_ns is None:
+            return 0.0
+        return round(max(stamp_ns - self._origin_ns, 0) * 1e-9, 3)
+
+    def _take(self, channel: ch.Channel, message: m.Message) -> None:
+        if isinstance(message, m.PoseEstimate | m.FusedMap):  # the world runs ahead of all others
+            self._newest_ns = max(self._newest_ns, message.stamp_ns)
+        timeless = isinstance(message, m.Liveliness | m.Status)
+        at_ns = self._newest_ns if timeless else message.stamp_ns
+        for event in self._chronicle.take(message, at_ns):
+            self._say("ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text)
+        match message:
+            case m.PoseEstimate():
+                self._take_pose(message, by_team=channel is ch.TEAM_POSE)
+            case m.Truth():
+                self._take_truth(message)
+            case m.FusedMap():
+                self._take_map(message)
+            case m.Status():
+                self._take_status(message)
+            case m.TruthLandmarks():
+                places = floats(message.positions, "positions").reshape(-1, 2).tolist()
+                names = ids(message.ids, "ids").tolist()
+                self._truth = {n: (x, y) for n, (x, y) in zip(names, places, strict=True)}
+                self._say("truth_map", ids=names, xy=[v for place in places for v in place])
+            case m.ParticleCloud():
+                points = floats(message.poses, "poses").reshape(-1, 3)[:, :2]
+                t = self._t(message.stamp_ns)
+                self._say("cloud", r=message.robot, t=t, v=_base64(points.astype("<f4")))
+            case m.Trajectory():
+                times = [self._t(at) for at in stamps(message.stamps, "stamps").tolist()]
+                poses = floats(message.poses, "poses").tolist()
+                self._say("path", r=message.robot, t=times, v=poses)
+            case _:
+                pass
+
+    def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
+        stream = self._streams[message.robot]
+        stream.by_team = stream.by_team or by_team
+        due = stream.pose_ns is None or message.stamp_ns >= stream.pose_ns + SPACING_NS
+        if by_team is not stream.by_team or not due:
+            return
+        stream.pose_ns = message.stamp_ns
+        x, y, heading = floats(message.pose, "pose").tolist()
+        P = floats(message.covariance, "covariance").reshape(3, 3)
+        spread = [float(P[0, 0]), float(P[0, 1]), float(P[1, 1]), float(P[2, 2])]
+        row = [_short(v) for v in (x, y, heading, *spread)]
+        stream.add("pose", self._t(message.stamp_ns), row)
+        stream.errors.take_pose(message)
+
+    def _take_truth(self, message: m.Truth) -> None:
+        stream = self._streams[message.robot]
+        poses = floats(message.poses, "poses").reshape(-1, 3).tolist()
+        for at, pose in zip(stamps(message.stamps, "stamps").tolist(), poses, strict=True):
+            if stream.truth_ns is None or at >= stream.truth_ns + SPACING_NS:
+                stream.truth_ns = at
+                stream.add("truth", self._t(at), [_short(v) for v in pose])
+        stream.errors.take_truth(message)
+
+    def _tell_errors(self, stream: _Stream) -> None:
+        errors = stream.errors.known()
+        stream.errors.forget((stream.pose_ns or 0) - FORGET_NS)
+        if errors is None:
+            return
+        for k, at in enumerate(errors.stamps_ns.tolist()):
+            row = [*errors.errors[k].tolist(), *(3.0 * errors.sigmas[k]).tolist()]
+            row.append(float(errors.nees[k]) / 3.0)
+            stream.add("err", self._t(at), [_short(v) for v in row])
+
+    def _take_map(self, message: m.FusedMap) -> None:
+        due = self._map_ns is None or message.stamp_ns >= self._map_ns + MAP_SPACING_NS
+        if not (due or message.final):
+            return
+        self._map_ns = message.stamp_ns
+        landmarks = landmarks_of(message)
+        fit = map_fit(landmarks, self._truth)
+        self._say(
+            "map",
+            t=self._t(message.stamp_ns),
+            ids=_base64(landmarks.ids.astype("<u4")),
+            xy=_base64(landmarks.means.astype("<f4")),
+            c=_base64(landmarks.blocks.astype("<f4")),
+            final=message.final,
+            rmse=None if fit is None else _short(fit.rmse_m),
+            nees=None if fit is None else _short(fit.nees_per_dof),
+        )
+
+    def _take_status(self, message: m.Status) -> None:
+        second = int(self._t(message.stamp_ns))
+        told = message.node == "central" or message.node.startswith("robot/")
+        if told and self._figures_s.get(message.node) != second:
+            self._figures_s[message.node] = second
+            figures = {name: _short(value) for name, value in message.figures.items()}
+            self._say("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)
+
+
+def _short(value: float) -> float:
+    """Seven digits are more than can be seen."""
+    return float(f"{value:.7g}")
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

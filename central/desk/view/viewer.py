@@ -1,0 +1,54 @@
+"""The viewer's process: a bus around the node; what it publishes the recorder takes as it is."""
+
+import threading
+import time
+from dataclasses import replace
+
+from central.desk.view.export import Viewing, heard
+from team.containment import Boundary
+from team.shell import STATUS_S, WAIT_S, judge
+from team.the_end import TheEnd
+from team.wire import channels as ch
+from team.wire.bus import Bus, Outgoing
+from team.wire.messages import FusedMap, Status
+
+NODE = "viewer"
+
+
+def run_viewer(bus: Bus, stop: threading.Event) -> int:
+    """Publish the views of a team until its final map is shown, or until `stop`; how many.
+
+    Raises FaultyRunError, at its end, where the map lacks a robot or something could not be drawn.
+    """
+    viewing = Viewing()
+    for channel in viewing.node.listens:
+        bus.subscribe(channel)
+    bus.watch_alive()
+    bus.declare_alive(NODE)
+    published = 0
+    end = TheEnd(bus, NODE)
+    boundary = Boundary(NODE)
+    due = 0.0
+    final: FusedMap | None = None
+    # One that comes after the end has nothing to show, so its node does not finish by the map.
+    while not (viewing.node.finished or final is not None or stop.is_set()):
+        if time.monotonic() >= due:
+            due = time.monotonic() + STATUS_S
+            status = Status(0, NODE, "viewing", {"messages": float(published)})
+            bus.publish(Outgoing(ch.STATUS, NODE, status))
+        for sample in (*bus.receive(WAIT_S), *end.missed()):
+            if ch.ALIVE.owner(sample.key) == NODE:
+                continue
+            try:
+                said = heard(sample)
+                if said is not None and isinstance(said[1], FusedMap) and said[1].final:
+                    final = said[1]
+                views = viewing.take(sample, said)
+            except Exception as error:  # what it can not draw it leaves out
+                bus.publish(boundary.note(error, sample, ""))
+                continue
+            for shown in views:
+                bus.publish_raw(replace(shown, wall_ns=time.time_ns()))
+                published += 1
+    judge(boundary, final)
+    return published

@@ -1,0 +1,218 @@
+"""Commands on logs: replay, report, repair, limit; and simulate, which writes a data set."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from sim.cli.options import (
+    FAILED,
+    LOOPBACK,
+    WRONG_USE,
+    Keys,
+    Robots,
+    ScenarioArgument,
+    Seed,
+    SpeedText,
+    connected,
+    fail,
+    parsed_speed,
+    refuse_existing,
+    refuse_open_door,
+    scenario_of,
+)
+from sim.scenarios.scenario import with_options
+
+if TYPE_CHECKING:
+    from central.desk.ledger import Ledger
+    from team.recording.reader import Log
+
+LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
+
+LONG_BYTES = 5_000_000
+"""A report of a log of this size takes a while, and says so."""
+app = typer.Typer()
+
+
+@app.command()
+def replay(
+    log: LogArgument,
+    speed: SpeedText = "1",
+    connect: Annotated[
+        str | None,
+        typer.Option(help="The router to publish at; default: one of our own.", metavar="ENDPOINT"),
+    ] = None,
+    listen: Annotated[
+        str, typer.Option(help="Where our own router listens; port 0: any free one.")
+    ] = LOOPBACK,
+    keys: Keys = None,
+    insecure: Annotated[
+        bool, typer.Option(help="Without keys, let in whoever reaches our own router.")
+    ] = False,
+    wait: Annotated[
+        float, typer.Option(help="Seconds between the router's start and the first message.")
+    ] = 1.0,
+) -> None:
+    """Publish a log's traffic again: same bytes, same order, same spacing in team time."""
+    from contextlib import nullcontext
+
+    from team.recording.reader import open_log
+    from team.recording.shell import replay as replay_samples
+    from team.shell import process
+    from team.wire.zenoh_bus import router
+
+    pace = parsed_speed(speed)
+    if connect is None:
+        if keys is not None:
+            fail("--keys is for a router that is there: give --connect", WRONG_USE)
+        refuse_open_door(listen, keys=False, insecure=insecure)
+    opened = open_log(log)
+    hub = router(listen) if connect is None else nullcontext(connect)
+    with (
+        process("replay") as stop,
+        hub as endpoint,
+        connected(opened.team, endpoint, keys, "replay") as bus,
+    ):
+        if connect is None:
+            typer.echo(f"listening at {endpoint}", err=True)
+            stop.wait(wait)
+        count = replay_samples(bus, opened.samples(), pace, stop)
+    typer.echo(f"replayed {count} messages of {log}")
+    _hint_if_cut(opened)
+
+
+@app.command()
+def report(
+    log: LogArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the report.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+    ledger: Annotated[
+        bool,
+        typer.Option(help="Prove the ledger: the robots consume the recorded readings again."),
+    ] = True,
+) -> None:
+    """A page, pictures, tables and figures of a run, from its log alone."""
+    from rich.console import Console
+
+    from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
+    from central.desk.evaluation.history import history
+    from central.desk.report.page import write_report
+    from central.desk.report.run import Run, nis_line, run_figures
+    from central.desk.report.tables import summary_tables
+    from team.recording.reader import open_log
+
+    _check_folder(output)
+    opened = open_log(log)
+    if log.stat().st_size > LONG_BYTES:
+        text = "this log is long: proving its ledger takes most of the time"
+        typer.echo(f"{text}, --no-ledger leaves it out" if ledger else "this log is long", err=True)
+    evaluation = with_holes(evaluate(opened.samples()), opened)
+    found, why = _ledger(opened) if ledger else (None, Run.no_ledger)
+    run = Run(evaluation, history(opened.samples()), opened.metadata, found, why)
+    figures = to_json(
+        evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
+    )
+    console = Console()
+    for table in summary_tables(evaluation):
+        console.print(table)
+    for note in evaluation.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    if (line := nis_line(run)) is not None:
+        console.print(line, highlight=False, soft_wrap=True)
+    if found is not None:
+        verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()
+        console.print(f"ledger: {verdict}", highlight=False, soft_wrap=True)
+    for path in write_report(run, output, figures):
+        console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    _hint_if_cut(opened)
+
+
+def _check_folder(path: Path) -> None:
+    """A folder that can not be made is found before the work, not after it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
+
+
+def _ledger(log: "Log") -> "tuple[Ledger | None, str]":
+    """The ledger of a log; without one, why."""
+    from central.desk.ledger import ledger
+    from central.desk.verification.recorded import RerunError, recorded
+
+    try:
+        return ledger(recorded(log)), ""
+    except RerunError as error:
+        return None, str(error)
+
+
+@app.command()
+def repair(
+    log: LogArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The new, complete log.")],
+) -> None:
+    """Complete a log whose recorder was killed: everything up to its last flush."""
+    from team.recording.repair import repaired
+
+    refuse_existing(output)
+    result = repaired(log, output)
+    until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
+    typer.echo(f"{output}: {result.messages} messages{until}")
+    for damage in result.damaged:
+        typer.echo(f"lost: {damage}", err=True)
+
+
+@app.command()
+def limit(
+    log: LogArgument,
+    noise: Annotated[
+        Literal["white", "profile"],
+        typer.Option(
+            help="white: each reading's error is its own, no sightings of teammates; profile: the "
+            "scenario's errors that persist, biases, and sightings."
+        ),
+    ] = "white",
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+) -> None:
+    """The batch MAP over all raw readings of a log: the limit that a team can reach."""
+    from sim.studies.batch_reference.reference import LimitError, batch_map
+    from team.recording.reader import open_log
+
+    try:
+        result = batch_map(open_log(log).samples(), noise)
+    except LimitError as error:
+        fail(str(error), FAILED)
+    figures = result.to_json()
+    typer.echo(json.dumps(figures, indent=2))
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+@app.command()
+def simulate(
+    scenario: ScenarioArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")],
+    robots: Robots = None,
+    seed: Seed = None,
+) -> None:
+    """Write a scenario's world as a data set in the UTIAS format, with a scenario that runs it."""
+    from sim.datasets.utias_writer import write_utias
+    from sim.scenarios.source import streams_of
+    from sim.scenarios.toml import data_set_scenario
+
+    if output.exists() and any(output.iterdir()):
+        fail(f"{output} is not empty: give a new folder", WRONG_USE)
+    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed)
+    write_utias(streams_of(resolved), output)
+    beside = output / "scenario.toml"
+    beside.write_text(data_set_scenario(resolved), encoding="utf-8")
+    typer.echo(f"wrote {output}; `teamslam launch {beside}` runs the team on it")
+
+
+def _hint_if_cut(log: "Log") -> None:
+    if not log.complete:
+        remedy = f"`teamslam repair {log.path} -o FIXED.mcap` completes it"
+        typer.echo(f"{log.path} is cut: {remedy}", err=True)

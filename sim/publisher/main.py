@@ -1,0 +1,75 @@
+"""The world process: the node's shell, which publishes as long as there is credit."""
+
+import logging
+import threading
+import time
+
+from sim.publisher.configurations import Configurations
+from sim.publisher.node import WorldNode, expected_nodes
+from sim.scenarios.scenario import Scenario
+from sim.scenarios.source import tells_map
+from sim.world.streams import WorldStreams
+from team import translate
+from team.shell import Shell
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Bus
+
+PACE_S = 0.002
+"""Wait when there is nothing to publish: the clock or the credit must move first."""
+_LOG = logging.getLogger("teamslam")
+
+
+def run_world(
+    bus: Bus,
+    scenario: Scenario,
+    streams: WorldStreams,
+    stop: threading.Event,
+    *,
+    speed: float,
+    recorder: bool,
+    cache: int | None = None,
+) -> None:
+    """Publish every reading of the world, then wait for the final map."""
+    robots = [robot.id for robot in scenario.robots]
+    configured = translate.configured("world", 0, 0, scenario)
+    node = WorldNode(
+        streams,
+        expected_nodes(robots, recorder=recorder),
+        configured,
+        speed,
+        cache,
+        Configurations(expected_configurations(scenario)),
+        tells_map(scenario, streams),
+    )
+    shell = Shell(bus, node, "world", stop)
+    for channel in (*node.listens, *node.announcements):
+        bus.subscribe(channel)
+    bus.watch_alive()
+    for robot in robots:
+        shell.answer(ch.READINGS, robot, node.readings)
+    shell.look_for_the_end()
+    if shell.going:
+        shell.begin()
+    said: set[str] = set()
+    while shell.going:
+        out = node.publish(time.monotonic())
+        shell.publish(out)
+        shell.take(bus.receive(0.0 if out else PACE_S))
+        for mismatch in node.configurations.mismatches:
+            if mismatch not in said:
+                said.add(mismatch)
+                _LOG.warning("%s", mismatch)
+        shell.look_for_the_end()
+        shell.report()
+    shell.report(last=True)
+    shell.wait_for_recorder(lambda: node.unrecorded > 0, shell.take)
+    _LOG.info("published %d readings", int(node.status().figures["readings"]))
+    shell.end(node.final)
+
+
+def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:
+    """What the centre and the robots of a scenario announce, by node."""
+    nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
+    robots = {node: translate.configured(node, 0, 0, robot) for node, robot in nodes.items()}
+    return {"central": translate.configured("central", 0, 0, scenario.central)} | robots

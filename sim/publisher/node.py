@@ -1,0 +1,433 @@
+"""The world's node: publishes every robot's readings in team time, as far as credit allows.
+
+It waits until everyone is there, never drops a reading, and ends with the last counters. It is the
+source of the streams, so it also answers for what a receiver missed.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from sim.publisher.configurations import Configurations
+from sim.world import streams as s
+from sim.world.streams import RobotStream, WorldStreams
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
+
+CREDIT_READINGS = 4096
+"""The world is at most this many readings ahead of the slowest living robot."""
+CREDIT_RECORDER = 16384
+"""… and this many, of all robots together, ahead of a living recorder."""
+BATCH = 256
+"""Readings between two looks at what has come in."""
+ANSWER = 8192
+"""Readings in one answer to a query; who wants more asks again."""
+TRUTH_BATCH_NS = 1_000_000_000
+HELD_UP_S = 5.0
+"""A node without whose progress the world can not go on is named after so long."""
+RESUME_S = 2.0
+"""A world that is started again waits so long for everyone to say how far he is."""
+FIRST_EPOCH = 1
+
+
+@dataclass
+class _Source:
+    """One robot's stream; its present epoch began at reading `base` of the whole."""
+
+    stream: RobotStream
+    epoch: int = FIRST_EPOCH
+    base: int = 0
+    published: int = 0
+    consumed: int = 0
+    truth_sent: int = 0
+    alive: bool = False
+
+    @property
+    def counter(self) -> int:
+        """Readings published in this epoch."""
+        return self.published - self.base
+
+    def message(self, index: int) -> m.Reading:
+        """The reading at `index` of the whole stream, as this epoch counts it."""
+        robot, epoch, reading = self.stream.robot, self.epoch, index - self.base
+        stamp_ns = int(self.stream.stamps_ns[index])
+        if reading == 0 and epoch > FIRST_EPOCH:
+            return m.Start(stamp_ns, robot, epoch, 0, b"", b"")
+        kind = self.stream.kinds[index]
+        if kind == s.ODOMETRY:
+            o = self.stream.odometry(index)
+            stamp_ns -= self.stream.clock_offset_ns
+            return m.Odometry(stamp_ns, robot, epoch, reading, o.duration_ns, o.forward, o.yaw_rate)
+        if kind == s.OBSERVATIONS:
+            z = self.stream.observations(index)
+            return m.Observations(
+                stamp_ns,
+                robot,
+                epoch,
+                reading,
+                from_ids(z.ids),
+                from_floats(z.ranges),
+                from_floats(z.bearings),
+            )
+        if kind == s.SIGHTINGS:
+            t = self.stream.sightings(index)
+            return m.Sightings(
+                stamp_ns,
+                robot,
+                epoch,
+                reading,
+                t.teammates,
+                from_floats(t.ranges),
+                from_floats(t.bearings),
+            )
+        start = self.stream.start
+        pose = b"" if start is None else from_floats(start.pose)
+        known = start is not None and start.covariance is not None
+        covariance = from_floats(start.covariance) if start is not None and known else b""
+        return m.Start(stamp_ns, robot, epoch, reading, pose, covariance)
+
+
+_CHANNEL_OF_KIND = {
+    s.START: ch.START,
+    s.ODOMETRY: ch.ODOMETRY,
+    s.OBSERVATIONS: ch.OBSERVATIONS,
+    s.SIGHTINGS: ch.SIGHTINGS,
+}
+
+
+@dataclass
+class WorldNode:
+    """`begin`, then `publish` again and again until `ended`; `handle` for what comes in.
+
+    expected: the nodes that must be alive before the first reading. speed: team seconds per second
+    of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's last
+    readings can be asked for again; None: all. Who asks for older ones gets a new epoch instead: a
+    start at an unknown pose, and readings that count from there. configurations: what the others
+    are to announce; the world does not begin while anyone has announced something else.
+    tells_map: the robots are told the landmarks, since they only localise themselves.
+    batch_s: team time between two looks at what has come in, at the most.
+    """
+
+    streams: WorldStreams
+    expected: frozenset[str]
+    scenario: m.Configured
+    speed: float = float("inf")
+    cache: int | None = None
+    configurations: Configurations = field(default_factory=lambda: Configurations({}))
+    tells_map: bool = False
+    batch_s: float = float("inf")
+    ended: bool = field(default=False, init=False)
+    finished: bool = field(default=False, init=False)
+    final: m.FusedMap | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self._sources = {x.robot: _Source(x) for x in self.streams.streams}
+        self._names = [x.robot for x in self.streams.streams]
+        robots, indices = self.streams.order()
+        self._order = deque(zip(robots.tolist(), indices.tolist(), strict=True))
+        self._alive: set[str] = set()
+        self._recorded: dict[tuple[str, int], int] = {}
+        self._recorder = False
+        self._unrecorded = 0
+        self._published = 0
+        self._began_at: float | None = None
+        self._consumed: dict[tuple[str, int], int] = {}
+        self._passed_ns: dict[str, int] = {}
+        self._heard_at: float | None = None
+        self._held_up: tuple[str, float] | None = None
+        self._clock_s = 0.0
+        self._starts: list[Outgoing] = []
+        first = [int(x.stamps_ns[0]) for x in self.streams.streams if len(x)]
+        self._first_ns = min(first, default=0)
+        self.now_ns = self._paced_ns = self._first_ns
+
+    listens: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.ROBOT_PROGRESS,
+        ch.RECORDER_PROGRESS,
+        ch.FINAL_MAP,
+        ch.GIVEN_UP,
+    )
+    announcements: ClassVar[tuple[ch.Channel, ...]] = (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
+    """Listened to as well where configurations are compared."""
+
+    @property
+    def waiting_for(self) -> list[str]:
+        """Who is not there yet, or has not said yet with which configuration."""
+        if self._began_at is not None:
+            return []
+        silent = self.configurations.unheard(self.expected & self._alive)
+        return sorted([*(self.expected - self._alive), *silent])
+
+    def begin(self) -> list[Outgoing]:
+        """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
+        out = [Outgoing(ch.WORLD_CONFIG, "", self.scenario)]
+        if self.streams.landmarks is not None:
+            order = np.argsort(self.streams.landmark_ids)
+            truth = m.TruthLandmarks(
+                self._first_ns,
+                from_ids(self.streams.landmark_ids[order]),
+                from_floats(self.streams.landmarks[order]),
+            )
+            out.append(Outgoing(ch.TRUTH_LANDMARKS, "", truth))
+            if self.tells_map:
+                told = m.KnownMap(self._first_ns, truth.ids, truth.positions)
+                out.append(Outgoing(ch.KNOWN_MAP, "", told))
+        return out
+
+    def refusal(self, message: m.Message) -> str | None:
+        """Why a message can not be true: credit for what never was, a final map before the end."""
+        match message:
+            case m.Progress():
+                source = self._sources.get(message.robot)
+                if source is None:
+                    return f"of {message.robot}, not in this team"
+                if message.epoch > source.epoch:
+                    return f"of incarnation {message.epoch} of {message.robot}, {source.epoch} is"
+                if message.readings > len(source.stream):
+                    return f"consumed {message.readings} of {len(source.stream)} readings"
+            case m.FusedMap() if message.final and self._published and not self.ended:
+                return "a final map before the end of the streams"
+            case _:
+                pass
+        return None
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Take progress, liveliness, configurations, the final map; the answer is always empty."""
+        match message:
+            case m.Liveliness():
+                self._take_liveliness(message)
+            case m.Progress() if message.node == "recorder":
+                stream = (message.robot, message.epoch)
+                self._recorded[stream] = max(self._recorded.get(stream, 0), message.readings)
+            case m.Progress():
+                if self._began_at is None and message.readings:
+                    self._note_consumed(message)
+                source = self._sources.get(message.robot)
+                if source is not None and message.epoch == source.epoch:
+                    source.consumed = max(source.consumed, source.base + message.readings)
+            case m.Configured():
+                self.configurations.take(message)
+            case m.FusedMap() if message.final:
+                self.finished, self.final = True, message
+            case m.GivenUp():
+                self.expected -= {message.node}
+            case _:
+                pass
+        return []
+
+    def _note_consumed(self, progress: m.Progress) -> None:
+        """What robots say before this world has begun is of an earlier life of it."""
+        stream = (progress.robot, progress.epoch)
+        if progress.robot in self._sources:
+            self._consumed[stream] = max(self._consumed.get(stream, 0), progress.readings)
+            self._passed_ns[progress.robot] = progress.stamp_ns
+
+    def _take_liveliness(self, message: m.Liveliness) -> None:
+        (self._alive.add if message.alive else self._alive.discard)(message.node)
+        came = not self._recorder and "recorder" in self._alive
+        if came and self._began_at is not None:  # it says what its log has
+            self._recorded, self._unrecorded = {}, self._out_of_reach
+        self._recorder = "recorder" in self._alive
+        for name, source in self._sources.items():
+            source.alive = ch.robot_node(name) in self._alive
+
+    def _going_on(self, clock_s: float) -> bool:
+        """Whether an earlier life of this world had begun, and it is known how far everyone is.
+
+        Robots and recorder report their progress again to whoever comes; the streams are the same
+        for the same scenario, so this life goes on from the least that everybody has, in the same
+        epochs. What someone has already he drops, what he misses he asks for.
+        """
+        if not self._consumed:
+            return False
+        if self._heard_at is None:
+            self._heard_at = clock_s
+        robots = {ch.robot_node(name) for name in self._sources}
+        waiting = self.waiting_for and robots - {ch.robot_node(n) for n, _ in self._consumed}
+        return not waiting or clock_s - self._heard_at >= RESUME_S
+
+    def _skip(self) -> list[Outgoing]:
+        """Leave out what everybody has; the starts once more, for a centre that comes later."""
+        starts = []
+        for name, source in self._sources.items():
+            epoch = max((e for n, e in self._consumed if n == name), default=FIRST_EPOCH)
+            consumed = self._consumed.get((name, epoch), 0)
+            if epoch > FIRST_EPOCH:  # where it began is not known any more, but how far it came
+                at = int(np.searchsorted(source.stream.stamps_ns, self._passed_ns[name], "right"))
+                source.epoch, source.published = epoch, max(at, 1)
+                self._begin_epoch(source)
+                continue
+            if self._recorder:
+                consumed = min(consumed, self._recorded.get((name, epoch), 0))
+            source.published = min(consumed, len(source.stream))
+            if source.published:
+                starts.append(Outgoing(ch.START, name, source.message(0)))
+            if source.published and source.stream.truth_ns is not None:
+                at_ns = int(source.stream.stamps_ns[source.published - 1]) - TRUTH_BATCH_NS
+                source.truth_sent = int(np.searchsorted(source.stream.truth_ns, at_ns))
+        kept = [(r, i) for r, i in self._order if i >= self._sources[self._names[r]].published]
+        self._order = deque(kept)
+        self._published = sum(source.published for source in self._sources.values())
+        self._unrecorded = self._published - sum(self._recorded.values())
+        if kept:
+            robot, index = kept[0]
+            self._paced_ns = int(self._sources[self._names[robot]].stream.stamps_ns[index])
+        return starts
+
+    @property
+    def _out_of_reach(self) -> int:
+        """Readings that nobody can ask for any more: a recorder that comes late never has them."""
+        if self.cache is None:
+            return 0
+        return sum(max(0, x.published - self.cache) for x in self._sources.values())
+
+    @property
+    def unrecorded(self) -> int:
+        """Readings that a living recorder still lacks by its own word."""
+        if not self._recorder:
+            return 0
+        return self._published - self._unrecorded - sum(self._recorded.values())
+
+    def publish(self, clock_s: float) -> list[Outgoing]:
+        """The next readings, at most BATCH and of batch_s: as many as pace and credit allow."""
+        if self.ended:  # a new epoch may begin after the end; it has its own last counters
+            out, self._starts = self._starts, []
+            return [*out, Outgoing(ch.END, "", self._end())] if out else []
+        if self._began_at is None:
+            if self.configurations.mismatches or not (
+                self._going_on(clock_s) if self._consumed else not self.waiting_for
+            ):
+                return []
+            self._began_at = clock_s
+            self._starts += self._skip() if self._consumed else []
+        horizon = self._horizon_ns(clock_s)
+        out, self._starts = self._starts, []
+        until_ns = float("inf")
+        while self._order and len(out) < BATCH:
+            robot, index = self._order[0]
+            source = self._sources[self._names[robot]]
+            stamp_ns = int(source.stream.stamps_ns[index])
+            until_ns = min(until_ns, stamp_ns + self.batch_s * 1e9)
+            if stamp_ns >= until_ns:
+                break
+            if stamp_ns > horizon:
+                self._held_up = None
+                break
+            if (who := self._without_credit(source)) is not None:
+                before = self._held_up
+                self._held_up = before if before and before[0] == who else (who, clock_s)
+                self._clock_s = clock_s
+                break
+            self._held_up = None
+            self._order.popleft()
+            self.now_ns = max(self.now_ns, stamp_ns)
+            kind = int(source.stream.kinds[index])
+            name = source.stream.robot
+            out.append(Outgoing(_CHANNEL_OF_KIND[kind], name, source.message(index)))
+            source.published = index + 1
+            self._published += 1
+            out += self._truth(source, stamp_ns, TRUTH_BATCH_NS)
+        if not self._order:
+            self.ended = True
+            for source in self._sources.values():
+                out += self._truth(source, 2**62, 0)
+            out.append(Outgoing(ch.END, "", self._end()))
+        return out
+
+    def _horizon_ns(self, clock_s: float) -> float:
+        assert self._began_at is not None
+        if self.speed == float("inf"):
+            return self.speed  # at the first look no time has passed: 0 · ∞ is not a number
+        return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
+
+    def _without_credit(self, source: _Source) -> str | None:
+        """Who has to get on before the next reading of this robot; None: nobody."""
+        if source.alive and source.published - source.consumed >= CREDIT_READINGS:
+            return ch.robot_node(source.stream.robot)
+        return "recorder" if self.unrecorded >= CREDIT_RECORDER else None
+
+    def _truth(self, source: _Source, stamp_ns: int, batch_ns: int) -> list[Outgoing]:
+        stream = source.stream
+        if stream.truth is None or stream.truth_ns is None:
+            return []
+        begin = source.truth_sent
+        if begin >= len(stream.truth_ns) or stamp_ns - stream.truth_ns[begin] < batch_ns:
+            return []
+        end = int(np.searchsorted(stream.truth_ns, stamp_ns, side="right"))
+        if end <= begin:
+            return []
+        source.truth_sent = end
+        truth = m.Truth(
+            int(stream.truth_ns[end - 1]),
+            stream.robot,
+            from_stamps(stream.truth_ns[begin:end]),
+            from_floats(stream.truth[begin:end]),
+        )
+        return [Outgoing(ch.TRUTH, stream.robot, truth)]
+
+    def _end(self) -> m.End:
+        ends = tuple(m.StreamEnd(n, x.epoch, x.counter) for n, x in self._sources.items())
+        notes = [*self.streams.notes]
+        for name, source in self._sources.items():
+            notes += [f"{name}: {note}" for note in source.stream.notes]
+        return m.End(self.now_ns, ends, tuple(notes))
+
+    def readings(self, request: bytes) -> Iterable[bytes]:
+        """The answer to `ReadingsWanted`: the published readings asked for, ANSWER at most."""
+        wanted = decoded(request, m.ReadingsWanted)
+        source = self._sources.get(wanted.robot)
+        if source is None or wanted.epoch not in (0, source.epoch):
+            return []
+        first = wanted.first
+        if self.cache is not None and first < source.counter - self.cache:
+            if not wanted.only:
+                self._begin_epoch(source)
+                return []
+            first = source.counter - self.cache
+        last = source.counter - 1 if wanted.last < 0 else min(wanted.last, source.counter - 1)
+        last = min(last, first + ANSWER - 1)
+        return [encoded(source.message(source.base + i)) for i in range(first, last + 1)]
+
+    def _begin_epoch(self, source: _Source) -> None:
+        """The stream can not be continued where the robot is: it begins anew at a free pose."""
+        source.epoch += 1
+        source.base = source.published - 1
+        source.consumed = source.base
+        start = source.message(source.base)
+        self._starts.append(Outgoing(ch.START, source.stream.robot, start))
+
+    def status(self) -> m.Status:
+        """How far the world is, for people."""
+        total = self._published + len(self._order)
+        figures = {
+            "readings": float(self._published),
+            "of": float(total),
+            "team_time_s": (self.now_ns - self._first_ns) * 1e-9,
+        }
+        waiting = self.waiting_for
+        state = "publishing" if self._began_at is not None else "waiting"
+        warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
+        if self._held_up is not None and self._clock_s - self._held_up[1] >= HELD_UP_S:
+            who, since = self._held_up
+            warnings = (
+                f"{who} holds the team up: it has got no further for {self._clock_s - since:.0f} s",
+            )
+        return m.Status(
+            self.now_ns,
+            "world",
+            "ended" if self.ended else state,
+            figures,
+            (*self.configurations.mismatches, *warnings),
+        )
+
+
+def expected_nodes(robots: Sequence[str], *, recorder: bool) -> frozenset[str]:
+    """Who must be alive before the world begins."""
+    nodes = {ch.robot_node(robot) for robot in robots} | {"central"}
+    return frozenset(nodes | {"recorder"} if recorder else nodes)

@@ -1,0 +1,77 @@
+"""The same readings under other conditions: the recorded team's nodes, in memory, with changes."""
+
+import msgspec
+
+from sim.in_memory.links import Conditions, Partition
+from sim.in_memory.team import run_nodes
+from sim.recorded.changes import Changes, Span
+from sim.recorded.noise import with_noise
+from sim.recorded.unsafe import UnsafeRobot
+from sim.recorded.world import RecordedWorld
+from sim.scenarios.checks import ScenarioError
+from sim.scenarios.scenario import Scenario, with_options
+from team.pairs import FEEDBACK
+from team.recording.reader import Log
+from team.robot.node import RobotNode
+from team.wire.bus import Sample
+
+
+def changed_run(log: Log, changes: Changes) -> list[Sample]:
+    """The samples of the changed run, as a recorder would have taken them.
+
+    Raises ScenarioError for a change that has no meaning, RerunError for a log that lacks readings.
+    """
+    world = RecordedWorld(log, changes.without)
+    scenario = changed_scenario(world.scenario, changes)
+    world.announce(scenario)
+    conditions = _conditions(scenario, changes, world.first_ns)
+    node = UnsafeRobot if changes.unsafe_feedback else RobotNode
+    return list(run_nodes(scenario, world, conditions, node))
+
+
+def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
+    """The recorded scenario with the changes; raises ScenarioError."""
+    names = [robot.id for robot in scenario.robots]
+    asked = {*changes.without, *(r for robots, _ in changes.partitions for r in robots)}
+    for name in sorted(asked - set(names)):
+        raise ScenarioError(f"no robot {name} in the log; there are {', '.join(names)}")
+    kept = tuple(robot for robot in scenario.robots if robot.id not in changes.without)
+    if not kept:
+        raise ScenarioError("a team without robots has nothing to compute")
+    front = {"particles": changes.particles, "window_s": changes.window_s}
+    front = {name: value for name, value in front.items() if value is not None}
+    noise = dict(changes.noise)
+    kept = tuple(
+        with_noise(
+            msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, **front)),
+            noise,
+        )
+        for r in kept
+    )
+    changed = with_options(
+        msgspec.structs.replace(scenario, robots=kept),
+        seed=changes.seed,
+        estimator=changes.estimator,
+        fusion=changes.fusion,
+    )
+    links = changes.loss or changes.delay_s or changes.no_centre or changes.partitions
+    if changed.fusion != "join" and (links or changes.unsafe_feedback):
+        why = "runs in lockstep" if changed.fusion in FEEDBACK else "is for comparison"
+        raise ScenarioError(
+            f"the rule {changed.fusion} {why}: loss, delay, partition, a missing centre "
+            "and unsafe feedback are for the rule join"
+        )
+    return changed
+
+
+def _conditions(scenario: Scenario, changes: Changes, first_ns: int) -> Conditions:
+    def at(span: Span) -> tuple[int, int]:
+        return first_ns + round(span[0] * 1e9), first_ns + round(span[1] * 1e9)
+
+    return Conditions(
+        round(changes.delay_s * 1e9),
+        changes.loss,
+        scenario.seed,
+        tuple(Partition(frozenset(robots), *at(span)) for robots, span in changes.partitions),
+        None if changes.no_centre is None else at(changes.no_centre),
+    )

@@ -1,0 +1,30 @@
+"""What is to be different when a log is computed again."""
+
+from dataclasses import dataclass
+
+Span = tuple[float, float]
+"""Begin and end in seconds since the log's first reading."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What is to be different; the readings are the log's whatever is asked.
+
+    without: robots that were not there. seed: of the estimators and of the losses. loss, delay_s:
+    of submaps on their way to the centre. no_centre: when there is none. partitions: robots that
+    the centre can not reach, and when. unsafe_feedback: see `UnsafeRobot`. noise: factors on the
+    standard deviations that the robots assume, by kind (`sim.recorded.noise`).
+    """
+
+    without: tuple[str, ...] = ()
+    fusion: str | None = None
+    estimator: str | None = None
+    particles: int | None = None
+    window_s: float | None = None
+    seed: int | None = None
+    loss: float = 0.0
+    delay_s: float = 0.0
+    no_centre: Span | None = None
+    partitions: tuple[tuple[tuple[str, ...], Span], ...] = ()
+    unsafe_feedback: bool = False
+    noise: tuple[tuple[str, float], ...] = ()

@@ -1,0 +1,61 @@
+"""A log as what other programs read: a UTIAS data set, paths in the TUM format."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from central.desk.evaluation.evaluation import evaluate
+from central.desk.export.tum import write_trajectories
+from sim.calibration.source import world_of
+from sim.datasets.utias_writer import write_utias
+from sim.publisher.node import FIRST_EPOCH
+from team.recording.reader import Log, LogError
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import opened
+from team.wire.codec import WireError
+
+CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
+
+
+def export_utias(log: Log, folder: Path) -> list[str]:
+    """Write the data set into `folder`; the robots in the order of their numbers 1, 2, …
+
+    The format has one stream per robot: the first epoch of each is written. Raises `LogError` for
+    a log that has no readings, or not those that the format needs.
+    """
+    messages = list(_sound(log))
+    readings = [each for each in messages if isinstance(each, m.Reading)]
+    robots = {each.robot for each in readings if each.epoch == FIRST_EPOCH}
+    if not robots:
+        raise LogError(log.path, "no sensor readings in it", "`--format csv` writes what there is")
+    sighted = {n for each in readings if isinstance(each, m.Sightings) for n in each.teammates}
+    if sighted - robots:
+        what = f"it sights {', '.join(sorted(sighted - robots))}, of whom it has no readings"
+        raise LogError(log.path, what, "`teamslam log merge` puts the robots' logs together")
+    try:
+        world = world_of(messages, log.path.name)
+    except ValueError as error:
+        remedy = "the format needs readings without gaps: `teamslam log cut` to a part without"
+        raise LogError(log.path, str(error), remedy) from None
+    write_utias(world, folder)
+    return [stream.robot for stream in world.streams]
+
+
+def export_tum(log: Log, folder: Path) -> list[Path]:
+    """Write every robot's paths in the TUM format; what was written.
+
+    Raises `LogError` for a log that has no path, as one of sensor readings alone.
+    """
+    written = write_trajectories(evaluate(log.samples()), folder)
+    if not written:
+        remedy = "`teamslam rerun` computes them, `--format csv` writes what there is"
+        raise LogError(log.path, "no robot's path in it", remedy)
+    return written
+
+
+def _sound(log: Log) -> Iterator[m.Message]:
+    for sample in log.samples(CHANNELS):
+        try:
+            yield opened(sample)[2]
+        except WireError:
+            continue  # no node would have let it in either; `teamslam log check` counts it

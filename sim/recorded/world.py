@@ -1,0 +1,126 @@
+"""The world of a log: its readings and its truth once more, second by second of team time."""
+
+from collections import deque
+from collections.abc import Collection
+from typing import ClassVar
+
+from central.desk.verification.recorded import RerunError
+from sim.scenarios.scenario import Scenario, loads
+from team import translate
+from team.pairs import NEEDS_MAP
+from team.recording.reader import Log
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing, opened
+from team.wire.codec import WireError
+
+STEP_NS = 1_000_000_000
+"""Team time between two looks at what became of the messages."""
+_SOURCE = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG, ch.END)
+
+
+class RecordedWorld:
+    """What a log's world published, of some of its robots, in the order of team time.
+
+    Each robot's readings come in the order of their counters. Raises RerunError where one is not in
+    the log, since no robot could go on behind it.
+    """
+
+    listens: ClassVar[tuple[ch.Channel, ...]] = ()
+
+    def __init__(self, log: Log, without: Collection[str] = ()) -> None:
+        self._configured: m.Configured | None = None
+        self._said: list[Outgoing] = []
+        self._notes: tuple[str, ...] = ()
+        published: dict[tuple[str, int, int], tuple[int, Outgoing]] = {}
+        truths: list[tuple[int, Outgoing]] = []
+        for sample in log.samples(_SOURCE):
+            try:
+                channel, name, message = opened(sample)
+            except WireError:
+                continue
+            match message:
+                case m.Reading() | m.Truth() if name in without:
+                    pass
+                case m.Reading():
+                    place = (message.robot, message.epoch, message.reading)
+                    out = Outgoing(channel, name, message)
+                    published.setdefault(place, (message.stamp_ns, out))
+                case m.Truth():
+                    truths.append((message.stamp_ns, Outgoing(channel, name, message)))
+                case m.TruthLandmarks():
+                    self._said.append(Outgoing(channel, "", message))
+                case m.Configured():
+                    self._configured = message
+                case m.End():
+                    self._notes = message.notes
+                case _:
+                    pass
+        self._end = _ends(published)
+        ordered = [*(published[place] for place in sorted(published)), *truths]
+        self._waiting = deque(sorted(ordered, key=lambda each: each[0]))
+        self.first_ns = self._waiting[0][0] if self._waiting else 0
+        self.last_ns = self._waiting[-1][0] if self._waiting else 0
+        self.now_ns = self.first_ns
+        self._ended = False
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the recorded run; raises RerunError, ScenarioError."""
+        if self._configured is None:
+            raise RerunError("the log has no scenario: its world was not recorded")
+        return loads(self._configured.configuration)
+
+    def announce(self, scenario: Scenario) -> None:
+        """The scenario that `begin` will name; raises RerunError if it needs a map there is not."""
+        if scenario.estimator in NEEDS_MAP:
+            truth = [o.message for o in self._said if isinstance(o.message, m.TruthLandmarks)]
+            if not truth:
+                raise RerunError(
+                    f"the estimator {scenario.estimator} needs a map of the landmarks, "
+                    "and the log has none"
+                )
+            told = m.KnownMap(truth[0].stamp_ns, truth[0].ids, truth[0].positions)
+            self._said.append(Outgoing(ch.KNOWN_MAP, "", told))
+        self._said.insert(
+            0, Outgoing(ch.WORLD_CONFIG, "", translate.configured("world", 0, 0, scenario))
+        )
+
+    def begin(self) -> list[Outgoing]:
+        """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
+        return self._said
+
+    def publish(self, clock_s: float) -> list[Outgoing]:
+        """The next STEP_NS of team time; with the last of them the end."""
+        if self._ended:
+            return []
+        until_ns = self.now_ns + STEP_NS
+        out = []
+        while self._waiting and self._waiting[0][0] < until_ns:
+            out.append(self._waiting.popleft()[1])
+        self.now_ns = until_ns
+        if not self._waiting:
+            self._ended = True
+            self.now_ns = self.last_ns
+            out.append(Outgoing(ch.END, "", m.End(self.last_ns, self._end, self._notes)))
+        return out or self.publish(clock_s)
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """A log listens to nobody."""
+        return []
+
+
+def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...]:
+    """The last epoch of every robot and its count; raises RerunError for a gap in any epoch."""
+    counts: dict[tuple[str, int], int] = {}
+    for robot, epoch, reading in sorted(published):
+        if reading != counts.setdefault((robot, epoch), 0):
+            raise RerunError(
+                f"reading {counts[robot, epoch]} of {robot}, epoch {epoch} is not in the log: "
+                "under other conditions the robot could not go on behind it"
+            )
+        counts[robot, epoch] += 1
+    last: dict[str, m.StreamEnd] = {}
+    for (robot, epoch), count in sorted(counts.items()):
+        last[robot] = m.StreamEnd(robot, epoch, count)
+    return tuple(last.values())

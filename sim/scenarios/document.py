@@ -1,0 +1,158 @@
+"""A user's TOML document → the plain fields of a resolved scenario.
+
+base = "thesis"            # optional: a built-in scenario that this file changes
+name, team, seed, estimator, fusion, exchange
+[world]      kind = "simulated" | "utias", then the fields of sim.world.config
+[defaults]   fields of every robot (team.config.RobotConfig)
+[[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS
+             world: its five
+[central]    fields of central.config.CentralConfig
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from central.config import CentralConfig
+from sim.scenarios.checks import ScenarioError, check_fields, check_known, plain
+from team.config import RobotConfig
+
+MAX_ROBOTS = 100
+UTIAS_ROBOTS = 5
+
+Fields = dict[str, Any]
+
+
+def builtin_names() -> tuple[str, ...]:
+    """The names of the scenarios that are installed with the package."""
+    found = (entry.name for entry in files("sim.scenarios.builtin").iterdir())
+    return tuple(sorted(name[:-5] for name in found if name.endswith(".toml")))
+
+
+def named_document(name: str) -> tuple[Fields, str]:
+    """The document of a built-in scenario or of a user's file, laid over its base; its short name.
+
+    A data set's path in a file is relative to that file.
+    """
+    if name in builtin_names():
+        return _builtin(name), name
+    path = Path(name)
+    if path.is_dir():
+        raise ScenarioError(
+            "a folder, not a scenario: give a .toml file in it; a data set goes with --dataset"
+        )
+    if not path.is_file():
+        raise ScenarioError(
+            f"no such scenario; built in: {', '.join(builtin_names())}; "
+            "or give a path to a .toml file"
+        )
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"can not be read as UTF-8 text: {error}") from None
+    document = _based(_parsed(text))
+    world = document.get("world")
+    if isinstance(world, dict) and isinstance(world.get("path"), str) and world["path"]:
+        world["path"] = str(path.parent / world["path"])
+    return document, path.stem
+
+
+def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
+    """Defaults merged below every robot, names given; `known`: the fields of a scenario.
+
+    What the user wrote is checked where it was written, so that an error names that place.
+    """
+    for name in document:
+        check_known(name, [*known, "base", "defaults", "robot_count"], "")
+    fields: Fields = {"name": re.sub(r"[^A-Za-z0-9_.-]", "-", stem)[:64]} | document
+    defaults = checked_table(fields.pop("defaults", {}), "defaults")
+    _check_part(defaults, RobotConfig, "defaults", {"id": "r1"})
+    if "id" in defaults:
+        raise ScenarioError("`id` at defaults would be every robot's: give it in [[robots]]")
+    count = fields.pop("robot_count", None)
+    if count is not None and "robots" in fields:
+        raise ScenarioError("robot_count and [[robots]] exclude each other: leave one away")
+    world = checked_table(fields.get("world", {}), "world")
+    if count is not None:
+        unnamed = checked_count(count)
+    else:
+        unnamed = UTIAS_ROBOTS if world.get("kind") == "utias" else 0
+    robots = fields.get("robots", [{}] * unnamed)
+    if not isinstance(robots, list):
+        raise ScenarioError("expected [[robots]], an array of tables, at robots")
+    for i, robot in enumerate(robots):
+        at = f"robots[{i}]"
+        _check_part(checked_table(robot, at), RobotConfig, at, {"id": "r1"})
+    fields["robots"] = [
+        _merged({"id": f"r{i}"} | defaults, robot) for i, robot in enumerate(robots, 1)
+    ]
+    _check_part(checked_table(fields.get("central", {}), "central"), CentralConfig, "central", {})
+    return {"team": fields["name"]} | fields
+
+
+def checked_table(value: object, at: str) -> Fields:
+    """The value if it is a table; raises ScenarioError."""
+    if not isinstance(value, dict):
+        raise ScenarioError(f"expected a table, got {type(value).__name__} at {at}")
+    return value
+
+
+def checked_count(count: object) -> int:
+    """The value if it is the size of a team; raises ScenarioError."""
+    if not isinstance(count, int) or isinstance(count, bool):
+        raise ScenarioError(f"expected a number of robots from 1 to {MAX_ROBOTS}, got {count!r}")
+    if not 1 <= count <= MAX_ROBOTS:
+        raise ScenarioError(f"{count} robots: a team has 1 to {MAX_ROBOTS}")
+    return count
+
+
+def _builtin(name: str) -> Fields:
+    return _based(
+        _parsed(files("sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8"))
+    )
+
+
+def _parsed(text: str) -> Fields:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"not valid TOML: {error}") from None
+
+
+def _based(document: Fields) -> Fields:
+    """The document laid over the built-in scenario that it names as its base."""
+    if "base" not in document:
+        return document
+    own = {key: value for key, value in document.items() if key != "base"}
+    base = document["base"]
+    if base not in builtin_names():
+        known = ", ".join(builtin_names())
+        raise ScenarioError(f"expected a built-in scenario, got {base!r} at base; known: {known}")
+    below = _builtin(base)
+    if "robot_count" in own:
+        below.pop("robots", None)
+    return _merged(below, own)
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
+    """Tables are merged at every depth; all else is replaced by what lies above."""
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        both = isinstance(old, dict) and isinstance(value, dict)
+        merged[key] = _merged(old, value) if both and old is not None else value
+    return merged
+
+
+def _check_part(value: Fields, declared: type[msgspec.Struct], at: str, needed: Fields) -> None:
+    """Check a part of the document alone, so that an error names where the user wrote it."""
+    check_fields(value, declared, at)
+    try:
+        msgspec.convert(needed | value, declared)
+    except msgspec.ValidationError as error:
+        raise plain(error, at) from None

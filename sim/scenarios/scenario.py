@@ -1,0 +1,207 @@
+"""A scenario: the world, the team's robots with their models, the centre and the seed.
+
+Users write TOML (`sim.scenarios.document` says how); processes hand the resolved scenario on as JSON
+(`dumps`, `loads`).
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from central.config import CentralConfig
+from sim.scenarios.checks import ScenarioError, check_fields, plain
+from sim.scenarios.document import (
+    MAX_ROBOTS,
+    Fields,
+    builtin_names,
+    checked_count,
+    checked_table,
+    named_document,
+    resolved,
+)
+from sim.world.config import SimulatedWorld, UtiasWorld, World
+from team.config import Estimator, Exchange, FusionRule, RobotConfig
+from team.pairs import PAIRS, named_pairs, rules_for
+
+__all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
+           "with_options"]  # fmt: skip
+
+WORLDS: dict[str, type[World]] = {"simulated": SimulatedWorld, "utias": UtiasWorld}
+
+KeyChunk = Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{1,64}$")]
+
+
+class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A resolved scenario: the robots and the centre carry the seed, the estimator and the rule.
+
+    team: the chunk of the keys `team/<team>/…` that keeps two teams on one network apart.
+    exchange: with "rendezvous" a robot sends its submaps only when it sees a teammate or is seen.
+    """
+
+    name: KeyChunk
+    team: KeyChunk
+    world: World
+    robots: tuple[RobotConfig, ...]
+    central: CentralConfig = CentralConfig()
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
+    estimator: Estimator = "hybrid"
+    fusion: FusionRule = "join"
+    exchange: Exchange = "continuous"
+
+
+def load(name_or_path: str | Path) -> Scenario:
+    """A built-in scenario by its name, or a user's TOML file; raises ScenarioError.
+
+    A data set's path in a file is relative to that file.
+    """
+    name = str(name_or_path)
+    known = [field.name for field in msgspec.structs.fields(Scenario)]
+    try:
+        return _converted(resolved(*named_document(name), known))
+    except ScenarioError as error:
+        raise ScenarioError(f"{name}: {error}") from error.__cause__
+
+
+def with_options(
+    scenario: Scenario,
+    *,
+    robots: int | None = None,
+    seed: int | None = None,
+    estimator: str | None = None,
+    fusion: str | None = None,
+    dataset: str | Path | None = None,
+) -> Scenario:
+    """The scenario with what a command line changes; None leaves it as it is.
+
+    robots: the first so many; further ones repeat the scenario's robots in turn, with new ids.
+    Raises ScenarioError.
+    """
+    fields: Fields = msgspec.to_builtins(scenario)
+    changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
+    fields |= {key: value for key, value in changes.items() if value is not None}
+    if robots is not None:
+        fields["robots"] = _counted(fields["robots"], robots)
+    if dataset is not None:
+        if not isinstance(scenario.world, UtiasWorld):
+            raise ScenarioError(
+                f"{scenario.name}: a simulated world takes no data set; use the scenario `utias`"
+            )
+        fields["world"]["path"] = str(dataset)
+    return _converted(fields)
+
+
+def dumps(scenario: Scenario) -> str:
+    """The resolved scenario as JSON; `loads` gives an equal one."""
+    return msgspec.json.encode(scenario).decode()
+
+
+def loads(text: str) -> Scenario:
+    """A resolved scenario from its JSON; raises ScenarioError."""
+    try:
+        fields = msgspec.json.decode(text, type=dict[str, Any])
+    except msgspec.DecodeError as error:
+        raise ScenarioError(f"not a resolved scenario in JSON: {error}") from None
+    return _converted(fields)
+
+
+def doubts(scenario: Scenario) -> list[str]:
+    """What is valid, but hardly meant, in words: a simulated robot whose odometry has no noise."""
+    if not isinstance(scenario.world, SimulatedWorld):
+        return []
+    return [
+        f"{robot.id}: odometry without noise; give it some in [defaults.motion]"
+        for robot in scenario.robots
+        if robot.motion.is_exact
+    ]
+
+
+def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
+    """So many robots: the first ones as they are, further ones after their pattern in turn."""
+    checked_count(count)
+    taken = {robot.get("id") for robot in robots}
+    spare = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
+    further = [robots[i % len(robots)] | {"id": next(spare)} for i in range(len(robots), count)]
+    return [*robots[:count], *further]
+
+
+def _converted(fields: Fields) -> Scenario:
+    """Plain fields → a scenario whose parts fit together; raises ScenarioError."""
+    world = checked_table(fields.get("world", {}), "world")
+    kind = world.get("kind")
+    if not isinstance(kind, str) or kind not in WORLDS:
+        known = ", ".join(f'"{each}"' for each in WORLDS)
+        got = "nothing" if kind is None else repr(kind)
+        raise ScenarioError(f"expected one of {known}, got {got} at world.kind")
+    check_fields(world, WORLDS[kind], "world")
+    for choice, declared in (
+        ("estimator", Estimator),
+        ("fusion", FusionRule),
+        ("exchange", Exchange),
+    ):
+        if choice in fields:
+            check_fields(fields[choice], declared, choice)
+    try:
+        return _filled(msgspec.convert(fields, Scenario))
+    except msgspec.ValidationError as error:
+        raise plain(error) from None
+
+
+def _filled(scenario: Scenario) -> Scenario:
+    """The seed, the estimator and the rule handed to the robots and the centre; all of it valid."""
+    if (scenario.estimator, scenario.fusion) not in PAIRS:
+        raise ScenarioError(
+            f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}, "
+            f"but {' or '.join(rules_for(scenario.estimator))}; valid: {named_pairs()}"
+        )
+    if scenario.exchange == "rendezvous" and PAIRS[scenario.estimator, scenario.fusion] != "submap":
+        raise ScenarioError(
+            f"the rule {scenario.fusion} needs a continuous exchange: at a rendezvous submaps are "
+            'sent, which the rule "join" takes'
+        )
+    _check_team([robot.id for robot in scenario.robots], scenario.world)
+    robots = tuple(
+        msgspec.structs.replace(
+            robot, seed=scenario.seed, estimator=scenario.estimator, fusion=scenario.fusion
+        )
+        for robot in scenario.robots
+    )
+    central = msgspec.structs.replace(scenario.central, fusion=scenario.fusion)
+    return msgspec.structs.replace(scenario, robots=robots, central=central)
+
+
+def _check_way_points(robots: int, world: SimulatedWorld) -> None:
+    """Robots without a path of their own go from one random way-point to the next, for ever."""
+    width = world.size_m if world.radius_m is None else 2.0 * world.radius_m
+    endless = robots > len(world.paths) and not world.way_point_count
+    if endless and world.way_point_tolerance_m > 0.5 * width:
+        raise ScenarioError(
+            f"world.way_point_tolerance_m is {world.way_point_tolerance_m:g} in a place "
+            f"{width:g} m wide: a robot would be at its way-points without moving; "
+            "give at most half the width"
+        )
+
+
+def _check_team(ids: list[str], world: World) -> None:
+    if not ids:
+        raise ScenarioError("no robots: give robot_count, [[robots]], or a base that has some")
+    checked_count(len(ids))
+    for i, robot in enumerate(ids):
+        if robot in ids[:i]:
+            raise ScenarioError(f"two robots have the id {robot}: ids must differ")
+        if isinstance(world, UtiasWorld) and not re.fullmatch("r[1-9][0-9]?|r100", robot):
+            raise ScenarioError(
+                f"the robot {robot}: in a UTIAS world robots are r1, r2, …, "
+                "the number being the data set's"
+            )
+    if isinstance(world, SimulatedWorld):
+        _check_way_points(len(ids), world)
+    for named in world.unknown_starts:
+        if named != "*" and named.removeprefix("!") not in ids:
+            raise ScenarioError(
+                f"world.unknown_starts names {named}, no such robot; known: {', '.join(ids)}, "
+                'and "*" for all of them'
+            )

@@ -1,0 +1,66 @@
+"""The streams of a scenario's world, whichever kind it is."""
+
+import hashlib
+from pathlib import Path
+
+import msgspec
+
+from sim.datasets.tables import opened
+from sim.datasets.utias import utias
+from sim.datasets.utias_log import present_robots
+from sim.scenarios.checks import ScenarioError
+from sim.scenarios.scenario import Scenario
+from sim.world.config import SimulatedWorld
+from sim.world.simulator import simulated
+from sim.world.streams import WorldStreams
+from team.pairs import NEEDS_MAP
+
+
+def streams_of(scenario: Scenario) -> WorldStreams:
+    """Simulate the world or read its data set; raises DatasetError."""
+    if isinstance(scenario.world, SimulatedWorld):
+        return simulated(scenario.world, scenario.robots, noise_seed(scenario))
+    return utias(scenario.world, scenario.robots)
+
+
+def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
+    """The scenario without the robots that its data set has no files of, and that in words.
+
+    Of a set that has files of none of them nothing is left out: reading it says what is wrong.
+    Raises DatasetError.
+    """
+    world = scenario.world
+    if isinstance(world, SimulatedWorld) or not world.path:
+        return scenario, None
+    with opened(world.path, "Barcodes.dat") as files:
+        present = {f"r{number}" for number in present_robots(files)}
+    kept = tuple(robot for robot in scenario.robots if robot.id in present)
+    missing = [robot.id for robot in scenario.robots if robot.id not in present]
+    if not kept or not missing:
+        return scenario, None
+    named = (name for name in world.unknown_starts if name.removeprefix("!") not in missing)
+    world = msgspec.structs.replace(world, unknown_starts=tuple(named))
+    team = ", ".join(robot.id for robot in kept)
+    said = f"{', '.join(missing)}: no files in {Path(world.path).name}; the team is {team}"
+    return msgspec.structs.replace(scenario, robots=kept, world=world), said
+
+
+def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
+    """Whether the robots are told the landmarks; raises ScenarioError where nobody knows them."""
+    needed = scenario.estimator in NEEDS_MAP
+    if needed and streams.landmarks is None:
+        raise ScenarioError(
+            f"the estimator {scenario.estimator} needs a map of the landmarks, "
+            f"and {streams.source} has none: choose another estimator"
+        )
+    return needed
+
+
+def noise_seed(scenario: Scenario) -> int:
+    """What the world's random numbers are keyed by: the scenario's name and its seed.
+
+    So two scenarios share no noise: what holds over the seeds of one and of the other are two
+    findings, not one finding twice. It is a positive integer of 63 bits.
+    """
+    text = f"{scenario.name}/{scenario.seed}".encode()
+    return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1

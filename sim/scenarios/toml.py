@@ -1,0 +1,42 @@
+"""A resolved scenario as TOML: the one that runs the team of a simulated world on its data set."""
+
+from typing import Any
+
+import msgspec
+import tomli_w
+
+from central.config import CentralConfig
+from sim.scenarios.checks import SAID_ONCE
+from sim.scenarios.scenario import Scenario
+from sim.world.config import UtiasWorld
+from team.config import RobotConfig
+
+
+def data_set_scenario(scenario: Scenario) -> str:
+    """The same robots and centre for the data set in the folder where this text lies.
+
+    The robots are called r1, r2, … as in every UTIAS world. What is as by default is left out.
+    """
+    head = {name: getattr(scenario, name) for name in ("name", *SAID_ONCE, "exchange")}
+    robots = [
+        {"id": f"r{i}"} | _chosen(robot, RobotConfig, ("id", *SAID_ONCE))
+        for i, robot in enumerate(scenario.robots, 1)
+    ]
+    world = {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ())
+    central = _chosen(scenario.central, CentralConfig, SAID_ONCE)
+    document = head | {"world": world} | ({"central": central} if central else {})
+    return tomli_w.dumps(document | {"robots": robots})
+
+
+def _chosen(
+    value: msgspec.Struct, declared: type[msgspec.Struct], without: tuple[str, ...]
+) -> dict[str, Any]:
+    """The fields that are not as by default, tables within them too."""
+    chosen: dict[str, Any] = {}
+    for field in msgspec.structs.fields(declared):
+        part = getattr(value, field.name)
+        if field.name in without or part is None or part == field.default:
+            continue
+        table = isinstance(part, msgspec.Struct)
+        chosen[field.name] = _chosen(part, type(part), ()) if table else part
+    return chosen

@@ -1,0 +1,1 @@
+"""Studies: experiments and the batch reference. The product runs without this folder."""

@@ -1,0 +1,201 @@
+"""The batch MAP's readings under the profile's own noise: errors that persist are states.
+
+A reading (range r, bearing b) of a landmark at distance d from robot k at time t is
+
+    b = β(x, l) + bias_b + σ_b √(1 − w_b) e_b(t) + σ_b √w_b ε,
+    r = (1 + bias_r) d(x, l) + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,    ε ~ N(0, 1) and white,
+
+with the shares w that the sensor calls white. e is a first-order Gauss-Markov process of unit
+variance for each robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ) with the
+sensor's correlation times; so it is in the simulator, and the robots' windows take it as constant.
+The biases are one pair per robot with the centre's priors. A teammate's sighting is a factor
+between two poses of the same time, as the robots reduce them. GTSAM has no factor for such a
+reading: it is a Python function of (pose, landmark, e, biases) with its own derivatives.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from central.config import BiasSigmas
+from sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
+from sim.studies.batch_reference.measurements import Chain
+from team.config import Sensor
+from team.estimation.geometry import Point, wrapped
+from team.estimation.models import NEAREST_M, noise, predicted
+
+FORGOTTEN = 1e-3
+"""A correlation below this is none: the process begins anew."""
+_ERRORS = 2**56
+_BIASES = 2**57
+
+
+class Look(NamedTuple):
+    """A landmark seen from a pose of a chain, and the error state of this reading.
+
+    before: the error state of the reading of the same landmark that is gap_s older.
+    """
+
+    key: int
+    chain: int
+    pose: int
+    landmark: int
+    distance: float
+    bearing: float
+    before: int | None
+    gap_s: float
+
+
+def bias_key(chain: int) -> int:
+    """The key of the biases (bearing [rad], range scale) of a chain."""
+    return _BIASES + chain
+
+
+def looks_of(chains: Sequence[Chain]) -> list[Look]:
+    """All readings of landmarks in the order of chain, pose and landmark."""
+    looks: list[Look] = []
+    for c, chain in enumerate(chains):
+        last: dict[int, tuple[int, int]] = {}
+        for i, scan in enumerate(chain.scans, 1):
+            stamp_ns = int(chain.stamps_ns[i])
+            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+                key = _ERRORS + len(looks)
+                before, then_ns = last.get(landmark, (None, stamp_ns))
+                gap_s = 1e-9 * (stamp_ns - then_ns)
+                looks.append(Look(key, c, i, landmark, float(r), float(b), before, gap_s))
+                last[landmark] = key, stamp_ns
+    return looks
+
+
+def profile_graph(
+    gtsam: Any,
+    chains: Sequence[Chain],
+    poses: Sequence[Poses],
+    landmarks: dict[int, Point],
+    robust_c: float | None,
+    sigmas: BiasSigmas,
+) -> Any:
+    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
+
+    The Cauchy loss of scale c is on √(χ²/2) of each reading and sighting, as the centre's is on
+    √(χ²/dim) of each submap.
+    """
+    graph = path_graph(gtsam, chains, poses)
+    loss = None if robust_c is None else math.sqrt(2.0) * robust_c
+    for c, chain in enumerate(chains):
+        biases = chain.config.front_end.biases
+        if has_biases(chain):
+            held = [getattr(sigmas, b) if b in biases else 1e-6 for b in ("bearing", "range_scale")]
+            model = gtsam.noiseModel.Diagonal.Sigmas(np.array(held))
+            graph.push_back(gtsam.PriorFactorPoint2(bias_key(c), np.zeros(2), model))
+    for look in looks_of(chains):
+        sensor = chains[look.chain].config.sensor
+        graph.push_back(_process_factor(gtsam, look, sensor))
+        distance, _ = predicted(poses[look.chain][look.pose], landmarks[look.landmark])
+        range_var, bearing_var = noise(sensor, distance)
+        variances = np.array([bearing_var, range_var])
+        white = np.array([sensor.bearing_white, sensor.range_white])
+        model = gtsam.noiseModel.Diagonal.Variances(variances * white)
+        keys = [pose_key(look.chain, look.pose), look.landmark, look.key]
+        if has_biases(chains[look.chain]):
+            keys.append(bias_key(look.chain))
+        reading = _reading(look, keys, np.sqrt(variances * (1.0 - white)))
+        graph.push_back(gtsam.CustomFactor(under_loss(gtsam, model, loss), keys, reading))
+    for factor in _sighting_factors(gtsam, chains, loss):
+        graph.push_back(factor)
+    return graph
+
+
+def has_biases(chain: Chain) -> bool:
+    """Whether the centre would estimate an error of this robot's sensor."""
+    return bool({"bearing", "range_scale"} & set(chain.config.front_end.biases))
+
+
+def add_errors(values: Any, chains: Sequence[Chain]) -> Any:
+    """The values with all error states and biases at zero."""
+    for look in looks_of(chains):
+        values.insert(look.key, np.zeros(2))
+    for c, chain in enumerate(chains):
+        if has_biases(chain):
+            values.insert(bias_key(c), np.zeros(2))
+    return values
+
+
+def _reading(
+    look: Look, keys: Sequence[int], scales: Float[np.ndarray, "2"]
+) -> Callable[[Any, Any, Any], np.ndarray]:
+    """The residual (bearing [rad], range [m]) of a reading, and its derivatives by `keys`."""
+    across, along = scales.tolist()
+
+    def residual(_: Any, values: Any, derivatives: Any) -> np.ndarray:
+        pose = values.atPose2(keys[0])
+        point, e = values.atPoint2(keys[1]), values.atPoint2(keys[2])
+        turned, scaled = values.atPoint2(keys[3]) if len(keys) > 3 else (0.0, 0.0)
+        dx, dy = point[0] - pose.x(), point[1] - pose.y()
+        distance = max(math.hypot(dx, dy), NEAREST_M)
+        direction = math.atan2(dy, dx)
+        bearing = direction - pose.theta()
+        k = 1.0 + scaled
+        if derivatives is not None:
+            c, s = math.cos(bearing), math.sin(bearing)
+            derivatives[0] = np.array([[s / distance, -c / distance, -1.0], [-k * c, -k * s, 0.0]])
+            c, s = math.cos(direction), math.sin(direction)
+            derivatives[1] = np.array([[-s / distance, c / distance], [k * c, k * s]])
+            derivatives[2] = np.array([[across, 0.0], [0.0, along]])
+            if len(keys) > 3:
+                derivatives[3] = np.array([[1.0, 0.0], [0.0, distance]])
+        return np.array(
+            [
+                wrapped(bearing + turned + across * e[0] - look.bearing),
+                k * distance + along * e[1] - look.distance,
+            ]
+        )
+
+    return residual
+
+
+def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
+    """e(t') − a e(t) ~ N(0, 1 − a²) of (bearing, range); the first of a process has no e(t)."""
+    times = (sensor.bearing_correlation_s, sensor.range_correlation_s)
+    a = np.array([math.exp(-look.gap_s / tau) if tau > 0.0 else 0.0 for tau in times])
+    if look.before is None or a.max() < FORGOTTEN:
+        unit = gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
+        return gtsam.PriorFactorPoint2(look.key, np.zeros(2), unit)
+    innovation = np.sqrt(np.maximum(1.0 - a * a, 1e-6))
+    A, B = np.diag(-a / innovation), np.diag(1.0 / innovation)
+    unit = gtsam.noiseModel.Unit.Create(2)
+    linear = gtsam.JacobianFactor(look.before, A, look.key, B, np.zeros(2), unit)
+    at = gtsam.Values()
+    for key in (look.before, look.key):
+        at.insert(key, np.zeros(2))
+    return gtsam.LinearContainerFactor(linear, at)
+
+
+def _sighting_factors(gtsam: Any, chains: Sequence[Chain], loss: float | None) -> list[Any]:
+    """Between the poses of two robots at one time; none where the teammate has no pose then."""
+    keys = {
+        (chain.config.id, int(stamp)): pose_key(c, i)
+        for c, chain in enumerate(chains)
+        for i, stamp in enumerate(chain.stamps_ns)
+    }
+    factors = []
+    for chain in chains:
+        for sighting in chain.sightings:
+            here = keys.get((chain.config.id, sighting.stamp_ns))
+            there = keys.get((sighting.teammate, sighting.stamp_ns))
+            if here is not None and there is not None:
+                model = gtsam.noiseModel.Gaussian.Covariance(sighting.covariance[::-1, ::-1])
+                distance, bearing = sighting.reading
+                factors.append(
+                    gtsam.BearingRangeFactorPose2(
+                        here,
+                        there,
+                        gtsam.Rot2(float(bearing)),
+                        float(distance),
+                        under_loss(gtsam, model, loss),
+                    )
+                )
+    return factors

@@ -1,0 +1,110 @@
+"""The factor graph of the batch MAP in GTSAM: keys, factors and values.
+
+GTSAM is handed in, since it is an optional extra. Its poses are perturbed on the right, like ours.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.evaluation import MapResult
+from sim.studies.batch_reference.measurements import Chain
+from team.estimation.baselines.batch import EXACT_SIGMA, FLOOR_SIGMAS
+from team.estimation.gaussian import Matrix
+from team.estimation.geometry import Point, Pose, tangent
+from team.estimation.models import located, noise, predicted
+
+Poses = Float[np.ndarray, "K 3"]
+_CHAIN = 2**32
+
+
+def pose_key(chain: int, pose: int) -> int:
+    """The key of a pose of a chain; a landmark's is its id, which is below 2³²."""
+    return (chain + 1) * _CHAIN + pose
+
+
+def landmark_starts(
+    chains: Sequence[Chain], poses: Sequence[Poses], joined: MapResult
+) -> dict[int, Point]:
+    """Every landmark that a chain sees: where the join has it, else where it is first seen."""
+    known = dict(zip(joined.ids.tolist(), joined.means, strict=True))
+    found: dict[int, Point] = {}
+    for chain, path in zip(chains, poses, strict=True):
+        for pose, scan in zip(path[1:], chain.scans, strict=True):
+            for i, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+                if i not in found:
+                    found[i] = known[i] if i in known else located(pose, float(r), float(b))
+    return found
+
+
+def factor_graph(
+    gtsam: Any,
+    chains: Sequence[Chain],
+    poses: Sequence[Poses],
+    landmarks: Mapping[int, Point],
+    robust_c: float | None,
+) -> Any:
+    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
+
+    Where no start pose is known, the first chain's is held where the joined solution has it.
+    """
+    graph = path_graph(gtsam, chains, poses)
+    for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
+        first = pose_key(c, 0)
+        for i, scan in enumerate(chain.scans, 1):
+            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+                distance, _ = predicted(path[i], landmarks[landmark])
+                range_var, bearing_var = noise(chain.config.sensor, distance)
+                model = gtsam.noiseModel.Diagonal.Variances(np.array([bearing_var, range_var]))
+                model = under_loss(gtsam, model, robust_c)
+                graph.push_back(
+                    gtsam.BearingRangeFactor2D(first + i, landmark, gtsam.Rot2(b), r, model)
+                )
+    return graph
+
+
+def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> Any:
+    """The factors of the start poses and of the odometry."""
+    graph = gtsam.NonlinearFactorGraph()
+    floor = np.diag(FLOOR_SIGMAS) ** 2
+    anyone = any(chain.start is not None for chain in chains)
+    for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
+        first = pose_key(c, 0)
+        start = chain.start if anyone or c > 0 else path[0]
+        if start is not None:
+            graph.push_back(_start_factor(gtsam, first, start, chain.start_covariance))
+        for i, increment in enumerate(chain.increments):
+            model = gtsam.noiseModel.Gaussian.Covariance(increment.covariance + floor)
+            motion = gtsam.Pose2(*increment.mean)
+            graph.push_back(gtsam.BetweenFactorPose2(first + i, first + i + 1, motion, model))
+    return graph
+
+
+def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
+    """The noise model under a Cauchy loss of this scale, or as it is."""
+    if c is None:
+        return model
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)
+
+
+def _start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
+    """The start pose; its covariance in (x, y, θ) is turned into the tangent space of the pose."""
+    if covariance is None:
+        model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
+    else:
+        turn = tangent(start[2])
+        model = gtsam.noiseModel.Gaussian.Covariance(turn.T @ covariance @ turn)
+    return gtsam.PriorFactorPose2(key, gtsam.Pose2(*start), model)
+
+
+def values_of(gtsam: Any, poses: Sequence[Poses], landmarks: Mapping[int, Point]) -> Any:
+    """Poses and landmarks as GTSAM takes them."""
+    values = gtsam.Values()
+    for c, path in enumerate(poses):
+        for i, pose in enumerate(path):
+            values.insert(pose_key(c, i), gtsam.Pose2(*pose))
+    for landmark, position in landmarks.items():
+        values.insert(landmark, np.asarray(position))
+    return values

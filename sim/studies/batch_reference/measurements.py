@@ -1,0 +1,167 @@
+"""From a log's raw readings to chains of poses: what the batch optimiser takes."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+from msgspec import structs
+
+from central.desk.evaluation.errors import Path, on_circle
+from sim.scenarios.scenario import Scenario
+from team import translate
+from team.config import RobotConfig
+from team.estimation.gaussian import Matrix
+from team.estimation.geometry import Pose, between, compose
+from team.estimation.hybrid_slam.keyframes import Epoch, Segmenter
+from team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
+from team.estimation.models import Increment
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+from team.wire.channels import channel_of
+
+_TAKEN = frozenset(
+    channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS, ch.SIGHTINGS)
+)
+_ENDLESS_S = 1e9
+"""The batch has one window."""
+
+
+class Scan(NamedTuple):
+    """What is seen from one pose: accepted and calibrated ranges [m] and bearings [rad]."""
+
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One epoch of a robot's stream: N + 1 poses, the first at the start.
+
+    increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1.
+    start: the pose that reading 0 gives (None: unknown), with its covariance (None: exact).
+    sightings: of teammates, from the poses at the team's grid times, if they were asked for.
+    """
+
+    config: RobotConfig
+    epoch: int
+    start: Pose | None
+    start_covariance: Matrix | None
+    stamps_ns: Int64[np.ndarray, " K"]
+    increments: tuple[Increment, ...]
+    scans: tuple[Scan, ...]
+    sightings: tuple[NodeSighting, ...] = ()
+
+    @property
+    def dead_reckoned(self) -> Float[np.ndarray, "K 3"]:
+        """The poses by odometry alone, in the frame of the first."""
+        poses = [np.zeros(3)]
+        for increment in self.increments:
+            poses.append(compose(poses[-1], increment.mean))
+        return np.array(poses)
+
+
+def chains_of(
+    samples: Iterable[Sample], scenario: Scenario, *, sightings: bool = False
+) -> list[Chain]:
+    """The chains of all robots by (robot, epoch); readings in the order of their counter, once.
+
+    With sightings there is a pose at each time of the team's grid (`front_end.node_s`) too.
+    Raises WireError for a reading that is not sound.
+    """
+    streams: dict[tuple[str, int], dict[int, m.Reading]] = {}
+    for sample in samples:
+        found = channel_of(sample.key)
+        if found is not None and found[0].name in _TAKEN:
+            message = opened(sample)[2]
+            if isinstance(message, m.Reading):
+                stream = streams.setdefault((message.robot, message.epoch), {})
+                stream[message.reading] = message
+    configs = {robot.id: robot for robot in scenario.robots}
+    chains = [
+        _chain(configs[robot], epoch, [readings[i] for i in sorted(readings)], sightings)
+        for (robot, epoch), readings in sorted(streams.items())
+        if robot in configs
+    ]
+    return [chain for chain in chains if chain is not None]
+
+
+def _chain(
+    config: RobotConfig, epoch: int, readings: Sequence[m.Reading], sightings: bool
+) -> Chain | None:
+    """None for a stream without odometry: it has no motion that links its poses."""
+    odometry = [
+        translate.motion_of(reading, config.clock_offset_s)
+        for reading in readings
+        if isinstance(reading, m.Odometry)
+    ]
+    if not odometry:
+        return None
+    first_ns, last_ns = odometry[0][0] - odometry[0][1], odometry[-1][0]
+    grid = _grid(config) if sightings else None
+    segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s, grid)
+    segmenter.begin(first_ns)
+    start: tuple[Pose | None, Matrix | None] = (None, None)
+    epochs: list[Epoch] = []
+    for reading in readings:
+        match reading:
+            case m.Start():
+                start = translate.pose_of(reading)
+            case m.Observations():
+                segmenter.observe(reading.stamp_ns, *translate.scan_of(reading))
+            case m.Sightings() if grid is not None:
+                grid.observe(reading.stamp_ns, reading.reading, translate.looks_of(reading))
+            case m.Odometry():
+                epochs += segmenter.drive(*translate.motion_of(reading, config.clock_offset_s))
+    last, rest = segmenter.cut(last_ns)
+    epochs += last
+    if rest.mean.any() or rest.covariance.any():
+        none = np.empty(0)
+        nothing = np.empty(0, np.uint32)
+        epochs.append(Epoch(last_ns, rest, nothing, none, none))
+    return Chain(
+        config,
+        epoch,
+        start[0],
+        start[1],
+        np.array([first_ns, *(e.stamp_ns for e in epochs)]),
+        tuple(e.increment for e in epochs),
+        tuple(Scan(e.ids, e.ranges, e.bearings) for e in epochs),
+        () if grid is None else grid.sightings(),
+    )
+
+
+def _grid(config: RobotConfig) -> PoseGrid | None:
+    """The grid of a robot whose submaps have pose nodes."""
+    if not config.front_end.node_s:
+        return None
+    return PoseGrid(config.sensor, structs.replace(config.front_end, window_s=_ENDLESS_S))
+
+
+def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
+    """Three ways to fill a chain's poses between known ones (at least one), by its odometry.
+
+    Onward from the anchor before each pose; back from the anchor after it; and the mean of both,
+    weighted by the time to each. Odometry between a pose and an anchor is taken to the chain's last
+    pose that is not after the anchor.
+    """
+    odometry = chain.dead_reckoned
+    at = np.searchsorted(chain.stamps_ns, anchors.stamps_ns, side="right") - 1
+    carried = [
+        np.array([compose(anchor, between(odometry[i], pose)) for pose in odometry])
+        for anchor, i in zip(anchors.poses, at, strict=True)
+    ]
+    before = np.searchsorted(anchors.stamps_ns, chain.stamps_ns, side="right") - 1
+    after = np.searchsorted(anchors.stamps_ns, chain.stamps_ns, side="left")
+    before, after = np.maximum(before, 0), np.minimum(after, len(at) - 1)
+    onward = np.array([carried[k][i] for i, k in enumerate(before)])
+    back = np.array([carried[k][i] for i, k in enumerate(after)])
+    span = anchors.stamps_ns[after] - anchors.stamps_ns[before]
+    share = np.clip((chain.stamps_ns - anchors.stamps_ns[before]) / np.maximum(span, 1), 0.0, 1.0)
+    step = back - onward
+    step[:, 2] = on_circle(step[:, 2])
+    mean = onward + share[:, np.newaxis] * step
+    return [onward, back, mean]

@@ -1,0 +1,323 @@
+"""The limit: the batch MAP over all raw readings of a log, by GTSAM (the extra `limit`).
+
+One pose per observation epoch of each robot. Factors: the start poses; between consecutive poses
+the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of `increment_of`, which is GTSAM's
+`BetweenFactorPose2` with its logarithm; each accepted range and bearing, independent, with the
+sensor's noise (under a Cauchy loss where the centre's `robust_c` asks for a robust join).
+Levenberg-Marquardt starts from the joined solution, so what it finds is never worse than that: from
+three ways to fill the paths between its poses (under the noise `profile` from the best of them).
+Under the noise `white` every reading's error is its own and sightings of teammates are not used;
+under `profile` the sensor's errors persist as the scenario says, biases are estimated and sightings
+are factors (`sim.studies.batch_reference.errors`). Not modelled: an error of the odometry's scale at speeds that the
+profile has not seen.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from central.desk.evaluation.errors import (
+    MapErrors,
+    Path,
+    distance_rmse,
+    interpolated,
+    map_errors,
+    pose_errors,
+)
+from central.desk.evaluation.evaluation import Evaluation, evaluate
+from sim.studies.batch_reference.errors import add_errors, bias_key, has_biases, profile_graph
+from sim.studies.batch_reference.graph import factor_graph, landmark_starts, pose_key, values_of
+from sim.studies.batch_reference.measurements import Chain, anchored, chains_of
+from team.estimation.gaussian import Matrix
+from team.estimation.geometry import tangent
+from team.wire.bus import Sample
+
+LARGEST_DECREMENT = 1e-3
+"""√(gᵀH⁻¹g) allowed at the optimum: how far the next Newton step goes, in standard deviations.
+
+A robust loss is minimised by weighting again and again, which converges by a constant factor."""
+ITERATIONS = 1000
+NoiseKind = Literal["white", "profile"]
+
+
+class LimitError(RuntimeError):
+    """The limit can not be computed: what is missing and what to do."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The optimum. cost = Σ‖r‖² there, initial_cost at the best of the starts.
+
+    gradient_norm: of the optimum's cost, in the units of the state; newton_decrement: √(gᵀH⁻¹g).
+    paths: all poses; final_pose_nees_per_dof and position_rmse_m where there is truth.
+    left_out: robots whose place in the team's frame is not known, and why.
+    biases: (bearing [rad], range scale) of each robot, estimated. team: the run's own final map.
+    """
+
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "L 2"]
+    covariance: Matrix
+    errors: MapErrors | None
+    cost: float
+    initial_cost: float
+    gradient_norm: float
+    newton_decrement: float
+    paths: Mapping[str, Path]
+    position_rmse_m: Mapping[str, float]
+    final_pose_nees_per_dof: Mapping[str, float]
+    robust: bool
+    left_out: tuple[str, ...]
+    noise: NoiseKind
+    biases: Mapping[str, tuple[float, float]]
+    team: MapErrors | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that machines read."""
+        return {
+            "noise": self.noise,
+            "landmarks": len(self.ids),
+            **_map_figures(self.errors),
+            "team": _map_figures(self.team),
+            "cost": self.cost,
+            "initial_cost": self.initial_cost,
+            "gradient_norm": self.gradient_norm,
+            "newton_decrement": self.newton_decrement,
+            "robots": {
+                robot: {
+                    "poses": len(path.stamps_ns),
+                    "position_rmse_m": self.position_rmse_m.get(robot),
+                    "final_pose_nees_per_dof": self.final_pose_nees_per_dof.get(robot),
+                    "bearing_bias_rad": self.biases.get(robot, (None, None))[0],
+                    "range_scale_bias": self.biases.get(robot, (None, None))[1],
+                }
+                for robot, path in self.paths.items()
+            },
+            "robust": self.robust,
+            "left_out": list(self.left_out),
+        }
+
+
+def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
+    shape = None if errors is None else errors.shape
+    return {
+        "landmark_rmse_m": None if errors is None else errors.rmse_m,
+        "landmark_rmse_aligned_m": None if errors is None else errors.aligned_rmse_m,
+        "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
+        "map_nees_in_band": None if errors is None else errors.in_band,
+        "shape_nees_per_landmark": None if shape is None else shape.nees_per_landmark,
+        "coverage": None if errors is None else errors.coverage,
+    }
+
+
+def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
+    """The batch MAP of a log of a run under the rule `join` or `batch`, from start to end.
+
+    Raises LimitError without GTSAM, without a scenario, without a joined map, or when the optimiser
+    does not come to rest.
+    """
+    gtsam = _gtsam()
+    kept = list(samples)
+    run = evaluate(kept)
+    if run.scenario is None or run.map is None:
+        raise LimitError("the log has no scenario or no final map: record a run to its end")
+    chains, anchors, left_out = _placed(
+        chains_of(kept, run.scenario, sightings=noise == "profile"), run
+    )
+    if not chains:
+        raise LimitError(
+            "no robot's trajectory is in the log: the batch starts from the joined solution, "
+            "so run the same scenario and seed with `--fusion join`"
+        )
+    robust_c = run.scenario.central.robust_c
+    fillings = list(
+        zip(*(anchored(c, a) for c, a in zip(chains, anchors, strict=True)), strict=True)
+    )
+    starts = [landmark_starts(chains, poses, run.map) for poses in fillings]
+    if noise == "profile":
+        descend = _stepped
+        sigmas = run.scenario.central.bias_sigma
+        graph = profile_graph(gtsam, chains, fillings[0], starts[0], robust_c, sigmas)
+    else:
+        descend = _optimised
+        graph = factor_graph(gtsam, chains, fillings[0], starts[0], robust_c)
+    initials = [
+        values_of(gtsam, poses, landmarks)
+        for poses, landmarks in zip(fillings, starts, strict=True)
+    ]
+    if noise == "profile":
+        initials = [add_errors(values, chains) for values in initials]
+        initials = [min(initials, key=graph.error)]
+    try:
+        optimum, figures = _solved(gtsam, graph, initials, descend)
+    except RuntimeError as error:
+        if isinstance(error, LimitError):
+            raise
+        raise LimitError(f"GTSAM can not solve the batch: {str(error).strip()}") from error
+    return _limit(
+        gtsam,
+        graph,
+        optimum,
+        chains,
+        sorted(starts[0]),
+        run,
+        robust=robust_c is not None,
+        left_out=left_out,
+        noise=noise,
+        **figures,
+    )
+
+
+def _solved(
+    gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, dict[str, float]]:
+    """The best optimum from all starts, and its figures; raises LimitError if it is none."""
+    optima = [descend(gtsam, graph, initial) for initial in initials]
+    costs = [2.0 * graph.error(optimum) for optimum in optima]
+    initial_cost = min(2.0 * graph.error(initial) for initial in initials)
+    best = int(np.argmin(costs))
+    if costs[best] > initial_cost:
+        raise LimitError(f"the batch cost {costs[best]} lies above its start's, {initial_cost}")
+    linear = graph.linearize(optima[best])
+    _, decrement = _newton_step(gtsam, linear)
+    if decrement > LARGEST_DECREMENT:
+        raise LimitError(
+            f"the batch has not converged: the next Newton step goes {decrement:.2g} sigma, "
+            f"{LARGEST_DECREMENT:g} allowed"
+        )
+    return optima[best], {
+        "cost": costs[best],
+        "initial_cost": initial_cost,
+        "gradient_norm": float(linear.gradientAtZero().norm()),
+        "newton_decrement": decrement,
+    }
+
+
+def _gtsam() -> Any:
+    try:
+        import gtsam
+    except ImportError:
+        raise LimitError(
+            "the batch limit needs GTSAM: python -m pip install 'teamslam[limit]'"
+        ) from None
+    return gtsam
+
+
+def _placed(
+    chains: Sequence[Chain], run: Evaluation
+) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
+    """The chains whose place is known, with the joined poses (and the start) that say it."""
+    placed, anchors, left_out = [], [], []
+    for chain in chains:
+        robot = chain.config.id
+        path = run.robots[robot].smoothed_path
+        own = (path.stamps_ns > chain.stamps_ns[0]) & (path.stamps_ns <= chain.stamps_ns[-1])
+        if not own.any():
+            left_out.append(f"{robot}: it is not in the joined map")
+            continue
+        stamps, poses = path.stamps_ns[own], path.poses[own]
+        if chain.start is not None:
+            stamps = np.concatenate((chain.stamps_ns[:1], stamps))
+            poses = np.concatenate((chain.start[np.newaxis], poses))
+        placed.append(chain)
+        anchors.append(Path(stamps, poses))
+    return placed, anchors, tuple(left_out)
+
+
+def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(ITERATIONS)
+    parameters.setRelativeErrorTol(1e-13)
+    parameters.setAbsoluteErrorTol(1e-11)
+    return gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters).optimize()
+
+
+def _newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
+    """The step to the optimum of a linear graph, and how many standard deviations it goes."""
+    step = linear.optimize()
+    gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
+    return step, float(np.sqrt(max(2.0 * gain, 0.0)))
+
+
+def _stepped(gtsam: Any, graph: Any, initial: Any) -> Any:
+    """Gauss-Newton; a step that does not lower the cost is halved.
+
+    For factors in Python: GTSAM's Levenberg-Marquardt takes five times as long for one iteration.
+    """
+    values, cost = initial, graph.error(initial)
+    for _ in range(ITERATIONS):
+        step, decrement = _newton_step(gtsam, graph.linearize(values))
+        if decrement < LARGEST_DECREMENT:
+            break
+        for halvings in range(30):
+            trial = values.retract(step.scale(0.5**halvings))
+            lower = graph.error(trial)
+            if lower < cost:
+                break
+        else:
+            break
+        values, cost = trial, lower
+    return values
+
+
+def _limit(
+    gtsam: Any,
+    graph: Any,
+    optimum: Any,
+    chains: Sequence[Chain],
+    landmarks: Sequence[int],
+    run: Evaluation,
+    **figures: Any,
+) -> Limit:
+    """The optimum's map, paths and covariances, against the truth."""
+    assert run.map is not None
+    marginals = gtsam.Marginals(graph, optimum)
+    ids = np.array(landmarks, dtype=np.uint32)
+    means = np.array([optimum.atPoint2(i) for i in landmarks])
+    joint = marginals.jointMarginalCovariance(landmarks)
+    covariance = np.block([[joint.at(i, k) for k in landmarks] for i in landmarks])
+    covariance = 0.5 * (covariance + covariance.T)
+    truth = dict(
+        zip(run.map.ids[run.map.known].tolist(), run.map.truth[run.map.known], strict=True)
+    )
+    known = [k for k, i in enumerate(landmarks) if i in truth]
+    rows = np.array([2 * k + axis for k in known for axis in range(2)], dtype=np.int64)
+    paths, errors, nees, biases = {}, {}, {}, {}
+    for c, chain in enumerate(chains):
+        robot, last = chain.config.id, pose_key(c, len(chain.increments))
+        keys = range(pose_key(c, 0), last + 1)
+        poses = [optimum.atPose2(key) for key in keys]
+        path = Path(chain.stamps_ns, np.array([[p.x(), p.y(), p.theta()] for p in poses]))
+        true_path = run.robots[robot].truth
+        true_poses, seen = interpolated(true_path, path.stamps_ns)
+        paths[robot] = path
+        if figures["noise"] == "profile" and has_biases(chain):
+            turned, scaled = optimum.atPoint2(bias_key(c)).tolist()
+            biases[robot] = (turned, scaled)
+        if seen.any():
+            errors[robot] = distance_rmse(path.poses[seen, :2], true_poses[seen, :2])
+        turn = tangent(path.poses[-1, 2])
+        P = turn @ marginals.marginalCovariance(last) @ turn.T
+        end = pose_errors(Path(path.stamps_ns[-1:], path.poses[-1:]), P[np.newaxis], true_path)
+        if end is not None:
+            nees[robot] = end.nees_per_dof
+    return Limit(
+        ids=ids,
+        means=means,
+        covariance=covariance,
+        errors=map_errors(
+            means[known],
+            covariance[np.ix_(rows, rows)],
+            np.array([truth[landmarks[k]] for k in known]),
+        )
+        if known
+        else None,
+        paths=paths,
+        position_rmse_m=errors,
+        final_pose_nees_per_dof=nees,
+        biases=biases,
+        team=run.map.errors,
+        **figures,
+    )

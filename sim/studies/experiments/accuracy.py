@@ -1,0 +1,39 @@
+"""How accurate and how honest the team is, in every kind of world: all parts of it, one command."""
+
+from sim.studies.experiments import (
+    accuracy_few,
+    accuracy_garbage,
+    accuracy_starts,
+    accuracy_utias,
+    accuracy_worlds,
+)
+from sim.studies.experiments.experiment import Experiment, Options, Outcome, Results, combined
+from sim.studies.experiments.task import Task
+
+PARTS: tuple[Experiment, ...] = (
+    accuracy_worlds,
+    accuracy_starts,
+    accuracy_few,
+    accuracy_garbage,
+    accuracy_utias,
+)
+
+ENOUGH_SEEDS = 30
+_CHANCE = (
+    "With so few seeds a mean NEES or a share of runs scatters by more than its goal allows: what "
+    "is missed here may be missed by chance. `teamslam experiment accuracy` has 50."
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """The runs of all parts; what two of them need is one run."""
+    found = {task.name: task for part in PARTS for task in part.tasks(options)}
+    return list(found.values())
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """All parts' figures, tables and goals."""
+    parts = [part.outcome(options, results) for part in PARTS]
+    few = len(options.seeds) < ENOUGH_SEEDS
+    title = "accuracy and honesty of the fused map"
+    return combined(title, [Outcome(title, {}, remarks=(_CHANCE,) if few else ()), *parts])

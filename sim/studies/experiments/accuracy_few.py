@@ -1,0 +1,149 @@
+"""Few landmarks and unknown starts: where wrong minima live. None of them may be silent.
+
+A map is wrong where it lies in another minimum of the cost than the truth (`true_minimum`); its
+submaps exclude the truth where the cost rises beyond 99.9 % when the truth is held. It lies beyond
+its ellipsoid where its shape (without the rigid part), or the first pose of a robot that joined, is
+beyond the 99.9 % of its own covariance: in the minimum of a curved valley that happens more often,
+though nothing is wrong. A map says so, or not: silent is what is wrong and does not. Of a right map
+an alarm says more than that a covariance is wide or bent.
+"""
+
+import msgspec
+
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.studies.experiments.accuracy_starts import WRONG_CHI2, unknown_starts
+from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import (
+    Figures,
+    Shown,
+    cells_of,
+    middle,
+    over_seeds,
+    team_task,
+)
+from sim.world.config import SimulatedWorld
+from team.estimation.consistency import chi2_interval
+
+WORLDS = ("thesis", "thesis-b")
+COUNTS = (3, 4, 5)
+SEEN_EVERY_S = 5.0
+"""With sightings: the robots' poses are nodes so often."""
+WIDE = ("is placed weakly", "farther off than its covariance")
+"""What a map says of its covariances, not of its minimum."""
+SHOWN: Shown = (
+    ("rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("aligned_median", "median [m]", "{:.3f}"),
+    ("shape_nees", "shape NEES", "{:.3g}"),
+    ("joined", "joined", "{:.0%}"),
+    ("said", "said", "{:.0f}"),
+    ("wrong", "wrong", "{:.0f}"),
+    ("silent", "silent", "{:.0f}"),
+    ("excluded", "excluded", "{:.0f}"),
+    ("beyond", "beyond", "{:.0f}"),
+    ("beyond_silent", "untold", "{:.0f}"),
+    ("alarms", "alarms", "{:.0f}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """Each world and number of landmarks, with and without sightings of teammates."""
+    return [task for case in _cases(options).values() for task in case]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """How often a map is wrong, and whether it says so."""
+    figures: dict[str, Figures] = {}
+    for name, case in _cases(options).items():
+        figures[name] = few_figures(results.of_all(case))
+    judged = [of_case for of_case in figures.values() if "silent" in of_case]
+    runs = sum(of_case["seeds"] for of_case in judged)
+    table = Table(
+        f"few landmarks, one start known, {len(options.seeds)} seeds",
+        ("world, landmarks", *(heading for _, heading, _ in SHOWN)),
+        tuple((name, *cells_of(of_case, SHOWN)) for name, of_case in figures.items()),
+        "said: maps with a doubt or a reason; wrong: in another minimum than the truth; silent: "
+        "wrong and nothing said; excluded: the submaps deny the truth (1 in 1000 by chance); "
+        "beyond: its own 99.9 % ellipsoid, untold: and nothing said; alarms: of a map that is none "
+        "of these more is said than that a robot is placed weakly or that an ellipsoid is bent",
+    )
+    goals = [
+        Goal(
+            f"few landmarks: {name}",
+            float(sum(of_case[name] for of_case in judged)) if judged else None,
+            0.0,
+            most,
+        )
+        for name, most in (("silent", 0.0), ("excluded", float(max(1, round(0.01 * runs)))))
+    ]
+    return Outcome("few landmarks", {"few": figures}, (table,), goals=tuple(goals))
+
+
+def few_figures(runs: list[Figures]) -> Figures:
+    """The figures over the seeds of one case, with how many maps are wrong, and silently so."""
+    figures = over_seeds(runs)
+    if not runs:
+        return figures
+    minima = [run["minimum"] for run in runs]
+    said = [bool(run["said"]) for run in runs]
+    wrong = [of_run["wrong"] for of_run in minima]
+    excluded = [of_run["excluded"] for of_run in minima]
+    beyond = [is_beyond(run) for run in runs]
+    bad = [any(each) for each in zip(wrong, excluded, beyond, strict=True)]
+    return figures | {
+        "aligned_median": middle(run["rmse_aligned"] for run in runs),
+        "joined": sum(not run["not_joined"] for run in runs) / len(runs),
+        "said": sum(said),
+        "wrong": sum(wrong),
+        "silent": sum(is_so and not told for is_so, told in zip(wrong, said, strict=True)),
+        "excluded": sum(excluded),
+        "beyond": sum(beyond),
+        "beyond_silent": sum(is_so and not told for is_so, told in zip(beyond, said, strict=True)),
+        "alarms": sum(_alarmed(run) and not is_so for is_so, run in zip(bad, runs, strict=True)),
+    }
+
+
+def _alarmed(run: Figures) -> bool:
+    """Whether more is said than what the covariances do not."""
+    return any(not any(words in text for words in WIDE) for text in run["said"])
+
+
+def is_beyond(run: Figures) -> bool:
+    """Whether the map's shape, or where a robot joined, lies beyond 99.9 % of its covariance."""
+    dof = 2 * round(run["landmarks"] or 0.0) - 3
+    shape = run["shape_nees"]
+    if shape is not None and dof > 0 and 0.5 * shape > chi2_interval(dof, 0.998, 1)[1]:
+        return True
+    robots = run["robots"]
+    first = [each["first_pose_chi2"] for name, each in robots.items() if name != min(robots)]
+    return any(chi2 is not None and chi2 > WRONG_CHI2 for chi2 in first)
+
+
+def _cases(options: Options) -> dict[str, list[Task]]:
+    return {
+        f"{world}, {count}, {'sightings' if seen else 'none seen'}": [
+            team_task(
+                _few(with_options(load(world), seed=seed), count, seen),
+                minimum=True,
+                note=f"{count} landmarks, one start known{', sightings' if seen else ''}",
+            )
+            for seed in options.seeds
+        ]
+        for world in WORLDS
+        for count in COUNTS
+        for seen in (False, True)
+    }
+
+
+def _few(scenario: Scenario, count: int, seen: bool) -> Scenario:
+    """So many landmarks at random, the first robot's start known, teammates seen or not."""
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = msgspec.structs.replace(scenario.world, landmarks=(), landmark_count=count)
+    node_s = SEEN_EVERY_S if seen else 0.0
+    robots = tuple(
+        msgspec.structs.replace(
+            robot, front_end=msgspec.structs.replace(robot.front_end, node_s=node_s)
+        )
+        for robot in scenario.robots
+    )
+    return unknown_starts(msgspec.structs.replace(scenario, world=world, robots=robots))

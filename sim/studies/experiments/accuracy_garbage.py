@@ -1,0 +1,102 @@
+"""Three readings in ten are garbage: how much worse is the map than without them.
+
+The clean run of the same seed leaves out the very readings that the others spoil, so it has as many
+good ones. A reading is spoilt to a uniform range and bearing, or to the identity of another
+landmark.
+"""
+
+import msgspec
+
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
+from sim.world.config import GarbageKind, SimulatedWorld
+
+WORLDS = ("thesis", "thesis-b")
+SHARE = 0.3
+LANDMARK_SUBMAPS = 2
+"""Of the centre, in the clean runs too: what one submap alone has may be garbage."""
+ROBUST_C = 2.0
+"""Of the centre, in the clean runs too: garbage that agrees by chance is left to it."""
+KINDS: tuple[GarbageKind, ...] = ("drop", "reading", "identity")
+NAMES = {"drop": "clean", "reading": "random readings", "identity": "random identities"}
+MOST_SEEDS = 30
+MOST_RATIO = 1.2
+SHOWN: Shown = (
+    ("rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("ratio_clean", "÷ clean", "{:.2f}"),
+    ("rmse", "RMSE [m]", "{:.3f}"),
+    ("nees", "NEES/dof", "{:.3g}"),
+    ("in_band", "in band", "{:.0%}"),
+    ("not_joined", "not joined", "{:.0f}"),
+    ("withdrawn", "withdrawn", "{:.0f}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """Each world, kind of garbage and seed."""
+    return [task for world in WORLDS for kind in KINDS for task in _tasks(world, kind, options)]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """Every kind of garbage beside the clean runs."""
+    figures: dict[str, dict[str, Figures]] = {}
+    goals = []
+    for world in WORLDS:
+        of_world = {}
+        for kind in KINDS:
+            runs = results.of_all(_tasks(world, kind, options))
+            of_kind = over_seeds(runs)
+            for name in ("not_joined", "withdrawn"):
+                of_kind[name] = sum(bool(run[name]) for run in runs)
+            of_world[NAMES[kind]] = of_kind
+        clean = of_world[NAMES["drop"]].get("rmse_aligned")
+        for kind in KINDS[1:]:
+            of_kind = of_world[NAMES[kind]]
+            aligned = of_kind.get("rmse_aligned")
+            of_kind["ratio_clean"] = aligned / clean if aligned and clean else None
+            name = f"{world}, 30 % {NAMES[kind]}: ratio_clean"
+            goals.append(Goal(name, of_kind["ratio_clean"], 0.0, MOST_RATIO))
+            withdrawn = float(of_kind["withdrawn"]) if of_kind["seeds"] else None
+            goals.append(Goal(f"{world}, 30 % {NAMES[kind]}: withdrawn", withdrawn, 0.0, 0.0))
+        figures[world] = of_world
+    rows = tuple(
+        (f"{world}, {name}", *cells_of(of_kind, SHOWN))
+        for world, of_world in figures.items()
+        for name, of_kind in of_world.items()
+    )
+    table = Table(
+        f"30 % garbage, {len(options.seeds[:MOST_SEEDS])} seeds",
+        ("world", *(heading for _, heading, _ in SHOWN)),
+        rows,
+        "not joined, withdrawn: runs in which a robot, all of them good, is not in the final map",
+    )
+    return Outcome("garbage", {"garbage": figures}, (table,), goals=tuple(goals))
+
+
+def _tasks(world: str, kind: GarbageKind, options: Options) -> list[Task]:
+    return [
+        team_task(_spoilt(with_options(load(world), seed=seed), kind), note=NAMES[kind])
+        for seed in options.seeds[:MOST_SEEDS]
+    ]
+
+
+def _spoilt(scenario: Scenario, kind: GarbageKind) -> Scenario:
+    """The scenario with garbage among its readings, which its windows and its centre expect.
+
+    The clean run has the same centre, and windows that take every reading.
+    """
+    replace = msgspec.structs.replace
+    assert isinstance(scenario.world, SimulatedWorld)
+    expected = 0.0 if kind == "drop" else SHARE
+    robots = tuple(
+        replace(robot, front_end=replace(robot.front_end, garbage=expected))
+        for robot in scenario.robots
+    )
+    return replace(
+        scenario,
+        world=replace(scenario.world, garbage=SHARE, garbage_kind=kind),
+        robots=robots,
+        central=replace(scenario.central, robust_c=ROBUST_C, landmark_submaps=LANDMARK_SUBMAPS),
+    )

@@ -1,0 +1,98 @@
+"""Unknown start poses: all robots but the first have to find their place in the team's map.
+
+A merge is wrong where the first pose of a robot that joined lies beyond the 99.9 % ellipsoid of its
+own covariance. What is left of a right merge is the place of the map as a whole, so maps are
+compared after alignment.
+"""
+
+import msgspec
+
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
+from team.estimation.consistency import chi2_interval
+
+WORLDS = ("thesis", "thesis-b")
+WRONG_CHI2 = chi2_interval(3, 0.998, 1)[1] * 3.0
+"""99.9 % of right poses lie below (3 degrees of freedom)."""
+SHOWN: Shown = (
+    ("rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("ratio_known", "÷ known", "{:.3f}"),
+    ("rmse", "RMSE [m]", "{:.3f}"),
+    ("nees", "NEES/dof", "{:.3g}"),
+    ("shape_nees", "shape NEES", "{:.3g}"),
+    ("joined", "joined", "{:.0%}"),
+    ("wrong_merges", "wrong merges", "{:.0f}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """Each world and seed with known starts, and without."""
+    return [task for world in WORLDS for pair in _pairs(world, options) for task in pair]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """The maps with and without known starts."""
+    figures: dict[str, dict[str, Figures]] = {}
+    rows, goals = [], []
+    for world in WORLDS:
+        pairs = [
+            (before, after)
+            for known, unknown in _pairs(world, options)
+            if (before := results.of(known)) and (after := results.of(unknown))
+        ]
+        known = over_seeds([before for before, _ in pairs])
+        unknown = over_seeds([after for _, after in pairs]) | _merges([after for _, after in pairs])
+        if pairs and known["rmse_aligned"] and unknown["rmse_aligned"]:
+            unknown["ratio_known"] = unknown["rmse_aligned"] / known["rmse_aligned"]
+        figures[world] = {"known": known, "unknown": unknown}
+        rows += [(f"{world}, {name}", *cells_of(f, SHOWN)) for name, f in figures[world].items()]
+        goals += [
+            Goal(f"{world}, unknown starts: ratio_known", unknown.get("ratio_known"), 0.0, 1.05),
+            Goal(f"{world}, unknown starts: wrong_merges", unknown.get("wrong_merges"), 0.0, 0.0),
+        ]
+    table = Table(
+        f"unknown start poses, {len(options.seeds)} seeds",
+        ("starts", *(heading for _, heading, _ in SHOWN)),
+        tuple(rows),
+        "ratio: of the aligned maps, to the same seeds with known starts",
+    )
+    return Outcome("unknown starts", {"starts": figures}, (table,), goals=tuple(goals))
+
+
+def _pairs(world: str, options: Options) -> list[tuple[Task, Task]]:
+    found = []
+    for seed in options.seeds:
+        scenario = with_options(load(world), seed=seed)
+        found.append(
+            (
+                team_task(scenario, batch=True),
+                team_task(unknown_starts(scenario), note="unknown starts"),
+            )
+        )
+    return found
+
+
+def unknown_starts(scenario: Scenario) -> Scenario:
+    """Only the first robot's start pose is told."""
+    names = tuple(robot.id for robot in scenario.robots[1:])
+    world = msgspec.structs.replace(scenario.world, unknown_starts=names)
+    return msgspec.structs.replace(scenario, world=world)
+
+
+def _merges(runs: list[Figures]) -> Figures:
+    """The share of robots that joined, and how many of them at a wrong place."""
+    chi2 = [
+        figures["first_pose_chi2"]
+        for run in runs
+        for name, figures in run["robots"].items()
+        if name != min(run["robots"])
+    ]
+    if not chi2:
+        return {}
+    joined = [value for value in chi2 if value is not None]
+    return {
+        "joined": len(joined) / len(chi2),
+        "wrong_merges": sum(value > WRONG_CHI2 for value in joined),
+    }

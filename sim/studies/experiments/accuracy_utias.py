@@ -1,0 +1,152 @@
+"""Real data: every UTIAS set that is given, five robots, one fixed profile for all of them.
+
+The raw map lies where the start poses say; `shape` is what no rigid motion explains, and its NEES
+is per landmark: 2 where the covariance is right. Beside each set stands the batch optimiser over
+all its raw readings under the same noise: the price of the submaps.
+"""
+
+from collections.abc import Mapping
+
+from sim.scenarios.scenario import load
+from sim.studies.experiments.accuracy_starts import unknown_starts
+from sim.studies.experiments.experiment import (
+    Dataset,
+    Goal,
+    Options,
+    Outcome,
+    Results,
+    Table,
+    without_datasets,
+)
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, Shown, cells_of, team_task
+
+NORMAL_SCALE = (0.8, 1.25)
+"""What the monitor says without the truth, in units of the profile's `normal_scale`."""
+MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
+"""By the data set's number; other sets have no goal of their own."""
+MOST_RAW_TRAJECTORY_M = {"1": 0.035, "2": 0.070, "6": 0.116}
+SHOWN: Shown = (
+    ("aligned", "aligned [m]", "{:.4f}"),
+    ("raw", "raw [m]", "{:.4f}"),
+    ("nees", "NEES/dof", "{:.3g}"),
+    ("shape_nees", "shape", "{:.3g}"),
+    ("coverage", "covered", "{:.0%}"),
+    ("covariance_scale", "scale", "{:.2f}"),
+    ("trajectory_raw", "path [m]", "{:.3f}"),
+    ("trajectory_aligned", "aligned [m]", "{:.3f}"),
+    ("online_position_rmse", "online [m]", "{:.3f}"),
+    ("online_pose_nees", "NEES/dof", "{:.3g}"),
+    ("bytes_per_step", "B/step", "{:.1f}"),
+)
+ROBOT: Shown = (
+    ("position_rmse", "path raw [m]", "{:.3f}"),
+    ("position_rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("pose_nees", "NEES/dof", "{:.3g}"),
+    ("online_position_rmse", "online [m]", "{:.3f}"),
+    ("online_pose_nees", "NEES/dof", "{:.3g}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """Each set with known starts and without; there is no randomness but the estimator's."""
+    return [
+        task for dataset in options.datasets for task in (team_on(dataset), _unknown_task(dataset))
+    ]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """The figures of each set, and of each robot in it."""
+    if not options.datasets:
+        return Outcome(
+            "real data", {"utias": {}}, missing=(without_datasets("figures on real data"),)
+        )
+    figures = {
+        dataset.name: set_figures(run)
+        for dataset in options.datasets
+        if (run := results.of(team_on(dataset))) is not None
+    }
+    unknown = {
+        dataset.name: set_figures(run)
+        for dataset in options.datasets
+        if (run := results.of(_unknown_task(dataset))) is not None
+    }
+    rows = tuple((name, *cells_of(of_set, SHOWN)) for name, of_set in figures.items())
+    rows += tuple(
+        (f"{name}, batch", *cells_of(of_set["batch"], SHOWN))
+        for name, of_set in figures.items()
+        if "batch" in of_set
+    )
+    rows += tuple(
+        (f"{name}, one start known", *cells_of(of_set, SHOWN)) for name, of_set in unknown.items()
+    )
+    robots = tuple(
+        (f"{name}, {robot}", *cells_of(of_robot, ROBOT))
+        for name, of_set in figures.items()
+        for robot, of_robot in of_set["robots"].items()
+    )
+    goals = [goal for dataset in options.datasets for goal in _goals(dataset, figures)]
+    goals += [
+        Goal(f"{name}, one start known: aligned [m]", of_set["aligned"], 0.0, 1.1 * known)
+        for name, of_set in unknown.items()
+        if (known := figures.get(name, {}).get("aligned")) is not None
+    ]
+    return Outcome(
+        "real data",
+        {"utias": figures, "utias_unknown_starts": unknown},
+        (
+            Table(
+                "UTIAS, five robots, one profile",
+                _heads("set", SHOWN),
+                rows,
+                "landmarks aligned and raw, their NEES as they lie, and per landmark of the shape "
+                "(2 is right); the monitor's covariance scale, 1 is right; paths raw and aligned; "
+                "online poses",
+            ),
+            Table("each robot", _heads("robot", ROBOT), robots),
+        ),
+        goals=tuple(goals),
+    )
+
+
+def set_figures(run: Figures) -> Figures:
+    """The figures of one set under the names of real data."""
+    renamed = {
+        "aligned": "rmse_aligned",
+        "raw": "rmse",
+        "trajectory_raw": "position_rmse",
+        "trajectory_aligned": "position_rmse_aligned",
+    }
+    figures = {new: run.get(old) for new, old in renamed.items()} | {
+        name: value for name, value in run.items() if name not in renamed.values()
+    }
+    if "batch" in run:
+        figures["batch"] = set_figures(run["batch"])
+    return figures
+
+
+def team_on(dataset: Dataset) -> Task:
+    """The team on a set, with the batch under the profile's noise beside it."""
+    return team_task(load("utias"), dataset=dataset, batch=True, noise="profile")
+
+
+def _unknown_task(dataset: Dataset) -> Task:
+    return team_task(unknown_starts(load("utias")), dataset=dataset, note="unknown starts")
+
+
+def _goals(dataset: Dataset, figures: Mapping[str, Figures]) -> list[Goal]:
+    name, of_set = dataset.name, figures.get(dataset.name, {})
+    number = "".join(each for each in name if each.isdigit())
+    goals = [
+        Goal(f"{name}: shape_nees", of_set.get("shape_nees"), 1.0, 3.5),
+        Goal(f"{name}: coverage", of_set.get("coverage"), 0.8, 1.0),
+        Goal(f"{name}: covariance_scale", of_set.get("covariance_scale"), *NORMAL_SCALE),
+    ]
+    for figure, most in (("aligned", MOST_ALIGNED_M), ("trajectory_raw", MOST_RAW_TRAJECTORY_M)):
+        if number in most:
+            goals.append(Goal(f"{name}: {figure} [m]", of_set.get(figure), 0.0, most[number]))
+    return goals
+
+
+def _heads(first: str, shown: Shown) -> tuple[str, ...]:
+    return (first, *(heading for _, heading, _ in shown))

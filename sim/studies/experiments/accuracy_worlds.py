@@ -1,0 +1,159 @@
+"""Simulated worlds under every pair of estimator and rule, and the batch MAP of the same readings.
+
+NEES is per degree of freedom: 1 where the covariance is right.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from sim.scenarios.scenario import load, with_options
+from sim.studies.experiments.experiment import (
+    Goal,
+    Options,
+    Outcome,
+    Results,
+    Table,
+)
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import (
+    OURS,
+    Figures,
+    Shown,
+    cells_of,
+    named,
+    over_seeds,
+    team_task,
+)
+from team.pairs import PAIRS
+
+
+class World(NamedTuple):
+    """A kind of world: its scenario, how many seeds at most, and what the default pair must reach.
+
+    rules: every valid pair runs in it, not only the default one. batch: with the batch MAP.
+    """
+
+    scenario: str
+    most_seeds: int
+    goals: Mapping[str, tuple[float, float]]
+    rules: bool = False
+    batch: bool = True
+
+
+OTHERS_SEEDS = 10
+"""Of the pairs that are there to compare with: their figures differ from ours by factors."""
+_THESIS = {
+    "nees": (0.93, 1.07),
+    "in_band": (0.90, 1.0),
+    "final_pose_nees": (0.85, 1.15),
+    "online_pose_nees": (0.85, 1.15),
+    "bytes_per_step": (0.0, 64.0),
+    "each_once": (1.0, 1.0),
+}
+_RANDOM = {"ratio": (0.0, 1.15), "nees": (0.8, 1.2)}
+WORLDS = (
+    World("thesis", 100_000, {"ratio": (0.0, 1.08)} | _THESIS, rules=True),
+    World("thesis-b", 100_000, {"ratio": (0.0, 1.10)} | _THESIS, rules=True),
+    World("random-3", 20, _RANDOM),
+    World("random-5", 20, _RANDOM),
+    World("random-10", 10, _RANDOM),
+    World("large", 1, {}, batch=False),
+)
+SHOWN: Shown = (
+    ("rmse", "RMSE [m]", "{:.3f}"),
+    ("ratio", "÷ batch", "{:.2f}"),
+    ("rmse_aligned", "aligned [m]", "{:.3f}"),
+    ("nees", "NEES/dof", "{:.3g}"),
+    ("nees_median", "median", "{:.3g}"),
+    ("in_band", "in band", "{:.0%}"),
+    ("covariance_scale", "scale", "{:.2f}"),
+    ("final_pose_nees", "final pose", "{:.3g}"),
+    ("online_pose_nees", "online pose", "{:.3g}"),
+    ("bytes_per_step", "B/step", "{:.0f}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """The runs of all worlds, rules and seeds."""
+    return [task for cells in _cells(options).values() for runs in cells.values() for task in runs]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """The figures of every world and rule, with the goals of the default rule."""
+    worlds: dict[str, dict[str, Figures]] = {}
+    goals: list[Goal] = []
+    tables: list[Table] = []
+    cells = _cells(options)
+    for world in _worlds(options):
+        runs = {rule: results.of_all(cell) for rule, cell in cells[world.scenario].items()}
+        figures = world_figures(runs)
+        worlds[world.scenario] = figures
+        goals += _goals(world, figures.get(named(*OURS), {}))
+        tables.append(_table(world, figures))
+    return Outcome("simulated worlds", {"worlds": worlds}, tuple(tables), goals=tuple(goals))
+
+
+def world_figures(runs: Mapping[str, Sequence[Figures]]) -> dict[str, Figures]:
+    """The figures over the seeds of each rule of one world, and of the batch.
+
+    ratio: of the RMS landmark errors to the batch's on the same seeds.
+    """
+    figures = {rule: over_seeds(of_rule) for rule, of_rule in runs.items() if of_rule}
+    batches = {run["seed"]: run["batch"] for run in runs.get(named(*OURS), []) if "batch" in run}
+    if batches:
+        figures["batch"] = over_seeds(list(batches.values())) | {"ratio": 1.0}
+    for rule, of_rule in runs.items():
+        both = [run for run in of_rule if run["seed"] in batches]
+        if both:
+            same = over_seeds([batches[run["seed"]] for run in both])
+            figures[rule]["ratio"] = _ratio(over_seeds(both)["rmse"], same["rmse"])
+    return figures
+
+
+def _ratio(value: float | None, reference: float | None) -> float | None:
+    return None if value is None or not reference else value / reference
+
+
+def _worlds(options: Options) -> list[World]:
+    return [world for world in WORLDS if not (options.quick and world.scenario == "large")]
+
+
+def _cells(options: Options) -> dict[str, dict[str, list[Task]]]:
+    """The tasks of each world and rule."""
+    return {
+        world.scenario: {
+            named(estimator, fusion): [
+                team_task(
+                    with_options(
+                        load(world.scenario), seed=seed, estimator=estimator, fusion=fusion
+                    ),
+                    batch=world.batch and (estimator, fusion) == OURS,
+                )
+                for seed in options.seeds[: _most(world, estimator, fusion)]
+            ]
+            for estimator, fusion in (PAIRS if world.rules else [OURS])
+        }
+        for world in _worlds(options)
+    }
+
+
+def _most(world: World, estimator: str, fusion: str) -> int:
+    """How many seeds of this pair at most."""
+    return world.most_seeds if (estimator, fusion) == OURS else OTHERS_SEEDS
+
+
+def _goals(world: World, figures: Figures) -> list[Goal]:
+    return [
+        Goal(f"{world.scenario}: {name}", figures.get(name), least, most)
+        for name, (least, most) in world.goals.items()
+    ]
+
+
+def _table(world: World, figures: Mapping[str, Figures]) -> Table:
+    rows = tuple((rule, *cells_of(of_rule, SHOWN)) for rule, of_rule in figures.items())
+    ours = figures.get(named(*OURS), {})
+    return Table(
+        f"{world.scenario}, {ours.get('seeds', 0)} seeds",
+        ("rule", *(heading for _, heading, _ in SHOWN)),
+        rows,
+    )

@@ -1,0 +1,257 @@
+"""A run's errors over team time, as a task: online poses, and one landmark of the map.
+
+The landmark is the first that the first robot saw. Its error and its sigma are those of the newest
+map at each time: the fused one, or the robot's own where nothing is fused.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from central.desk.evaluation.errors import Path, PoseErrors, pose_errors
+from central.desk.evaluation.evaluation import evaluate
+from sim.scenarios.scenario import Scenario, loads
+from sim.scenarios.source import streams_of
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, named
+from sim.world.streams import Detections, RobotStream, WorldStreams, robot_stream
+from team import translate
+from team.pairs import PAIRS
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+from team.wire.bus import Sample, opened
+
+STEP_S = 1.0
+"""Of the thesis' world."""
+Map = m.FusedMap | m.MapEstimate
+DIGITS = 5
+"""Significant digits of a kept curve: a picture shows three."""
+
+
+def curves_task(
+    scenario: Scenario,
+    told: Scenario | None = None,
+    label: str = "",
+    *,
+    late: bool = False,
+    shots: Sequence[int] = (),
+) -> Task:
+    """The curves of a run. told: the scenario that the team is told, where the world's differs.
+
+    late: each step's readings are those of the step before. shots: the steps at which maps and
+    paths are kept to be drawn.
+    """
+    return Task(
+        "sim.studies.experiments.curves:curves_run",
+        {"world": msgspec.to_builtins(scenario)}
+        | ({} if told is None else {"told": msgspec.to_builtins(told)})
+        | ({"late": True} if late else {})
+        | ({"shots": list(shots)} if shots else {}),
+        f"{'maps of ' if shots else ''}{label or scenario.name}, "
+        f"{named(scenario.estimator, scenario.fusion)}, seed {scenario.seed}",
+        expected_s(scenario),
+    )
+
+
+def curves_run(
+    world: Mapping[str, Any],
+    told: Mapping[str, Any] | None = None,
+    late: bool = False,
+    shots: Sequence[int] = (),
+) -> Figures:
+    """The curves of every robot's pose, of the first landmark, of the map; the map at `shots`."""
+    scenario = loads(msgspec.json.encode(world).decode())
+    team = scenario if told is None else loads(msgspec.json.encode(told).decode())
+    streams = streams_of(scenario)
+    samples = list(TimedRun().samples(team, a_step_late(streams) if late else streams))
+    evaluation = evaluate(samples)
+    ids, positions = true_landmarks(samples)
+    truth = dict(zip(ids.tolist(), positions, strict=True))
+    first = scenario.robots[0].id
+    maps = _maps(samples, first)
+    paths = {name: said_poses(samples, pose_keys(team, name)) for name in evaluation.robots}
+    found: Figures = {
+        "poses": {
+            name: _pose_curve(errors)
+            for name, robot in evaluation.robots.items()
+            if (errors := pose_errors(*paths[name], robot.truth)) is not None
+        },
+        "landmark": _landmark_curve(samples, maps, first, truth),
+        "map": {
+            "time_s": short(np.array([each.stamp_ns * 1e-9 for each in maps])),
+            "error_m": short(np.array([_map_rmse(each, truth) for each in maps])),
+        },
+    }
+    if shots:
+        lines = {n: (paths[n][0], robot.truth) for n, robot in evaluation.robots.items()}
+        found["shots"] = [_shot(step, maps, lines, truth) for step in shots]
+        found["landmarks"] = positions.tolist()
+    return found
+
+
+def true_landmarks(
+    samples: Iterable[Sample],
+) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """The ids and positions [m] of the world's landmarks; none where nobody knows them."""
+    for message in messages(samples, ch.TRUTH_LANDMARKS.key()):
+        if isinstance(message, m.TruthLandmarks):
+            return translate.landmarks_of(message)
+    return np.empty(0, np.uint32), np.empty((0, 2))
+
+
+def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
+    """The messages of one key, in their order."""
+    return (opened(sample)[2] for sample in samples if sample.key == key)
+
+
+def a_step_late(streams: WorldStreams) -> WorldStreams:
+    """Each message of landmarks says what was seen one before; needs a look at the start."""
+    return replace(streams, streams=tuple(_a_step_late(stream) for stream in streams.streams))
+
+
+def _a_step_late(stream: RobotStream) -> RobotStream:
+    seen = stream.landmark_detections
+    rows = int(seen.offsets[-2])
+    late = Detections(
+        seen.stamps_ns[1:], seen.offsets[:-1], seen.ids[:rows], seen.ranges[:rows],
+        seen.bearings[:rows],
+    )  # fmt: skip
+    return robot_stream(
+        stream.robot,
+        int(stream.stamps_ns[0]),
+        stream.start,
+        stream.intervals,
+        late,
+        stream.teammate_detections,
+        stream.teammates,
+        stream.truth_ns,
+        stream.truth,
+        stream.notes,
+        stream.clock_offset_ns,
+    )
+
+
+def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
+    """Where a robot's online pose is said: by the centre if it is the one that estimates it; else
+    by the robot, with the team's map once it has one.
+    """
+    if PAIRS[scenario.estimator, scenario.fusion] == "readings":
+        return (ch.CENTRAL_POSE.key(robot),)
+    return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
+
+
+def said_poses(
+    samples: Iterable[Sample], keys: Sequence[str]
+) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
+    """The poses and covariances of these keys; of one time that of the last key."""
+    said: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
+    for sample in samples:
+        if sample.key in said:
+            message = opened(sample)[2]
+            if isinstance(message, m.PoseEstimate):
+                said[sample.key][message.stamp_ns] = message
+    newest = {stamp_ns: pose for key in keys for stamp_ns, pose in said[key].items()}
+    estimates = [newest[stamp_ns] for stamp_ns in sorted(newest)]
+    return Path(
+        np.array(sorted(newest), dtype=np.int64),
+        np.array([floats(p.pose, "pose") for p in estimates]).reshape(-1, 3),
+    ), np.array([floats(p.covariance, "covariance") for p in estimates]).reshape(-1, 3, 3)
+
+
+def _pose_curve(found: PoseErrors) -> Figures:
+    """Distance and heading error with their sigmas; √(σx² + σy²) is that of the distance."""
+    errors, sigmas = found.errors, found.sigmas
+    return {
+        "time_s": short(found.stamps_ns * 1e-9),
+        "error_m": short(np.hypot(errors[:, 0], errors[:, 1])),
+        "sigma_m": short(np.hypot(sigmas[:, 0], sigmas[:, 1])),
+        "heading_error_deg": short(np.degrees(np.abs(errors[:, 2]))),
+        "heading_sigma_deg": short(np.degrees(sigmas[:, 2])),
+        "nees": short(found.nees / 3.0),
+    }
+
+
+def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
+    """The team's maps with landmarks in them in their order; without any, those of the robot."""
+    for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
+        said = messages(samples, key)
+        maps = [each for each in said if isinstance(each, m.FusedMap | m.MapEstimate) and each.ids]
+        if maps:
+            return maps
+    return []
+
+
+def _map_rmse(said: Map, truth: Mapping[int, Float[np.ndarray, "2"]]) -> float:
+    ids, means = translate.landmarks_of(said)
+    true = np.array([truth[int(landmark)] for landmark in ids])
+    return float(np.sqrt(((means - true) ** 2).sum(axis=1).mean()))
+
+
+def _shot(
+    step: int,
+    maps: Sequence[Map],
+    lines: Mapping[str, tuple[Path, Path]],
+    truth: Mapping[int, Float[np.ndarray, "2"]],
+) -> Figures:
+    """The newest map, its landmarks' 2 × 2 blocks and its error, and the paths until then."""
+    now_ns = round(step * STEP_S * 1e9)
+    newest = next((each for each in reversed(maps) if each.stamp_ns <= now_ns), None)
+    return {
+        "step": step,
+        "means": [] if newest is None else translate.landmarks_of(newest)[1].tolist(),
+        "blocks": [] if newest is None else translate.landmark_blocks_of(newest).tolist(),
+        "rmse_m": None if newest is None else _map_rmse(newest, truth),
+        "paths": {
+            name: {
+                kind: path.poses[path.stamps_ns <= now_ns, :2].round(2).tolist()
+                for kind, path in (("online", online), ("truth", true))
+            }
+            for name, (online, true) in lines.items()
+        },
+    }
+
+
+def _landmark_curve(
+    samples: Sequence[Sample],
+    maps: Sequence[Map],
+    robot: str,
+    truth: Mapping[int, Float[np.ndarray, "2"]],
+) -> Figures | None:
+    """The error of the first landmark that this robot saw; None if it saw none."""
+    landmark = next(
+        (
+            int(translate.scan_of(message)[0][0])
+            for message in messages(samples, ch.OBSERVATIONS.key(robot))
+            if isinstance(message, m.Observations) and message.ids
+        ),
+        None,
+    )
+    if landmark is None or not maps:
+        return None
+    times, errors, sigmas = [], [], []
+    for fused in maps:
+        ids, means = translate.landmarks_of(fused)
+        place = np.flatnonzero(ids == landmark)
+        if not len(place):
+            continue
+        k = int(place[0])
+        covariance = translate.landmark_covariance_of(fused)[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        times.append(fused.stamp_ns * 1e-9)
+        errors.append(float(np.hypot(*(means[k] - truth[landmark]))))
+        sigmas.append(float(np.sqrt(np.trace(covariance))))
+    return {
+        "id": landmark,
+        "time_s": short(np.array(times)),
+        "error_m": short(np.array(errors)),
+        "sigma_m": short(np.array(sigmas)),
+    }
+
+
+def short(values: Float[np.ndarray, " K"]) -> list[float]:
+    """The values in so many digits, to be kept as JSON."""
+    return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]

@@ -1,0 +1,299 @@
+"""Runs after J. Downs' thesis as tasks: whole-run maps of each robot, and submaps joined his way.
+
+His protocol: readings sampled to a second, a submap for every step, of which only the mean is kept:
+each robot's submaps are joined by least squares with the identity as covariance, and the robots'
+maps are tied by singular values (`svd-join-spherical`). A submap of ours is a window of the hybrid
+estimator of one step, his is a step of an EKF without landmarks before it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from central.baselines.svd_rule import tied
+from central.desk.evaluation.errors import MapErrors, Path, map_errors, pose_errors
+from central.desk.evaluation.evaluation import Evaluation, evaluate
+from central.submap_set import Stream
+from sim.in_memory.team import run_team
+from sim.scenarios.scenario import Scenario, loads, with_options
+from sim.scenarios.source import streams_of
+from sim.studies.experiments.curves import messages, said_poses, true_landmarks
+from sim.studies.experiments.experiment import Dataset
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, expected_s
+from sim.world.config import UtiasWorld
+from team import translate
+from team.config import Sensor
+from team.estimation.baselines import svd_joining
+from team.estimation.baselines.svd_joining import (
+    SETTINGS,
+    PointPairs,
+    SubmapJoining,
+    mutual_sighting,
+    weighted,
+)
+from team.estimation.contribution import Contribution
+from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.map_joining import joining
+from team.estimation.models import corrected
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+
+STEP_S = 1.0
+NEVER_S = 1e6
+DRAWN_POINTS = 1000
+"""The centre joins once, when the run has ended."""
+
+
+def his_protocol(scenario: Scenario) -> Scenario:
+    """Readings and submaps of a second, exact starts, no loss, no factor, no error states."""
+    change = msgspec.structs.replace
+    robots = tuple(
+        change(
+            robot,
+            front_end=change(
+                robot.front_end, window_s=STEP_S, window_m=0.0, keyframe_s=STEP_S, node_s=0.0,
+                biases=(),
+            ),
+        )
+        for robot in scenario.robots
+    )  # fmt: skip
+    central = change(
+        scenario.central, tick_s=NEVER_S, broadcast_s=NEVER_S, robust_c=None,
+        covariance_factor=1.0, withdraw_above=None,
+    )  # fmt: skip
+    world = scenario.world
+    if isinstance(world, UtiasWorld):
+        world = change(world, start_sigma_m=0.0, start_sigma_rad=0.0)
+    return change(scenario, robots=robots, central=central, world=world)
+
+
+def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str = "") -> Task:
+    """Every robot's own map and path, such as those of `ekf-slam` with `alone`."""
+    return _task("whole_run", scenario, dataset, note)
+
+
+def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
+    """Every robot's submaps joined his way, and the robots' maps tied; of his protocol."""
+    return _task("spherical_run", his_protocol(scenario), dataset, "submaps of a step, identity")
+
+
+def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> Task:
+    place = scenario.name if dataset is None else dataset.name
+    return Task(
+        f"sim.studies.experiments.downs_joined:{work}",
+        {"scenario": msgspec.to_builtins(scenario)}
+        | ({} if dataset is None else {"sha256": dataset.sha256}),
+        f"{place}, {scenario.estimator}{f', {note}' if note else ''}, "
+        f"{len(scenario.robots)} robots, seed {scenario.seed}",
+        expected_s(scenario),
+        {} if dataset is None else {"path": str(dataset.path)},
+    )
+
+
+def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
+    """By robot: the errors of its last own map, and of its online path; one robot's map itself."""
+    samples = _samples(scenario, path)
+    evaluation = evaluate(samples)
+    return {
+        "sample": _sample(samples, evaluation),
+        "robots": {
+            name: _map_figures(robot.own_map)
+            | {"position_rmse": None if robot.online is None else robot.online.position_rmse_m}
+            for name, robot in evaluation.robots.items()
+        },
+    }
+
+
+def _sample(samples: Sequence[Sample], evaluation: Evaluation) -> Figures:
+    """The first robot's last map and its paths, to be drawn."""
+    name, robot = next(iter(evaluation.robots.items()))
+    said = [opened(s)[2] for s in samples if s.key == ch.OWN_MAP.key(name)]
+    last = next((each for each in reversed(said) if isinstance(each, m.MapEstimate)), None)
+    return {
+        "robot": name,
+        "means": [] if last is None else translate.landmarks_of(last)[1].tolist(),
+        "blocks": [] if last is None else translate.landmark_blocks_of(last).tolist(),
+        "landmarks": true_landmarks(samples)[1].tolist(),
+        "online": _thinned(said_poses(samples, (ch.OWN_POSE.key(name),))[0]),
+        "truth": _thinned(robot.truth),
+    }
+
+
+def _thinned(path: Path) -> list[list[float]]:
+    every = max(1, len(path.poses) // DRAWN_POINTS)
+    points: list[list[float]] = path.poses[::every, :2].round(3).tolist()
+    return points
+
+
+def spherical_run(
+    scenario: Mapping[str, Any], sha256: str = "", path: str | None = None
+) -> Figures:
+    """By robot: the errors of its joined map and smoothed path, and the map; the team's errors.
+
+    with_covariances: of the same submaps in one join with the covariances that he discards.
+    """
+    samples = _samples(scenario, path)
+    evaluation = evaluate(samples)
+    ids, positions = true_landmarks(samples)
+    truth = dict(zip(ids.tolist(), positions, strict=True))
+    robots, maps, paths = {}, {}, {}
+    for name in evaluation.robots:
+        submaps = _submaps(samples, name)
+        if not submaps:
+            continue
+        state = _joined(name, _start(samples, name), submaps)
+        found = svd_joining.landmark_gaussian(state)
+        maps[name, 0] = found
+        paths[name] = _path(name, state, submaps)
+        robots[name] = _map_figures(_errors(found, truth)) | {
+            "position_rmse": _path_error(evaluation, name, paths[name]),
+            "submaps": len(submaps),
+            "map": {
+                "ids": found.ids.tolist(),
+                "means": found.means.tolist(),
+                "covariance": found.covariance.tolist(),
+            },
+        }
+    if not maps:
+        return {"robots": {}, "team": _map_figures(None), "reasons": []}
+    sensors = {
+        robot["id"]: msgspec.convert(robot["sensor"], Sensor) for robot in scenario["robots"]
+    }
+    sightings = _mutual(samples, sensors, paths)
+    team, reasons = tied(min(maps), maps, full=False, sightings=sightings)
+    return {
+        "robots": robots,
+        "team": _map_figures(_errors(team, truth)),
+        "sightings": sum(len(pairs.in_a) for pairs in sightings.values()),
+        "with_covariances": _map_figures(None if evaluation.map is None else evaluation.map.errors),
+        "reasons": list(reasons),
+    }
+
+
+def _samples(scenario: Mapping[str, Any], path: str | None) -> list[Sample]:
+    resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
+    return list(run_team(resolved, streams_of(resolved)))
+
+
+def _submaps(samples: Sequence[Sample], robot: str) -> list[m.Submap]:
+    """A robot's submaps in their order."""
+    said = [opened(s)[2] for s in samples if s.key == ch.SUBMAP.key(robot)]
+    by_sequence = {each.sequence: each for each in said if isinstance(each, m.Submap)}
+    return [by_sequence[sequence] for sequence in sorted(by_sequence)]
+
+
+def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
+    """What the robot is told of its start; the origin of a frame of its own where that is not."""
+    for sample in samples:
+        if sample.key == ch.START.key(robot):
+            message = opened(sample)[2]
+            if isinstance(message, m.Start):
+                pose = translate.pose_of(message)[0]
+                return np.zeros(3) if pose is None else pose
+    return np.zeros(3)
+
+
+def _joined(
+    robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]
+) -> SubmapJoining:
+    """All submaps at once: what taking them one by one converges to."""
+    begun = svd_joining.begun({robot: start})
+    contributions = [
+        Contribution(robot, 0, k, k, weighted(translate.local_map_of(s).without_nodes, "identity"))
+        for k, s in enumerate(submaps)
+    ]
+    return svd_joining.solved(
+        replace(begun, fold=joining.folded(begun.fold, contributions, SETTINGS))
+    )
+
+
+def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path:
+    """The ends of the submaps, which lie at their stamps."""
+    graph = state.fold.main.graph
+    ends = graph.offset[np.array(graph.streams[robot, 0][1:])]
+    poses = state.fold.main.state[ends[:, None] + np.arange(3)]
+    return Path(np.array([submap.stamp_ns for submap in submaps], dtype=np.int64), poses)
+
+
+def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
+    """Of a joined path [m]."""
+    unit = np.broadcast_to(np.eye(3), (len(path.poses), 3, 3))
+    errors = pose_errors(path, unit, evaluation.robots[robot].truth)
+    return None if errors is None else errors.position_rmse_m
+
+
+def _mutual(
+    samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
+) -> dict[tuple[Stream, Stream], PointPairs]:
+    """Where two robots saw each other in the same step: both places in both maps, one a step."""
+    looks = {name: _looks(samples, name, sensors[name]) for name in paths}
+    found: dict[tuple[Stream, Stream], PointPairs] = {}
+    for a in sorted(paths):
+        for b in sorted(paths):
+            steps = sorted(looks[a].get(b, {}).keys() & looks[b].get(a, {}).keys()) if a < b else []
+            pairs = [
+                mutual_sighting(
+                    paths[a].poses[at_a],
+                    *looks[a][b][step],
+                    paths[b].poses[at_b],
+                    *looks[b][a][step],
+                )
+                for step in steps
+                if (at_a := _at(paths[a], step)) is not None
+                and (at_b := _at(paths[b], step)) is not None
+            ]
+            if pairs:
+                found[(a, 0), (b, 0)] = PointPairs(
+                    *(np.concatenate(each) for each in zip(*pairs, strict=True))
+                )
+    return found
+
+
+def _looks(
+    samples: Sequence[Sample], robot: str, sensor: Sensor
+) -> dict[str, dict[int, tuple[float, float]]]:
+    """By teammate and step the last (range [m], bearing [rad]) of that step, calibrated."""
+    found: dict[str, dict[int, tuple[float, float]]] = {}
+    for message in messages(samples, ch.SIGHTINGS.key(robot)):
+        if isinstance(message, m.Sightings):
+            teammates, *read = translate.looks_of(message)
+            ranges, bearings = corrected(sensor, *read)
+            for name, seen, bearing in zip(teammates, ranges, bearings, strict=True):
+                look = float(seen) - sensor.marker_range_offset, float(bearing)
+                found.setdefault(name, {})[round(message.stamp_ns / STEP_S * 1e-9)] = look
+    return found
+
+
+def _at(path: Path, step: int) -> int | None:
+    """The pose at a step; None where the robot has none within half of one."""
+    stamp_ns = round(step * STEP_S * 1e9)
+    nearest = int(np.argmin(np.abs(path.stamps_ns - stamp_ns)))
+    near = abs(int(path.stamps_ns[nearest]) - stamp_ns) <= 0.5e9 * STEP_S
+    return nearest if near else None
+
+
+def _errors(
+    found: LandmarkGaussian, truth: Mapping[int, Float[np.ndarray, "2"]]
+) -> MapErrors | None:
+    """Of the landmarks with truth."""
+    known = [k for k, id_ in enumerate(found.ids.tolist()) if id_ in truth]
+    if not known:
+        return None
+    rows = np.repeat(2 * np.array(known), 2) + np.tile([0, 1], len(known))
+    positions = np.array([truth[int(found.ids[k])] for k in known])
+    return map_errors(found.means[known], found.covariance[np.ix_(rows, rows)], positions)
+
+
+def _map_figures(errors: MapErrors | None) -> Figures:
+    return {
+        "rmse": None if errors is None else errors.rmse_m,
+        "rmse_aligned": None if errors is None else errors.aligned_rmse_m,
+        "nees": None if errors is None else errors.nees_per_dof,
+        "landmarks": 0 if errors is None else errors.count,
+    }

@@ -1,0 +1,269 @@
+"""Tables 5.1 … 5.5 of J. Downs' thesis on his own simulator: 10 and 100 landmarks, a run a seed.
+
+He ran it thirty times for each (section 4.2) and prints no figure of it, so there is nothing to
+stand beside; the methods and the t-tests are those of the tables. It has one robot; table 5.5 needs
+a team, two robots here that start at its centre together.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.stats import ttest_rel
+
+from central.desk.pictures.run import TRUTH_COLOUR
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.studies.experiments.downs_joined import spherical_task, whole_run_task
+from sim.studies.experiments.drawing import draw_map, figure, ruled, spread
+from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, team_task
+from sim.world.config import SimulatedWorld
+
+WORLDS = ("downs-10", "downs-100")
+TEAM = 2
+QUICK_STEPS = 300
+STARTED, ALIGNED = "rmse", "rmse_aligned"
+"""Errors of a map as it lies, and after the rigid motion that fits it to the truth."""
+
+
+class Simulated(NamedTuple):
+    """A method on the simulator: its name, its run, where its figures are, its colour.
+
+    robot: the figures are of robot 1 among those of the run; else of `part`, or of the run itself.
+    """
+
+    name: str
+    task: Callable[[Scenario], Task]
+    robots: int
+    colour: str
+    robot: bool = False
+    part: str | None = None
+
+    def of(self, run: Figures, name: str) -> float | None:
+        """One figure of a run."""
+        place: Mapping[str, float | None] = run
+        if self.robot:
+            place = run["robots"]["r1"]
+        elif self.part is not None:
+            place = run[self.part]
+        return place.get(name)
+
+
+def _ekf(scenario: Scenario) -> Task:
+    return whole_run_task(with_options(scenario, estimator="ekf-slam", fusion="alone"))
+
+
+EKF = Simulated("EKF", _ekf, 1, "#D55E00", robot=True)
+HIS_JOINED = Simulated("joined, his protocol", spherical_task, TEAM, "#E69F00", robot=True)
+OUR_JOINED = Simulated("joined, ours", team_task, 1, "#0072B2")
+HIS_TEAM = Simulated("team, his protocol", spherical_task, TEAM, "#009E73", part="team")
+OUR_TEAM = Simulated("team, ours", team_task, TEAM, "#111111")
+
+
+class SimulatedTable(NamedTuple):
+    """What a table has of the simulator. figures: which, and what to call it.
+
+    compared: pairs of methods whose maps the paired t-test compares, before and after. sample: a
+    map of the first method is drawn, as in figure 5.1.
+    """
+
+    methods: tuple[Simulated, ...]
+    figures: tuple[tuple[str, str], ...]
+    compared: tuple[tuple[Simulated, Simulated], ...] = ()
+    sample: bool = False
+
+    def tasks(self, options: Options) -> list[Task]:
+        """Every world, method and seed; what the t-tests need besides, too."""
+        found = [
+            _task(world, method, options, seed)
+            for world in WORLDS
+            for method in self._needed()
+            for seed in options.seeds
+        ]
+        return list({task.name: task for task in found}.values())
+
+    def outcome(self, title: str, options: Options, results: Results) -> Outcome:
+        """The errors over the seeds, their t-tests, and every run as a dot."""
+        errors = self._errors(options, results)
+        if not errors:
+            return Outcome(title, {})
+        table = Table(
+            f"{title}: his simulator, {len(options.seeds)} seeds [m]",
+            ("landmarks, method", "runs", "median", "10 … 90 %", "mean", "sd", "the run"),
+            tuple((name, *_cells(values)) for name, values in errors.items()),
+            f"nothing is printed of it; the run: seed {options.seeds[0]}",
+        )
+        tests = self._tests(options, results)
+        tables = [table]
+        if tests:
+            rows = tuple((name, *_test_cells(test)) for name, test in tests.items())
+            columns = ("before → after", "pairs", "mean before [m]", "mean after [m]", "p")
+            tables.append(Table("paired t-test of the simulator's maps as they lie", columns, rows))
+        picture = Picture(
+            "simulator",
+            f"{title}: runs on his simulator, one dot a seed on a logarithmic scale; bar: the "
+            f"median; ringed: the run of seed {options.seeds[0]}.",
+            partial(self._draw, title, errors),
+        )
+        figures: Figures = {
+            "simulator": {name: _numbers(values) for name, values in errors.items()},
+            "simulator_t_tests": tests,
+        }
+        pictures = [picture]
+        for world in WORLDS if self.sample else ():
+            run = results.of(_task(world, self.methods[0], options, options.seeds[0]))
+            if run is not None:
+                name = f"{world.partition('-')[2]} landmarks, seed {options.seeds[0]}"
+                pictures.append(sample_picture(f"sample-{world}", name, run["sample"]))
+        return Outcome(title, figures, tuple(tables), tuple(pictures))
+
+    def _needed(self) -> list[Simulated]:
+        compared = [method for pair in self.compared for method in pair]
+        return list(dict.fromkeys([*self.methods, *compared]))
+
+    def _errors(self, options: Options, results: Results) -> dict[str, list[float]]:
+        """By world, method and figure, over the seeds."""
+        found = {}
+        for world in WORLDS:
+            count = world.partition("-")[2]
+            for method in self.methods:
+                for name, said in self.figures:
+                    values = list(_by_seed(world, method, name, options, results).values())
+                    if values:
+                        found[f"{count}, {method.name}{said}"] = values
+        return found
+
+    def _tests(self, options: Options, results: Results) -> dict[str, Figures]:
+        found = {}
+        for world in WORLDS:
+            for pair in self.compared:
+                before, after = (_by_seed(world, m, STARTED, options, results) for m in pair)
+                both = [(before[seed], after[seed]) for seed in before if seed in after]
+                if both:
+                    name = f"{world.partition('-')[2]}, {pair[0].name} → {pair[1].name}"
+                    found[name] = paired_test(both)
+        return found
+
+    def _draw(self, title: str, errors: Mapping[str, Sequence[float]], path: Path) -> None:
+        colours = {method.name: method.colour for method in self.methods}
+        picture = figure(9.0, 1.4 + 0.5 * len(errors))
+        axis = picture.add_subplot()
+        for row, (name, values) in enumerate(errors.items()):
+            colour = next(c for method, c in colours.items() if f", {method}" in name)
+            heights = row + 0.25 * np.linspace(-1.0, 1.0, len(values))
+            axis.plot(values, heights, linestyle="", marker=".", color=colour)
+            axis.plot(values[0], heights[0], linestyle="", marker="o", markersize=10,
+                      markerfacecolor="none", color=colour)  # fmt: skip
+            axis.plot([np.median(values)] * 2, [row - 0.35, row + 0.35], color=colour)
+        axis.set_yticks(range(len(errors)), list(errors), fontsize=9)
+        axis.invert_yaxis()
+        axis.set_xscale("log")
+        axis.set_xlabel("RMSE [m]")
+        axis.set_title(f"{title}\nhis simulator", fontsize=11)
+        ruled(axis)
+        picture.savefig(path, dpi=120)
+
+
+def sample_picture(name: str, title: str, sample: Figures) -> Picture:
+    """As his figure 5.1: a map of the EKF."""
+    return Picture(
+        name,
+        f"As figure 5.1, a map of the EKF: {title}, {sample['robot']}. Ellipses hold 95 % of what "
+        "the map believes; crosses are the true landmarks, grey the true path.",
+        partial(_draw_sample, title, sample),
+    )
+
+
+def _draw_sample(title: str, sample: Figures, path: Path) -> None:
+    picture = figure(7.5, 7.5)
+    axis = picture.add_subplot()
+    for key, colour, label in (
+        ("truth", TRUTH_COLOUR, "true path"),
+        ("online", EKF.colour, f"{sample['robot']}, online"),
+    ):
+        axis.plot(*np.array(sample[key]).reshape(-1, 2).T, color=colour, linewidth=1.0, label=label)
+    axis.plot(
+        *np.array(sample["landmarks"]).reshape(-1, 2).T, linestyle="", marker="x",
+        color="#C00000", label="true landmarks",
+    )  # fmt: skip
+    draw_map(axis, sample["means"], sample["blocks"], label="map, 95 %")
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    axis.set_title(f"EKF: {title}", fontsize=11)
+    picture.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    ruled(axis)
+    picture.savefig(path, dpi=110)
+
+
+def _task(world: str, method: Simulated, options: Options, seed: int) -> Task:
+    scenario = with_options(load(world), robots=method.robots, seed=seed)
+    if options.quick and isinstance(scenario.world, SimulatedWorld):
+        part = msgspec.structs.replace(scenario.world, steps=QUICK_STEPS)
+        scenario = msgspec.structs.replace(scenario, world=part)
+    return method.task(scenario)
+
+
+def _by_seed(
+    world: str, method: Simulated, name: str, options: Options, results: Results
+) -> dict[int, float]:
+    """The figure of each seed's run that has it."""
+    found = {}
+    for seed in options.seeds:
+        run = results.of(_task(world, method, options, seed))
+        value = None if run is None else method.of(run, name)
+        if value is not None:
+            found[seed] = value
+    return found
+
+
+def paired_test(pairs: Sequence[tuple[float, float]]) -> Figures:
+    """The paired t-test, two-sided, of figures before and after; p None below two pairs."""
+    both = np.array(pairs).reshape(-1, 2)
+    return {
+        "pairs": len(both),
+        "mean_before_m": float(both[:, 0].mean()) if len(both) else None,
+        "mean_after_m": float(both[:, 1].mean()) if len(both) else None,
+        "p": float(ttest_rel(both[:, 0], both[:, 1]).pvalue) if len(both) > 1 else None,
+    }
+
+
+def _test_cells(test: Figures) -> list[str]:
+    numbers = (test[key] for key in ("mean_before_m", "mean_after_m", "p"))
+    return [str(test["pairs"]), *("–" if n is None else f"{n:.3g}" for n in numbers)]
+
+
+def _cells(values: Sequence[float]) -> list[str]:
+    found = _numbers(values)
+    sd = "–" if found["sd"] is None else f"{found['sd']:.3g}"
+    return [
+        str(len(values)), f"{found['median']:.3g}", f"{found['p10']:.3g} … {found['p90']:.3g}",
+        f"{found['mean']:.3g}", sd, f"{values[0]:.3g}",
+    ]  # fmt: skip
+
+
+def _numbers(values: Sequence[float]) -> Figures:
+    return spread(np.array(values)) | {
+        "mean": float(np.mean(values)),
+        "sd": float(np.std(values, ddof=1)) if len(values) > 1 else None,
+        "runs": list(values),
+    }
+
+
+_MAPS = ((STARTED, ""), (ALIGNED, ", aligned"))
+_PATHS = (("position_rmse", ""),)
+SIMULATED_5_1 = SimulatedTable((EKF,), _MAPS, sample=True)
+SIMULATED_5_2 = SimulatedTable((EKF,), _PATHS)
+SIMULATED_5_3 = SimulatedTable(
+    (EKF, HIS_JOINED, OUR_JOINED), _MAPS, ((EKF, HIS_JOINED), (EKF, OUR_JOINED))
+)
+SIMULATED_5_4 = SimulatedTable((HIS_JOINED, OUR_JOINED), _PATHS)
+SIMULATED_5_5 = SimulatedTable(
+    (HIS_JOINED, OUR_JOINED, HIS_TEAM, OUR_TEAM),
+    _MAPS,
+    ((HIS_JOINED, HIS_TEAM), (OUR_JOINED, OUR_TEAM)),
+)

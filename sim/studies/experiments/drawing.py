@@ -1,0 +1,119 @@
+"""Curves over many seeds on common times, and the look of the experiments' pictures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.pictures.run import MAP_COLOUR, ellipse_of
+
+if TYPE_CHECKING:  # Matplotlib takes half a second to import
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BAND = (0.1, 0.9)
+"""The band of a picture holds four fifths of the runs."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Errors and sigmas of S runs at K common times; NaN where a run says nothing yet.
+
+    nees: the mean per degree of freedom of each run; None where the runs have none.
+    """
+
+    times_s: Float[np.ndarray, " K"]
+    errors: Float[np.ndarray, "S K"]
+    sigmas: Float[np.ndarray, "S K"]
+    nees: Float[np.ndarray, " S"] | None
+
+    @classmethod
+    def on(
+        cls,
+        times_s: Float[np.ndarray, " K"],
+        runs: Sequence[Mapping[str, Any]],
+        *,
+        held: bool,
+    ) -> Self:
+        """The runs' curves at these times. held: a value stands until the next one comes."""
+        nees = [float(np.mean(run["nees"])) for run in runs if "nees" in run]
+        return cls(
+            times_s,
+            np.array([sampled(times_s, run, "error_m", held=held) for run in runs]),
+            np.array([sampled(times_s, run, "sigma_m", held=held) for run in runs]),
+            np.array(nees) if nees else None,
+        )
+
+    def quantile(self, share: float) -> Float[np.ndarray, " K"]:
+        """Over the runs that say something, at each time; NaN where none does."""
+        values = np.full(len(self.times_s), np.nan)
+        there = ~np.isnan(self.errors).all(axis=0)
+        values[there] = np.nanquantile(self.errors[:, there], share, axis=0)
+        return values
+
+    def rms(self) -> Float[np.ndarray, " S"]:
+        """Over time, of each run."""
+        means: Float[np.ndarray, " S"] = np.sqrt(np.nanmean(self.errors**2, axis=1))
+        return means
+
+
+def sampled(
+    times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, held: bool
+) -> Float[np.ndarray, " K"]:
+    """A curve of a run at these times; held: as `Curves.on` has it."""
+    stamps, values = np.array(run["time_s"]), np.array(run[name])
+    if not len(stamps):
+        return np.full(len(times_s), np.nan)
+    if not held:
+        between: Float[np.ndarray, " K"] = np.interp(times_s, stamps, values)
+        return between
+    place = np.searchsorted(stamps, times_s + 1e-6, side="right") - 1
+    found: Float[np.ndarray, " K"] = np.where(place < 0, np.nan, values[np.maximum(place, 0)])
+    return found
+
+
+def spread(values: Float[np.ndarray, " S"]) -> dict[str, float]:
+    """Median and band over runs, for machines."""
+    low, middle, high = np.nanquantile(values, (BAND[0], 0.5, BAND[1]))
+    return {"median": float(middle), "p10": float(low), "p90": float(high)}
+
+
+def figure(width: float, height: float) -> "Figure":
+    """A figure on Agg without pyplot's global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    made = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(made)
+    return made
+
+
+def draw_map(
+    axis: "Axes",
+    means: Sequence[Sequence[float]],
+    blocks: Sequence[Any],
+    colour: str = MAP_COLOUR,
+    label: str | None = None,
+) -> None:
+    """Landmarks as dots with their 95 % ellipses. blocks: a 2 × 2 covariance each [m²].
+
+    label: of the dots, in a legend.
+    """
+    from matplotlib.patches import Ellipse
+
+    dots = np.array(means, dtype=np.float64).reshape(-1, 2)
+    axis.plot(*dots.T, linestyle="", marker=".", color=colour, zorder=5, label=label)
+    for mean, block in zip(means, blocks, strict=True):
+        width, height, turn_deg = ellipse_of(np.array(block))
+        axis.add_patch(
+            Ellipse((mean[0], mean[1]), width, height, angle=turn_deg, fill=False,
+                    edgecolor=colour, zorder=5)
+        )  # fmt: skip
+
+
+def ruled(axis: "Axes") -> None:
+    """A grid behind the curves."""
+    axis.grid(color="#e4e4e4", linewidth=0.6)
+    axis.set_axisbelow(True)

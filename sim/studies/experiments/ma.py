@@ -1,0 +1,191 @@
+"""What the experiments after K.-C. Ma and Z. Ma's report have in common: runs on a UTIAS set.
+
+The report prints no parameters and no data set's number. Both are in its program (the repository
+that its appendix names): the start pose of robot 1 is that of set 2, α₁ … α₆ are 0.1 for intervals
+of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad². It takes the logged
+odometry as it is, without calibration.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.errors import Path, pose_errors
+from central.desk.evaluation.evaluation import evaluate
+from sim.scenarios.scenario import Scenario, load, loads, with_options
+from sim.studies.experiments.curves import messages, pose_keys, said_poses, short, true_landmarks
+from sim.studies.experiments.experiment import Dataset
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, TimedRun, named
+from sim.studies.experiments.xu import Method, with_particles
+from sim.world.config import UtiasWorld
+from team import translate
+from team.config import MotionModel, RobotConfig, Sensor
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+from team.wire.bus import Sample, opened
+
+FRAME_S = 0.2
+FRAMES = 1400
+"""Roughly five minutes, as the report says of its 1400 frames."""
+MOTION = MotionModel(alphas=(0.1,) * 6, alpha_interval_s=0.02)
+SENSOR = Sensor(range_sigma=0.0167**0.5, bearing_sigma=0.000736589**0.5)
+START_SIGMA = 1e-3
+"""Of the program's initial covariance [m, rad]."""
+PARTICLES = 100
+"""The program's default; the report does not say."""
+DEAD_RECKONING = Method("dead reckoning", "dead-reckoning", "alone", 1, "#D55E00", PARTICLES)
+SINGLE = Method("single FastSLAM", "fastslam1", "alone", 1, "#0072B2", PARTICLES)
+MULTI_3 = Method("multi, 3 robots", "dead-reckoning", "joint-fastslam", 3, "#E69F00", PARTICLES)
+MULTI_5 = MULTI_3._replace(name="multi, 5 robots", robots=5, colour="#009E73")
+OURS = Method("hybrid + join, 5 robots", "hybrid", "join", 5, "#111111", None)
+"""With the models and figures of the scenario `utias`; all others with the program's."""
+_COST_S = 4.0
+_LINE_POINTS = 1400
+
+
+def ma_task(dataset: Dataset, method: Method, seed: int) -> Task:
+    """The run of one method on the first 1400 frames of a set."""
+    scenario = _scenario(method, seed)
+    return Task(
+        "sim.studies.experiments.ma:ma_run",
+        {"scenario": msgspec.to_builtins(scenario), "sha256": dataset.sha256},
+        f"{dataset.name}, {method.robots} robots, {named(method.estimator, method.fusion)}, "
+        f"seed {seed}",
+        _COST_S * method.robots,
+        {"path": str(dataset.path)},
+    )
+
+
+def _scenario(method: Method, seed: int) -> Scenario:
+    scenario = with_options(
+        load("utias"),
+        seed=seed,
+        robots=method.robots,
+        estimator=method.estimator,
+        fusion=method.fusion,
+    )
+    world, replace = scenario.world, msgspec.structs.replace
+    assert isinstance(world, UtiasWorld)
+    world = replace(world, duration_s=FRAMES * FRAME_S)
+    if method.particles is None:
+        return replace(scenario, world=world)
+    world = replace(
+        world, odometry_delay_s=0.0, start_sigma_m=START_SIGMA, start_sigma_rad=START_SIGMA
+    )
+    robots = tuple(_as_in_the_program(robot) for robot in scenario.robots)
+    central = replace(scenario.central, broadcast_s=1.0)
+    return with_particles(
+        replace(scenario, world=world, robots=robots, central=central), method.particles
+    )
+
+
+def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
+    """Its models; every reading by itself, resampled at each step; a map said each second."""
+    replace = msgspec.structs.replace
+    front_end = replace(
+        robot.front_end, resample_below=1.0, keyframe_s=0.0, window_s=1.0, window_m=0.0, biases=()
+    )
+    return replace(robot, motion=MOTION, sensor=SENSOR, front_end=front_end, pose_s=FRAME_S)
+
+
+def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
+    """Errors over frames of every robot's path and of the map, the lines and the last map.
+
+    sha256: of the data set at `path`; it stands for it in the task's name.
+    """
+    resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
+    samples = list(TimedRun().samples(resolved))
+    evaluation = evaluate(samples)
+    paths = {
+        name: (*said_poses(samples, pose_keys(resolved, name)), robot.truth)
+        for name, robot in evaluation.robots.items()
+    }
+    start_ns = min(int(said.stamps_ns[0]) for said, _, _ in paths.values() if len(said.stamps_ns))
+    ids, positions = true_landmarks(samples)
+    truth = dict(zip(ids.tolist(), positions, strict=True))
+    robots = {name: _robot(*said, start_ns) for name, said in paths.items()}
+    first = resolved.robots[0].id
+    return {
+        "robots": robots,
+        "map": _map(samples, first, truth, start_ns),
+        "clouds": _clouds(samples, first),
+        "truth": positions.tolist(),
+    }
+
+
+def _frames(stamps_ns: np.ndarray, start_ns: int) -> list[float]:
+    return short((stamps_ns - start_ns) * 1e-9 / FRAME_S)
+
+
+def _robot(
+    said: Path, covariances: Float[np.ndarray, "K 3 3"], true: Path, start_ns: int
+) -> Figures:
+    """The curve of a robot's position error over frames, and its lines."""
+    thinned = max(1, -(-len(said.poses) // _LINE_POINTS))
+    end_ns = int(said.stamps_ns[-1]) if len(said.stamps_ns) else 0
+    there = (true.stamps_ns >= start_ns) & (true.stamps_ns <= end_ns)
+    every = max(1, -(-int(there.sum()) // _LINE_POINTS))
+    found = pose_errors(said, covariances, true)
+    return {
+        "line": said.poses[::thinned, :2].round(3).tolist(),
+        "truth": true.poses[there][::every, :2].round(3).tolist(),
+        "end_block": covariances[-1, :2, :2].tolist() if len(covariances) else None,
+        "curve": None
+        if found is None
+        else {
+            "time_s": _frames(found.stamps_ns, start_ns),
+            "error_m": short(np.hypot(found.errors[:, 0], found.errors[:, 1])),
+            "sigma_m": short(np.hypot(found.sigmas[:, 0], found.sigmas[:, 1])),
+            "nees": [found.nees_per_dof],
+        },
+    }
+
+
+def _map(
+    samples: list[Sample], robot: str, truth: Mapping[int, np.ndarray], start_ns: int
+) -> Figures | None:
+    """The mean distance of the landmarks from the truth over frames, and the last map."""
+    fused, own = (
+        [
+            each
+            for each in messages(samples, key)
+            if isinstance(each, m.FusedMap | m.MapEstimate) and each.ids
+        ]
+        for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot))
+    )
+    maps = fused or own
+    if not maps:
+        return None
+    errors, sigmas = [], []
+    for each in maps:
+        ids, means = translate.landmarks_of(each)
+        true = np.array([truth[int(landmark)] for landmark in ids])
+        blocks = translate.landmark_blocks_of(each)
+        errors.append(float(np.hypot(*(means - true).T).mean()))
+        sigmas.append(float(np.sqrt(np.trace(blocks, axis1=1, axis2=2)).mean()))
+    _, means = translate.landmarks_of(maps[-1])
+    return {
+        "curve": {
+            "time_s": _frames(np.array([each.stamp_ns for each in maps]), start_ns),
+            "error_m": short(np.array(errors)),
+            "sigma_m": short(np.array(sigmas)),
+        },
+        "means": means.tolist(),
+        "blocks": translate.landmark_blocks_of(maps[-1]).tolist(),
+    }
+
+
+def _clouds(samples: list[Sample], robot: str) -> list[list[list[float]]]:
+    """The positions of the particles at eight times."""
+    clouds = [
+        floats(message.poses, "poses").reshape(-1, 3)[:, :2].round(3).tolist()
+        for message in (opened(s)[2] for s in samples if s.key == ch.PARTICLES.key(robot))
+        if isinstance(message, m.ParticleCloud)
+    ]
+    every = max(1, len(clouds) // 8)
+    return clouds[::-1][::every][:8]

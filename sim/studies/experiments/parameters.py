@@ -1,0 +1,62 @@
+"""The parameters of the runs in words: where they differ from a built-in scenario."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from sim.scenarios.scenario import load, with_options
+from sim.studies.experiments.task import Task
+
+IN_THE_LABEL = frozenset({"name", "team", "seed", "estimator", "fusion", "robots.id"})
+"""Said by a run's label, or of every robot its own."""
+COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central.fusion"})
+
+
+def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
+    """The runs that differ in their seed only: their label, how many, and their parameters."""
+    found: dict[tuple[str, str], int] = {}
+    for task in tasks:
+        label = task.label.rpartition(", seed ")[0] or task.label
+        kind = label, "; ".join(_said(task))
+        found[kind] = found.get(kind, 0) + 1
+    return [(label, count, said) for (label, said), count in found.items()]
+
+
+def _said(task: Task) -> Iterator[str]:
+    """Its scenarios by their differences from the built-in ones, all else as it is."""
+    yield task.work.rpartition(".")[2]
+    for name, value in task.parameters.items():
+        if isinstance(value, Mapping) and "robots" in value:
+            changes = ", ".join(_differences(value)) or "as it is"
+            yield f"{name}: {value['name']}, {changes}"
+        else:
+            yield f"{name} = {json.dumps(value, ensure_ascii=False)}"
+
+
+def _differences(scenario: Mapping[str, Any]) -> Iterator[str]:
+    """`path = value` for what is not as in the built-in scenario of the same name."""
+    built_in = msgspec.to_builtins(
+        with_options(load(scenario["name"]), robots=len(scenario["robots"]))
+    )
+    before = dict(_flat(built_in, ""))
+    for path, value in _flat(scenario, ""):
+        if path not in IN_THE_LABEL | COPIES and before.get(path) != value:
+            yield f"{path} = {value}"
+
+
+def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
+    """Leaves by their dotted paths; those of the robots as one where all are alike."""
+    if isinstance(value, Mapping):
+        for name, each in value.items():
+            yield from _flat(each, f"{path}.{name}" if path else name)
+    elif path == "robots":
+        leaves: dict[str, list[str]] = {}
+        for robot in value:
+            for name, leaf in _flat(robot, path):
+                leaves.setdefault(name, []).append(leaf)
+        for name, of_robots in leaves.items():
+            yield name, " | ".join(dict.fromkeys(of_robots))
+    else:
+        yield path, f"{value:.6g}" if isinstance(value, float) else json.dumps(value)

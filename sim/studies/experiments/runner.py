@@ -1,0 +1,124 @@
+"""Runs an experiment: what is kept already is taken, the rest is computed, all is made known."""
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import cast
+
+from sim.datasets.tables import opened
+from sim.studies.experiments.catalogue import Entry
+from sim.studies.experiments.experiment import Dataset, Experiment, Options, Outcome, Results
+from sim.studies.experiments.parameters import kinds_of
+from sim.studies.experiments.store import Store
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.workers import Done, run
+
+FAILURES = "failures.txt"
+"""Beside the results: the tracebacks of the last command's failed runs."""
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Concluded:
+    """An experiment's outcome, and the runs of it that failed, with their errors.
+
+    kinds: runs that differ in their seed only, how many, and their parameters.
+    """
+
+    entry: Entry
+    options: Options
+    outcome: Outcome
+    runs: int
+    failed: Mapping[str, str] = field(default_factory=dict)
+    kinds: Sequence[tuple[str, int, str]] = ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An experiment, what it is asked, and its tasks."""
+
+    entry: Entry
+    options: Options
+    experiment: Experiment
+    tasks: tuple[Task, ...]
+
+
+Progress = Callable[[Sequence[Task], int], AbstractContextManager[Callable[[Done], None]]]
+"""Given the tasks to compute and how many are kept: what hears of every finished task."""
+
+
+def planned(entry: Entry, options: Options) -> Plan:
+    """The experiment's tasks; raises ScenarioError, DatasetError."""
+    name, _, attribute = entry.module.partition(":")
+    module = import_module(f"sim.studies.experiments.{name}")
+    experiment = cast(Experiment, getattr(module, attribute) if attribute else module)
+    return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
+
+
+def computed(
+    plans: Sequence[Plan],
+    folder: Path,
+    jobs: int,
+    progress: Progress,
+) -> list[Concluded]:
+    """The outcomes of all plans; their tasks run together, one that several need runs once."""
+    tasks = {task.name: task for plan in plans for task in plan.tasks}
+    store = Store(folder)
+    results = store.found(tasks.values())
+    missing = [task for name, task in tasks.items() if name not in results]
+    failures: dict[str, Done] = {}
+    with progress(missing, len(results)) as tell:
+        for done in run(missing, jobs):
+            if done.result is None:
+                failures[done.task.name] = done
+            else:
+                store.keep(done.task, done.result, done.seconds)
+                results[done.task.name] = done.result
+            tell(done)
+    _write_failures(folder / FAILURES, list(failures.values()))
+    return [_concluded(plan, Results(results), failures) for plan in plans]
+
+
+def _concluded(plan: Plan, results: Results, failures: Mapping[str, Done]) -> Concluded:
+    failed = {task.label: failures[task.name].error for task in plan.tasks if task.name in failures}
+    outcome = plan.experiment.outcome(plan.options, results)
+    kinds = kinds_of(plan.tasks)
+    return Concluded(plan.entry, plan.options, outcome, len(plan.tasks), failed, kinds)
+
+
+def _write_failures(path: Path, failures: Sequence[Done]) -> None:
+    path.unlink(missing_ok=True)
+    if failures:
+        texts = [f"{done.task.label}\n{done.details or done.error}\n" for done in failures]
+        path.write_text("\n".join(texts), encoding="utf-8")
+
+
+def dataset(path: Path) -> Dataset:
+    """A data set with its checksum; raises DatasetError where there is none."""
+    with opened(str(path), "Barcodes.dat"):
+        pass
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    digest = hashlib.sha256()
+    for file in files:
+        if file is not path:
+            digest.update(f"{file.relative_to(path)}\n".encode())
+        for block in _blocks(file):
+            digest.update(block)
+    return Dataset(path.stem if path.is_file() else path.name, path.resolve(), digest.hexdigest())
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            yield block
+
+
+def cores() -> int:
+    """The processor's cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,208 @@
+"""All estimators and rules on the same readings, and the thesis' tables 2.1 and 2.2 in numbers.
+
+The thesis praises and blames the methods in words; here is what was measured for those that are
+implemented, on its own world and on the one with an accurate sensor. The methods that are not
+implemented are named.
+"""
+
+from typing import NamedTuple
+
+from sim.scenarios.scenario import load, with_options
+from sim.studies.experiments.experiment import Options, Outcome, Results, Table
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import (
+    OURS,
+    Figures,
+    Shown,
+    cells_of,
+    named,
+    over_seeds,
+    team_task,
+)
+from sim.studies.experiments.xu import with_particles
+from team.config import Estimator, FusionRule
+from team.pairs import PAIRS
+
+WORLDS = ("thesis", "thesis-b")
+MOST_SEEDS = 12
+"""The methods differ by factors, and there are two dozen pairs of a second or two each."""
+PARTICLES = (50, 200, 1000)
+SHOWN: Shown = (
+    ("rmse", "map [m]", "{:.3f}"),
+    ("rmse_aligned", "aligned", "{:.3f}"),
+    ("online_position_rmse", "pose [m]", "{:.2f}"),
+    ("online_position_rmse_aligned", "aligned", "{:.2f}"),
+    ("position_rmse", "smoothed", "{:.2f}"),
+    ("position_rmse_aligned", "aligned", "{:.2f}"),
+    ("nees", "NEES/dof", "{:.3g}"),
+    ("in_band", "in band", "{:.0%}"),
+    ("online_pose_nees", "pose NEES", "{:.3g}"),
+    ("bytes_per_step", "B/step", "{:.0f}"),
+    ("us_per_step", "µs/step", "{:.0f}"),
+    ("ms_per_fusion", "ms/fusion", "{:.2f}"),
+)
+
+
+class Said(NamedTuple):
+    """A method of tables 2.1 and 2.2: what the thesis says, and the pair that stands for it."""
+
+    method: str
+    uncertainty: str
+    online: str
+    pros: str
+    cons: str
+    pair: tuple[Estimator, FusionRule] | None
+
+
+POSTERIOR, LIKELIEST = "posterior poses and map", "maximum likelihood map"
+SAID = (
+    Said("Kalman filter / EKF", POSTERIOR, "yes", "handles uncertainty, converges",
+         "computational complexity", ("ekf-slam", "alone")),
+    Said("graph based", LIKELIEST, "no", "linear memory",
+         "needs the whole path", None),
+    Said("expectation maximisation", LIKELIEST, "no", "optimal map, data association",
+         "needs the whole path", None),
+    Said("sparse extended information filter", POSTERIOR, "yes", "fast for large maps",
+         "data association", None),
+    Said("thin junction tree filter", POSTERIOR, "yes", "less computation",
+         "size of the tree", None),
+    Said("particle filter / FastSLAM", POSTERIOR, "yes", "low computational complexity",
+         "over-confident, needs many particles", ("fastslam1", "alone")),
+    Said("sub-maps", POSTERIOR, "yes", "less memory, large places",
+         "many maps to merge", OURS),
+    Said("hybrid, as in the thesis", POSTERIOR, "yes", "less memory",
+         "data association", ("hybrid-thesis", "alone")),
+)  # fmt: skip
+BATCH = "graph based"
+"""The batch MAP is this method's optimum; it runs after the team has ended."""
+
+
+def tasks(options: Options) -> list[Task]:
+    """Every pair in every world, and FastSLAM with few and many particles."""
+    pairs = [task for world in WORLDS for pair in PAIRS for task in _runs(world, pair, options)]
+    return pairs + [task for count in PARTICLES for task in _fastslam(count, options)]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """One table a world, and the two of the thesis with numbers."""
+    figures = {world: _world(world, options, results) for world in WORLDS}
+    seeds = len(options.seeds[:MOST_SEEDS])
+    tables = [
+        Table(
+            f"{world}, two robots, {seeds} seeds",
+            ("estimator + rule", *(heading for _, heading, _ in SHOWN)),
+            tuple((name, *cells_of(of_pair, SHOWN)) for name, of_pair in of_world.items()),
+            "without a fused map the robots' own; pose: online; bytes: from a robot to the centre; "
+            "times: of a processor",
+        )
+        for world, of_world in figures.items()
+    ]
+    particles = {
+        str(count): _timed(over_seeds(results.of_all(_fastslam(count, options))))
+        for count in PARTICLES
+    }
+    tables += [_table_2_1(figures["thesis"]), _table_2_2(figures["thesis"], particles)]
+    absent = ", ".join(s.method for s in SAID if s.pair is None and s.method != BATCH)
+    return Outcome(
+        "all estimators and rules on the same readings",
+        {"survey": figures, "fastslam_particles": particles},
+        tuple(tables),
+        remarks=(
+            f"Not implemented, so without numbers: {absent}.",
+            "Associations are known here, as in the thesis' own experiments: what tables 2.1 and "
+            "2.2 say of data association is not measured.",
+        ),
+    )
+
+
+def _world(world: str, options: Options, results: Results) -> dict[str, Figures]:
+    """The figures of each pair, and of the batch MAP."""
+    figures = {}
+    for pair in PAIRS:
+        runs = results.of_all(_runs(world, pair, options))
+        if runs:
+            figures[named(*pair)] = _timed(over_seeds(runs))
+        batches = [run["batch"] for run in runs if "batch" in run]
+        if batches:
+            figures["batch"] = over_seeds(batches)
+    return figures
+
+
+def _timed(figures: Figures) -> Figures:
+    step, fusion = figures.get("seconds_per_step"), figures.get("seconds_per_fusion")
+    return figures | {
+        "us_per_step": None if step is None else 1e6 * step,
+        "ms_per_fusion": None if fusion is None else 1e3 * fusion,
+    }
+
+
+def _runs(world: str, pair: tuple[Estimator, FusionRule], options: Options) -> list[Task]:
+    """The same runs as those of `accuracy`."""
+    return [
+        team_task(
+            with_options(load(world), seed=seed, estimator=pair[0], fusion=pair[1]),
+            batch=pair == OURS,
+        )
+        for seed in options.seeds[:MOST_SEEDS]
+    ]
+
+
+def _fastslam(particles: int, options: Options) -> list[Task]:
+    return [
+        team_task(
+            with_particles(
+                with_options(load("thesis"), seed=seed, estimator="fastslam1", fusion="alone"),
+                particles,
+            ),
+            note=f"{particles} particles",
+        )
+        for seed in options.seeds[:MOST_SEEDS]
+    ]
+
+
+def _table_2_1(figures: dict[str, Figures]) -> Table:
+    """Uncertainty and online, as printed and as measured."""
+    rows = []
+    for said in SAID:
+        found = _found(said, figures)
+        measured = cells_of(
+            found,
+            (("nees", "", "{:.3g}"), ("online_pose_nees", "", "{:.3g}"),
+             ("us_per_step", "", "{:.0f}")),
+        )  # fmt: skip
+        rows.append((said.method, said.uncertainty, said.online, *measured))
+    return Table(
+        "table 2.1 of the thesis, with what was measured on `thesis`",
+        ("method", "uncertainty", "online", "map NEES/dof", "pose NEES/dof", "µs/step"),
+        tuple(rows),
+        "NEES: 1 where the stated uncertainty is right; graph based: the batch MAP",
+    )
+
+
+def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Table:
+    """Adjectives beside numbers."""
+    columns: Shown = (
+        ("rmse", "map [m]", "{:.2f}"),
+        ("nees", "NEES/dof", "{:.3g}"),
+        ("us_per_step", "µs/step", "{:.0f}"),
+        ("bytes_per_step", "B/step", "{:.0f}"),
+    )
+    rows = [
+        (said.method, said.pros, said.cons, *cells_of(_found(said, figures), columns))
+        for said in SAID
+    ]
+    rows += [
+        (f"… with {count} particles", "", "", *cells_of(found, columns))
+        for count, found in particles.items()
+    ]
+    return Table(
+        "table 2.2 of the thesis, with what was measured on `thesis`",
+        ("method", "pros", "cons", *(heading for _, heading, _ in columns)),
+        tuple(rows),
+    )
+
+
+def _found(said: Said, figures: dict[str, Figures]) -> Figures:
+    if said.method == BATCH:
+        return figures.get("batch", {})
+    return {} if said.pair is None else figures.get(named(*said.pair), {})

@@ -1,0 +1,305 @@
+"""One run of a team in memory, judged against the truth and the batch optimiser, as a task."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from statistics import fmean, median
+from typing import Any, NamedTuple
+
+import msgspec
+
+from central.desk.evaluation.evaluation import Evaluation, RobotResult, evaluate
+from central.node import CentralNode
+from sim.in_memory.team import run_team
+from sim.scenarios.scenario import Scenario, loads, with_options
+from sim.scenarios.source import streams_of
+from sim.studies.batch_reference.reference import Limit, LimitError, NoiseKind, batch_map
+from sim.studies.experiments.experiment import Dataset
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.true_minimum import true_minimum
+from sim.world.config import SimulatedWorld
+from sim.world.streams import WorldStreams
+from team.config import Estimator, FusionRule
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample
+
+Figures = dict[str, Any]
+Shown = Sequence[tuple[str, str, str]]
+"""Columns of a table: the figure's name, the heading, the format."""
+OURS: tuple[Estimator, FusionRule] = ("hybrid", "join")
+_HYBRID_STEP_S, _STEP_S = 2e-3, 5e-4
+"""Of a robot's step, about."""
+_STEPS_TO_A_WAY_POINT = 22
+_DOUBLING_LANDMARKS = 100
+"""With so many more a step takes once more its time."""
+_UTIAS_S, _UTIAS_BATCH_S = 40.0, 160.0
+
+
+def team_task(
+    scenario: Scenario,
+    *,
+    batch: bool = False,
+    minimum: bool = False,
+    dataset: Dataset | None = None,
+    note: str = "",
+    noise: NoiseKind = "white",
+) -> Task:
+    """A run of this scenario. batch: with the batch MAP of the same readings beside it.
+
+    minimum: with how the map's minimum lies to the truth. note: what the scenario's name does not
+    say. noise: the batch's.
+    """
+    pair = named(scenario.estimator, scenario.fusion)
+    place = scenario.name if dataset is None else dataset.name
+    place += f", {note}" if note else ""
+    return Task(
+        "sim.studies.experiments.team_runs:team_run",
+        {"scenario": msgspec.to_builtins(scenario), "batch": batch, "noise": noise}
+        | ({"minimum": True} if minimum else {})
+        | ({} if dataset is None else {"sha256": dataset.sha256}),
+        f"{place}, {len(scenario.robots)} robots, {pair}, seed {scenario.seed}",
+        expected_s(scenario, batch=batch, minimum=minimum),
+        {} if dataset is None else {"path": str(dataset.path)},
+    )
+
+
+def expected_s(scenario: Scenario, *, batch: bool = False, minimum: bool = False) -> float:
+    """About how many seconds of a processor a run takes: long ones begin first."""
+    world = scenario.world
+    if not isinstance(world, SimulatedWorld):
+        return _UTIAS_S + batch * _UTIAS_BATCH_S
+    steps = world.steps
+    if world.way_point_count:
+        steps = min(steps, _STEPS_TO_A_WAY_POINT * world.way_point_count)
+    a_step = _HYBRID_STEP_S if scenario.estimator == "hybrid" else _STEP_S
+    landmarks = world.landmark_count or len(world.landmarks)
+    a_step *= (1.0 + landmarks / _DOUBLING_LANDMARKS) * (1.0 + batch) * (1.0 + minimum)
+    return a_step * steps * len(scenario.robots)
+
+
+def named(estimator: str, fusion: str) -> str:
+    """A pair as users write it."""
+    return f"{estimator} + {fusion}"
+
+
+def team_run(
+    scenario: Mapping[str, Any],
+    batch: bool,
+    noise: NoiseKind = "white",
+    minimum: bool = False,
+    sha256: str = "",
+    path: str | None = None,
+) -> Figures:
+    """The figures of one run; `batch` and `minimum`, if asked for, hold those of their own.
+
+    sha256: of the data set at `path`; it stands for it in the task's name.
+    """
+    resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
+    run = TimedRun()
+    # Provisional maps and priors are the bulk of a large team's log, and nobody looks at them here.
+    bulk = {ch.FUSED_MAP.key(), *(ch.PRIOR.key(robot.id) for robot in resolved.robots)}
+    samples = [sample for sample in run.samples(resolved) if sample.key not in bulk]
+    evaluation = evaluate(samples)
+    figures: Figures = {"seed": resolved.seed} | team_figures(evaluation) | run.figures()
+    if minimum:
+        found = true_minimum(samples, evaluation)
+        if found is not None:
+            told = {"wrong": found.wrong, "excluded": found.excluded}
+            figures["minimum"] = found._asdict() | told
+    if batch:
+        try:
+            figures["batch"] = limit_figures(batch_map(samples, noise))
+        except LimitError as error:
+            figures["batch_error"] = str(error)
+    return figures
+
+
+class TimedRun:
+    """A team in memory, and the CPU time [s] that its robots and its centre spend on messages."""
+
+    def __init__(self) -> None:
+        self._robots = 0.0
+        self._centre = 0.0
+        self._steps = 0
+        self._fusions = 0
+
+    def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
+        """Run the team; its log. streams: what the world says; None: as the scenario has it."""
+        readings = streams_of(scenario) if streams is None else streams
+        odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
+        for sample in run_team(scenario, readings, *self._nodes()):
+            self._steps += sample.key in odometry
+            self._fusions += sample.key == ch.FUSED_MAP.key()
+            yield sample
+
+    def figures(self) -> Figures:
+        """The times in all, per odometry interval and per fused map."""
+        return {
+            "robot_seconds": self._robots,
+            "centre_seconds": self._centre,
+            "seconds_per_step": self._robots / self._steps if self._steps else None,
+            "seconds_per_fusion": self._centre / self._fusions if self._fusions else None,
+        }
+
+    def _nodes(self) -> tuple[type[RobotNode], type[CentralNode]]:
+        """The nodes with a watch on what they do with a message."""
+        run = self
+
+        class TimedRobot(RobotNode):
+            def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+                begin = time.process_time()
+                out = super().handle(message, now_ns)
+                run._robots += time.process_time() - begin
+                return out
+
+        class TimedCentre(CentralNode):
+            def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+                begin = time.process_time()
+                out = super().handle(message, now_ns)
+                run._centre += time.process_time() - begin
+                return out
+
+        return TimedRobot, TimedCentre
+
+
+def team_figures(evaluation: Evaluation) -> Figures:
+    """The figures of a run; None where there is nothing to judge. Means are over the robots.
+
+    Without a fused map those of a map are over the robots' own.
+    """
+    robots = list(evaluation.robots.values())
+    fused = evaluation.map
+    own = [robot.own_map for robot in robots if robot.own_map is not None]
+    maps = own if fused is None or fused.errors is None else [fused.errors]
+    shapes = [errors.shape for errors in maps if errors.shape is not None]
+    steps = sum(r.consumption.steps for r in robots)
+    sent = sum(r.uplink_bytes or 0 for r in robots)
+    return {
+        "rmse": rms(errors.rmse_m for errors in maps),
+        "rmse_aligned": rms(errors.aligned_rmse_m for errors in maps),
+        "nees": mean(errors.nees_per_dof for errors in maps),
+        "in_band": mean(float(errors.in_band) for errors in maps),
+        "landmarks": mean(float(errors.count) for errors in maps),
+        "coverage_raw": mean(errors.coverage for errors in maps),
+        "shape_nees": mean(shape.nees_per_landmark for shape in shapes),
+        "coverage": mean(shape.coverage for shape in shapes),
+        "cost_per_dof": None if evaluation.map is None else evaluation.map.cost_per_dof,
+        "covariance_scale": None if fused is None else fused.covariance_scale,
+        "position_rmse": rms(r.smoothed.position_rmse_m for r in robots if r.smoothed),
+        "position_rmse_aligned": rms(r.aligned_rmse_m for r in robots),
+        "final_pose_nees": mean(r.final_pose_nees_per_dof for r in robots),
+        "online_position_rmse": rms(r.online.position_rmse_m for r in robots if r.online),
+        "online_position_rmse_aligned": rms(r.online_aligned_rmse_m for r in robots),
+        "online_pose_nees": mean(r.online.nees_per_dof for r in robots if r.online),
+        "bytes_per_step": sent / steps if steps else None,
+        "each_once": all(
+            r.consumption.each_once and r.consumption.consumed == r.consumption.published
+            for r in robots
+        ),
+        "final_map_sha256": None if evaluation.map is None else evaluation.map.payload_sha256,
+        "not_joined": [] if fused is None else [r for r in fused.reasons if "not joined" in r],
+        "withdrawn": [] if fused is None else list(fused.withdrawn),
+        "said": [] if fused is None else list(fused.reasons),
+        "robots": {name: _robot_figures(robot) for name, robot in evaluation.robots.items()},
+    }
+
+
+def _robot_figures(robot: RobotResult) -> Figures:
+    """One robot's errors [m]; first_pose_chi2: of the motion of
+    the frame that its first smoothed pose is off by, 3 degrees of freedom.
+    """
+    smoothed, online = robot.smoothed, robot.online
+    return {
+        "position_rmse": None if smoothed is None else smoothed.position_rmse_m,
+        "position_rmse_aligned": robot.aligned_rmse_m,
+        "pose_nees": None if smoothed is None else smoothed.nees_per_dof,
+        "first_pose_chi2": None if smoothed is None else float(smoothed.motion_nees[0]),
+        "online_position_rmse": None if online is None else online.position_rmse_m,
+        "online_pose_nees": None if online is None else online.nees_per_dof,
+    }
+
+
+def limit_figures(limit: Limit) -> Figures:
+    """The figures of the batch MAP under the same names."""
+    errors = limit.errors
+    shape = None if errors is None else errors.shape
+    return {
+        "rmse": None if errors is None else errors.rmse_m,
+        "rmse_aligned": None if errors is None else errors.aligned_rmse_m,
+        "nees": None if errors is None else errors.nees_per_dof,
+        "in_band": None if errors is None else errors.in_band,
+        "shape_nees": None if shape is None else shape.nees_per_landmark,
+        "coverage": None if shape is None else shape.coverage,
+        "position_rmse": rms(limit.position_rmse_m.values()),
+        "final_pose_nees": mean(limit.final_pose_nees_per_dof.values()),
+    }
+
+
+class Figure(NamedTuple):
+    """A figure over seeds: its name, the run's figure that it is made of, and how."""
+
+    name: str
+    source: str
+    over_seeds: Callable[[Iterable[float | None]], float | None]
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """The mean of the values that there are."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
+
+
+def middle(values: Iterable[float | None]) -> float | None:
+    """The median of the values that there are."""
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
+def rms(values: Iterable[float | None]) -> float | None:
+    """The root of the mean square of the values that there are."""
+    square = mean(None if value is None else value * value for value in values)
+    return None if square is None else square**0.5
+
+
+OVER_SEEDS = (
+    Figure("rmse", "rmse", rms),
+    Figure("rmse_aligned", "rmse_aligned", rms),
+    Figure("nees", "nees", mean),
+    Figure("nees_median", "nees", middle),
+    Figure("in_band", "in_band", mean),
+    Figure("shape_nees", "shape_nees", mean),
+    Figure("coverage", "coverage", mean),
+    Figure("coverage_raw", "coverage_raw", mean),
+    Figure("cost_per_dof", "cost_per_dof", mean),
+    Figure("covariance_scale", "covariance_scale", mean),
+    Figure("position_rmse", "position_rmse", rms),
+    Figure("position_rmse_aligned", "position_rmse_aligned", rms),
+    Figure("final_pose_nees", "final_pose_nees", mean),
+    Figure("online_position_rmse", "online_position_rmse", rms),
+    Figure("online_position_rmse_aligned", "online_position_rmse_aligned", rms),
+    Figure("online_pose_nees", "online_pose_nees", mean),
+    Figure("bytes_per_step", "bytes_per_step", mean),
+    Figure("each_once", "each_once", mean),
+    Figure("robot_seconds", "robot_seconds", mean),
+    Figure("centre_seconds", "centre_seconds", mean),
+    Figure("seconds_per_step", "seconds_per_step", mean),
+    Figure("seconds_per_fusion", "seconds_per_fusion", mean),
+)
+"""Errors as the root of the mean square over the seeds, all else as the mean."""
+
+
+def over_seeds(runs: Sequence[Figures]) -> Figures:
+    """The figures of several runs, under the runs' names, with how many there are."""
+    return {"seeds": len(runs)} | {
+        figure.name: figure.over_seeds(run.get(figure.source) for run in runs)
+        for figure in OVER_SEEDS
+        if any(figure.source in run for run in runs)
+    }
+
+
+def cells_of(figures: Figures, shown: Shown) -> list[str]:
+    """A row of a table; a dash where there is no figure."""
+    return [
+        "–" if figures.get(name) is None else form.format(figures[name]) for name, _, form in shown
+    ]

@@ -1,0 +1,158 @@
+"""Is a map in the minimum that the truth lies in? Asked of the cost, not of the covariance.
+
+An ellipsoid is exceeded wherever the valley of the cost is curved, though the minimum is the right
+one. So the final map's own cost is asked three things: whether a solution that starts at the truth
+ends lower, whether it ends in another place that is about as likely, and by how much the cost rises
+where the truth is held fixed (the likelihood ratio: χ² of the numbers held, however they are
+written down). The cost and its minima are those of `plain_cost`, which shares nothing with the map
+joining that it judges: the map's state is taken as it is, and is wrong too where it has not come
+to rest.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.errors import Path, interpolated
+from central.desk.evaluation.evaluation import Evaluation
+from central.desk.verification.recorded import Recorded
+from central.tick_fold import TickFold
+from sim.studies.experiments.plain_cost import PlainCost
+from team import translate
+from team.estimation.consistency import chi2_quantile
+from team.estimation.map_joining.gauss_newton import Island
+from team.estimation.map_joining.joining import Fold, converged
+from team.wire import messages as m
+from team.wire.bus import Sample
+
+LOWER = 1.0
+"""A cost that is lower by more than this belongs to another minimum."""
+LIKELY = 0.999
+"""Quantile of χ² beyond which a place, or the truth, is excluded."""
+NEARBY = 3
+"""Starts about the truth, beside the truth itself."""
+NEARBY_RAD = 0.1
+"""… whose headings are off by about so much."""
+Values = Float[np.ndarray, " _"]
+
+
+class TrueMinimum(NamedTuple):
+    """How the map's minimum lies to the truth.
+
+    lower: by how much a solution from the truth has less cost. elsewhere: it ends in another place
+    that is likely. rise: of the cost with the landmarks and each robot's first end of a submap held
+    at the truth; dof: how many numbers that holds.
+    """
+
+    lower: float
+    elsewhere: bool
+    rise: float
+    dof: int
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the map is in another minimum than the truth."""
+        return self.lower > LOWER or self.elsewhere
+
+    @property
+    def excluded(self) -> bool:
+        """Whether the submaps exclude the truth with 99.9 %."""
+        return self.rise > float(chi2_quantile(LIKELY, self.dof))
+
+
+def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | None:
+    """Of the final map of a run under `join`; None without a start that is known."""
+    fold = final_fold(samples)
+    if run.map is None or not fold.starts:
+        return None
+    landmarks = dict(
+        zip(run.map.ids[run.map.known].tolist(), run.map.truth[run.map.known], strict=True)
+    )
+    return judged(fold.main, landmarks, {name: each.truth for name, each in run.robots.items()})
+
+
+def final_fold(samples: Iterable[Sample]) -> Fold:
+    """The centre's final fold, from the submaps and sightings that a log has."""
+    log = Recorded()
+    for sample in samples:
+        log.take(sample)
+    ticks = TickFold(log.central_config()[0])
+    sightings = log.sightings()
+    for stream, readings in log.readings.items():
+        start = readings.get(0)
+        value = translate.start_of(start) if isinstance(start, m.Start) else None
+        if value is not None:
+            ticks.know_start(value)
+        for sequence, submap in sorted(log.submaps().get(stream, {}).items()):
+            ticks.add(submap, b"", sightings.get((*stream, sequence), ()))
+    ticks.take_until(float("inf"))
+    return converged(ticks.fold, ticks.settings)
+
+
+def judged(
+    island: Island,
+    landmarks: Mapping[int, Float[np.ndarray, "2"]],
+    paths: Mapping[str, Path],
+) -> TrueMinimum:
+    """Of an island in the frame of the truth, as it is; plain squares without biases."""
+    graph, settings = island.graph, island.settings
+    if settings.robust_c is not None:
+        raise NotImplementedError("the judge has plain squares: central.robust_c must be left out")
+    if settings.joined_ranges:
+        raise NotImplementedError("the judge knows no central.joined_ranges: leave it out")
+    fixed = np.repeat(graph.fixed, np.diff(graph.offset))
+    cost = PlainCost(graph, settings.covariance_factor, fixed)
+    ours = cost.of(island.state)
+    truth, known = _at_truth(island, landmarks, paths)
+    headings = graph.headings[~fixed[graph.headings]]
+    rng = np.random.default_rng(0)
+    found = [cost.solved(truth)]
+    for _ in range(NEARBY):
+        near = truth.copy()
+        near[headings] += NEARBY_RAD * rng.normal(size=len(headings))
+        found.append(cost.solved(near))
+    ends = found[0]
+    away = ends.state - island.state
+    away[graph.headings] = np.angle(np.exp(1j * away[graph.headings]))
+    whitened = cost.jacobian(island.state) @ away[cost.free]
+    place = float(chi2_quantile(LIKELY, 3))
+    other = ends.at_rest and whitened @ whitened > place and ends.cost - ours < place
+    firsts = {nodes[1] for nodes in graph.streams.values()}
+    held = sorted(({*graph.landmarks.values()} | firsts) & known)
+    spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in held]
+    pinned = fixed.copy()
+    pinned[np.concatenate([np.zeros(0, np.int64), *spans])] = True
+    given = PlainCost(graph, settings.covariance_factor, pinned)
+    from_ours = np.where(pinned, truth, island.state)
+    rise = min(given.solved(state).cost for state in (truth, from_ours)) - ours
+    dof = len(cost.free) - len(given.free)
+    lower = ours - min(each.cost for each in found)
+    return TrueMinimum(lower, bool(other), rise, dof)
+
+
+def _at_truth(
+    island: Island, landmarks: Mapping[int, Float[np.ndarray, "2"]], paths: Mapping[str, Path]
+) -> tuple[Values, set[int]]:
+    """The state with every node at its true value, and the nodes of which that is known."""
+    graph, state = island.graph, island.state.copy()
+    known: set[int] = set()
+
+    def place(node: int, value: Values) -> None:
+        state[graph.offset[node] : graph.offset[node + 1]] = value
+        known.add(node)
+
+    for id_, node in graph.landmarks.items():
+        if id_ in landmarks:
+            place(node, landmarks[id_])
+    for contribution, nodes, _ in graph.submaps:
+        path = paths[contribution.robot]
+        stamps = np.array([contribution.end_ns, *contribution.local.node_stamps.tolist()])
+        poses, there = interpolated(path, stamps)
+        for node, pose, told in zip(nodes[1:], poses, there, strict=False):
+            if told:
+                place(int(node), pose)
+        if contribution.sequence == 0 and not graph.fixed[nodes[0]] and len(path.poses):
+            place(int(nodes[0]), path.poses[0])
+    return state, known

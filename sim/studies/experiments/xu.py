@@ -1,0 +1,316 @@
+"""What the experiments after W. Xu's thesis have in common: its world, its methods, its curves.
+
+Its world is the built-in scenario `thesis`, with the 50 particles of its section 4.4.2. A figure of
+the thesis is one run; ours is the median of many seeds with the band that holds four fifths of
+them, and one run picked out with its 3σ bound.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.studies.experiments.curves import curves_task
+from sim.studies.experiments.drawing import BAND, Curves, figure, ruled, spread
+from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures
+from sim.world.config import SimulatedWorld
+from team.config import MotionNoise
+
+if TYPE_CHECKING:  # Matplotlib takes half a second to import
+    from matplotlib.axes import Axes
+
+PARTICLES = 50
+STEP_S = 1.0
+CODED_NOISE = (0.05**2, math.radians(3.0) ** 2)
+CODED_BEARING_SIGMA = math.sqrt(math.pi / 18.0**2)
+
+
+class Method(NamedTuple):
+    """A curve of a figure: its name, the pair that makes it, how many robots, its colour.
+
+    particles: 50, as in the thesis; None: what our scenario has.
+    """
+
+    name: str
+    estimator: str
+    fusion: str
+    robots: int
+    colour: str
+    particles: int | None = PARTICLES
+
+
+EKF = Method("EKF-SLAM", "ekf-slam", "alone", 1, "#009E73")
+FASTSLAM = Method("FastSLAM", "fastslam1", "alone", 1, "#D55E00")
+HYBRID = Method("Hybrid, as written", "hybrid-thesis", "alone", 1, "#0072B2")
+HYBRID_CODED = Method("Hybrid, as coded", "hybrid-thesis-coded", "alone", 1, "#CC79A7")
+OURS = Method("Hybrid, ours", "hybrid", "join", 1, "#111111", None)
+MULTI_FASTSLAM = Method("multi-FastSLAM", "dead-reckoning", "joint-fastslam", 2, "#009E73")
+SINGLE_HYBRID = HYBRID._replace(name="single Hybrid, as written", colour="#D55E00")
+SINGLE_HYBRID_CODED = HYBRID_CODED._replace(name="single Hybrid, as coded", colour="#D55E00")
+MULTI_HYBRID = Method("multi-Hybrid, as written", "hybrid-thesis", "kalman-per-axis", 2, "#0072B2")
+MULTI_CODED = Method(
+    "multi-Hybrid, as coded", "hybrid-thesis-coded", "kalman-per-axis", 2, "#0072B2"
+)
+OUR_TEAM = Method("multi-Hybrid, ours", "hybrid", "join", 2, "#111111", None)
+
+
+Reading = Literal["stated", "exact", "coded"]
+
+
+class Panel(NamedTuple):
+    """One world of a figure, its methods, and what the thesis says of each in metres.
+
+    noise: of the odometry, (m, rad) in a step; None: as the scenario has it.
+    reading: how the thesis is taken. "stated": its text. "exact": the same, but the odometry has no
+    error, while the filters believe that it has. "coded": its appendix' program (`as_coded`).
+    printed: by the method's name, the largest error that the text or the picture names.
+    """
+
+    name: str
+    methods: tuple[Method, ...]
+    printed: Mapping[str, float]
+    noise: tuple[float, float] | None = None
+    reading: Reading = "stated"
+
+
+class ErrorFigure(NamedTuple):
+    """A figure of errors over 500 steps. of: "pose" of robot 1, or "landmark", the first seen."""
+
+    title: str
+    of: str
+    panels: tuple[Panel, ...]
+    remarks: tuple[str, ...]
+
+    def tasks(self, options: Options) -> list[Task]:
+        """Every panel, method and seed."""
+        return [
+            task(panel, method, seed)
+            for panel in self.panels
+            for method in panel.methods
+            for seed in options.seeds
+        ]
+
+    def outcome(self, options: Options, results: Results) -> Outcome:
+        """Medians and bands over the seeds beside the printed figures."""
+        found = {panel.name: self._curves(panel, options, results) for panel in self.panels}
+        rows = [
+            (f"{panel.name}: {method.name}" if panel.name else method.name, *row(panel, method, c))
+            for panel in self.panels
+            for method in panel.methods
+            if (c := found[panel.name].get(method.name)) is not None
+        ]
+        columns = ("method", "printed max [m]", "run's max [m]", "max [m]", "10 … 90 %",
+                   "RMS [m]", "end [m]", "NEES/dof")  # fmt: skip
+        table = Table(
+            f"{self.title}, {len(options.seeds)} seeds",
+            columns,
+            tuple(rows),
+            f"the run: seed {options.seeds[0]}; max, RMS and end: median over the seeds; "
+            "NEES: median, 1 is right",
+        )
+        pictures = [
+            Picture(
+                panel.name.partition(",")[0].replace(" ", "-") or "errors",
+                f"{self.title}{': ' if panel.name else ''}{panel.name}. Above: medians over "
+                f"{len(options.seeds)} seeds and the band of four fifths of them. Below: the run "
+                f"of seed {options.seeds[0]} within its own 3σ bound; dashed: the printed maximum.",
+                drawing(f"{self.title}{': ' if panel.name else ''}{panel.name}", panel, curves),
+            )
+            for panel in self.panels
+            if (curves := found[panel.name])
+        ]
+        figures = {
+            panel.name or "figure": {
+                name: numbers(panel, name, curves) for name, curves in found[panel.name].items()
+            }
+            for panel in self.panels
+        }
+        return Outcome(self.title, figures, (table,), tuple(pictures), remarks=self.remarks)
+
+    def _curves(self, panel: Panel, options: Options, results: Results) -> dict[str, Curves]:
+        """By method, where there is a run of it."""
+        steps = np.arange(1, 501) * STEP_S
+        found = {}
+        for method in panel.methods:
+            runs = results.of_all([task(panel, method, seed) for seed in options.seeds])
+            curves = [curve for run in runs if (curve := _of(run, self.of)) is not None]
+            if curves:
+                found[method.name] = Curves.on(steps, curves, held=self.of == "landmark")
+        return found
+
+
+def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -> Task:
+    """The run of one method in one panel's world; shots: the steps whose maps are drawn."""
+    scenario = with_options(
+        load("thesis"),
+        seed=seed,
+        robots=method.robots,
+        estimator=method.estimator,
+        fusion=method.fusion,
+    )
+    if method.estimator != "hybrid":
+        scenario = _telling(scenario)
+    if method.particles is not None:
+        scenario = with_particles(scenario, method.particles)
+    if panel.noise is not None:
+        scenario = with_noise(scenario, *panel.noise)
+    label = f"thesis, {panel.name}" if panel.name else "thesis"
+    if panel.reading == "stated":
+        return curves_task(scenario, None, label, shots=shots)
+    told = as_coded(scenario) if panel.reading == "coded" else scenario
+    late = panel.reading == "coded"
+    return curves_task(with_noise(told, 0.0, 0.0), told, label, late=late, shots=shots)
+
+
+def _telling(scenario: Scenario) -> Scenario:
+    """A filter over the whole run says its map at every step; it has no windows otherwise."""
+    replace = msgspec.structs.replace
+    robots = tuple(
+        replace(robot, front_end=replace(robot.front_end, window_s=STEP_S))
+        for robot in scenario.robots
+    )
+    return replace(scenario, robots=robots, central=replace(scenario.central, broadcast_s=STEP_S))
+
+
+def as_coded(scenario: Scenario) -> Scenario:
+    """The inputs of the appendix' program, where they differ from section 4.4.2.
+
+    `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` are what a normal number is multiplied by in
+    `add_control_noise`: variances taken for standard deviations, 2.5 mm and 0.16° instead of 5 cm
+    and 3°. `R(2,2) = pi/18^2` is a variance: 5.6°, not 10°. Landmarks are seen from any distance
+    below 20 m. `get_observations(xtrue(:,i), …)` looks from the pose before the motion; the world
+    looks at its start for that.
+    """
+    replace = msgspec.structs.replace
+    assert isinstance(scenario.world, SimulatedWorld)
+    robots = tuple(
+        replace(robot, sensor=replace(robot.sensor, bearing_sigma=CODED_BEARING_SIGMA))
+        for robot in scenario.robots
+    )
+    world = replace(scenario.world, visible_from_m=0.0, look_at_start=True)
+    return with_noise(replace(scenario, robots=robots, world=world), *CODED_NOISE)
+
+
+def with_particles(scenario: Scenario, particles: int) -> Scenario:
+    """The same with so many particles for every robot, and for a filter at the centre."""
+    replace = msgspec.structs.replace
+    robots = tuple(
+        replace(robot, front_end=replace(robot.front_end, particles=particles))
+        for robot in scenario.robots
+    )
+    central = replace(scenario.central, particles=particles)
+    return replace(scenario, robots=robots, central=central)
+
+
+def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
+    """The same with odometry noise of (m, rad) in a step of a second."""
+    replace = msgspec.structs.replace
+    motion = {"forward": MotionNoise(per_s=forward), "turn": MotionNoise(per_s=turn)}
+    robots = tuple(
+        replace(robot, motion=replace(robot.motion, **motion)) for robot in scenario.robots
+    )
+    return replace(scenario, robots=robots)
+
+
+def _of(run: Figures, what: str) -> Figures | None:
+    """The curve of robot 1's pose, or of the landmark."""
+    curve: Figures | None = (
+        run["landmark"] if what == "landmark" else next(iter(run["poses"].values()), None)
+    )
+    return curve
+
+
+def row(panel: Panel, method: Method, curves: Curves) -> tuple[str, ...]:
+    """The figures of one method as cells of a table."""
+    printed = panel.printed.get(method.name)
+    largest = np.nanmax(curves.errors, axis=1)
+    low, middle, high = np.quantile(largest, (BAND[0], 0.5, BAND[1]))
+    return (
+        "–" if printed is None else f"{printed:g}",
+        f"{largest[0]:.2f}",
+        f"{middle:.2f}",
+        f"{low:.2f} … {high:.2f}",
+        f"{np.median(curves.rms()):.2f}",
+        f"{np.median(curves.errors[:, -1]):.2f}",
+        "–" if curves.nees is None else f"{np.median(curves.nees):.3g}",
+    )
+
+
+def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
+    """The figures of one method for machines."""
+    largest = np.nanmax(curves.errors, axis=1)
+    return {
+        "printed_max_m": panel.printed.get(name),
+        "run_max_m": float(largest[0]),
+        "max_m": spread(largest),
+        "rms_m": spread(curves.rms()),
+        "end_m": spread(curves.errors[:, -1]),
+        "nees_per_dof": None if curves.nees is None else spread(curves.nees),
+        "seeds": len(curves.errors),
+        "median_m": [round(value, 4) for value in curves.quantile(0.5).tolist()],
+    }
+
+
+def drawing(
+    title: str, panel: Panel, found: Mapping[str, Curves], unit: str = "step"
+) -> Callable[[Path], None]:
+    """What draws the medians with their bands, and one run within its bound; unit: of the times."""
+
+    def draw(path: Path) -> None:
+        _draw(path, title, panel, found, unit)
+
+    return draw
+
+
+def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], unit: str) -> None:
+    methods = [method for method in panel.methods if method.name in found]
+    picture = figure(11.0, 8.0)
+    grid = picture.add_gridspec(2, len(methods), height_ratios=(1.3, 1.0))
+    above = picture.add_subplot(grid[0, :])
+    for method in methods:
+        curves = found[method.name]
+        low, high = curves.quantile(BAND[0]), curves.quantile(BAND[1])
+        above.fill_between(
+            curves.times_s, low, high, color=method.colour, alpha=0.15, linewidth=0.0
+        )
+        above.plot(
+            curves.times_s, curves.quantile(0.5), color=method.colour, linewidth=1.8,
+            label=method.name,
+        )  # fmt: skip
+    above.set_title(title, fontsize=12)
+    above.set_xlabel(unit)
+    above.set_ylabel("distance to the truth,\nmedian and 10 … 90 % of the seeds [m]")
+    above.set_xlim(0, max(curves.times_s[-1] for curves in found.values()))
+    # One method that is lost in some runs would press all the others to the floor.
+    largest = max(float(np.nanmax(curves.quantile(BAND[1]))) for curves in found.values())
+    middle = max(float(np.nanmax(curves.quantile(0.5))) for curves in found.values())
+    above.set_ylim(0, 1.05 * min(largest, 2.0 * middle))
+    picture.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=10)
+    ruled(above)
+    for column, method in enumerate(methods):
+        below = picture.add_subplot(grid[1, column])
+        _draw_run(below, method, found[method.name], panel.printed.get(method.name))
+        below.set_xlabel(unit)
+        if column == 0:
+            below.set_ylabel("one run, shaded: its 3σ [m]")
+    picture.savefig(path, dpi=120)
+
+
+def _draw_run(axis: "Axes", method: Method, curves: Curves, printed: float | None) -> None:
+    error, bound = curves.errors[0], 3.0 * curves.sigmas[0]
+    axis.fill_between(curves.times_s, 0.0, bound, color=method.colour, alpha=0.15, linewidth=0.0)
+    axis.plot(curves.times_s, error, color=method.colour, linewidth=1.2)
+    most = float(np.nanmax(error))
+    if printed is not None:
+        axis.axhline(printed, color=method.colour, linestyle="--", linewidth=1.0)
+        most = max(most, printed)
+    axis.set_ylim(0, 1.15 * max(most, min(float(np.nanquantile(bound, 0.9)), 3.0 * most)))
+    axis.set_xlim(0, curves.times_s[-1])
+    axis.set_title(method.name, fontsize=10)
+    ruled(axis)

@@ -1,0 +1,429 @@
+"""Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a map that is known.
+
+Its figures 3.2 to 3.5 are those of Fox et al. 2000, without figures. Here the same is shown on the
+thesis' own world: the three steps of the filter one by one at the end of a blind stretch, and a
+start anywhere. The states are those of `team.estimation.baselines.localisation`; the motions and
+readings are what the robot of such a run hears, cut into epochs as at every node.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from central.baselines.team_keyframes import RobotEpoch, TeamEpochs
+from central.desk.evaluation.evaluation import evaluate
+from central.desk.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
+from sim.in_memory.team import run_team
+from sim.scenarios.scenario import Scenario, load, loads, with_options
+from sim.scenarios.source import streams_of
+from sim.studies.experiments.curves import true_landmarks
+from sim.studies.experiments.drawing import figure, ruled, spread
+from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table, combined
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures
+from sim.studies.experiments.xu import ErrorFigure, Method, Panel, with_particles
+from sim.world.config import SimulatedWorld
+from team import translate
+from team.estimation.baselines import localisation
+from team.estimation.baselines.localisation import Localisation
+from team.estimation.consistency import nees
+from team.estimation.geometry import wrapped
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.models import Increment
+from team.estimation.randomness import generator
+from team.wire import messages as m
+from team.wire.bus import opened
+
+if TYPE_CHECKING:  # Matplotlib takes half a second to import
+    from matplotlib.axes import Axes
+
+STRETCH = ((28.715, 33.276), (51.298, 53.539), (64.3, 67.3))
+"""A part of robot 1's path: from the lower left to the upper right, as in figure 3.2."""
+STRETCH_STEPS = 49
+BLIND_CLOUDS = 6
+PARTICLES = 1000
+ANYWHERE_PARTICLES = 20_000
+ANYWHERE_STEPS = (0, 1, 40)
+DRAWN = 2000
+"""Particles of a picture; more would be one blot."""
+STAGES = ("prediction", "update", "resampling")
+_COST_S = 1.0
+
+DEAD = Method("dead reckoning", "dead-reckoning", "alone", 1, "#D55E00", None)
+FEW = Method("localisation, 50 particles", "localisation", "alone", 1, "#0072B2", 50)
+MANY = Method("localisation, 1000 particles", "localisation", "alone", 1, "#111111", PARTICLES)
+ERRORS = ErrorFigure(
+    "Thesis, section 3.5: pose error on the known map",
+    "pose",
+    (Panel("", (DEAD, FEW, MANY), {}),),
+    (),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """The three steps, a start anywhere and the errors over 500 steps, for every seed."""
+    return [
+        *(_stages_task(options, seed) for seed in options.seeds),
+        *(_anywhere_task(options, seed) for seed in options.seeds),
+        *ERRORS.tasks(options),
+    ]
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """Three pictures of the steps, one of the start anywhere, one of the errors."""
+    stages = results.of_all([_stages_task(options, seed) for seed in options.seeds])
+    anywhere = results.of_all([_anywhere_task(options, seed) for seed in options.seeds])
+    errors = ERRORS.outcome(options, results)
+    pictures = []
+    if stages:
+        pictures += [
+            Picture(name, caption, partial(_draw_stage, stages[0], name))
+            for name, caption in zip(STAGES, _captions(stages[0]), strict=True)
+        ]
+    if anywhere:
+        pictures.append(
+            Picture(
+                "anywhere",
+                "Figure 3.5 (a), (b), (c): a start anywhere, with the farthest landmark read at "
+                f"each step. Dots: one in ten of {ANYWHERE_PARTICLES} particles; the circle is the "
+                "true position. "
+                f"Seed {options.seeds[0]}.",
+                partial(_draw_anywhere, anywhere[0]),
+            )
+        )
+    columns = ("step", "distance [m]", "10 … 90 %", "σ [m]", "NEES/dof", "ESS", "different poses")
+    rows = []
+    if stages and anywhere:
+        rows += [(f"blind for {STRETCH_STEPS} steps, {n}", *_row(stages, n)) for n in STAGES]
+        rows += [(f"anywhere, step {n}", *_row(anywhere, str(n))) for n in ANYWHERE_STEPS]
+    table = Table(
+        f"Thesis, section 3.5: the filter's steps, {len(options.seeds)} seeds",
+        columns,
+        tuple(rows),
+        "distance: of the particles' mean from the true position; σ: √(σx² + σy²) of the "
+        "particles; medians over the seeds; NEES: of the position, mean over the seeds, 1 is "
+        "right; ESS: effective sample size, eq. 3.25",
+    )
+    figures = {
+        "stages": {name: _numbers(stages, name) for name in STAGES} if stages else {},
+        "anywhere": {str(s): _numbers(anywhere, str(s)) for s in ANYWHERE_STEPS}
+        if anywhere
+        else {},
+    }
+    remarks = (
+        "The thesis takes its figures 3.2 to 3.5 from Fox et al. 2000, made with a laser or sonar "
+        "in a building; here they are made on its own world of 18 landmarks with its own noise. "
+        f"It names no number of particles for them: {PARTICLES} here, {ANYWHERE_PARTICLES} for a "
+        "start anywhere, since enough of them must fit the first readings.",
+        "Resampling changes no information: mean and spread stay, but many particles become copies "
+        "of few; the next motion spreads them again.",
+    )
+    first = Outcome(
+        "Thesis, section 3.5: particle-filter localisation on a known map",
+        figures,
+        (table,) if table.rows else (),
+        tuple(pictures),
+        remarks=remarks,
+    )
+    return combined(first.title, (first, replace(errors, figures={"errors": errors.figures})))
+
+
+def _stages_task(options: Options, seed: int) -> Task:
+    scenario = _alone(seed, PARTICLES)
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = msgspec.structs.replace(scenario.world, paths=(STRETCH,), steps=STRETCH_STEPS)
+    return _task("stages_run", msgspec.structs.replace(scenario, world=world), options, seed)
+
+
+def _anywhere_task(options: Options, seed: int) -> Task:
+    scenario = _alone(seed, ANYWHERE_PARTICLES)
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = msgspec.structs.replace(
+        scenario.world, steps=ANYWHERE_STEPS[-1], paths=(_beginning(scenario.world),)
+    )
+    return _task("anywhere_run", msgspec.structs.replace(scenario, world=world), options, seed)
+
+
+def _beginning(world: SimulatedWorld) -> tuple[tuple[float, float], ...]:
+    """The first leg of robot 1, cut to a metre a step."""
+    (x, y), (to_x, to_y) = world.paths[0][:2]
+    part = ANYWHERE_STEPS[-1] / float(np.hypot(to_x - x, to_y - y))
+    return (x, y), (x + part * (to_x - x), y + part * (to_y - y))
+
+
+def _alone(seed: int, particles: int) -> Scenario:
+    scenario = with_options(
+        load("thesis"), seed=seed, robots=1, estimator="localisation", fusion="alone"
+    )
+    return with_particles(scenario, particles)
+
+
+def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
+    """Clouds are kept for the picture of the first seed only."""
+    return Task(
+        f"sim.studies.experiments.xu_localisation:{work}",
+        {"world": msgspec.to_builtins(scenario), "clouds": seed == options.seeds[0]},
+        f"thesis, section 3.5, {work.partition('_')[0]}, seed {seed}",
+        _COST_S,
+    )
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What a robot hears in a run, the map that it is told, and where it truly is."""
+
+    scenario: Scenario
+    epochs: list[RobotEpoch]
+    start: np.ndarray
+    ids: np.ndarray
+    landmarks: Float[np.ndarray, "L 2"]
+    truth: Mapping[int, np.ndarray]
+
+
+def _heard(world: Mapping[str, Any]) -> _Run:
+    scenario = loads(msgspec.json.encode(world).decode())
+    config = scenario.robots[0]
+    samples = list(run_team(scenario, streams_of(scenario)))
+    cut = TeamEpochs([config.id])
+    cut.configure(config.id, config)
+    for message in (opened(sample)[2] for sample in samples):
+        match message:
+            case m.Start() | m.Odometry() | m.Observations():
+                cut.put(message)
+            case m.End():
+                cut.end(message)
+            case _:
+                pass
+    starts = cut.starts
+    assert starts is not None
+    pose, _ = translate.pose_of(starts[config.id][1])
+    ids, landmarks = true_landmarks(samples)
+    truth = evaluate(samples).robots[config.id].truth
+    return _Run(
+        scenario,
+        [step[0] for step in cut.steps()],
+        np.zeros(3) if pose is None else pose,
+        ids,
+        landmarks,
+        dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True)),
+    )
+
+
+def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
+    """Predict over the whole stretch, weigh by one reading, resample; a summary of each cloud."""
+    run = _heard(world)
+    sensor = run.scenario.robots[0].sensor
+    random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)
+    nothing = np.empty(0)
+    none = np.empty(0, np.uint32)
+    state = replace(
+        localisation.begun(run.start, PARTICLES, run.ids, run.landmarks), resample_below=0.0
+    )
+    blind = [state]
+    for each in run.epochs:
+        motion = each.epoch.increment
+        blind.append(
+            localisation.stepped(blind[-1], motion, sensor, none, nothing, nothing, random)
+        )
+    last = run.epochs[-1]
+    true = run.truth[last.stamp_ns]
+    # One landmark, the one farthest to the left: as in figure 3.3.
+    k = int(np.argmax(last.epoch.bearings))
+    reading = (
+        last.epoch.ids[k : k + 1],
+        last.epoch.ranges[k : k + 1],
+        last.epoch.bearings[k : k + 1],
+    )
+    weighed = localisation.stepped(blind[-1], Increment.identity(), sensor, *reading, random)
+    cloud, _ = fastslam.resampled(weighed.cloud, random)
+    resampled = replace(weighed, cloud=cloud)
+    found: Figures = {
+        name: _summary(each, true)
+        for name, each in zip(STAGES, (blind[-1], weighed, resampled), strict=True)
+    }
+    if clouds:
+        places = np.linspace(0, len(run.epochs), BLIND_CLOUDS + 1).round().astype(int)[1:]
+        found["clouds"] = {
+            "blind": [_cloud(blind[k].cloud, DRAWN // BLIND_CLOUDS) for k in places],
+            "blind_steps": places.tolist(),
+            "update": _cloud(weighed.cloud, DRAWN),
+            "resampling": _cloud(resampled.cloud, DRAWN),
+        }
+        found["path"] = [run.start[:2].tolist()] + [
+            run.truth[each.stamp_ns][:2].tolist() for each in run.epochs
+        ]
+        found["true"] = true.tolist()
+        found["landmarks"] = run.landmarks.tolist()
+        found["read"] = {
+            "landmark": run.landmarks[np.searchsorted(run.ids, reading[0][0])].tolist(),
+            "range_m": float(reading[1][0]),
+        }
+    return found
+
+
+def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
+    """The filter from a uniform cloud over the place, by the farthest reading of each step."""
+    run = _heard(world)
+    config = run.scenario.robots[0]
+    assert isinstance(run.scenario.world, SimulatedWorld)
+    random = generator(run.scenario.seed, config.id, 0, 0)
+    side = run.scenario.world.size_m
+    state = localisation.begun_anywhere(
+        np.zeros(2), np.full(2, side), ANYWHERE_PARTICLES, run.ids, run.landmarks, random
+    )
+    found: Figures = {"0": _summary(state, run.start)}
+    kept = [_cloud(state.cloud, DRAWN)]
+    poses = [run.start.tolist()]
+    for k, each in enumerate(run.epochs, 1):
+        epoch = each.epoch
+        far = np.argsort(epoch.ranges)[-1:]  # with all of them the first step would do
+        readings = epoch.ids[far], epoch.ranges[far], epoch.bearings[far]
+        state = localisation.stepped(state, epoch.increment, config.sensor, *readings, random)
+        if k in ANYWHERE_STEPS:
+            true = run.truth[each.stamp_ns]
+            found[str(k)] = _summary(state, true)
+            # What carries no weight is gone after the next resampling.
+            kept.append(_cloud(fastslam.resampled(state.cloud, random)[0], DRAWN))
+            poses.append(true.tolist())
+    if clouds:
+        found |= {"clouds": kept, "poses": poses, "landmarks": run.landmarks.tolist()}
+    return found
+
+
+def _summary(state: Localisation, true: np.ndarray) -> Figures:
+    """The error of the cloud's mean and what the cloud believes of it."""
+    mean, covariance = localisation.pose_gaussian(state)
+    off = mean[:2] - true[:2]
+    return {
+        "distance_m": float(np.hypot(*off)),
+        "sigma_m": float(np.sqrt(np.trace(covariance[:2, :2]))),
+        "heading_error_deg": float(abs(np.degrees(wrapped(mean[2] - true[2])))),
+        "nees_per_dof": nees(off, covariance[:2, :2]) / 2.0,
+        "effective": fastslam.effective_sample_size(state.cloud.log_weights),
+        "different": len(np.unique(state.cloud.poses, axis=0)),
+    }
+
+
+def _cloud(particles: Particles, most: int) -> Figures:
+    every = max(1, len(particles.poses) // most)
+    weights = np.exp(particles.log_weights[::every])
+    return {
+        "points": particles.poses[::every, :2].round(2).tolist(),
+        "weights": (weights / weights.max()).round(4).tolist(),
+    }
+
+
+def _row(runs: list[Figures], name: str) -> tuple[str, ...]:
+    found = _numbers(runs, name)
+    distance = found["distance_m"]
+    return (
+        f"{distance['median']:.2f}",
+        f"{distance['p10']:.2f} … {distance['p90']:.2f}",
+        f"{found['sigma_m']['median']:.2f}",
+        f"{found['nees_per_dof']:.2f}",
+        f"{found['effective']['median']:.0f}",
+        f"{found['different']['median']:.0f}",
+    )
+
+
+def _numbers(runs: list[Figures], name: str) -> Figures:
+    def over_runs(key: str) -> Float[np.ndarray, " S"]:
+        return np.array([run[name][key] for run in runs], dtype=np.float64)
+
+    return {
+        key: spread(over_runs(key))
+        for key in ("distance_m", "sigma_m", "heading_error_deg", "effective", "different")
+    } | {"nees_per_dof": float(over_runs("nees_per_dof").mean())}
+
+
+def _captions(run: Figures) -> tuple[str, str, str]:
+    steps = ", ".join(map(str, run["clouds"]["blind_steps"]))
+    return (
+        f"As figure 3.2, prediction: the particles after {steps} steps without a reading, from a "
+        "start that is known exactly at the lower left; grey: the true path.",
+        "As figure 3.3, update: one reading of the landmark in the circle of its range; the darker "
+        "a particle, the higher its weight.",
+        "As figure 3.4, resampling: particles in proportion to their weights, all with the same "
+        "weight again.",
+    )
+
+
+def _draw_stage(run: Figures, name: str, path: Path) -> None:
+    picture = figure(7.5, 7.2)
+    axis = picture.add_subplot()
+    clouds = run["clouds"]
+    axis.plot(*np.array(run["path"]).T, color=TRUTH_COLOUR, linewidth=1.0, label="true path")
+    if name == "prediction":
+        for k, cloud in enumerate(clouds["blind"]):
+            _scatter(axis, cloud, "particles" if not k else None)
+    else:
+        _scatter(axis, clouds[name], "particles")
+        (x, y), radius = run["read"]["landmark"], run["read"]["range_m"]
+        turns = np.linspace(0.0, 2.0 * np.pi, 200)
+        axis.plot(
+            x + radius * np.cos(turns), y + radius * np.sin(turns), color=ROBOT_COLOURS[1],
+            linewidth=1.0, linestyle="--", label="the range that was read",
+        )  # fmt: skip
+    _draw_place(axis, run["landmarks"], run["true"])
+    summary = run[name]
+    axis.set_title(
+        f"{name}: mean {summary['distance_m']:.1f} m from the truth, "
+        f"σ {summary['sigma_m']:.1f} m, ESS {summary['effective']:.0f} of {PARTICLES}",
+        fontsize=11,
+    )
+    axis.set_xlim(15, 95)
+    axis.set_ylim(15, 95)
+    picture.legend(fontsize=9, loc="outside lower center", ncols=3, frameon=False)
+    picture.savefig(path, dpi=110)
+
+
+def _scatter(axis: "Axes", cloud: Figures, label: str | None) -> None:
+    """Darker where the weight is higher, and the darkest on top."""
+    points, weights = np.array(cloud["points"]), np.array(cloud["weights"])
+    order = np.argsort(weights)
+    shades = np.column_stack(
+        (np.zeros(len(weights)), np.full((len(weights), 1), 0.27), np.full((len(weights), 1), 0.7))
+    )
+    alpha = 0.12 + 0.88 * weights[order] if np.ptp(weights) > 0 else np.full(len(weights), 0.35)
+    xs, ys = points[order].T
+    axis.scatter(
+        xs, ys, s=7, color=np.column_stack((shades, alpha)), linewidths=0, label=label,
+        zorder=3,
+    )  # fmt: skip
+
+
+def _draw_place(axis: "Axes", landmarks: list[list[float]], true: list[float]) -> None:
+    axis.plot(
+        *np.array(landmarks).T, linestyle="", marker="x", color="#C00000", label="known landmarks"
+    )
+    axis.plot(
+        true[0], true[1], marker="o", markersize=10, markerfacecolor="none",
+        markeredgecolor="#111111", linestyle="", label="true position", zorder=6,
+    )  # fmt: skip
+    axis.set_aspect("equal")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    ruled(axis)
+
+
+def _draw_anywhere(run: Figures, path: Path) -> None:
+    picture = figure(16.0, 5.8)
+    row = picture.subplots(1, len(ANYWHERE_STEPS), sharey=True)
+    for letter, axis, step, cloud, pose in zip(
+        "abc", row, ANYWHERE_STEPS, run["clouds"], run["poses"], strict=True
+    ):
+        _scatter(axis, cloud, "particles")
+        _draw_place(axis, run["landmarks"], pose)
+        axis.set_title(f"({letter}) step {step}: σ {run[str(step)]['sigma_m']:.1f} m", fontsize=11)
+        axis.set_xlim(-5, 105)
+        axis.set_ylim(-5, 105)
+    handles = row[0].get_legend_handles_labels()
+    picture.legend(*handles, fontsize=9, loc="outside lower center", ncols=3, frameon=False)
+    picture.savefig(path, dpi=100)

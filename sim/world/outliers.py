@@ -1,0 +1,62 @@
+"""Readings that have nothing to do with what is there: of the simulated world, if it is asked to.
+
+Which readings are spoilt is drawn for each of them, in the same way for every kind of garbage; so
+runs of different kinds, and the run in which the same readings are left out, can be compared.
+"""
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from sim.world.config import GarbageKind
+from sim.world.streams import Detections
+
+
+def spoilt(
+    seen: Detections,
+    share: float,
+    kind: GarbageKind,
+    span: tuple[float, float],
+    field_of_view: float,
+    landmarks: int,
+    uniforms: Float[np.ndarray, "R 3"],
+) -> Detections:
+    """The detections with a share of the readings spoilt, from uniform numbers in [0, 1).
+
+    The first number of a row chooses it. "reading": the other two are the range, uniform in `span`
+    [m], and the bearing, uniform in the field of view. "identity": the second is which other of the
+    landmarks 1 … `landmarks` it is taken for. "drop": it is left out.
+    """
+    chosen = uniforms[:, 0] < share
+    if kind == "drop":
+        kept = np.concatenate(([0], np.cumsum(~chosen)))
+        return Detections(
+            seen.stamps_ns,
+            kept[seen.offsets],
+            seen.ids[~chosen],
+            seen.ranges[~chosen],
+            seen.bearings[~chosen],
+        )
+    if kind == "identity":
+        ids = np.where(chosen, _others(seen.ids, landmarks, uniforms[:, 1]), seen.ids)
+        return Detections(
+            seen.stamps_ns, seen.offsets, ids.astype(np.uint32), seen.ranges, seen.bearings
+        )
+    nearest, farthest = span
+    ranges = nearest + (farthest - nearest) * uniforms[:, 1]
+    bearings = field_of_view * (0.5 - uniforms[:, 2])
+    return Detections(
+        seen.stamps_ns,
+        seen.offsets,
+        seen.ids,
+        np.where(chosen, ranges, seen.ranges),
+        np.where(chosen, bearings, seen.bearings),
+    )
+
+
+def _others(
+    ids: UInt32[np.ndarray, " R"], landmarks: int, uniform: Float[np.ndarray, " R"]
+) -> UInt32[np.ndarray, " R"]:
+    """Any of the ids 1 … landmarks but the own one, each as probable; with only one, that."""
+    ahead = 1 + np.floor(uniform * max(landmarks - 1, 1)).astype(np.int64)
+    others: UInt32[np.ndarray, " R"] = (ids - 1 + ahead) % landmarks + 1
+    return others.astype(np.uint32)

@@ -1,0 +1,389 @@
+"""The figures of a run: each must equal what it says it is."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.desk.evaluation.errors import Path, interpolated, map_errors, moved, pose_errors
+from central.desk.evaluation.evaluation import evaluate, to_json
+from sim.scenarios.scenario import Scenario
+from team.estimation.consistency import chi2_interval, nees, state_error
+from team.translate import joint_bytes
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing, Sample
+from tests.sim.logs import (
+    final_map,
+    joined_log,
+    online,
+    samples,
+    scenario,
+    streams,
+    trajectory,
+    world_log,
+)
+from tests.support import spd
+
+SECOND = 10**9
+numbers = st.floats(-50.0, 50.0)
+
+
+def path(stamps_s: list[float], poses: list[list[float]]) -> Path:
+    return Path(np.rint(np.array(stamps_s) * SECOND).astype(np.int64), np.array(poses))
+
+
+def stamps(*seconds: float) -> np.ndarray:
+    return np.rint(np.array(seconds) * SECOND).astype(np.int64)
+
+
+def done(readings: int, ledger: tuple[tuple[str, int], ...]) -> Outgoing:
+    entries = tuple(m.Disposed(name, count) for name, count in ledger)
+    return Outgoing(ch.ROBOT_DONE, "r1", m.Done(9, "r1", 1, readings, 20, 2, entries))
+
+
+def submap(sequence: int, first: int, last: int) -> Outgoing:
+    message = m.Submap(
+        sequence + 1, "r1", 1, sequence, first, last, 0, bytes(8),
+        from_ids([]), from_floats(np.zeros(3)), joint_bytes(np.eye(3)),
+    )  # fmt: skip
+    return Outgoing(ch.SUBMAP, "r1", message)
+
+
+def test_truth_is_interpolated_along_the_shorter_arc() -> None:
+    truth = path([0.0, 1.0], [[0.0, 2.0, 3.0], [4.0, 0.0, -3.0]])
+    poses, known = interpolated(truth, stamps(0.25))
+    turn = 2.0 * np.pi - 6.0
+    assert known.all()
+    np.testing.assert_allclose(poses, [[1.0, 1.5, 3.0 + 0.25 * turn]], atol=1e-12)
+
+
+def test_truth_is_not_extrapolated() -> None:
+    truth = path([1.0, 2.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    _, known = interpolated(truth, stamps(0.999, 1.0, 2.0, 2.001))
+    assert known.tolist() == [False, True, True, False]
+
+
+def test_truth_is_not_interpolated_across_a_gap_but_known_at_its_ends() -> None:
+    truth = path([0.0, 1.5, 2.5], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+    poses, known = interpolated(truth, stamps(0.0, 0.7, 1.5, 2.0))
+    assert known.tolist() == [True, False, True, True]
+    np.testing.assert_allclose(poses[known, 0], [0.0, 3.0, 3.5])
+
+
+def test_without_truth_nothing_is_known() -> None:
+    nowhere = Path(np.empty(0, np.int64), np.empty((0, 3)))
+    assert not interpolated(nowhere, stamps(0.0, 1.0))[1].any()
+    assert pose_errors(path([0.0], [[0.0, 0.0, 0.0]]), np.eye(3)[np.newaxis], nowhere) is None
+
+
+@settings(deadline=None, max_examples=50)
+@given(x=numbers, y=numbers, theta=st.floats(-3.1, 3.1), seed=st.integers(0, 2**31))
+def test_a_map_that_is_only_moved_has_no_error_after_alignment(
+    x: float, y: float, theta: float, seed: int
+) -> None:
+    truth = np.random.default_rng(seed).uniform(-20.0, 20.0, (5, 2))
+    motion = np.array([x, y, theta])
+    errors = map_errors(moved(motion, truth), np.eye(10), truth)
+    assert errors.aligned_rmse_m is not None
+    assert errors.aligned_rmse_m < 1e-9
+    shift = moved(motion, truth) - truth
+    assert errors.rmse_m == pytest.approx(np.sqrt(np.mean(np.sum(shift**2, axis=1))), abs=1e-9)
+
+
+def test_alignment_does_not_scale() -> None:
+    truth = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+    errors = map_errors(1.5 * truth, np.eye(8), truth)
+    assert errors.aligned_rmse_m == pytest.approx(0.5 * np.sqrt(2.0))
+
+
+def test_one_landmark_has_an_error_but_no_alignment() -> None:
+    errors = map_errors(np.array([[3.0, 4.0]]), np.diag([9.0, 16.0]), np.zeros((1, 2)))
+    assert errors.rmse_m == 5.0
+    assert errors.aligned_rmse_m is None
+    assert errors.nees_per_dof == pytest.approx(1.0)
+
+
+def test_map_nees_takes_the_joint_covariance_not_its_blocks() -> None:
+    P = spd(4)
+    error = np.array([0.5, -0.25, 0.75, 1.0])
+    errors = map_errors(error.reshape(2, 2), P, np.zeros((2, 2)))
+    assert errors.nees_per_dof == pytest.approx(error @ np.linalg.solve(P, error) / 4.0)
+
+
+def drawn_maps(runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True positions, maps drawn about them, and the covariance that they were drawn with."""
+    rng = np.random.default_rng(7)
+    truth = rng.uniform(-8.0, 8.0, (15, 2))
+    P = 1e-4 * spd(30)
+    noise = rng.standard_normal((runs, 30)) @ np.linalg.cholesky(P).T
+    return truth, truth + noise.reshape(runs, 15, 2), P
+
+
+def test_the_shape_of_drawn_maps_has_nees_2_per_landmark_and_covers_95_percent() -> None:
+    runs = 200
+    truth, maps, P = drawn_maps(runs)
+    motion = np.array([3.0, -2.0, 0.5])
+    turn = np.kron(np.eye(15), np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]]))
+    turned = turn @ P @ turn.T
+    values, covered, raw = [], [], []
+    for means in maps:
+        shape = map_errors(moved(motion, means), turned, truth).shape
+        assert shape is not None
+        values.append(shape.nees_per_landmark)
+        covered.append(shape.coverage)
+        raw.append(map_errors(means, P, truth).coverage)
+    low, high = chi2_interval(27, 0.999, runs)
+    assert 2.0 * low < np.mean(values) < 2.0 * high
+    assert np.mean(covered) == pytest.approx(0.95, abs=0.015)
+    assert np.mean(raw) == pytest.approx(0.95, abs=0.015)
+    # The mutant: a covariance that claims half of the variance.
+    claimed = [map_errors(means, 0.5 * P, truth) for means in maps]
+    shapes = [each.shape for each in claimed if each.shape is not None]
+    assert np.mean([each.nees_per_landmark for each in shapes]) > 2.0 * high
+    assert np.mean([each.coverage for each in shapes]) < 0.85
+    assert np.mean([each.coverage for each in claimed]) < 0.85
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_the_shape_of_few_landmarks_is_what_their_distances_say(count: int) -> None:
+    truth = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])[:count]
+    means = truth + np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]])[:count]
+    shape = map_errors(means, 0.01 * np.eye(2 * count), truth).shape
+    assert shape is not None
+    if count == 2:  # one number: a length of variance 0.02 that is 0.3 too large
+        assert shape.nees_per_landmark == pytest.approx(2.0 * 0.09 / 0.02)
+        assert shape.coverage == 0.0
+    else:
+        assert 0.0 < shape.nees_per_landmark < 2.0 * 0.09 / 0.01
+
+
+def test_pose_errors_are_those_of_the_consistency_module() -> None:
+    P = np.stack([spd(3), 0.25 * spd(3)])
+    truth = path([0.0, 1.0], [[0.0, 0.0, 3.1], [1.0, 1.0, -1.0]])
+    estimate = path([0.0, 1.0], [[0.1, -0.2, -3.1], [1.5, 1.0, -1.25]])
+    errors = pose_errors(estimate, P, truth)
+    assert errors is not None
+    expected = [state_error(a, b) for a, b in zip(estimate.poses, truth.poses, strict=True)]
+    np.testing.assert_allclose(errors.errors, expected, atol=1e-12)
+    np.testing.assert_allclose(errors.nees, [nees(e, p) for e, p in zip(expected, P, strict=True)])
+    assert errors.position_rmse_m == pytest.approx(np.sqrt((0.05 + 0.25) / 2.0))
+
+
+def test_coverage_is_the_share_of_poses_within_their_own_95_percent() -> None:
+    truth = path([0.0, 3.0], [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    offsets = [[2.79, 0.0, 0.0], [2.80, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 2.81]]
+    errors = pose_errors(path([0.0, 1.0, 2.0, 3.0], offsets), np.tile(np.eye(3), (4, 1, 1)), truth)
+    assert errors is not None
+    assert errors.coverage == 0.5  # the 95 % quantile of three numbers is 2.795²
+
+
+def test_a_log_whose_map_is_off_by_a_known_shift_says_so() -> None:
+    run = evaluate(joined_log(scenario(robots=2), 0.3))
+    assert run.map is not None
+    assert run.map.errors is not None
+    assert run.map.errors.rmse_m == pytest.approx(0.3 * np.sqrt(2.0))
+    assert run.map.errors.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert run.map.errors.nees_per_dof == pytest.approx(0.09 / 0.01)
+    assert not run.map.errors.in_band
+    assert run.map.cost_per_dof == 1.5
+    for robot in run.robots.values():
+        assert robot.smoothed is not None
+        assert robot.smoothed.position_rmse_m == pytest.approx(0.15 * np.sqrt(2.0))
+        assert robot.smoothed.heading_rmse_rad == pytest.approx(0.03)
+        assert robot.final_pose_nees_per_dof == pytest.approx(0.09 * 0.51 / 0.01 / 3.0)
+        assert robot.alignment == "map"
+        # The map's own alignment takes its shift of (0.3, −0.3) off; (0.15, −0.15) is left.
+        assert robot.aligned_rmse_m == pytest.approx(0.15 * np.sqrt(2.0))
+        assert robot.online_aligned_rmse_m is None
+
+
+def own_map(shift: float, of: Scenario) -> Outgoing:
+    world = streams(of)
+    n = len(world.landmark_ids)
+    estimate = m.MapEstimate(
+        9, "r1", 1, 7, 0, True, from_ids(world.landmark_ids), from_floats(world.landmarks + shift),
+        joint_bytes(0.01 * np.eye(2 * n)),
+    )  # fmt: skip
+    return Outgoing(ch.OWN_MAP, "r1", estimate)
+
+
+def test_a_robots_last_own_map_is_held_against_the_truth() -> None:
+    of = scenario(robots=2)
+    nothing = final_map([], np.empty((0, 2)), np.empty((0, 0)))
+    said = [own_map(5.0, of), own_map(0.3, of), nothing]
+    run = evaluate([*world_log(of), *samples(said)])
+    own = run.robots["r1"].own_map
+    assert own is not None
+    assert own.rmse_m == pytest.approx(0.3 * np.sqrt(2.0))
+    assert own.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert own.nees_per_dof == pytest.approx(0.09 / 0.01)
+    assert run.robots["r2"].own_map is None
+    figures = to_json(run)["robots"]
+    assert figures["r1"]["own_map_rmse_m"] == own.rmse_m
+    assert figures["r2"]["own_map_nees_per_dof"] is None
+
+
+def test_a_reading_that_is_in_the_log_twice_is_counted_once() -> None:
+    log = world_log(scenario())
+    again = [s for s in log if s.key == ch.ODOMETRY.key("r1")]
+    once, twice = evaluate(log).robots["r1"], evaluate(log + again).robots["r1"]
+    assert once.consumption.steps == twice.consumption.steps == 20
+    assert once.consumption.published == twice.consumption.published == 41
+
+
+def test_steps_are_odometry_intervals_and_the_uplink_is_what_the_rule_consumes() -> None:
+    sent = samples([submap(0, 0, 20), submap(1, 21, 40)])
+    robot = evaluate(world_log(scenario()) + sent).robots["r1"]
+    assert robot.uplink_bytes == sum(len(s.payload) for s in sent)
+    assert robot.uplink_bytes_per_step == robot.uplink_bytes / 20
+    assert robot.consumption.submaps == 2
+
+
+@pytest.mark.parametrize(
+    ("first", "counted", "once"),
+    [(21, 41, True), (20, 41, False), (21, 42, False)],
+    ids=["disjoint", "a reading in two submaps", "a ledger that counts one twice"],
+)
+def test_a_reading_that_is_used_twice_is_found(first: int, counted: int, once: bool) -> None:
+    said = [submap(0, 0, 20), submap(1, first, 40), done(41, (("in a submap", counted),))]
+    robot = evaluate(world_log(scenario()) + samples(said)).robots["r1"]
+    assert robot.consumption.consumed == 41
+    assert robot.consumption.each_once == once
+
+
+def test_a_log_without_truth_has_no_errors_but_the_rest() -> None:
+    hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
+    log = [s for s in joined_log(scenario(), 0.1) if s.key not in hidden]
+    figures = to_json(evaluate(log))
+    assert figures["landmarks"] == 8
+    for name in ("landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof"):
+        assert figures[name] is None
+    robot = figures["robots"]["r1"]
+    assert robot["steps"] == 20
+    for name in ("position_rmse_m", "heading_rmse_rad", "pose_nees_per_dof"):
+        assert robot[name] is None
+
+
+def test_a_log_that_was_cut_before_the_final_map_is_evaluated() -> None:
+    figures = to_json(evaluate(world_log(scenario())[:30]))
+    assert figures["final_map_digest"] is None
+    assert figures["landmark_rmse_m"] is None
+    assert figures["robots"]["r1"]["readings_consumed"] is None
+
+
+def test_an_empty_log_is_evaluated() -> None:
+    run = evaluate([])
+    assert run.scenario is None
+    assert run.map is None
+    assert not run.robots
+
+
+def test_the_trajectory_aligns_itself_where_the_map_can_not() -> None:
+    of = scenario()
+    stream = streams(of).streams[0]
+    assert stream.truth is not None
+    assert stream.truth_ns is not None
+    turned = np.array(
+        [[*moved(np.array([1.0, 2.0, 0.3]), p[np.newaxis, :2])[0], p[2]] for p in stream.truth]
+    )
+    said = [trajectory("r1", stream.truth_ns.tolist(), turned, 1.0)]
+    robot = evaluate(world_log(of) + samples(said)).robots["r1"]
+    assert robot.alignment == "trajectory"
+    assert robot.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_own_pose_counts_only_where_there_is_no_team_pose() -> None:
+    of = scenario()
+    stream = streams(of).streams[0]
+    assert stream.truth is not None
+    assert stream.truth_ns is not None
+    own = online(ch.OWN_POSE, stream.truth[1:] + np.array([3.0, 4.0, 0.0]), of)
+    team = online(ch.TEAM_POSE, stream.truth[1:] + np.array([0.0, 1.0, 0.0]), of)
+    alone = evaluate(world_log(of) + samples(own)).robots["r1"]
+    both = evaluate(world_log(of) + samples([*own, *team])).robots["r1"]
+    assert alone.online is not None
+    assert both.online is not None
+    assert (alone.online_channel, both.online_channel) == ("own/pose", "team/pose")
+    assert alone.online.position_rmse_m == pytest.approx(5.0)
+    assert both.online.position_rmse_m == pytest.approx(1.0)
+    assert both.online.nees_per_dof == pytest.approx(1.0 / 3.0)
+    joined = evaluate([*joined_log(of, 0.3), *samples(team)]).robots["r1"]
+    # The map's alignment takes its shift of (0.3, −0.3) off the online poses as well.
+    assert joined.online_aligned_rmse_m == pytest.approx(np.hypot(0.3, 1.3))
+
+
+def test_damaged_messages_are_counted_and_left_out() -> None:
+    log = joined_log(scenario(), 0.1)
+    damaged = [
+        replace(s, payload=s.payload[:-3])
+        if s.key in (ch.FINAL_MAP.key(), ch.START.key("r1"))
+        else s
+        for s in log
+    ]
+    run = evaluate([*damaged, Sample("nobody/knows", b"\xc1", 0, 0, 0)])
+    assert run.map is None
+    assert run.unsound == 2
+    assert run.channels["nobody/knows"].bytes == 1
+
+
+def test_landmarks_without_truth_are_left_out_of_the_errors() -> None:
+    ids, positions = [1, 2, 77], np.array([[5.0, 6.0], [15.0, 5.0], [0.0, 0.0]])
+    said = final_map(ids, positions, 0.5 * spd(6))
+    run = evaluate(world_log(scenario()) + samples([said]))
+    assert run.map is not None
+    assert run.map.errors is not None
+    assert run.map.known.tolist() == [True, True, False]
+    assert run.map.errors.count == 2
+    assert run.map.errors.rmse_m == 0.0
+
+
+def test_blocks_without_correlations_are_judged_as_such() -> None:
+    P = spd(4)
+    blocks = P.copy()
+    blocks[:2, 2:] = blocks[2:, :2] = 0.0
+    error = np.array([[0.5, 0.25], [-0.5, 1.0]])
+    means = np.array([[5.0, 6.0], [15.0, 5.0]]) + error
+    run = evaluate(world_log(scenario()) + samples([final_map([1, 2], means, P, joint=False)]))
+    assert run.map is not None
+    assert run.map.errors is not None
+    assert run.map.errors.nees_per_dof == pytest.approx(nees(error.ravel(), blocks) / 4.0)
+
+
+def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds() -> None:
+    extra = {"processes": {"world": {"pid": 7, "exit": 0}}, "log": "run.mcap", "wall_s": 1.5}
+    figures = json.loads(json.dumps(to_json(evaluate(joined_log(scenario(), 0.1)), extra)))
+    names = (
+        "landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof", "joint_cost_per_dof",
+        "shape_nees_per_landmark", "shape_coverage_95", "landmark_coverage_95",
+        "landmarks", "final_map_digest", "robots", "channels", "processes", "log", "wall_s",
+    )  # fmt: skip
+    of_a_robot = (
+        "steps", "readings_published", "readings_consumed", "position_rmse_m", "heading_rmse_rad",
+        "pose_nees_per_dof", "pose_coverage_95", "uplink_bytes", "submaps",
+        "position_rmse_aligned_m", "online_position_rmse_m", "online_position_rmse_aligned_m",
+        "online_pose_nees_per_dof", "online_pose_coverage_95",
+    )  # fmt: skip
+    assert set(names) <= set(figures)
+    assert set(of_a_robot) <= set(figures["robots"]["r1"])
+    assert figures["processes"]["world"]["exit"] == 0
+    assert set(figures["channels"][ch.ODOMETRY.key("r1")]) == {"messages", "bytes"}
+
+
+def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone() -> None:
+    """A pose 100 m away errs by 5 m along the circle and by 0.13 m across it; sigma there: 1 mm."""
+    turn, sigma = 0.05, 0.05
+    truth = np.array([[100.0, 0.0, 0.3]])
+    pose = np.array([[100.0 * np.cos(turn), 100.0 * np.sin(turn), 0.3 + turn]])
+    A = np.array([[1.0, 0.0, pose[0, 1]], [0.0, 1.0, -pose[0, 0]], [0.0, 0.0, 1.0]])
+    back = np.linalg.inv(A)
+    covariance = back @ np.diag([1e-6, 1e-6, sigma**2]) @ back.T
+    stamps = np.array([0])
+    found = pose_errors(Path(stamps, pose), covariance[None], Path(stamps, truth))
+    assert found is not None
+    assert found.motion_nees[0] == pytest.approx((turn / sigma) ** 2)
+    assert found.nees[0] > 1000.0

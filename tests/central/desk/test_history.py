@@ -1,0 +1,195 @@
+"""How a run went over its time: figures against what was put into the log, events in words."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from central.desk.evaluation.events import MOST, EventLog, without_figures
+from central.desk.evaluation.history import History, history
+from central.desk.pictures.time import BINS, binned, speaker
+from sim.in_memory.team import run_team
+from team import translate
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing, Sample, opened
+from tests.sim.logs import final_map, joined_log, samples, scenario, streams
+from tests.support import submap
+
+MS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def log() -> list[Sample]:
+    of = scenario(robots=2)
+    return list(run_team(of, streams(of)))
+
+
+@pytest.fixture(scope="module")
+def run(log: list[Sample]) -> History:
+    return history(log)
+
+
+def test_every_byte_is_counted_under_its_key(run: History, log: list[Sample]) -> None:
+    assert sum(int(t.sizes.sum()) for t in run.traffic.values()) == sum(len(s.payload) for s in log)
+    assert set(run.traffic) == {s.key for s in log}
+
+
+def test_nis_is_what_the_robots_said_of_their_windows(run: History, log: list[Sample]) -> None:
+    said = [opened(s)[2] for s in log if s.key == ch.INNOVATION.key("r1")]
+    submaps = [opened(s)[2] for s in log if s.key == ch.SUBMAP.key("r1")]
+    found = run.innovations["r1"]
+    assert found.stamps_ns.tolist() == [s.stamp_ns for s in submaps]
+    assert found.per_dof == sum(i.squared for i in said) / sum(i.dof for i in said)
+    assert found.dof.sum() > 50
+    resumed = history([*log, *(s for s in log if s.key == ch.INNOVATION.key("r1"))])
+    assert resumed.innovations["r1"].per_dof == found.per_dof
+
+
+def test_the_cost_and_the_nees_are_those_of_each_map(run: History, log: list[Sample]) -> None:
+    keys = (ch.FUSED_MAP.key(), ch.FINAL_MAP.key())
+    maps = [opened(s)[2] for s in log if s.key in keys]
+    assert len(run.map_cost.values) == len([x for x in maps if x.dof])
+    assert run.map_cost.values[-1] == maps[-1].chi2 / maps[-1].dof
+    blocks = translate.landmark_blocks_of(maps[-1])
+    ids, means = translate.landmarks_of(maps[-1])
+    world = streams(scenario(robots=2))
+    true = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
+    errors = [mean - true[i] for i, mean in zip(ids.tolist(), means, strict=True)]
+    nees = [e @ np.linalg.solve(P, e) / 2 for e, P in zip(errors, blocks, strict=True)]
+    assert run.map_nees.values[-1] == pytest.approx(np.mean(nees))
+    assert (np.diff(run.map_nees.stamps_ns) >= 0).all()
+
+
+def reading(k: int, wall_ms: int) -> Sample:
+    (sample,) = samples([Outgoing(ch.ODOMETRY, "r1", m.Odometry(k * MS, "r1", 0, k, MS, 0.5, 0.1))])
+    return dataclasses.replace(sample, wall_ns=wall_ms * MS)
+
+
+def at(outgoing: Outgoing, wall_ms: int) -> Sample:
+    return dataclasses.replace(samples([outgoing])[0], wall_ns=wall_ms * MS)
+
+
+def fused(stamp_ns: int, last: int, **fields: object) -> Outgoing:
+    values = {"members": (m.Member("r1", 0, last),), "reasons": (), "final": False} | fields
+    message = m.FusedMap(
+        stamp_ns, "join", bytes(8), "r1/0", values["final"], False, 0, values["members"], (),
+        False, from_ids([1]), from_floats([0.0, 0.0]), from_floats([1.0, 0.0, 1.0]), 3.0, 2,
+        values["reasons"],
+    )  # fmt: skip
+    return Outgoing(ch.FUSED_MAP, "", message)
+
+
+def test_latency_runs_from_a_readings_publication_to_the_first_map_that_used_it() -> None:
+    windows = [submap(k, "r1") for k in range(2)]  # of readings 0-9 and 10-19
+    log = [reading(k, 100 + 10 * k) for k in range(20)]
+    log += [at(Outgoing(ch.SUBMAP, "r1", w), 400) for w in windows]
+    log += [at(fused(9, 0), 450), at(fused(10, 0), 700), at(fused(11, 1), 900)]
+    found = history(log).latencies["r1"]
+    np.testing.assert_allclose(found.last_s, [0.450 - 0.190, 0.900 - 0.290])
+    np.testing.assert_allclose(found.first_s, [0.350, 0.700])
+
+
+def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
+    log = [reading(k, 10 * k) for k in range(12, 20)]
+    log += [at(Outgoing(ch.SUBMAP, "r1", submap(k, "r1")), 400) for k in range(2)]
+    assert "r1" not in history([*log, at(fused(9, 1), 450)]).latencies
+    absurd = samples([Outgoing(ch.ODOMETRY, "r1", m.Odometry(5, "r1", 0, 2**60, MS, 0.5, 0.1))])
+    assert history([*log, *absurd]).end_ns == 19 * MS
+
+
+def events_of(*told: tuple[ch.Channel, str, m.Message]) -> list[str]:
+    log = EventLog()
+    for channel, name, message in told:
+        log.take(channel, name, message)
+    return [f"{e.node} {e.kind}: {e.text}" for e in log.events]
+
+
+def alive(t: int, node: str, there: bool) -> tuple[ch.Channel, str, m.Message]:
+    return ch.ALIVE, node, m.Liveliness(t, node, there)
+
+
+def mapped(t: int, **fields: object) -> tuple[ch.Channel, str, m.Message]:
+    return ch.FUSED_MAP, "", fused(t, 0, **fields).message
+
+
+def test_events_tell_who_came_was_lost_came_again_and_joined() -> None:
+    waits = "r2: 1 shared landmark, 2 needed"
+    assert events_of(
+        alive(0, "robot/r1", True),
+        alive(0, "robot/r1", True),
+        mapped(5, reasons=(waits,)),
+        mapped(6, reasons=(waits,)),
+        alive(7, "robot/r1", False),
+        alive(8, "robot/r1", True),
+        mapped(9, members=(m.Member("r1", 0, 3), m.Member("r2", 0, 0))),
+        (ch.ROBOT_DONE, "r1", m.Done(20, "r1", 0, 1200, 9, 4, ())),
+        alive(21, "robot/r1", False),
+    ) == [
+        "r1 came: is there",
+        "r1 map: its submaps are in the team's map, frame r1/0",
+        f"central map: {waits}",
+        "r1 lost: is lost",
+        "r1 restarted: is there again",
+        "r2 map: its submaps are in the team's map, frame r1/0",
+        f"central map: no longer: {waits}",
+        "r1 ended: has used its 1,200 readings, 4 submaps",
+    ]
+
+
+def status(t: int, *warnings: str) -> tuple[ch.Channel, str, m.Message]:
+    return ch.STATUS, "central", m.Status(t, "central", "joining", {}, warnings)
+
+
+def test_a_warning_is_one_event_whatever_its_figures_and_waiting_is_none() -> None:
+    assert events_of(
+        status(1, "waiting for r1", "r5: submap 20 disagrees, cost 8.8"),
+        status(2, "r5: submap 20 disagrees, cost 9.1", "r5: submap 21 disagrees, cost 9.1"),
+    ) == [
+        "central warning: r5: submap 20 disagrees, cost 8.8",
+        "central warning: r5: submap 21 disagrees, cost 9.1",
+    ]
+    assert without_figures("submap 20, cost 9.1") == "submap 20, cost #"
+
+
+def test_a_new_life_of_a_stream_is_an_event_and_their_number_is_bounded() -> None:
+    start = m.Start(1, "r1", 1, 0, b"", b"")
+    again = m.Start(9, "r1", 2, 0, b"", b"")
+    assert events_of((ch.START, "r1", start), (ch.START, "r1", start), (ch.START, "r1", again)) == [
+        "r1 restarted: its stream of readings begins anew, epoch 2"
+    ]
+    many = [alive(t, "robot/r1", t % 2 == 0) for t in range(MOST + 50)]
+    assert len(events_of(*many)) == MOST
+
+
+def test_bins_lose_nothing_and_take_what_lies_outside_at_the_ends(run: History) -> None:
+    rng = np.random.default_rng(1)
+    stamps = rng.integers(run.start_ns - 10**10, run.end_ns + 10**10, 500)
+    values = rng.normal(size=500)
+    centres, (sums, counts) = binned(run, stamps, values, np.ones(500))
+    assert counts.sum() == 500
+    assert sums.sum() == pytest.approx(values.sum())
+    assert len(centres) <= BINS
+    assert (np.diff(centres) > 0).all()
+
+
+def test_a_robot_speaks_on_its_nodes_keys_and_not_on_its_sensors() -> None:
+    assert speaker(ch.SUBMAP.key("r1")) == "r1"
+    assert speaker(ch.STATUS.key("robot/r1")) == "r1"
+    for key in (ch.ODOMETRY.key("r1"), ch.PRIOR.key("r1"), ch.STATUS.key("central"), "view/x"):
+        assert speaker(key) is None
+
+
+def test_without_truth_there_is_the_cost_and_no_nees() -> None:
+    of = scenario()
+    hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
+    blind = history([s for s in joined_log(of, 0.1) if s.key not in hidden])
+    assert len(blind.map_nees.values) == 0
+    assert blind.map_cost.values.tolist() == [1.5]
+    assert final_map([1], np.zeros((1, 2)), np.eye(2)).message.dof == 20
+
+
+def test_an_empty_log_has_an_empty_history() -> None:
+    empty = history([])
+    assert (empty.start_ns, empty.end_ns, empty.events, empty.traffic) == (0, 0, (), {})

@@ -1,0 +1,142 @@
+"""Each reading of a log has exactly one disposition, or the offender is named."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from central.desk.ledger import Ledger, ledger
+from central.desk.verification.recorded import recorded
+from sim.cli.rerun import app
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+from tests.sim.recorded.test_rerun import restless
+from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    return team_samples(thesis(STEPS))
+
+
+def ledger_of(samples: list[Sample], folder: Path) -> Ledger:
+    return ledger(recorded(written(folder / "log.mcap", samples)))
+
+
+def submap_changed(samples: list[Sample], sequence: int, **fields: int) -> list[Sample]:
+    def change(message: m.Message) -> m.Message:
+        hit = (message.robot, message.sequence) == ("r1", sequence)
+        return msgspec.structs.replace(message, **fields) if hit else message
+
+    return changed(samples, ch.SUBMAP, change)
+
+
+def test_a_good_log_disposes_of_each_reading_once(samples: list[Sample], tmp_path: Path) -> None:
+    found = ledger_of(samples, tmp_path)
+    assert found.offenders == ()
+    (end,) = messages(samples, ch.END)
+    assert found.readings == sum(s.readings for s in end.streams)
+    assert sum(found.totals().values()) == found.readings
+    for robot in ("r1", "r2"):
+        (done,) = messages(samples, ch.ROBOT_DONE, robot)
+        assert found.totals(robot) == {d.disposition: d.readings for d in done.ledger}
+    assert f"each of {found.readings} readings has exactly one disposition" in found.statement()
+
+
+def test_every_submap_names_the_maps_that_used_it(samples: list[Sample], tmp_path: Path) -> None:
+    found = ledger_of(samples, tmp_path)
+    (final,) = messages(samples, ch.FINAL_MAP)
+    assert len(found.maps) == 2 * STEPS // 10
+    assert all(used[-1] == final.digest.hex() for used in found.maps.values())
+    assert len(found.maps["r1", 1, 0]) > len(found.maps["r1", 1, 5])
+
+
+def test_a_reading_in_two_submaps_is_named(samples: list[Sample], tmp_path: Path) -> None:
+    second = messages(samples, ch.SUBMAP, "r1")[1]
+    twice = submap_changed(samples, 1, first_reading=second.first_reading - 1)
+    (offender,) = ledger_of(twice, tmp_path).offenders
+    counter = second.first_reading - 1
+    assert offender == f"reading {counter} of r1, epoch 1 is in two submaps: 0 and 1"
+
+
+def test_a_reading_that_no_submap_took_is_named(samples: list[Sample], tmp_path: Path) -> None:
+    second = messages(samples, ch.SUBMAP, "r1")[1]
+    skipped = submap_changed(samples, 1, first_reading=second.first_reading + 1)
+    offenders = ledger_of(skipped, tmp_path).offenders
+    name = f"reading {second.first_reading} of r1, epoch 1"
+    assert offenders[0] == f"{name} is behind its submaps and in none of them"
+    assert "r1, epoch 1 says" in offenders[1]
+
+
+def test_a_submap_of_readings_that_are_not_there_is_named(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    last = messages(samples, ch.SUBMAP, "r1")[-1]
+    beyond = submap_changed(samples, last.sequence, last_reading=last.last_reading + 2**40)
+    (offender,) = ledger_of(beyond, tmp_path).offenders
+    assert offender.startswith(f"submap {last.sequence} of r1, epoch 1 uses reading")
+
+
+def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    gone = changed(samples, ch.SUBMAP, lambda x: None if (x.robot, x.sequence) == ("r2", 5) else x)
+    (final,) = messages(samples, ch.FINAL_MAP)
+    found = ledger_of(gone, tmp_path)
+    assert (
+        f"map {final.digest.hex()} uses submap 5 of r2, epoch 1, which is not in the log"
+        in found.offenders
+    )
+
+
+def test_a_reading_that_was_changed_and_sent_again_is_named(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    copy = next(s for s in samples if s.key == ch.ODOMETRY.key("r1"))
+    counter = messages([copy], ch.ODOMETRY, "r1")[0].reading
+    (again,) = changed([copy], ch.ODOMETRY, lambda x: msgspec.structs.replace(x, forward=9.0))
+    (offender,) = ledger_of([*samples, again], tmp_path).offenders
+    assert offender == f"reading {counter} of r1, epoch 1 is in the log twice, and not the same"
+
+
+def test_a_robots_false_word_is_named(samples: list[Sample], tmp_path: Path) -> None:
+    def lie(done: m.Message) -> m.Message:
+        ledger = tuple(m.Disposed(d.disposition, d.readings + 1) for d in done.ledger)
+        return msgspec.structs.replace(done, ledger=ledger) if done.robot == "r2" else done
+
+    offenders = ledger_of(changed(samples, ch.ROBOT_DONE, lie), tmp_path).offenders
+    assert len(offenders) == 2
+    assert all(offender.startswith("r2, epoch 1") for offender in offenders)
+
+
+def test_a_dead_robots_last_readings_are_open_or_lost(tmp_path: Path) -> None:
+    found = ledger_of(said(restless(2, dies=True)), tmp_path)
+    assert found.offenders == ()
+    lost = found.totals("r1")
+    assert lost.get("open", 0) + lost.get("lost", 0) > 0
+    assert not found.totals("r2").keys() & {"open", "lost"}
+
+
+@pytest.mark.parametrize("cache", [None, 0])
+def test_restarts_and_new_epochs_use_no_reading_twice(cache: int | None, tmp_path: Path) -> None:
+    assert ledger_of(said(restless(1, cache=cache)), tmp_path).offenders == ()
+
+
+def test_the_command_ends_with_1_and_names_the_offender(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    good = written(tmp_path / "good.mcap", samples)
+    runner = CliRunner()
+    proof = runner.invoke(app, ["verify-ledger", str(good.path)])
+    assert proof.exit_code == 0, proof.output
+    assert "exactly one disposition" in proof.output
+    second = messages(samples, ch.SUBMAP, "r1")[1]
+    bad = submap_changed(samples, 1, first_reading=second.first_reading - 1)
+    path = written(tmp_path / "bad.mcap", bad).path
+    result = runner.invoke(app, ["verify-ledger", str(path)])
+    assert result.exit_code == 1
+    assert "is in two submaps: 0 and 1" in result.output

@@ -1,0 +1,137 @@
+"""Pictures and the report: drawn where there is something to draw, self-contained, readable."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
+from central.desk.pictures.run import (
+    ELLIPSE_CHI2,
+    ellipse_of,
+    error_picture,
+    label_offsets,
+    map_picture,
+)
+from central.desk.report.tables import summary_tables
+from sim.scenarios.scenario import with_options
+from team.wire import channels as ch
+from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def run() -> Evaluation:
+    return evaluate(joined_log(scenario(robots=2), 0.1))
+
+
+@settings(deadline=None, max_examples=50)
+@given(a=st.floats(0.1, 5.0), b=st.floats(0.1, 5.0), share=st.floats(-0.95, 0.95))
+def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(
+    a: float, b: float, share: float
+) -> None:
+    P = np.array([[a, share * np.sqrt(a * b)], [share * np.sqrt(a * b), b]])
+    width, height, turn_deg = ellipse_of(P)
+    turn = np.radians(turn_deg)
+    ends = (
+        0.5 * width * np.array([np.cos(turn), np.sin(turn)]),
+        0.5 * height * np.array([-np.sin(turn), np.cos(turn)]),
+    )
+    for end in ends:
+        assert end @ np.linalg.solve(P, end) == pytest.approx(ELLIPSE_CHI2, rel=1e-6)
+    assert width >= height
+
+
+def test_both_pictures_are_drawn(run: Evaluation, tmp_path: Path) -> None:
+    assert map_picture(run, tmp_path / "map.png")
+    assert error_picture(run, tmp_path / "errors.png")
+    assert (tmp_path / "map.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "errors.png").read_bytes().startswith(PNG)
+
+
+def test_the_same_run_draws_the_same_bytes(run: Evaluation, tmp_path: Path) -> None:
+    pictures = []
+    for name in ("a.png", "b.png"):
+        map_picture(run, tmp_path / name)
+        pictures.append((tmp_path / name).read_bytes())
+    assert pictures[0] == pictures[1]
+
+
+def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path: Path) -> None:
+    hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
+    blind = evaluate([s for s in joined_log(scenario(), 0.1) if s.key not in hidden])
+    assert map_picture(blind, tmp_path / "map.png")
+    assert not error_picture(blind, tmp_path / "errors.png")
+    assert not (tmp_path / "errors.png").exists()
+
+
+def test_an_empty_run_draws_nothing(tmp_path: Path) -> None:
+    assert not map_picture(evaluate([]), tmp_path / "map.png")
+
+
+def test_the_tables_fit_a_terminal_of_80_columns_and_name_their_units(run: Evaluation) -> None:
+    console = Console(width=80, record=True, force_terminal=False)
+    tables = summary_tables(run)
+    for table in tables:
+        assert console.measure(table).maximum <= 80
+        console.print(table)
+    text = console.export_text()
+    for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2", "2 is right", "0% within 95 %"):
+        assert words in text
+    assert "…" not in text.partition("readings")[2]
+
+
+def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
+    of = scenario()
+    truth = streams(of).streams[0].truth
+    assert truth is not None
+    said = online(ch.OWN_POSE, truth[1:] + np.array([3.0, 4.0, 0.0]), of)
+    console = Console(width=80, record=True, force_terminal=False)
+    console.print(summary_tables(evaluate(world_log(of) + samples(said)))[1])
+    text = console.export_text()
+    assert "5.000*" in text
+    assert "* of online ones" in text
+
+
+def test_a_star_is_explained_only_where_there_is_one(run: Evaluation) -> None:
+    console = Console(width=80, record=True, force_terminal=False)
+    console.print(summary_tables(run)[1])
+    assert "*" not in console.export_text()
+
+
+@pytest.mark.parametrize(
+    ("fusion", "said"),
+    [
+        ("join", "> 1000: over-confident"),
+        ("kalman", "> 1000: over-confident (rule counts readings again)"),
+    ],
+)
+def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(
+    run: Evaluation, fusion: str, said: str
+) -> None:
+    assert run.map is not None
+    assert run.map.errors is not None
+    assert run.scenario is not None
+    absurd = replace(
+        run,
+        map=replace(run.map, errors=replace(run.map.errors, nees_per_dof=6e18)),
+        scenario=with_options(run.scenario, fusion=fusion),
+    )
+    console = Console(width=80, record=True, force_terminal=False)
+    console.print(summary_tables(absurd)[0])
+    (line,) = [x for x in console.export_text().splitlines() if "NEES per dof" in x]
+    assert line.strip("│ ").partition("│")[2].strip() == said
+    assert to_json(absurd)["map_nees_per_dof"] == 6e18
+
+
+def test_labels_point_away_from_their_neighbours() -> None:
+    points = np.array([[0.0, 0.0], [0.1, 0.0], [50.0, 50.0]])
+    left, right, alone = label_offsets(points)
+    assert left[0] < 0.0 < right[0]
+    assert left[1] == right[1] == 0.0
+    assert (alone > 0.0).all()

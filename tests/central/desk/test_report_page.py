@@ -1,0 +1,139 @@
+"""The report: one page that needs nothing else, whatever the log lacks and whatever it says."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from central.desk.evaluation.evaluation import evaluate, to_json
+from central.desk.evaluation.history import history
+from central.desk.ledger import Entry, Ledger
+from central.desk.pictures.time import latency_picture
+from central.desk.report.page import write_report
+from central.desk.report.run import Run, run_figures
+from sim.cli.main import app
+from sim.in_memory.team import run_team
+from team.recording.recorder import Recorder
+from team.wire import channels as ch
+from team.wire.bus import Sample
+from tests.sim.logs import joined_log, scenario, streams, world_log
+
+PICTURES = ["map", "errors", "consistency", "traffic", "latency", "timeline"]
+
+
+def run_of(log: list[Sample], **metadata: str) -> Run:
+    return Run(evaluate(log), history(log), metadata)
+
+
+def page_of(run: Run, folder: Path) -> str:
+    figures = to_json(run.evaluation, run_figures(run))
+    return write_report(run, folder, figures)[0].read_text("utf-8")
+
+
+@pytest.fixture(scope="module")
+def log() -> list[Sample]:
+    """A run in memory, which has no wall clock: each message a millisecond after the one before."""
+    of = scenario(robots=2)
+    return [
+        replace(sample, wall_ns=(k + 1) * 1_000_000)
+        for k, sample in enumerate(run_team(of, streams(of)))
+    ]
+
+
+def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Path) -> None:
+    run = run_of(log, seed="1")
+    paths = write_report(run, tmp_path / "new", to_json(run.evaluation, run_figures(run)))
+    names = [path.name for path in paths]
+    assert names == ["report.html", "report.json", *(f"{p}.png" for p in PICTURES), "trajectories"]
+    page = paths[0].read_text("utf-8")
+    assert page.count("data:image/png;base64,") == len(PICTURES)
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+    targets = set(re.findall(r'href="#(\w+)"', page))
+    assert targets == set(re.findall(r'<h2 id="(\w+)"', page))
+    assert {"honesty", "latency", "events", "traffic"} <= targets
+    assert '<meta name="viewport" content="width=device-width' in page
+    figures = json.loads(paths[1].read_text("utf-8"))
+    assert figures["landmarks"] == 8
+    assert set(figures["nis_per_dof"]) == {"r1", "r2"}
+    assert figures["trajectories"]["r1"]["online"]["poses"] > 10
+    assert figures["bytes_per_s"][ch.SUBMAP.key("r1")] > 0.0
+
+
+def test_clocks_that_disagree_still_give_a_picture(log: list[Sample], tmp_path: Path) -> None:
+    behind = [replace(s, wall_ns=1) if s.key.startswith("central") else s for s in log]
+    found = history(behind)
+    assert max(of.last_s.max() for of in found.latencies.values()) < 0.0
+    assert latency_picture(found, tmp_path / "latency.png")  # a warning would be an error here
+
+
+def test_what_a_log_says_can_not_become_markup(log: list[Sample], tmp_path: Path) -> None:
+    run = run_of(log, commit="<b>", long="<i>" * 100)
+    bad = "<script>alert(1)</script> [red]x[/nothing]"
+    evaluation = replace(run.evaluation, notes=(bad,))
+    events = tuple(replace(event, text=bad, node=bad) for event in run.history.events[:1])
+    hostile = replace(
+        run, evaluation=evaluation, history=replace(run.history, events=events), no_ledger=bad
+    )
+    page = page_of(hostile, tmp_path)
+    assert not re.search("<script|<b>|<i>", page)
+    assert "<td>&lt;b&gt;</td>" in page
+
+
+def test_without_truth_there_are_the_monitor_and_nis(log: list[Sample], tmp_path: Path) -> None:
+    blind = [s for s in log if not s.key.startswith("truth")]
+    run = run_of(blind)
+    page = page_of(run, tmp_path)
+    assert 'id="honesty"' in page
+    assert 'id="paths"' not in page
+    assert (tmp_path / "consistency.png").exists()
+    assert not (tmp_path / "errors.png").exists()
+    assert {path.name for path in (tmp_path / "trajectories").iterdir()} == {
+        f"{robot}.{kind}.tum" for robot in ("r1", "r2") for kind in ("smoothed", "online")
+    }
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_a_log_that_stops_anywhere_is_reported(count: int, tmp_path: Path) -> None:
+    page = page_of(run_of(world_log(scenario())[:count]), tmp_path)
+    assert "did not come to its end" in page
+
+
+def written(log: list[Sample], path: Path) -> Path:
+    with Recorder(path, "small", {"seed": "1"}) as recorder:
+        recorder.write(log)
+    return path
+
+
+def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: Path) -> None:
+    file = written(log, tmp_path / "log.mcap")
+    done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    assert "has exactly one disposition" in done.output
+    assert re.search(r"^NIS per dof: r1 [\d.]+, r2 [\d.]+$", done.output, re.MULTILINE)
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert re.search(r'class="good">Ledger: each of \d+ readings has exactly one', page)
+    figures = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
+    assert figures["ledger"]["offenders"] == []
+    assert figures["provenance"] == {"seed": "1"}
+
+
+def test_a_reading_used_twice_is_named_on_the_page(log: list[Sample], tmp_path: Path) -> None:
+    run = run_of(log)
+    name = "reading 7 of r1, epoch 1 is in two submaps: 0 and 1"
+    offending = Ledger({("r1", 1): 3 * (Entry("in a submap", 0),)}, {}, (name,))
+    page = page_of(replace(run, ledger=offending), tmp_path)
+    assert 'class="bad">Ledger: 1 offenders: reading 7 of r1' in page
+
+
+def test_a_log_that_lacks_what_the_ledger_needs_says_what(tmp_path: Path) -> None:
+    file = written(joined_log(scenario(), 0.1), tmp_path / "log.mcap")
+    done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "the log has no configuration of robot/r1" in page
+    told = CliRunner().invoke(app, ["report", str(file), "-o", str(file)])
+    assert told.exit_code == 2
+    assert "give a folder" in told.output

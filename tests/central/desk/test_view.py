@@ -1,0 +1,372 @@
+"""Views: what a viewer node makes of a team's messages, read back by a reader that is not ours."""
+
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import jsonschema
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from central.desk.view.drawn import PATH_POINTS, Track, ellipses, in_order, landmarks_of
+from central.desk.view.errors import RunningErrors, map_fit
+from central.desk.view.events import Chronicle
+from central.desk.view.export import export_views, with_views
+from central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode
+from sim.in_memory.team import final_map, run_team
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from team import translate
+from team.recording.check import checked
+from team.recording.reader import open_log
+from team.recording.recorder import Recorder
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire import views
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import Sample
+from team.wire.codec import decoded
+from tests.support import spd
+
+S = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    """What two robots say in 40 steps of the thesis' world."""
+    scenario = with_options(load("thesis"), seed=1)
+    scenario = msgspec.structs.replace(
+        scenario, world=msgspec.structs.replace(scenario.world, steps=40)
+    )
+    return list(run_team(scenario, streams_of(scenario)))
+
+
+@pytest.fixture(scope="module")
+def exported(samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("view")
+    with Recorder(folder / "log.mcap", "thesis", {}) as recorder:
+        recorder.write(samples)
+    export_views(open_log(folder / "log.mcap"), folder / "views.mcap")
+    return folder / "views.mcap"
+
+
+@pytest.fixture(scope="module")
+def read(exported: Path) -> dict[str, list[tuple[int, object]]]:
+    """(log time, message) by topic, decoded by the schemas in the file alone."""
+    found = defaultdict(list)
+    with exported.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for schema, channel, message in reader.iter_messages():
+            if "/view/" not in channel.topic:
+                continue
+            if channel.message_encoding == "json":
+                value = json.loads(message.data)
+                jsonschema.validate(value, json.loads(schema.data))
+            else:
+                value = DecoderFactory().decoder_for(channel.message_encoding, schema)(message.data)
+            found[channel.topic.removeprefix("team/thesis/")].append((message.log_time, value))
+    return found
+
+
+def test_every_view_of_the_table_is_in_an_exported_log(read):
+    assert {views.view_of(key) for key in read} == set(views.VIEWS)
+    assert {"view/robot/r1", "view/robot/r2", "view/pose/r2", "view/particles/r1"} <= set(read)
+
+
+def test_the_log_with_views_is_sound_and_has_the_teams_bytes_unchanged(exported, samples):
+    log = open_log(exported)
+    assert checked(log) == []
+    kept = [s for s in log.samples() if ch.VIEW.owner(s.key) is None]
+    assert [(s.key, s.payload) for s in kept] == [(s.key, s.payload) for s in samples]
+
+
+def test_the_last_scene_has_the_final_map(read, samples):
+    final = final_map(samples)
+    names, means = translate.landmarks_of(final)
+    entities = {entity.id: entity for entity in read["view/map"][-1][1].entities}
+    landmarks = entities["landmarks"]
+    assert [text.text for text in landmarks.texts] == [str(name) for name in names]
+    dots = [(d.pose.position.x, d.pose.position.y) for d in landmarks.cylinders[1::2]]
+    np.testing.assert_allclose(dots, means)
+    joint = translate.landmark_covariance_of(final)
+    for i, disc in enumerate(landmarks.cylinders[::2]):
+        P = joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
+        turn = 2.0 * np.arctan2(disc.pose.orientation.z, disc.pose.orientation.w)
+        R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        half = 0.5 * np.array([disc.size.x, disc.size.y])
+        np.testing.assert_allclose(R @ np.diag(half**2) @ R.T, 5.991 * P, rtol=1e-6, atol=1e-9)
+    assert len(entities["true landmarks"].cubes) == 18
+
+
+def test_a_view_comes_once_a_second_and_has_every_robot_where_it_was(read, samples):
+    times = [at for at, _ in read["view/robots"]]
+    assert times == sorted(times)
+    assert set(np.diff(times[:-1])) == {PERIOD_NS}
+    said = {}
+    for sample in samples:
+        if sample.key.endswith("/pose"):
+            pose = np.frombuffer(decoded(sample.payload, m.PoseEstimate).pose)
+            said.setdefault((sample.key.split("/")[1], sample.stamp_ns), []).append(pose[:2])
+    for at, scene in read["view/robots"]:
+        drawn = {e.id: e.arrows[0].pose.position for e in scene.entities}
+        for robot in ("r1", "r2"):
+            if f"robot {robot}" in drawn and (robot, at) in said:
+                place = drawn[f"robot {robot}"]
+                assert any(np.allclose([place.x, place.y], p) for p in said[robot, at])
+
+
+def test_the_transform_is_the_robots_pose(read):
+    (at, transforms), (_, pose) = read["view/transforms"][-1], read["view/pose/r1"][-1]
+    of_r1 = next(t for t in transforms.transforms if t.child_frame_id == "robot/r1")
+    assert of_r1.parent_frame_id == "map"
+    assert (of_r1.translation.x, of_r1.translation.y) == (
+        pose.pose.position.x,
+        pose.pose.position.y,
+    )
+    assert str(of_r1.rotation) == str(pose.pose.orientation)  # two equal types of two schemas
+    assert of_r1.timestamp.ToNanoseconds() == at
+
+
+def test_figures_hold_errors_within_their_bounds_and_the_monitors_cost(read):
+    _, robot = read["view/robot/r1"][-1]
+    assert abs(robot["error_x_m"]) < robot["three_sigma_x_m"] + 1.0
+    assert robot["nees_per_dof"] > 0.0
+    _, team = read["view/team"][-1]
+    assert team["landmarks"] > 10
+    assert 0.0 < team["map_rmse_m"] < 5.0
+    assert 0.1 < team["map_nees_per_dof"] < 10.0
+
+
+def test_the_log_view_tells_the_end(read):
+    texts = [line.message for _, line in read["view/log"]]
+    assert "r1 joined" in texts
+    assert "r2 is in the team's map" in texts
+    assert any(text.startswith("final map of ") for text in texts)
+
+
+def test_views_of_the_same_log_are_the_same_bytes(samples):
+    assert list(with_views(samples)) == list(with_views(samples))
+
+
+def test_views_that_are_in_a_log_are_not_doubled(samples):
+    once = list(with_views(samples))
+    assert list(with_views(once)) == once
+
+
+def test_without_the_truth_there_are_views_without_errors(samples):
+    blind = [s for s in samples if not s.key.startswith("truth")]
+    team = [json.loads(s.payload) for s in with_views(blind) if s.key == "view/team"]
+    robot = [json.loads(s.payload) for s in with_views(blind) if s.key == "view/robot/r1"]
+    assert team[-1]["landmarks"] > 10
+    assert "map_rmse_m" not in team[-1]
+    assert "error_x_m" not in robot[-1]
+    assert robot[-1]["three_sigma_x_m"] > 0.0
+
+
+@pytest.mark.parametrize("node", [RobotNode])
+def test_no_robot_hears_a_view(node):
+    assert ch.VIEW not in node.listens
+
+
+# What is drawn.
+
+
+def test_the_blocks_of_a_joint_covariance_are_those_of_the_whole_matrix():
+    P = spd(6)
+    joint = m.FusedMap(
+        0, "join", bytes(8), "r1/1", False, False, 0, (), (), True,
+        from_ids([1, 2, 3]), from_floats(range(6)), translate.joint_bytes(P), 0.0, 0,
+    )  # fmt: skip
+    blocks = msgspec.structs.replace(
+        joint, joint=False, covariance=translate.block_bytes(translate.blocks_of(P))
+    )
+    np.testing.assert_array_equal(landmarks_of(joint).blocks, landmarks_of(blocks).blocks)
+
+
+def test_an_ellipse_has_the_axes_of_its_covariance():
+    theta = 0.4
+    R = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    P = R @ np.diag([9.0, 0.25]) @ R.T
+    (major,), (minor,), (direction,) = ellipses(np.array([[P[0, 0], P[0, 1], P[1, 1]]]))
+    np.testing.assert_allclose([major, minor, direction], [3 * 5.991**0.5, 0.5 * 5.991**0.5, theta])
+
+
+def test_robots_are_in_the_order_in_which_people_count() -> None:
+    assert in_order(["r10", "alpha", "r2", "r1", "7", "r"]) == [
+        "7",
+        "alpha",
+        "r",
+        "r1",
+        "r2",
+        "r10",
+    ]
+
+
+def test_a_long_path_keeps_its_ends_and_few_points():
+    track = Track()
+    for i in range(10 * PATH_POINTS):
+        track.take(i * 100_000_000, float(i), 0.0)
+    assert len(track.points) <= PATH_POINTS
+    assert track.points[0] == (0.0, 0.0)
+    assert track.points[-1][0] > 9.9 * PATH_POINTS
+
+
+# Errors.
+
+
+def pose(at_s: float, x: float, robot: str = "r1", sigma: float = 0.5) -> m.PoseEstimate:
+    P = from_floats(sigma**2 * np.eye(3))
+    return m.PoseEstimate(round(at_s * S), robot, 1, 0, bytes(8), from_floats([x, 0, 0]), P)
+
+
+def truth(times: list[float], robot: str = "r1") -> m.Truth:
+    poses = from_floats(np.column_stack([times, np.zeros((len(times), 2))]))
+    return m.Truth(round(times[-1] * S), robot, from_stamps([round(t * S) for t in times]), poses)
+
+
+@pytest.mark.parametrize("truth_first", [True, False])
+def test_an_error_is_known_as_soon_as_pose_and_truth_are_there(truth_first):
+    errors = RunningErrors()
+    steps = [
+        lambda: errors.take_truth(truth([0.0, 1.0, 2.0])),
+        lambda: errors.take_pose(pose(1.5, 2)),
+    ]
+    for step in steps if truth_first else steps[::-1]:
+        assert errors.known() is None
+        step()
+    found = errors.known()
+    assert found is not None
+    np.testing.assert_allclose(found.errors, [[0.5, 0.0, 0.0]])
+    np.testing.assert_allclose(found.nees, [1.0])
+
+
+def test_truth_that_is_far_ahead_is_kept_for_the_estimates():
+    errors = RunningErrors()
+    for begin in range(0, 300, 10):
+        errors.take_truth(truth([float(begin + i) for i in range(11)]))
+    errors.take_pose(pose(3.0, 3.25))
+    found = errors.known()
+    np.testing.assert_allclose(found.errors[0, 0], 0.25)
+    errors.forget(250 * S)
+    assert errors.truth_at(3 * S) is None
+    np.testing.assert_allclose(errors.truth_at(round(260.5 * S)), [260.5, 0.0, 0.0])
+
+
+def test_a_maps_nees_is_of_each_landmark():
+    found = landmarks_of(
+        m.FusedMap(
+            0, "join", bytes(8), "r1/1", False, False, 0, (), (), False, from_ids([4, 7]),
+            from_floats([1.0, 0.0, 5.0, 5.0]), from_floats([0.25, 0.0, 1.0] * 2), 0.0, 0,
+        )
+    )  # fmt: skip
+    fit = map_fit(found, {4: (0.0, 0.0)})
+    assert fit == (1, 1.0, 2.0)
+    assert map_fit(found, {}) is None
+
+
+# Time.
+
+
+def shown(node: ViewerNode, *messages: tuple[ch.Channel, m.Message]) -> list[tuple[str, int]]:
+    return [(s.key, s.stamp_ns) for c, message in messages for s in node.handle(c, message)]
+
+
+def robots_at(out: list[tuple[str, int]]) -> list[int]:
+    return [at // S for key, at in out if key == "view/robots"]
+
+
+def test_the_view_waits_for_the_slowest_robot_at_work():
+    node = ViewerNode()
+    ready = [(ch.OWN_POSE, pose(0, 0)), (ch.OWN_POSE, pose(0, 0, "r2"))]
+    assert robots_at(shown(node, *ready)) == [0]
+    assert robots_at(shown(node, *[(ch.OWN_POSE, pose(t, t)) for t in range(1, 9)])) == []
+    assert robots_at(shown(node, (ch.OWN_POSE, pose(3, 3, "r2")))) == [1, 2, 3]
+    lost = (ch.ALIVE, m.Liveliness(0, "robot/r2", False))
+    assert robots_at(shown(node, lost)) == [4, 5, 6, 7, 8]
+
+
+def test_a_robot_that_has_stopped_holds_the_view_for_a_while_only():
+    node = ViewerNode()
+    shown(node, (ch.OWN_POSE, pose(0, 0)), (ch.OWN_POSE, pose(0, 0, "r2")))
+    ahead = LAG_NS // S + 5
+    out = shown(node, *[(ch.OWN_POSE, pose(t, t)) for t in range(1, ahead + 1)])
+    assert robots_at(out) == [1, 2, 3, 4, 5]
+
+
+def test_a_stamp_from_far_ahead_does_not_make_views_without_end():
+    node = ViewerNode()
+    out = shown(node, (ch.OWN_POSE, pose(0, 0)), (ch.OWN_POSE, pose(1e9, 0)))
+    assert len(robots_at(out)) <= MOST_PERIODS + 2
+
+
+def test_the_teams_pose_goes_before_the_robots_own():
+    node = ViewerNode()
+    node.handle(ch.OWN_POSE, pose(0, 0))
+    node.handle(ch.TEAM_POSE, pose(1, 7.0))
+    out = node.handle(ch.OWN_POSE, pose(2, 9.0)) + node.handle(ch.TEAM_POSE, pose(2, 8.0))
+    figures = [json.loads(s.payload) for s in out if s.key == "view/robot/r1"]
+    assert figures[-1]["x_m"] == 8.0
+
+
+# Events.
+
+
+def told(*messages: m.Message) -> list[tuple[str, str]]:
+    chronicle = Chronicle()
+    return [(e.kind, e.text) for message in messages for e in chronicle.take(message, 5)]
+
+
+def test_a_robot_joins_is_lost_and_comes_back():
+    alive, gone = (m.Liveliness(0, "robot/r1", x) for x in (True, False))
+    assert told(alive, gone, gone, alive) == [
+        ("joined", "r1 joined"), ("lost", "r1 was lost"), ("joined", "r1 came back"),
+    ]  # fmt: skip
+
+
+def test_a_robot_that_is_done_leaves():
+    came, gone = (m.Liveliness(0, "robot/r1", x) for x in (True, False))
+    assert told(came, m.Done(0, "r1", 1, 10, 5, 1, ()), gone)[1:] == [
+        ("done", "r1 used all its 10 readings"), ("left", "r1 left"),
+    ]  # fmt: skip
+
+
+def fused(
+    robots: list[str], reasons: tuple[str, ...] = (), withdrawn: tuple[str, ...] = ()
+) -> m.FusedMap:
+    members = tuple(m.Member(robot, 1, 0) for robot in robots)
+    return m.FusedMap(
+        0, "join", bytes(8), "r1/1", False, False, 0, members, (), False, b"", b"", b"", 0.0, 0,
+        reasons, (), (), withdrawn,
+    )  # fmt: skip
+
+
+def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once():
+    why = "r2: 1 shared landmark, 2 needed"
+    alone = fused(["r1"], (why,))
+    assert told(alone, alone, fused(["r1", "r2"]), fused(["r1"], (), ("r2",))) == [
+        ("map", "r1 is in the team's map"), ("warning", why), ("map", "r2 is in the team's map"),
+        ("withdrawn", "r2 was withdrawn from the map"),
+    ]  # fmt: skip
+
+
+def test_a_withdrawal_is_told_once_with_its_reason():
+    said = m.Withdrawal(3, "r2", "central", "its wheels slip")
+    assert told(fused(["r1", "r2"]), said, fused(["r1"]))[2:] == [
+        ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
+    ]  # fmt: skip
+
+
+def test_a_warning_whose_figures_move_is_told_once_and_a_refusal_is_one():
+    def status(refused: int, *warnings: str) -> m.Status:
+        return m.Status(0, "central", "joining", {"refused": float(refused)}, warnings)
+
+    begun = pose(0, 0)
+    said = (status(0, "cost 1.2"), status(0, "cost 1.3"), status(2, "refused: overlap"))
+    assert told(status(0, "waits"), begun, *said) == [
+        ("warning", "central: cost 1.2"),
+        ("refused", "the centre refused 2 submaps"), ("refused", "central: refused: overlap"),
+    ]  # fmt: skip

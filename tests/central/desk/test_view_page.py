@@ -1,0 +1,383 @@
+"""The page and its server: what the page is told, who may ask, what Foxglove gets."""
+
+import base64
+import json
+import re
+import socket
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from http.client import HTTPConnection
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from foxglove.websocket import PlaybackStatus
+from mcap.reader import make_reader
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from central.desk.view.export import with_views
+from central.desk.view.foxglove_door import refusal
+from central.desk.view.foxglove_server import Player, Views
+from central.desk.view.layout import layout
+from central.desk.view.server import Feed, ServerError, page_files, serving
+from central.desk.view.session import Shown, session
+from team.recording.reader import LogError
+from team.recording.recorder import Recorder
+from team.recording.tail import Tail
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import encoded
+from tests.crowd import crowd
+from tests.support import ROOT, wait_until
+
+ROBOTS, LANDMARKS, SECONDS = 3, 40, 60
+PAGE = ROOT / "central" / "desk" / "view" / "page"
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    return list(crowd(ROBOTS, LANDMARKS, SECONDS))
+
+
+@pytest.fixture(scope="module")
+def log(samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "log.mcap"
+    with Recorder(path, "crowd", {"seed": "7", "scenario": '{"name": "small crowd"}'}) as recorder:
+        recorder.write(samples)
+    return path
+
+
+def told(path: Path) -> list[dict[str, object]]:
+    feed = Feed(Tail(path))
+    while not feed.ended:
+        feed.look(growing=False)
+    assert feed.error is None
+    return [json.loads(frame) for frame in feed.frames]
+
+
+@pytest.fixture(scope="module")
+def frames(log: Path) -> dict[str, list[dict[str, object]]]:
+    """What the page is told of the log, by kind."""
+    found = defaultdict(list)
+    for frame in told(log):
+        found[frame["k"]].append(frame)
+    return found
+
+
+# What the page is told.
+
+
+def test_the_page_is_greeted_first_and_told_the_end_last(log):
+    kinds = [frame["k"] for frame in told(log)]
+    assert kinds[0] == "hello"
+    assert kinds[-1] == "eof"
+    assert told(log)[0]["title"] == "small crowd, seed 7 · log.mcap"
+
+
+def test_the_page_gets_every_pose_and_its_error(frames):
+    for robot in ("r1", "r2", "r3"):
+        poses = [f for f in frames["pose"] if f["r"] == robot]
+        times = [t for f in poses for t in f["t"]]
+        np.testing.assert_allclose(times, np.arange(5 * SECONDS) / 5.0)
+        rows = np.array([v for f in poses for v in f["v"]]).reshape(-1, 7)
+        np.testing.assert_allclose(rows[:, 3:], np.tile([0.04, 0.0, 0.09, 1e-3], (len(rows), 1)))
+        errors = np.array([v for f in frames["err"] if f["r"] == robot for v in f["v"]])
+        errors = errors.reshape(-1, 7)
+        assert len(errors) == len(rows)
+        np.testing.assert_allclose(errors[0, 3:6], [0.6, 0.9, 3 * 1e-3**0.5], rtol=1e-6)
+        assert 0.7 < errors[:, 6].mean() < 1.3
+
+
+def test_the_page_gets_the_maps_and_how_they_fit(frames, samples):
+    maps = frames["map"]
+    assert len(maps) == sum(s.key in ("central/map", "central/final") for s in samples)
+    assert maps[-1]["final"]
+    assert len(np.frombuffer(base64.b64decode(maps[-1]["ids"]), "<u4")) == LANDMARKS
+    assert 0.05 < maps[-1]["rmse"] < 0.3
+    assert 0.5 < maps[-1]["nees"] < 2.0
+
+
+def test_the_page_is_told_every_byte_by_key(frames, samples):
+    found = defaultdict(lambda: [0, 0])
+    for frame in frames["bytes"]:
+        for key, _, messages, size in frame["v"]:
+            found[key][0] += messages
+            found[key][1] += size
+    said = defaultdict(lambda: [0, 0])
+    for sample in samples:
+        said[sample.key][0] += 1
+        said[sample.key][1] += len(sample.payload)
+    assert found == said
+
+
+def test_the_page_is_told_who_joined_and_the_end(frames):
+    texts = [event["x"] for event in frames["ev"]]
+    assert texts[:3] == ["r1 joined", "r2 joined", "r3 joined"]
+    assert texts[-1] == f"final map of {LANDMARKS} landmarks"
+
+
+def test_an_event_is_at_the_time_of_what_it_is_about(samples, tmp_path):
+    ended = m.End(SECONDS * 10**9, ())
+    early = [*samples[:8], Sample(ch.END.key(), encoded(ended), ended.stamp_ns, 0, 0), *samples[8:]]
+    with Recorder(tmp_path / "early.mcap", "crowd", {}) as recorder:
+        recorder.write(early)
+    times = {f["x"]: f["t"] for f in told(tmp_path / "early.mcap") if f["k"] == "ev"}
+    assert times["the world has ended"] == SECONDS
+    assert times["r1 is in the team's map"] == 4.8
+
+
+def test_a_damaged_chunk_costs_the_page_no_more_than_itself(log, tmp_path):
+    data = bytearray(log.read_bytes())
+    with log.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    chunk = chunks[len(chunks) // 2]
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    (tmp_path / "damaged.mcap").write_bytes(data)
+    found = told(tmp_path / "damaged.mcap")
+    assert found[-1]["k"] == "eof"
+    assert found[-2]["x"].startswith(
+        "1 damaged parts of the log were left out; `teamslam log check"
+    )
+
+
+# The tail of a log.
+
+
+def test_the_tail_of_a_growing_log_gives_each_sample_once_in_order(log, samples, tmp_path):
+    path = tmp_path / "growing.mcap"
+    tail = Tail(path)
+    assert tail.more() == []
+    data = log.read_bytes()
+    got: list[Sample] = []
+    with path.open("wb") as file:
+        for begin in range(0, len(data), 9_973):
+            file.write(data[begin : begin + 9_973])
+            file.flush()
+            got += tail.more()
+    while more := tail.more():
+        got += more
+    assert tail.ended
+    assert [(s.key, s.payload) for s in got] == [(s.key, s.payload) for s in samples]
+
+
+def test_the_tail_of_what_is_no_log_says_so(tmp_path):
+    path = tmp_path / "no.mcap"
+    path.write_bytes(b"no log" * 20_000)
+    with pytest.raises(LogError, match="not an MCAP file"):
+        Tail(path).more()
+
+
+# The server.
+
+
+@pytest.fixture(scope="module")
+def shown(log: Path) -> Iterator[Shown]:
+    with session(log, "127.0.0.1", 0, 0, growing=False) as found:
+        wait_until(lambda: found.feed.ended, what="the log is read")
+        yield found
+
+
+def asked(
+    shown: Shown, path: str, at: str | None = None, **headers: str
+) -> tuple[int, bytes, dict[str, str]]:
+    at = urlsplit(at or shown.url)
+    connection = HTTPConnection(at.hostname, at.port, timeout=20)
+    try:
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read(), dict(answer.getheaders())
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize("path", sorted(page_files()))
+def test_every_file_of_the_page_is_served(shown, path):
+    status, body, headers = asked(shown, path)
+    assert status == 200
+    name = "index.html" if path == "/" else path[1:]
+    assert body == (PAGE / name).read_bytes()
+    assert "default-src 'self'" in headers["Content-Security-Policy"]
+
+
+def test_the_page_names_nothing_beyond_itself():
+    named = {
+        url
+        for path in PAGE.iterdir()
+        for url in re.findall(r"""(?:https?:)?//[\w.-]+\.\w+[^\s"'`]*""", path.read_text())
+    }
+    assert named <= {"http://www.w3.org/2000/svg"}
+
+
+@pytest.mark.parametrize("path", ["/../server.py", "/server.py", "/..%2fserver.py", "/nothing"])
+def test_other_files_are_not_served(shown, path):
+    assert asked(shown, path)[0] == 404
+
+
+def test_a_request_under_another_name_is_refused(shown):
+    assert asked(shown, "/", Host="elsewhere.example")[0] == 403
+
+
+def test_the_stream_is_for_the_page_itself(shown):
+    url = shown.url.replace("http", "ws") + "stream"
+    with connect(url, origin=shown.url.rstrip("/")) as socket:
+        assert json.loads(socket.recv(timeout=20))[0]["k"] == "hello"
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(url, origin="http://elsewhere.example")
+
+
+def test_a_port_that_is_taken_is_told_with_a_remedy(log):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        for ports in ((port, 0), (0, port)):
+            with (
+                pytest.raises(ServerError, match=rf":{port}: .*choose another --"),
+                session(log, "127.0.0.1", *ports, growing=False),
+            ):
+                pass
+
+
+def test_a_log_that_comes_later_is_shown_when_it_is_there(log, tmp_path):
+    path = tmp_path / "later.mcap"
+    feed = Feed(Tail(path))
+    with serving(feed, "127.0.0.1", 0, growing=True) as url:
+        with connect(url.replace("http", "ws") + "stream") as socket:
+            path.write_bytes(log.read_bytes())
+            assert json.loads(socket.recv(timeout=20))[0]["k"] == "hello"
+        wait_until(lambda: feed.ended, what="the log is read")
+        assert json.loads(feed.frames[-1]) == {"k": "eof", "complete": True}
+
+
+# Foxglove.
+
+
+def foxglove(shown: Shown) -> AbstractContextManager:
+    return connect(shown.foxglove, subprotocols=["foxglove.sdk.v1"])
+
+
+def offered(socket, count: int) -> list[dict[str, str]]:
+    channels: list[dict[str, str]] = []
+    while len(channels) < count:
+        said = json.loads(socket.recv(timeout=20))
+        channels += said.get("channels", [])
+    return channels
+
+
+def test_foxglove_is_offered_every_view_and_may_play_the_log(shown):
+    with foxglove(shown) as socket:
+        info = json.loads(socket.recv(timeout=20))
+        assert "playbackControl" in info["capabilities"]
+        assert info["dataEndTime"]["sec"] == SECONDS - 1
+        topics = {channel["topic"] for channel in offered(socket, 13)}
+    assert {"team/crowd/view/map", "team/crowd/view/pose/r3", "team/crowd/view/team"} <= topics
+
+
+def test_of_a_growing_log_foxglove_gets_the_newest_view_at_once(log, tmp_path):
+    path = tmp_path / "grown.mcap"
+    path.write_bytes(log.read_bytes())
+    with session(path, "127.0.0.1", 0, 0, growing=True) as found:
+        wait_until(lambda: found.feed.ended, what="the log is read")
+        with foxglove(found) as socket:
+            assert "playbackControl" not in json.loads(socket.recv(timeout=20))["capabilities"]
+            number = next(
+                c["id"] for c in offered(socket, 13) if c["topic"] == "team/crowd/view/team"
+            )
+            wish = {"id": 1, "channelId": number}
+            socket.send(json.dumps({"op": "subscribe", "subscriptions": [wish],
+                                    "channels": [wish | {"id": number}]}))  # fmt: skip
+            while True:
+                said = socket.recv(timeout=20)
+                if isinstance(said, bytes) and b"landmarks" in said:
+                    break
+        assert json.loads(said[said.index(b"{") :])["landmarks"] == LANDMARKS
+
+
+def test_foxglove_is_for_viewers_of_this_machine(shown):
+    for origin in ("https://app.foxglove.dev", "http://localhost:8080", None):
+        with connect(shown.foxglove, origin=origin, subprotocols=["foxglove.sdk.v1"]) as socket:
+            assert "playbackControl" in json.loads(socket.recv(timeout=20))["capabilities"]
+    for origin in ("http://elsewhere.example", "https://app.foxglove.dev.example", "null"):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(shown.foxglove, origin=origin, subprotocols=["foxglove.sdk.v1"])
+    at = shown.foxglove.replace("ws:", "http:") + "/"
+    assert asked(shown, "/", at=at, Host="elsewhere.example")[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("at", "host", "origins", "let_in"),
+    [
+        ("127.0.0.1", "127.0.0.1:8765", [], True),
+        ("::1", "[::1]:8765", ["http://[::1]:80"], True),
+        ("127.0.0.1", "elsewhere.example:8765", [], False),
+        ("127.0.0.1", "", [], False),
+        ("0.0.0.0", "lab.example:8765", ["http://lab.example:8765"], True),
+        ("0.0.0.0", "lab.example:8765", ["http://elsewhere.example"], False),
+        ("0.0.0.0", "", ["null"], False),
+        ("127.0.0.1", "localhost:1", ["http://localhost", "http://elsewhere.example"], False),
+    ],
+)
+def test_foxgloves_door_looks_at_host_and_origin(at, host, origins, let_in):
+    assert (refusal(at, host, origins) is None) == let_in
+
+
+class Told(Views):
+    """Views that note what was said."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.name("crowd")
+        self.said: list[Sample] = []
+
+    def say(self, view: Sample) -> None:
+        self.said.append(view)
+
+
+@pytest.fixture(scope="module")
+def kept(samples: list[Sample]) -> list[Sample]:
+    return [s for s in with_views(samples) if ch.VIEW.owner(s.key) is not None]
+
+
+def test_a_jump_shows_every_topic_as_it_was(kept):
+    views = Told()
+    player = Player(views, kept)
+    views.said.clear()
+    player.ask(30_500_000_000, 1.0, play=False)
+    state = player.state()
+    assert (state.current_time, state.status) == (30_500_000_000, PlaybackStatus.Paused)
+    newest = {view.key: view for view in kept if view.stamp_ns <= 30_500_000_000}
+    assert {view.key: view for view in views.said} == newest
+    assert player.turn(1.0) is False
+
+
+def test_playing_says_each_view_once_at_its_time(kept):
+    views = Told()
+    player = Player(views, kept)
+    player.ask(0, 10.0, play=True)
+    views.said.clear()
+    assert player.turn(2.0)
+    assert views.said == [v for v in kept if 0 < v.stamp_ns <= 20_000_000_000]
+    while player.turn(1.0):
+        pass
+    assert views.said == [v for v in kept if v.stamp_ns > 0]
+    assert player.state().status == PlaybackStatus.Ended
+
+
+# The layout.
+
+
+def test_the_layout_names_only_topics_that_there_are(kept):
+    text = layout("crowd", ["r1", "r2", "r3"])
+    there = {f"team/crowd/{view.key}" for view in kept}
+    named = set(re.findall(r"team/crowd/view/[\w/]+", text))
+    optional = {f"team/crowd/view/particles/r{i}" for i in (1, 2, 3)}
+    assert named - optional <= there
+    assert {"team/crowd/view/map", "team/crowd/view/robot/r3", "team/crowd/view/log"} <= named
+
+
+def test_every_panel_of_the_layout_is_placed_once():
+    found = json.loads(layout("crowd", ["r1"]))
+    placed = re.findall(r"\"(\w+![\w]+)\"", json.dumps(found["layout"]))
+    assert sorted(placed) == sorted(found["configById"])

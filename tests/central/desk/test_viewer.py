@@ -1,0 +1,40 @@
+"""The viewer's process: it leaves at the end, whenever it comes."""
+
+import threading
+
+import msgspec
+import pytest
+
+from central.desk.view.viewer import run_viewer
+from team import the_end
+from team.shell import FaultyRunError
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork
+from team.wire.codec import encoded
+from tests.support import examples
+
+FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))
+
+
+@pytest.mark.parametrize("lost", [(), ("r2",)])
+def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(
+    lost: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(the_end, "FINAL_S", 0.1)
+    final = msgspec.structs.replace(FINAL, final=True, lost=lost)
+    network = MemoryNetwork()
+    router = MemoryBus(network)
+    router.answer(ch.FINAL_KEPT, "", lambda _: [encoded(m.FinalKept(0, 0, encoded(final)))])
+    stop = threading.Event()
+    timer = threading.Timer(20.0, stop.set)
+    timer.start()
+    try:
+        if lost:
+            with pytest.raises(FaultyRunError, match="r2 lost"):
+                run_viewer(MemoryBus(network), stop)
+        else:
+            run_viewer(MemoryBus(network), stop)
+        assert not stop.is_set(), "it left by itself"
+    finally:
+        timer.cancel()

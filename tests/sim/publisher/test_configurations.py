@@ -1,0 +1,108 @@
+"""What the others announce, against the world's scenario; and that the world waits for it."""
+
+import msgspec
+import pytest
+
+from sim.in_memory.team import run_team
+from sim.publisher.configurations import Configurations, differences
+from sim.publisher.main import expected_configurations
+from sim.publisher.node import WorldNode, expected_nodes
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from team.wire import channels as ch
+from team.wire import messages as m
+from tests.teams import stream, world_of
+
+SCENARIO = with_options(load("thesis"), robots=2)
+OTHER = with_options(SCENARIO, seed=7, fusion="kalman")
+STREAMS = world_of(stream("r1", 12), stream("r2", 9))
+
+
+def world() -> WorldNode:
+    """A world that waits for two robots and a centre, which are all alive."""
+    expected = expected_nodes(["r1", "r2"], recorder=False)
+    configurations = Configurations(expected_configurations(SCENARIO))
+    announced = m.Configured(0, "world", 0, bytes(8), "{}")
+    node = WorldNode(STREAMS, expected, announced, configurations=configurations)
+    for name in expected:
+        node.handle(m.Liveliness(0, name, True), 0)
+    return node
+
+
+def announced(node: WorldNode, *others: str) -> None:
+    """Everyone announces the world's scenario, `others` another one."""
+    here, there = expected_configurations(SCENARIO), expected_configurations(OTHER)
+    for name in here:
+        node.handle((there if name in others else here)[name], 0)
+
+
+def test_with_one_configuration_for_all_the_world_begins() -> None:
+    node = world()
+    assert node.publish(0.0) == [], "who is alive may still announce another configuration"
+    assert node.waiting_for == ["central", "robot/r1", "robot/r2"]
+    announced(node)
+    assert node.publish(0.0)
+    assert node.status().warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("other", "field"),
+    [("robot/r2", 'fusion is "kalman" there and "join" here, seed is 7 there and 1 here'),
+     ("central", 'fusion is "kalman" there and "join" here')],
+)  # fmt: skip
+def test_with_another_configuration_the_world_does_not_begin_and_says_why(
+    other: str, field: str
+) -> None:
+    node = world()
+    announced(node, other)
+    assert node.publish(0.0) == []
+    assert node.status().state == "waiting"
+    (warning,) = node.status().warnings
+    assert warning == (
+        f"{other} differs from the world's scenario: {field}: "
+        "start it again with the same scenario and options"
+    )
+    announced(node)
+    assert node.publish(0.0), "it was started again with the right one"
+
+
+def test_a_robot_that_comes_later_with_another_configuration_is_a_warning() -> None:
+    node = world()
+    announced(node)
+    assert node.publish(0.0)
+    announced(node, "robot/r1")
+    assert node.status().state != "waiting"
+    assert "robot/r1 differs" in node.status().warnings[0]
+
+
+def test_a_robot_that_is_not_in_the_scenario_is_named() -> None:
+    configurations = Configurations(expected_configurations(SCENARIO))
+    configurations.take(m.Configured(0, "robot/r9", 1, bytes(8), "{}"))
+    (warning,) = configurations.mismatches
+    assert warning.startswith("robot/r9 is not in the world's scenario, which has central, robot/r")
+
+
+def test_where_nothing_is_expected_nothing_is_compared() -> None:
+    configurations = Configurations({})
+    configurations.take(expected_configurations(SCENARIO)["robot/r1"])
+    assert configurations.mismatches == ()
+    assert configurations.unheard(["robot/r1"]) == []
+
+
+def test_differences_are_named_at_every_depth() -> None:
+    one, two = '{"a": {"b": 1, "c": []}, "d": null}', '{"a": {"b": 2, "c": []}, "e": {}}'
+    assert differences(one, two) == [
+        "a.b is 1 there and 2 here",
+        "d is null there and absent here",
+        "e is absent there and {} here",
+    ]
+
+
+def test_what_a_team_of_the_scenario_announces_is_what_is_expected() -> None:
+    short = msgspec.structs.replace(
+        SCENARIO, world=msgspec.structs.replace(SCENARIO.world, steps=3)
+    )
+    expected = expected_configurations(short)
+    keys = {ch.CENTRAL_CONFIG.key(), *(ch.ROBOT_CONFIG.key(r.id) for r in short.robots)}
+    said = [s.payload for s in run_team(short, streams_of(short)) if s.key in keys]
+    assert sorted(said) == sorted(msgspec.msgpack.encode(x) for x in expected.values())

@@ -1,0 +1,376 @@
+"""The world's node: everything in order, never too far ahead, and an answer for what was missed."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+
+from sim.publisher import node as world_node
+from sim.publisher.node import WorldNode, expected_nodes
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats, stamps
+from team.wire.codec import WireError, decoded, encoded
+from tests.teams import of, stream, world_of
+
+SCENARIO = m.Configured(0, "world", 0, bytes(8), "{}")
+STREAMS = world_of(stream("r1", 12), stream("r2", 9, off_ns=300_000_000, beyond=2))
+
+
+def world(streams=STREAMS, expected=frozenset(), **options):
+    return WorldNode(streams, expected, SCENARIO, **options)
+
+
+def alive(node, name, *, here=True):
+    node.handle(m.Liveliness(0, name, here), 0)
+
+
+def all_of(node, clock=0.0):
+    out = []
+    while not node.ended:
+        out += node.publish(clock)
+    return out
+
+
+def readings(out):
+    return [o.message for o in out if isinstance(o.message, m.Reading)]
+
+
+def progress(robot, count, epoch=1, node="robot"):
+    return m.Progress(0, node, robot, epoch, count, 0)
+
+
+def test_it_waits_for_everyone_and_says_for_whom():
+    expected = expected_nodes(["r1", "r2"], recorder=True)
+    node = world(expected=expected)
+    for name in sorted(expected):
+        assert name in node.waiting_for
+        assert node.publish(5.0) == []
+        assert name in node.status().warnings[0]
+        alive(node, name)
+    assert node.waiting_for == []
+    assert readings(node.publish(5.0))
+
+
+def test_it_does_not_begin_without_one_that_came_and_went():
+    node = world(expected=frozenset({"central", "robot/r1"}))
+    alive(node, "central")
+    alive(node, "central", here=False)
+    alive(node, "robot/r1")
+    assert node.publish(0.0) == []
+
+
+def test_readings_come_by_stamp_then_robot_and_count_from_0():
+    out = readings(all_of(world()))
+    assert [(r.stamp_ns, r.robot) for r in out] == sorted((r.stamp_ns, r.robot) for r in out)
+    for each in STREAMS.streams:
+        mine = [r for r in out if r.robot == each.robot]
+        assert [r.reading for r in mine] == list(range(len(each)))
+        assert {r.epoch for r in mine} == {1}
+        assert isinstance(mine[0], m.Start)
+
+
+def test_a_batch_spans_no_more_than_it_may():
+    node = world(batch_s=0.4)
+    batches = []
+    while not node.ended:
+        batches.append([r.stamp_ns for r in readings(node.publish(0.0))])
+    in_order = [stamp_ns for batch in batches for stamp_ns in batch]
+    assert in_order == [r.stamp_ns for r in readings(all_of(world()))]
+    assert all(batches)
+    assert max(max(batch) - min(batch) for batch in batches) < 400_000_000
+    for batch, later in pairwise(batches):
+        assert min(later) - min(batch) >= 400_000_000
+
+
+def test_every_message_is_on_its_channel_and_passes_the_door():
+    node = world()
+    for o in [*node.begin(), *all_of(node)]:
+        assert decoded(encoded(o.message), o.channel.message) == o.message
+        assert getattr(o.message, "robot", "") == o.name
+
+
+def test_run_twice_it_says_the_same():
+    one, two = ([encoded(o.message) for o in all_of(world())] for _ in range(2))
+    assert one == two
+
+
+def test_it_ends_once_with_the_last_counters():
+    node = world()
+    out = all_of(node)
+    (end,) = of(out, ch.END)
+    assert out[-1].message is end
+    assert [(s.robot, s.epoch, s.readings) for s in end.streams] == [
+        (each.robot, 1, len(each)) for each in STREAMS.streams
+    ]
+    assert node.publish(1e9) == []
+    assert node.status().state == "ended"
+    assert not node.finished
+
+
+@pytest.mark.parametrize("slow", ["r1", "r2"])
+def test_it_is_never_more_than_its_credit_ahead_of_a_living_robot(monkeypatch, slow):
+    monkeypatch.setattr(world_node, "CREDIT_READINGS", 5)
+    node = world()
+    for name in ("robot/r1", "robot/r2"):
+        alive(node, name)
+    consumed = {"r1": 0, "r2": 0}
+    sent = {"r1": 0, "r2": 0}
+    for _ in range(2):
+        for reading in readings(node.publish(0.0)):
+            sent[reading.robot] += 1
+            assert sent[reading.robot] - consumed[reading.robot] <= 5
+        (other,) = {"r1", "r2"} - {slow}
+        consumed[other] = sent[other]
+        node.handle(progress(other, sent[other]), 0)
+    assert sent[slow] == 5
+    assert not node.ended
+    node.handle(progress(slow, 3), 0)
+    node.handle(progress(slow, 1), 0)
+    for reading in readings(node.publish(0.0)):
+        sent[reading.robot] += 1
+    assert sent[slow] == 8, "progress that comes late takes no credit back"
+    node.handle(progress(slow, 100, epoch=9), 0)
+    assert readings(node.publish(0.0)) == [], "nor does another epoch's give any"
+    node.handle(progress(other, 1000), 0)
+    alive(node, f"robot/{slow}", here=False)
+    all_of(node)
+    assert node.ended, "a dead robot's credit is freed"
+
+
+def test_the_recorder_is_waited_for_while_it_lives(monkeypatch):
+    monkeypatch.setattr(world_node, "CREDIT_RECORDER", 10)
+    node = world()
+    alive(node, "recorder")
+    assert len(readings(node.publish(0.0))) == 10
+    assert readings(node.publish(0.0)) == []
+    node.handle(progress("r1", 2, node="recorder"), 0)
+    node.handle(progress("r2", 2, node="recorder"), 0)
+    assert len(readings(node.publish(0.0))) == 4
+    alive(node, "recorder", here=False)
+    all_of(node)
+
+
+@pytest.mark.parametrize("cache", [None, 3])
+def test_a_recorder_that_comes_late_is_waited_for_until_it_has_what_can_be_had(monkeypatch, cache):
+    monkeypatch.setattr(world_node, "CREDIT_RECORDER", 10)
+    monkeypatch.setattr(world_node, "BATCH", 15)
+    node = world(cache=cache)
+    sent = len(readings(node.publish(0.0)))
+    for _ in range(2):
+        alive(node, "recorder")
+        if cache is None:
+            assert readings(node.publish(0.0)) == [], "it has not said yet what its log has"
+            node.handle(progress("r1", sent, node="recorder"), 0)
+            assert node.unrecorded == 0
+        taken = len(readings(node.publish(0.0)))
+        assert 0 < taken <= 10
+        sent += taken
+        assert node.unrecorded > 0
+        node.handle(progress("r1", sent, node="recorder"), 0)
+        assert node.unrecorded <= 0
+        alive(node, "recorder", here=False)
+        assert node.unrecorded == 0, "who is not there is not waited for"
+
+
+def test_who_holds_the_team_up_is_named(monkeypatch):
+    monkeypatch.setattr(world_node, "CREDIT_READINGS", 5)
+    node = world()
+    alive(node, "robot/r1")
+    for clock in (0.0, 4.0):
+        node.publish(clock)
+        assert node.status().warnings == ()
+    node.publish(6.0)
+    assert node.status().warnings == ("robot/r1 holds the team up: it has got no further for 6 s",)
+    node.handle(progress("r1", 5), 0)
+    node.publish(7.0)
+    assert node.status().warnings == ()
+
+
+def test_at_a_given_speed_it_publishes_what_is_due():
+    node = world(speed=2.0)
+    last = [max((r.stamp_ns for r in readings(node.publish(100.0))), default=None)]
+    for clock in (100.25, 101.0, 102.0):
+        due = readings(node.publish(clock))
+        assert all(r.stamp_ns <= (clock - 100.0) * 2e9 for r in due)
+        last.append(max((r.stamp_ns for r in due), default=None))
+    assert last == [0, None, 2_000_000_000, 4_000_000_000]
+    assert not node.ended
+
+
+def test_at_speed_max_only_credit_holds_it_back():
+    node = world()
+    out = node.publish(7.0)
+    assert len(readings(out)) == sum(len(each) for each in STREAMS.streams)
+
+
+def wanted(node, robot="r1", epoch=1, first=0, last=-1):
+    return list(node.readings(encoded(m.ReadingsWanted(0, robot, epoch, first, last))))
+
+
+def test_what_is_asked_for_is_answered_with_the_bytes_that_were_published():
+    node = world()
+    out = [encoded(r) for r in readings(all_of(node)) if r.robot == "r1"]
+    assert wanted(node) == wanted(node, epoch=0) == out
+    assert wanted(node, first=3, last=5) == out[3:6]
+    assert wanted(node, first=len(out) - 1, last=10_000) == out[-1:]
+    assert wanted(node, first=len(out)) == []
+    assert wanted(node, epoch=2) == wanted(node, robot="r9") == []
+
+
+def test_only_what_was_published_is_answered_and_in_portions(monkeypatch):
+    monkeypatch.setattr(world_node, "BATCH", 7)
+    monkeypatch.setattr(world_node, "ANSWER", 3)
+    node = world()
+    assert wanted(node) == []
+    out = [encoded(r) for r in readings(node.publish(0.0)) if r.robot == "r2"]
+    got = []
+    while part := wanted(node, robot="r2", first=len(got)):
+        assert len(part) <= 3
+        got += part
+    assert got == out
+
+
+def test_a_query_that_is_damaged_is_an_error_that_says_so():
+    with pytest.raises(WireError):
+        list(world().readings(b"\x93nonsense"))
+
+
+def test_who_asks_for_what_is_no_longer_kept_gets_a_new_epoch_at_a_free_pose(monkeypatch):
+    monkeypatch.setattr(world_node, "BATCH", 12)
+    node = world(cache=3)
+    before = [r for r in readings(node.publish(0.0)) if r.robot == "r1"]
+    assert wanted(node, first=len(before) - 3) == [encoded(r) for r in before[-3:]]
+    assert wanted(node, first=0) == []
+    assert wanted(node, first=0) == [], "asked twice, there is still one new epoch"
+    out = all_of(node)
+    mine = [r for r in readings(out) if r.robot == "r1"]
+    assert {r.epoch for r in mine} == {2}
+    assert [r.reading for r in mine] == list(range(len(mine)))
+    assert isinstance(mine[0], m.Start)
+    assert (mine[0].pose, mine[0].covariance) == (b"", b"")
+    (end,) = of(out, ch.END)
+    assert end.streams[0] == m.StreamEnd("r1", 2, len(mine))
+    total = len(STREAMS.streams[0])
+    assert len(before) + len(mine) - 1 == total, "the start takes the place of the last one sent"
+
+
+def test_a_new_epoch_after_the_end_has_its_own_end():
+    node = world(cache=3)
+    all_of(node)
+    wanted(node, first=0)
+    out = node.publish(0.0)
+    assert [type(o.message) for o in out] == [m.Start, m.End]
+    assert out[-1].message.streams[0] == m.StreamEnd("r1", 2, 1)
+    assert node.publish(0.0) == []
+
+
+def test_the_truth_comes_whole_in_batches_and_on_its_own_channels_only():
+    node = world()
+    out = [*node.begin(), *all_of(node)]
+    for each in STREAMS.streams:
+        batches = [o.message for o in out if o.channel is ch.TRUTH and o.name == each.robot]
+        assert len(batches) > 1
+        np.testing.assert_array_equal(
+            np.concatenate([stamps(b.stamps, "stamps") for b in batches]), each.truth_ns
+        )
+        np.testing.assert_array_equal(
+            np.concatenate([floats(b.poses, "poses") for b in batches]).reshape(-1, 3), each.truth
+        )
+    (landmarks,) = of(out, ch.TRUTH_LANDMARKS)
+    np.testing.assert_array_equal(
+        floats(landmarks.positions, "positions").reshape(-1, 2), STREAMS.landmarks
+    )
+    others = {o.channel.name for o in out if isinstance(o.message, m.Truth | m.TruthLandmarks)}
+    assert others == {"truth", "truth_landmarks"}
+
+
+def test_without_truth_there_is_none():
+    silent = (replace(s, truth=None, truth_ns=None) for s in STREAMS.streams)
+    node = world(
+        replace(
+            STREAMS,
+            landmark_ids=np.zeros(0, np.uint32),
+            landmarks=None,
+            streams=tuple(silent),
+        )
+    )
+    out = [*node.begin(), *all_of(node)]
+    assert not [o for o in out if o.channel in (ch.TRUTH, ch.TRUTH_LANDMARKS)]
+
+
+def test_it_is_finished_with_the_final_map():
+    node = world()
+    fused = m.FusedMap(
+        0, "join", bytes(8), "", False, False, 0, (), (), False, b"", b"", b"", 0.0, 0
+    )
+    node.handle(fused, 0)
+    assert not node.finished
+    node.handle(msgspec.structs.replace(fused, final=True), 0)
+    assert node.finished
+
+
+def again(r1: int, r2: int, recorder=None, **options):
+    """A world that is started anew while its robots have so many readings."""
+    expected = expected_nodes(["r1", "r2"], recorder=recorder is not None)
+    node = world(expected=expected, **options)
+    for name in sorted(expected):
+        alive(node, name)
+    for robot, count in (("r1", r1), ("r2", r2)):
+        node.handle(progress(robot, count), 0)
+        if recorder is not None:
+            node.handle(progress(robot, recorder, node="recorder"), 0)
+    return node
+
+
+def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
+    before = readings(all_of(world()))
+    node = again(7, 5)
+    out = readings(all_of(node))
+    starts = [r for r in out if isinstance(r, m.Start)]
+    assert {(r.robot, r.reading, r.epoch) for r in starts} == {("r1", 0, 1), ("r2", 0, 1)}
+    least = {"r1": 7, "r2": 5}
+    assert out[len(starts) :] == [r for r in before if r.reading >= least[r.robot]]
+    assert node.status().figures["readings"] == len(before)
+    request = encoded(m.ReadingsWanted(0, "r1", 1, 0, -1))
+    assert [decoded(reply).reading for reply in node.readings(request)] == list(range(26))
+
+
+def test_a_world_that_is_started_again_gives_the_recorder_what_it_lacks():
+    out = readings(all_of(again(7, 5, recorder=3)))
+    assert min(r.reading for r in out if not isinstance(r, m.Start)) == 3
+
+
+def test_a_world_that_is_started_again_is_paced_from_where_it_goes_on():
+    node = again(12, 12, speed=2.0)
+    first = [r for r in readings(node.publish(100.0)) if not isinstance(r, m.Start)]
+    begins_ns = min(r.stamp_ns for r in first)
+    assert begins_ns > 4_000_000_000
+    later = readings(node.publish(101.0))
+    assert max(r.stamp_ns for r in later) == begins_ns + 2_000_000_000
+
+
+def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_ever():
+    node = world(expected=expected_nodes(["r1", "r2"], recorder=False))
+    node.handle(progress("r1", 7), 0)
+    assert node.publish(100.0) == []
+    assert readings(node.publish(100.0 + world_node.RESUME_S))
+
+
+def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot_is():
+    node = world()
+    node.handle(m.Progress(5_000_000_000, "robot/r1", "r1", 3, 4, 0), 0)
+    out = [r for r in readings(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
+    assert {r.epoch for r in out} == {4}
+    assert [r.reading for r in out] == list(range(len(out)))
+    assert min(r.stamp_ns for r in out) == 5_000_000_000
+
+
+def test_a_world_begins_without_a_node_that_is_given_up():
+    node = world(expected=frozenset({"robot/r1", "recorder"}))
+    alive(node, "robot/r1")
+    assert node.publish(0.0) == []
+    node.handle(m.GivenUp(0, "recorder", "launch", "it died 5 times"), 0)
+    assert readings(node.publish(0.0))

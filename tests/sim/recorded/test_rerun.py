@@ -1,0 +1,386 @@
+"""A log is computed again: equal to the last bit, and what was changed in it is named."""
+
+import random
+import struct
+from pathlib import Path
+from typing import get_type_hints
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from central.desk.evaluation.evaluation import evaluate
+from central.desk.verification.differences import ARRAYS
+from central.desk.verification.recorded import RerunError
+from central.desk.verification.verification import Verification, verify
+from sim.cli.rerun import app
+from sim.recorded.changed_run import changed_run
+from sim.recorded.changes import Changes
+from sim.recorded.noise import with_noise
+from sim.scenarios.checks import ScenarioError
+from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from team.estimation.models import increment_of
+from team.pairs import LOCALISERS, PAIRS
+from team.recording.reader import Log
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats, from_floats
+from team.wire.bus import Sample
+from team.wire.codec import encoded
+from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
+from tests.teams import Team, config, stream, world_of
+
+STEPS = 60
+ODOMETRY_OF_SUBMAP_3 = 35
+"""The 35th interval of r2 lies in its fourth window of 10 s."""
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> list[Sample]:
+    """A run whose readings come second by second, so that maps come back while robots drive."""
+    hurried = written(tmp_path_factory.mktemp("log") / "log.mcap", team_samples(thesis(STEPS)))
+    return changed_run(hurried, Changes())
+
+
+@pytest.fixture(scope="module")
+def log(samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) -> Log:
+    return written(tmp_path_factory.mktemp("log") / "log.mcap", samples)
+
+
+def counts(result: Verification) -> dict[str, tuple[int, int]]:
+    return {c.channel: (c.messages, c.equal) for c in result.channels}
+
+
+def all_equal(result: Verification) -> bool:
+    assert result.first is None, str(result.first)
+    return all(c.equal == c.messages for c in result.channels) and result.other_platform == ()
+
+
+def with_one_bit(message: m.Message) -> m.Message:
+    (bits,) = struct.unpack("<q", struct.pack("<d", message.forward))
+    (other,) = struct.unpack("<d", struct.pack("<q", bits ^ 1))
+    return msgspec.structs.replace(message, forward=other)
+
+
+def flipped(samples: list[Sample]) -> list[Sample]:
+    """One bit of one odometry reading of r2 is another."""
+    counter = messages(samples, ch.ODOMETRY, "r2")[ODOMETRY_OF_SUBMAP_3].reading
+
+    def change(message: m.Message) -> m.Message:
+        hit = (message.robot, message.reading) == ("r2", counter)
+        return with_one_bit(message) if hit else message
+
+    return changed(samples, ch.ODOMETRY, change)
+
+
+def test_every_recomputable_message_of_a_run_comes_out_again(log: Log) -> None:
+    result = verify(log)
+    assert all_equal(result)
+    silent = {ch.SIGHTING_FACTOR.name, ch.CENTRAL_POSE.name}
+    recomputable = {c.name for c in ch.CHANNELS if c.recomputable}
+    assert counts(result).keys() == recomputable - silent
+    assert counts(result)["submap"] == (12, 12)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "fusion"), sorted(pair for pair in PAIRS if pair != ("hybrid", "join"))
+)
+def test_what_every_other_pair_says_comes_out_again(
+    estimator: str, fusion: str, tmp_path: Path
+) -> None:
+    samples = team_samples(thesis(30, estimator=estimator, fusion=fusion))
+    result = verify(written(tmp_path / "log.mcap", samples))
+    assert all_equal(result)
+    assert counts(result)["own_pose"][0] >= 30
+    if fusion != "alone":
+        assert counts(result)["fused_map"][0] >= 2
+    if estimator not in LOCALISERS:
+        assert counts(result)["own_map"][0] >= 4
+
+
+@pytest.mark.parametrize("fusion", ["latest", "alone"])
+def test_a_tampered_own_map_is_found_and_so_is_what_was_made_of_it(
+    fusion: str, tmp_path: Path
+) -> None:
+    samples = team_samples(thesis(30, estimator="ekf-slam", fusion=fusion))
+    victim = messages(samples, ch.OWN_MAP, "r2")[-1]
+
+    def change(message: m.Message) -> m.Message:
+        if message != victim:
+            return message
+        means = floats(message.means, "means").copy()
+        means[0] += 0.25
+        return msgspec.structs.replace(message, means=from_floats(means))
+
+    result = verify(written(tmp_path / "log.mcap", changed(samples, ch.OWN_MAP, change)))
+    found = {c.channel: c.different for c in result.channels if c.different}
+    assert found == {"own_map": 1, "final_map": 1}
+
+
+def test_a_flipped_bit_of_one_odometry_reading_is_traced_to_its_submap(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    result = verify(written(tmp_path / "log.mcap", flipped(samples)))
+    first = result.first
+    assert first is not None
+    assert (first.key, first.counter) == ("robot/r2/submap", 3)
+    assert first.field.startswith("mean[")
+    assert counts(result)["submap"] == (12, 11), "no other submap depends on that reading"
+    for name in ("fused_map", "prior", "final_map", "trajectory"):
+        assert counts(result)[name][0] == counts(result)[name][1], "maps follow from submaps"
+
+
+def test_a_tampered_map_is_the_only_one_that_differs(samples: list[Sample], tmp_path: Path) -> None:
+    victim = messages(samples, ch.FUSED_MAP)[1]
+
+    def change(message: m.Message) -> m.Message:
+        if message != victim:
+            return message
+        means = floats(message.means, "means").copy()
+        means[3] += 0.25
+        return msgspec.structs.replace(message, means=from_floats(means))
+
+    result = verify(written(tmp_path / "log.mcap", changed(samples, ch.FUSED_MAP, change)))
+    assert sum(c.different for c in result.channels) == 1
+    assert result.first is not None
+    assert (result.first.key, result.first.field) == ("central/map", "means[3]")
+    recorded, recomputed = float(result.first.recorded), float(result.first.recomputed)
+    assert recorded == pytest.approx(recomputed + 0.25)
+
+
+def test_a_missing_reading_is_named_and_the_windows_behind_it_come_out(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    lost = messages(samples, ch.ODOMETRY, "r2")[ODOMETRY_OF_SUBMAP_3]
+    cut = changed(samples, ch.ODOMETRY, lambda x: None if x == lost else x)
+    result = verify(written(tmp_path / "log.mcap", cut))
+    assert counts(result)["submap"] == (12, 11)
+    assert result.first is not None
+    assert f"reading {lost.reading} is not in the log" in result.first.recomputed
+
+
+def test_on_another_platform_numbers_are_compared_within_a_tolerance(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    def moved(by: float) -> list[Sample]:
+        return changed(
+            samples,
+            ch.FINAL_MAP,
+            lambda x: msgspec.structs.replace(x, means=from_floats(floats(x.means, "means") + by)),
+        )
+
+    other = {"kernels": "those of another day"}
+    near = verify(written(tmp_path / "near.mcap", moved(1e-8), other))
+    assert near.other_platform == ("kernels",)
+    assert near.first is None
+    assert [c.close for c in near.channels if c.channel == "final_map"] == [1]
+    far = verify(written(tmp_path / "far.mcap", moved(1e-3), other))
+    assert far.first is not None
+    assert far.first.key == "central/final"
+    here = verify(written(tmp_path / "here.mcap", moved(1e-8)))
+    assert here.first is not None, "on the same platform one bit is a difference"
+
+
+def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team:
+    """Two robots in any order of delivery; r1 is killed on the way, and comes again or not.
+
+    cache: how many readings its source has kept then; with too few a new epoch begins.
+    """
+    robots = [stream("r1", 40), stream("r2", 40, y=1.0)]
+    team = Team(world_of(*robots), [config("r1"), config("r2")], random.Random(seed))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sim.publisher.node.BATCH", 4)  # the world is not at its end so soon
+        while len(team.sent[ch.SUBMAP.key("r1")]) < 3:
+            assert team.step()
+        team.kill("r1", patience=not dies)
+        if not dies:
+            team.resume(config("r1"))
+            team.world.cache = cache
+            first = team.robots["r1"].next_reading
+            team.world.readings(encoded(m.ReadingsWanted(0, "r1", 0, first, -1)))
+            team.world.cache = None
+        team.run()
+    return team
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_log_with_a_restart_and_any_order_comes_out_again(seed: int, tmp_path: Path) -> None:
+    team = restless(seed)
+    assert len(team.sent[ch.ROBOT_CONFIG.key("r1")]) == 2, "there were two lives"
+    assert all_equal(verify(written(tmp_path / "log.mcap", said(team))))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_log_with_a_new_epoch_comes_out_again(seed: int, tmp_path: Path) -> None:
+    team = restless(seed, cache=0)
+    assert {s.epoch for s in team.sent[ch.SUBMAP.key("r1")]} == {1, 2}
+    assert all_equal(verify(written(tmp_path / "log.mcap", said(team))))
+
+
+def test_a_log_with_a_dead_robot_comes_out_again(tmp_path: Path) -> None:
+    team = restless(2, dies=True)
+    assert not team.sent[ch.ROBOT_DONE.key("r1")]
+    assert all_equal(verify(written(tmp_path / "log.mcap", said(team))))
+
+
+def test_a_log_without_a_configuration_can_not_be_computed(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    bare = [
+        s for s in samples if s.key != ch.ROBOT_CONFIG.key("robot/r1") and "config" not in s.key
+    ]
+    with pytest.raises(RerunError, match="no configuration of robot/r1"):
+        verify(written(tmp_path / "log.mcap", bare))
+
+
+def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(
+    log: Log, samples: list[Sample], tmp_path: Path
+) -> None:
+    runner = CliRunner()
+    good = runner.invoke(app, ["rerun", str(log.path), "--verify"])
+    assert good.exit_code == 0, good.output
+    assert "all equal" in good.output
+    bad = written(tmp_path / "bad.mcap", flipped(samples))
+    result = runner.invoke(app, ["rerun", str(bad.path), "--verify"])
+    assert result.exit_code == 1
+    assert "robot/r2/submap" in result.output
+    for wrong in (
+        ["--verify", "--delay", "3"],
+        ["--loss", "1"],
+        ["--no-centre", "9-3"],
+        ["--noise", "luck=2"],
+        ["--noise", "range=0"],
+        ["--noise", "range=2", "--noise", "range=3"],
+    ):
+        assert runner.invoke(app, ["rerun", str(log.path), *wrong]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "channel", [c for c in ch.CHANNELS if c.recomputable], ids=lambda c: c.name
+)
+def test_every_array_that_is_recomputed_is_compared_number_by_number(channel: ch.Channel) -> None:
+    hints = get_type_hints(channel.message, include_extras=True)
+    assert ARRAYS.issuperset(name for name, hint in hints.items() if hint is bytes)
+
+
+# Under other conditions.
+
+
+def final(samples: list[Sample]) -> bytes:
+    (payload,) = [s.payload for s in samples if s.key == ch.FINAL_MAP.key()]
+    return payload
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        Changes(),
+        Changes(delay_s=25.0),
+        Changes(loss=0.6),
+        Changes(no_centre=(15.0, 42.0)),
+        Changes(partitions=((("r1",), (12.0, 38.0)), (("r1", "r2"), (45.0, 50.0)))),
+    ],
+    ids=["nothing", "delay", "loss", "no centre", "partition"],
+)
+def test_the_way_of_the_messages_does_not_change_the_final_map(
+    changes: Changes, log: Log, samples: list[Sample]
+) -> None:
+    assert final(changed_run(log, changes)) == final(samples)
+
+
+def test_a_partition_changes_what_the_team_knows_meanwhile(log: Log, samples: list[Sample]) -> None:
+    run = changed_run(log, Changes(partitions=((("r1",), (12.0, 58.0)),)))
+    during, then = ([p.stamp_ns for p in messages(each, ch.PRIOR, "r1")] for each in (run, samples))
+    assert during != then
+
+
+def test_without_a_robot_the_map_is_that_of_a_team_that_never_had_it(
+    log: Log, samples: list[Sample]
+) -> None:
+    run = changed_run(log, Changes(without=("r2",)))
+    assert messages(run, ch.SUBMAP, "r1") == messages(samples, ch.SUBMAP, "r1")
+    alone = team_samples(thesis(STEPS, robots=1))  # there nobody is sighted: fewer readings
+    (one,), (other,) = (messages(each, ch.FINAL_MAP) for each in (run, alone))
+    assert (one.means, one.covariance) == (other.means, other.covariance)
+    assert one.members == other.members == (m.Member("r1", 1, STEPS // 10 - 1),)
+
+
+def test_another_rule_is_the_run_that_would_have_used_it(log: Log) -> None:
+    other = team_samples(thesis(STEPS, fusion="kalman"))
+    assert final(changed_run(log, Changes(fusion="kalman"))) == final(other)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        Changes(seed=7),
+        Changes(particles=20),
+        Changes(window_s=20.0),
+        Changes(noise=(("odometry", 2.0),)),
+        Changes(noise=(("range", 0.5), ("bearing", 0.5))),
+    ],
+    ids=str,
+)
+def test_another_estimator_sees_the_same_readings_and_gives_another_map(
+    changes: Changes, log: Log, samples: list[Sample]
+) -> None:
+    run = changed_run(log, changes)
+    assert messages(run, ch.ODOMETRY, "r1") == messages(samples, ch.ODOMETRY, "r1")
+    assert final(run) != final(samples)
+    assert final(run) == final(changed_run(log, changes))
+
+
+def test_a_noise_is_a_factor_on_every_standard_deviation_of_its_kind() -> None:
+    motion = MotionModel(
+        kind="differential-drive",
+        wheel_base=0.3,
+        left_wheel=0.1,
+        right_wheel=0.2,
+        turn=MotionNoise(per_rad=0.2),
+        alphas=(0.01,) * 6,
+    )
+    robot = RobotConfig("r1", motion, Sensor(0.1, 0.02, 0.3))
+    noisy = with_noise(robot, {"odometry": 3.0, "range": 2.0})
+    assert noisy.sensor == Sensor(0.2, 0.04, 0.3)
+    before, after = (increment_of(each.motion, 0.5, 0.4, 0.3).covariance for each in (robot, noisy))
+    np.testing.assert_allclose(after, 9.0 * before, rtol=1e-12)
+
+
+def test_unsafe_feedback_ruins_the_covariance_before_the_error(tmp_path: Path) -> None:
+    hurried = team_samples(thesis(120))
+    log = written(tmp_path / "log.mcap", hurried)
+    honest, fed = (
+        evaluate(each).map.errors
+        for each in (hurried, changed_run(log, Changes(unsafe_feedback=True)))
+    )
+    assert honest.nees_per_dof < 3.0
+    assert fed.nees_per_dof > 8.0 * honest.nees_per_dof
+    assert fed.rmse_m < 2.0 * honest.rmse_m
+    assert np.isfinite(fed.nees_per_dof)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        (Changes(without=("r9",)), "no robot r9"),
+        (Changes(without=("r1", "r2")), "without robots"),
+        (Changes(fusion="kalman", delay_s=1.0), "lockstep"),
+        (Changes(fusion="latest", delay_s=1.0), "the rule latest is for comparison"),
+        (Changes(estimator="hybrid-thesis"), "can not feed"),
+    ],
+)
+def test_a_change_without_a_meaning_is_refused(changes: Changes, why: str, log: Log) -> None:
+    with pytest.raises(ScenarioError, match=why):
+        changed_run(log, changes)
+
+
+def test_a_log_that_lacks_a_reading_runs_under_no_other_conditions(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    lost = messages(samples, ch.ODOMETRY, "r1")[5]
+    cut = changed(samples, ch.ODOMETRY, lambda x: None if x == lost else x)
+    with pytest.raises(
+        RerunError, match=f"reading {lost.reading} of r1, epoch 1 is not in the log"
+    ):
+        changed_run(written(tmp_path / "log.mcap", cut), Changes())

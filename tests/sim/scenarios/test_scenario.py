@@ -1,0 +1,285 @@
+"""Scenarios: built-in ones, a user's file, a command line, and what is said of mistakes."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from sim.scenarios.checks import ScenarioError
+from sim.scenarios.scenario import builtin_names, doubts, dumps, load, loads, with_options
+from sim.scenarios.source import streams_of
+from sim.world.config import SimulatedWorld, UtiasWorld
+from team.pairs import PAIRS
+
+SMALL = """
+[world]
+kind = "simulated"
+steps = 3
+landmark_count = 2
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "my.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_built_in_scenarios_are_the_documented_ones() -> None:
+    assert builtin_names() == (
+        "downs-10",
+        "downs-100",
+        "large",
+        "random-10",
+        "random-3",
+        "random-5",
+        "thesis",
+        "thesis-b",
+        "utias",
+        "waypoints",
+    )
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_a_built_in_scenario_survives_json(name: str) -> None:
+    scenario = load(name)
+    assert loads(dumps(scenario)) == scenario
+    assert scenario.name == scenario.team == name
+
+
+@pytest.mark.parametrize("name", ["thesis", "thesis-b", "waypoints"])
+def test_a_built_in_simulated_world_gives_every_robot_a_stream(name: str) -> None:
+    scenario = load(name)
+    streams = streams_of(scenario).streams
+    assert [stream.robot for stream in streams] == [robot.id for robot in scenario.robots]
+    assert all(len(stream.landmark_detections.ids) > 300 for stream in streams)
+
+
+def test_thesis_b_is_thesis_with_another_sensor() -> None:
+    a, b = load("thesis"), load("thesis-b")
+    assert (a.robots[0].sensor.range_sigma, b.robots[0].sensor.range_sigma) == (2.0, 0.2)
+    assert a.world == b.world
+    assert a.robots[1].motion == b.robots[1].motion
+
+
+def test_a_waypoints_team_is_heterogeneous() -> None:
+    robots = load("waypoints").robots
+    assert len({msgspec.json.encode(r.motion) + msgspec.json.encode(r.sensor) for r in robots}) == 3
+    assert robots[1].motion.forward.per_m == robots[0].motion.forward.per_m, "merged below"
+
+
+def test_the_utias_scenario_has_the_five_robots_of_the_rig() -> None:
+    scenario = load("utias")
+    assert [robot.id for robot in scenario.robots] == ["r1", "r2", "r3", "r4", "r5"]
+    assert scenario.robots[4].motion.yaw_scale == 0.936
+    assert scenario.central.covariance_factor == 1.9
+
+
+def test_estimator_rule_and_seed_are_said_once_and_handed_to_all(tmp_path: Path) -> None:
+    text = 'seed = 7\nestimator = "hybrid-thesis"\nfusion = "kalman-per-axis"\nrobot_count = 3\n'
+    scenario = load(written(tmp_path, text + SMALL))
+    told = {(robot.id, robot.seed, robot.estimator, robot.fusion) for robot in scenario.robots}
+    rule = ("hybrid-thesis", "kalman-per-axis")
+    assert told == {("r1", 7, *rule), ("r2", 7, *rule), ("r3", 7, *rule)}
+    assert scenario.central.fusion == "kalman-per-axis"
+
+
+def test_a_users_file_is_named_after_itself_and_may_change_a_built_in_one(tmp_path: Path) -> None:
+    path = written(
+        tmp_path, 'base = "thesis"\nrobot_count = 4\n[defaults.sensor]\nrange_sigma = 1\n'
+    )
+    scenario = load(path)
+    assert scenario.name == "my"
+    assert isinstance(scenario.world, SimulatedWorld)
+    assert len(scenario.world.landmarks) == 18
+    assert [robot.sensor.range_sigma for robot in scenario.robots] == [1.0] * 4
+    assert scenario.robots[0].sensor.bearing_sigma == load("thesis").robots[0].sensor.bearing_sigma
+
+
+def test_a_data_sets_path_is_relative_to_the_file_that_names_it(tmp_path: Path) -> None:
+    scenario = load(written(tmp_path, 'base = "utias"\nworld = { path = "set2.zip" }\n'))
+    assert isinstance(scenario.world, UtiasWorld)
+    assert Path(scenario.world.path) == tmp_path / "set2.zip"
+
+
+def test_a_command_line_changes_what_it_names_and_nothing_else() -> None:
+    scenario = load("waypoints")
+    assert with_options(scenario) == scenario
+    changed = with_options(scenario, robots=5, seed=9, fusion="covariance-intersection")
+    assert [robot.id for robot in changed.robots] == ["r1", "r2", "r3", "r4", "r5"]
+    assert changed.robots[4].sensor == scenario.robots[1].sensor, "the scenario's robots in turn"
+    assert {robot.seed for robot in changed.robots} == {changed.seed} == {9}
+    assert {robot.fusion for robot in changed.robots} == {changed.central.fusion, changed.fusion}
+    assert with_options(scenario, robots=2).robots == scenario.robots[:2]
+    utias = with_options(load("utias"), dataset="x.zip")
+    assert isinstance(utias.world, UtiasWorld)
+    assert utias.world.path == "x.zip"
+
+
+@pytest.mark.parametrize(("estimator", "fusion"), PAIRS)
+def test_every_valid_pair_can_be_chosen(estimator: str, fusion: str) -> None:
+    scenario = with_options(load("thesis"), estimator=estimator, fusion=fusion)
+    assert (scenario.robots[0].estimator, scenario.central.fusion) == (estimator, fusion)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"robots": 0}, "0 robots: a team has 1 to 100"),
+        ({"robots": 101}, "101 robots: a team has 1 to 100"),
+        (
+            {"estimator": "hybrid-thesis"},
+            "can not feed the rule join, but kalman-per-axis or latest or alone; valid: ",
+        ),
+        ({"fusion": "joyn"}, 'expected one of "join", "kalman", "kalman-per-axis", '),
+        ({"seed": -1}, "expected int >= 0 at seed"),
+        ({"dataset": "x.zip"}, "thesis: a simulated world takes no data set"),
+    ],
+)
+def test_a_wrong_option_is_refused_with_what_is_right(
+    options: dict[str, int | str], said: str
+) -> None:
+    with pytest.raises(ScenarioError) as refused:
+        with_options(load("thesis"), **options)  # type: ignore[arg-type]  # wrong on purpose
+    assert said in str(refused.value)
+
+
+UTIAS = 'world = { kind = "utias" }\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            SMALL + "[defaults.front_end]\npartcles = 5",
+            "unknown field `partcles` at defaults.front_end; known: particles, proposal, ",
+        ),
+        (SMALL + "[defaults.front_end]\npartcles = 5", "did you mean `particles`?"),
+        (SMALL + "wold = 3", "unknown field `wold` at world; known: steps, size_m"),
+        ("sead = 3\n" + SMALL, "unknown field `sead` at the top; known: name, team, world, robots"),
+        (
+            SMALL + '[central]\nfusion = "kalman"',
+            "`fusion` is said once for the whole team, at the top of the file",
+        ),
+        (
+            SMALL + "[[robots]]\n[[robots]]\nmotion = { turn = { per_y = 1 } }",
+            "unknown field `per_y` at robots[1].motion.turn",
+        ),
+        (SMALL + "[defaults.sensor]\nrange_sigma = 'a'", "expected float, got str at defaults.s"),
+        (SMALL + "[defaults.sensor]\nrange_sigma = 0", "expected float > 0.0 at defaults.sensor"),
+        (SMALL + "[defaults.sensor]\nrange_sigma = inf", "expected a finite number, got inf at d"),
+        (SMALL + "[defaults.sensor]\nrange_sigma = nan", "expected a finite number, got nan at d"),
+        (
+            SMALL + "[defaults.motion]\nkind = 'velo'",
+            'expected one of "turn-then-drive", "velocity", "differential-drive", got ',
+        ),
+        (SMALL + "[central]\ntick_s = -1", "expected float > 0.0 at central.tick_s"),
+        (SMALL + "[central", "not valid TOML: "),
+        (SMALL + "x = = 2", "line 6, column 5"),
+        ("seed = 1.5\n" + SMALL, "expected int, got float at seed"),
+        ("robot_count = 0\n" + SMALL, "0 robots: a team has 1 to 100"),
+        ("robot_count = 101\n" + SMALL, "101 robots: a team has 1 to 100"),
+        ("robot_count = 'two'\n" + SMALL, "expected a number of robots from 1 to 100, got 'two'"),
+        ("robots = []\n" + SMALL, "no robots: give robot_count, [[robots]], or a base"),
+        (SMALL, "no robots: give robot_count, [[robots]], or a base that has some"),
+        ("robots = 3\n" + SMALL, "expected [[robots]], an array of tables, at robots"),
+        ("robots = [3]\n" + SMALL, "expected a table, got int at robots[0]"),
+        ("central = 3\n" + SMALL, "expected a table, got int at central"),
+        ("robot_count = 2\n" + SMALL + "[[robots]]", "robot_count and [[robots]] exclude each"),
+        (SMALL + "[[robots]]\nid = 'a'\n[[robots]]\nid = 'a'", "two robots have the id a"),
+        (
+            SMALL + "[[robots]]\nid = 'A 1'",
+            "expected a small letter, then small letters, digits and _",
+        ),
+        ("name = 'a b'\nrobot_count = 1\n" + SMALL, "expected letters, digits, _, . and -"),
+        (SMALL + "[defaults]\nid = 'a'", "`id` at defaults would be every robot's"),
+        ("seed = 1", 'expected one of "simulated", "utias", got nothing at world.kind'),
+        ("world = { kind = [1] }", "got [1] at world.kind"),
+        ("world = 3", "expected a table, got int at world"),
+        ("base = [1]\n" + SMALL, "expected a built-in scenario, got [1] at base"),
+        (SMALL + "landmarks = [[1, 2]]", "landmarks and landmark_count exclude each other"),
+        (SMALL + "paths = [[[1, 2]]]", "path 0 has no length: give two way-points or more"),
+        (
+            "robot_count = 1\n" + SMALL + "unknown_starts = ['r2']",
+            "world.unknown_starts names r2, no such robot",
+        ),
+        (
+            "robot_count = 3\n" + SMALL + "size_m = 1.9",
+            "way_point_tolerance_m is 1 in a place 1.9 m wide",
+        ),
+        (
+            "robot_count = 3\n" + SMALL + "radius_m = 0.9\npaths = [[[0, 0], [1, 1]]]",
+            "way_point_tolerance_m is 1 in a place 1.8 m wide",
+        ),
+        ("world = { kind = 'simulated' }", "missing required field steps"),
+        (
+            SMALL + "[defaults.motion]\nkind = 'differential-drive'",
+            "differential-drive needs wheel_base, the distance of its wheels in metres at def",
+        ),
+        (SMALL + "[defaults.motion]\nleft_wheel = 0.1", "noises of differential-drive, not of vel"),
+        (
+            SMALL + "[defaults.motion]\nalphas = [0.1, 0.2]",
+            "expected array of length 6, got 2 at defaults.motion.alphas",
+        ),
+        (SMALL + "garbage_kind = 'rubbish'", 'expected one of "reading", "identity", "drop"'),
+        (UTIAS + "[[robots]]\nid = 'alice'", "the robot alice: in a UTIAS world robots are r1, r2"),
+        ("world = { kind = 'utias', start_sigma_m = 1 }", "are both 0 or both above 0"),
+        (
+            "base = 'thesys'",
+            "expected a built-in scenario, got 'thesys' at base; known: downs-10, ",
+        ),
+        ("estimator = 'hybrid-thesis'\n" + SMALL, "valid: hybrid + join, hybrid + kalman, "),
+    ],
+)
+def test_a_mistake_in_a_file_is_named_with_file_place_and_remedy(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(ScenarioError) as refused:
+        load(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert said in str(refused.value)
+
+
+def test_an_unknown_name_lists_what_is_built_in() -> None:
+    with pytest.raises(ScenarioError) as refused:
+        load("thesis2")
+    assert str(refused.value) == (
+        f"thesis2: no such scenario; built in: {', '.join(builtin_names())}; "
+        "or give a path to a .toml file"
+    )
+
+
+def test_a_small_place_is_one_where_robots_have_paths_or_few_way_points(tmp_path: Path) -> None:
+    small = "robot_count = 1\n" + SMALL + "size_m = 1.0\n"
+    load(written(tmp_path, small + "paths = [[[0, 0], [1, 1]]]"))
+    load(written(tmp_path, small + "way_point_count = 3"))
+
+
+def test_a_folder_is_no_scenario_and_may_be_a_data_set(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"a folder, .* a data set goes with --dataset"):
+        load(tmp_path)
+
+
+def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ScenarioError, match="can not be read as UTF-8 text"):
+        load(path)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}"])
+def test_json_that_is_no_resolved_scenario_is_refused(text: str) -> None:
+    with pytest.raises(ScenarioError):
+        loads(text)
+
+
+def test_a_simulated_robot_whose_odometry_has_no_noise_is_doubted(tmp_path: Path) -> None:
+    noisy = "[[robots]]\nmotion = { turn = { per_rad = 0.1 } }\n[[robots]]\n"
+    (said,) = doubts(load(written(tmp_path, SMALL + noisy)))
+    assert said.startswith("r2: odometry without noise")
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_a_built_in_scenario_is_not_doubted(name: str) -> None:
+    assert doubts(load(name)) == []

@@ -1,0 +1,162 @@
+"""The experiments after Downs' thesis: his protocol on his simulator, his tables and tests."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from sim.datasets.utias import utias
+from sim.datasets.utias_writer import write_utias
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from sim.studies.experiments import downs_minima
+from sim.studies.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
+from sim.studies.experiments.downs_joined import spherical_task
+from sim.studies.experiments.downs_printed import EKF_MAPS, JOINED_MAPS
+from sim.studies.experiments.downs_simulated import (
+    SIMULATED_5_1,
+    SIMULATED_5_2,
+    SIMULATED_5_3,
+    SIMULATED_5_4,
+    SIMULATED_5_5,
+    WORLDS,
+)
+from sim.studies.experiments.experiment import Dataset, Options, Results
+from sim.studies.experiments.team_runs import Figures
+from sim.world.config import UtiasWorld
+from team.estimation.map_joining.alignment import procrustes
+
+SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
+
+
+def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_covariances() -> None:
+    scenario = with_options(load("downs-100"), robots=2)
+    world = msgspec.structs.replace(scenario.world, steps=60)
+    result = spherical_task(msgspec.structs.replace(scenario, world=world)).run()
+    assert set(result["robots"]) == {"r1", "r2"}
+    for robot in result["robots"].values():
+        assert robot["submaps"] == pytest.approx(60, abs=2)
+        assert 0 < robot["rmse"] < 2.0
+        assert robot["rmse_aligned"] < 0.5
+        assert 0 < robot["position_rmse"] < 2.0
+        assert len(robot["map"]["ids"]) == robot["landmarks"]
+    assert result["with_covariances"]["rmse"] < 0.5 * result["team"]["rmse"]
+
+
+def _results(ekf: float, joined: float) -> Results:
+    """Every robot of every run with the same map error, but for a millimetre a robot."""
+    options = Options((1,), datasets=(SET_1,))
+    tasks = {t.name: t for table in (TABLE_5_3, TABLE_5_5) for t in table.tasks(options)}
+
+    def result(label: str) -> Figures:
+        error = ekf if "ekf-slam" in label else joined
+        robots = {f"r{k}": {"rmse": error + 0.001 * k * k * error} for k in range(1, 6)}
+        return {"robots": robots, "rmse": error, "team": {"rmse": error}}
+
+    return Results({name: result(task.label) for name, task in tasks.items()})
+
+
+def test_the_paired_test_tells_maps_that_differ_from_those_that_do_not() -> None:
+    options = Options((1,), datasets=(SET_1,))
+    apart = TABLE_5_3.outcome(options, _results(0.4, 0.03)).figures["t_tests"][HIS]
+    same = TABLE_5_3.outcome(options, _results(0.4, 0.4)).figures["t_tests"][
+        "printed, all nine sets"
+    ]
+    assert apart["pairs"] == 5
+    assert apart["p"] < 1e-6
+    assert same["pairs"] == 45
+    assert same["mean_before_m"] == pytest.approx(0.4004, abs=5e-4)
+    assert same["mean_after_m"] == pytest.approx(0.0347, abs=5e-4)
+
+
+def test_the_team_is_compared_set_by_set_and_one_set_has_no_p() -> None:
+    options = Options((1,), datasets=(SET_1,))
+    tests = TABLE_5_5.outcome(options, _results(0.4, 0.03)).figures["t_tests"]
+    assert tests[HIS]["pairs"] == 1
+    assert tests[HIS]["p"] is None
+    assert tests["printed, all nine sets"]["p"] == pytest.approx(0.128, abs=1e-3)
+
+
+def test_what_is_printed_stands_beside_what_is_computed() -> None:
+    outcome = TABLE_5_1.outcome(Options((1,), datasets=(SET_1,)), Results({}))
+    assert outcome.figures["sets"]["MRCLAM_Dataset1"]["printed"] == EKF_MAPS["1"]
+    assert len(EKF_MAPS) == len(JOINED_MAPS) == 9
+    (picture,) = outcome.pictures
+    assert "logarithmic" in picture.caption
+
+
+def _map(points: np.ndarray, sigma: float) -> Figures:
+    return {
+        "ids": list(range(len(points))),
+        "means": points.tolist(),
+        "covariance": (sigma**2 * np.eye(2 * len(points))).tolist(),
+    }
+
+
+def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_form() -> None:
+    points = np.array([[0.0, 0.0], [5.0, 1.0], [2.0, 7.0], [-4.0, 3.0]])
+    turned = points @ np.array([[0.0, -1.0], [1.0, 0.0]]) + [3.0, -2.0]
+    turned[2] += 0.3
+    pair = downs_minima.common(_map(points, 0.1), _map(turned, 0.2))
+    turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    assert downs_minima.minima(downs_minima.profile(pair, turns)) == 1
+    closed = procrustes(points, turned, np.ones(4))
+    np.testing.assert_allclose(downs_minima.evolved(pair, 1), closed, atol=1e-4)
+    alike, weighted = (
+        kind(pair, turns) for kind in (downs_minima.profile, downs_minima.profile_with_covariances)
+    )
+    np.testing.assert_allclose(weighted, 2.0 * alike / (0.1**2 + 0.2**2), rtol=1e-9)
+
+
+def test_a_curve_with_two_minima_is_said_to_have_two() -> None:
+    turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    assert downs_minima.minima(np.cos(2.0 * turns)) == 2
+    assert downs_minima.minima(np.cos(turns)) == 1
+
+
+def test_his_simulator_stands_in_every_table_and_no_set_is_needed_for_it(tmp_path: Path) -> None:
+    options = Options((1, 2), quick=True)
+    short = SIMULATED_5_1.tasks(options)
+    assert len(short) == 2 * len(WORLDS)
+    results = Results({task.name: task.run() for task in short})
+    outcome = TABLE_5_1.outcome(options, results)
+    assert outcome.missing
+    (table,) = outcome.tables
+    assert [row[0] for row in table.rows][:2] == ["10, EKF", "10, EKF, aligned"]
+    assert all(row[1] == "2" for row in table.rows)
+    of_100 = outcome.figures["simulator"]["100, EKF"]
+    assert 0.0 < of_100["p10"] <= of_100["median"] <= of_100["p90"] < 0.5
+    assert [p.name for p in outcome.pictures] == [
+        "simulator",
+        "sample-downs-10",
+        "sample-downs-100",
+    ]
+    for picture in outcome.pictures:
+        picture.draw(tmp_path / "picture.png")
+        assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_the_tables_share_the_simulators_runs() -> None:
+    options = Options((1,))
+    tables = (SIMULATED_5_1, SIMULATED_5_2, SIMULATED_5_3, SIMULATED_5_4, SIMULATED_5_5)
+    every = {task.name for table in tables for task in table.tasks(options)}
+    # The EKF, his protocol, ours alone and ours as a team.
+    assert len(every) == 4 * len(WORLDS)
+
+
+def test_his_simulator_is_written_as_a_data_set_that_reads_the_same(tmp_path: Path) -> None:
+    scenario = load("downs-10")
+    world = msgspec.structs.replace(scenario.world, steps=120)
+    written = streams_of(msgspec.structs.replace(scenario, world=world))
+    write_utias(written, tmp_path)
+    read = utias(UtiasWorld(path=str(tmp_path)), scenario.robots)
+    (there,), (here,) = written.streams, read.streams
+    np.testing.assert_allclose(here.intervals.forward, there.intervals.forward, atol=1e-8)
+    np.testing.assert_allclose(here.intervals.yaw_rate, there.intervals.yaw_rate, atol=1e-8)
+    seen = there.landmark_detections
+    np.testing.assert_allclose(here.landmark_detections.ranges, seen.ranges, atol=1e-8)
+    assert len(seen.ranges) > 20
+    told = there.intervals
+    turned = np.abs(told.yaw_rate) > 0.05
+    assert (np.abs(told.forward[turned]) < 0.05).all(), "it turns, then drives"

@@ -1,0 +1,190 @@
+"""Runs of experiments: in processes of their own, kept as they come, none lost by another's end."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import active_children
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from sim.datasets.tables import DatasetError
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.studies.experiments import xu_localisation
+from sim.studies.experiments.catalogue import ENTRIES, Entry
+from sim.studies.experiments.experiment import Options, Outcome, Results
+from sim.studies.experiments.output import write
+from sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
+from sim.studies.experiments.store import Store
+from sim.studies.experiments.task import ROOTS, Task
+from sim.studies.experiments.team_runs import team_run, team_task
+from sim.studies.experiments.workers import Done, run
+from sim.world.config import SimulatedWorld
+from team.sources import sources_of
+
+WORK = "json:loads"
+"""A function that a process imports at once."""
+
+
+def counted(rmse: float) -> Task:
+    return Task(WORK, {"s": json.dumps({"rmse": rmse})}, f"run {rmse}")
+
+
+def short(steps: int) -> Scenario:
+    scenario = load("thesis")
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = msgspec.structs.replace(scenario.world, steps=steps)
+    return msgspec.structs.replace(scenario, world=world)
+
+
+@pytest.mark.parametrize("estimator", ["localisation", "ekf-slam"])
+def test_a_team_that_fuses_nothing_has_the_figures_of_its_robots(estimator: str) -> None:
+    scenario = with_options(short(20), estimator=estimator, fusion="alone")
+    figures = team_run(msgspec.to_builtins(scenario), batch=False)
+    assert figures["final_map_sha256"] is not None, "it came to its end"
+    assert figures["each_once"]
+    assert 0.1 < figures["online_pose_nees"] < 5.0
+    unmapped = estimator == "localisation"
+    assert [figures[name] is None for name in ("rmse", "nees", "in_band")] == [unmapped] * 3
+
+
+class Mean:
+    """An experiment of three runs."""
+
+    def __init__(self, *tasks: Task) -> None:
+        self._tasks = list(tasks)
+
+    def tasks(self, _: Options) -> list[Task]:
+        return self._tasks
+
+    def outcome(self, _: Options, results: Results) -> Outcome:
+        return Outcome("means", {"means": [r["rmse"] for r in results.of_all(self._tasks)]})
+
+
+def plan(*tasks: Task) -> Plan:
+    entry = Entry("means", "", "Means.")
+    return Plan(entry, Options((1,)), Mean(*tasks), tasks)
+
+
+@contextmanager
+def silent(tasks: Sequence[Task], kept: int) -> Iterator[Callable[[Done], None]]:
+    yield lambda _: None
+
+
+def test_a_run_in_a_worker_gives_the_bits_of_a_run_here() -> None:
+    task = team_task(short(24))
+    (done,) = run([task], 1)
+    here = team_run(**task.parameters)
+    assert done.result is not None
+    assert done.result["final_map_sha256"] == here["final_map_sha256"]
+    assert done.result["rmse"] == here["rmse"]
+
+
+def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path: Path) -> None:
+    wrong = Task(WORK, {"no_such": 1}, "wrong")
+    dead = Task("os:_exit", {"status": 3}, "dead")
+    good = [counted(1.0), counted(5.0)]
+    (concluded,) = computed([plan(wrong, dead, *good)], tmp_path, 1, silent)
+    assert concluded.outcome.figures["means"] == [1.0, 5.0]
+    assert "TypeError" in concluded.failed["wrong"]
+    assert concluded.failed["dead"] == "its process ended with exit status 3"
+    assert "Traceback" in (tmp_path / FAILURES).read_text()
+
+
+def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path: Path) -> None:
+    computed([plan(counted(1.0), Task("os:_exit", {"status": 3}, "dead"))], tmp_path, 1, silent)
+    asked: list[Task] = []
+
+    @contextmanager
+    def watched(tasks: Sequence[Task], kept: int) -> Iterator[Callable[[Done], None]]:
+        asked.extend(tasks)
+        assert kept == 1
+        yield lambda _: None
+
+    again = plan(counted(1.0), counted(2.0), Task("os:_exit", {"status": 3}, "dead"))
+    (concluded,) = computed([again], tmp_path, 2, watched)
+    assert {task.label for task in asked} == {"run 2.0", "dead"}
+    assert concluded.outcome.figures["means"] == [1.0, 2.0]
+
+
+def test_a_result_of_another_program_does_not_count(tmp_path: Path) -> None:
+    store, task = Store(tmp_path), counted(1.0)
+    store.keep(task, {"rmse": 1.0}, 0.1)
+    assert store.found([task]) == {task.name: {"rmse": 1.0}}
+    line = json.loads(store.path.read_text())
+    store.path.write_text(json.dumps(line | {"program": "0" * 16}) + "\n")
+    assert store.found([task]) == {}
+
+
+def test_a_line_that_was_cut_off_is_passed_over_and_the_next_one_stands_alone(
+    tmp_path: Path,
+) -> None:
+    store, first, second = Store(tmp_path), counted(1.0), counted(2.0)
+    store.keep(first, {"rmse": 1.0}, 0.1)
+    whole = store.path.read_bytes()
+    store.path.write_bytes(whole[:-9])
+    store = Store(tmp_path)
+    store.keep(second, {"rmse": 2.0}, 0.1)
+    assert store.found([first, second]) == {second.name: {"rmse": 2.0}}
+
+
+def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> None:
+    assert counted(1.0).name == counted(1.0).name
+    assert counted(1.0).name != counted(2.0).name
+    there, here = (Task(WORK, {"a": 1}, "", local={"path": path}) for path in ("/there", "/here"))
+    assert there.name == here.name
+
+
+def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
+    sources = sources_of("sim.studies.experiments.team_runs", ROOTS)
+    wanted = {
+        "team.estimation.hybrid_slam.fastslam_kernel",
+        "central.join_rule",
+        "sim.studies.batch_reference.graph",
+        "sim",
+    }
+    assert wanted <= sources.keys()
+    assert "sim.studies.experiments.output" not in sources
+    assert not {name for name in sources if name.partition(".")[0] == "numpy"}
+
+
+def test_leaving_early_ends_the_processes() -> None:
+    runs = run([counted(1.0), team_task(load("large"))], 2)
+    assert next(runs).task == counted(1.0)
+    runs.close()  # type: ignore[attr-defined] # a generator
+    assert active_children() == []
+
+
+def test_a_data_set_is_known_by_its_content(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "Barcodes.dat").write_text("1 5\n")
+    a, b = dataset(tmp_path / "a"), dataset(tmp_path / "b")
+    assert (a.name, b.name) == ("a", "b")
+    assert a.sha256 == b.sha256
+    (tmp_path / "b" / "Barcodes.dat").write_text("1 6\n")
+    assert dataset(tmp_path / "b").sha256 != a.sha256
+    with pytest.raises(DatasetError, match="no such file"):
+        dataset(tmp_path / "c")
+
+
+def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_not(
+    tmp_path: Path,
+) -> None:
+    entry = next(each for each in ENTRIES if each.name == "xu-3.5")
+    options = Options((1, 2), quick=True)
+    tasks = tuple(xu_localisation.tasks(options)[:4])
+    experiment = planned(entry, options).experiment
+    whole = Plan(entry, options, experiment, tasks)
+    begun = Plan(entry, options, experiment, tasks[:1])
+    computed([begun], tmp_path / "resumed", 1, silent)
+    (resumed,) = computed([whole], tmp_path / "resumed", 2, silent)
+    (at_once,) = computed([whole], tmp_path / "at once", 1, silent)
+    pages = []
+    for name, concluded in (("resumed", resumed), ("at once", at_once)):
+        folder = tmp_path / name
+        pages.append(write([concluded], folder, "index", {}).read_bytes())
+        assert (folder / "xu-3.5.json").exists()
+    assert pages[0] == pages[1]
+    assert sum(count for _, count, _ in resumed.kinds) == len(tasks)

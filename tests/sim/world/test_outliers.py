@@ -1,0 +1,89 @@
+"""Garbage of the simulated world: as much as asked, of its kind, and nothing else is touched."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from sim.scenarios.scenario import load
+from sim.scenarios.source import streams_of
+from sim.world.streams import WorldStreams
+from tests.sim.world.test_simulator import content, true_detections
+
+
+def world_with(garbage: float, kind: str, name: str = "thesis-b") -> WorldStreams:
+    scenario = load(name)
+    world = msgspec.structs.replace(scenario.world, garbage=garbage, garbage_kind=kind)
+    return streams_of(msgspec.structs.replace(scenario, world=world))
+
+
+@pytest.fixture(scope="module")
+def clean() -> WorldStreams:
+    return world_with(0.0, "reading")
+
+
+def joined(world: WorldStreams, field: str) -> np.ndarray:
+    return np.concatenate([getattr(s.landmark_detections, field) for s in world.streams])
+
+
+def test_three_in_ten_readings_are_spoilt_the_same_ones_for_every_kind(
+    clean: WorldStreams,
+) -> None:
+    spoilt = world_with(0.3, "reading")
+    other = world_with(0.3, "identity")
+    dropped = world_with(0.3, "drop")
+    bad = joined(spoilt, "ranges") != joined(clean, "ranges")
+    assert np.mean(bad) == pytest.approx(0.3, abs=3.3 * np.sqrt(0.21 / len(bad)))
+    assert np.array_equal(joined(other, "ids") != joined(clean, "ids"), bad)
+    for field in ("ids", "ranges", "bearings"):
+        assert np.array_equal(joined(dropped, field), joined(clean, field)[~bad])
+        assert np.array_equal(joined(spoilt, field)[~bad], joined(clean, field)[~bad])
+    assert np.array_equal(joined(spoilt, "ids"), joined(clean, "ids"))
+    assert np.array_equal(joined(other, "ranges"), joined(clean, "ranges"))
+
+
+def test_what_is_spoilt_is_the_landmarks_readings_alone(clean: WorldStreams) -> None:
+    for kind in ("reading", "identity", "drop"):
+        for before, after in zip(clean.streams, world_with(0.3, kind).streams, strict=True):
+            assert np.array_equal(before.stamps_ns, after.stamps_ns), "no message is lost"
+            assert np.array_equal(before.intervals.forward, after.intervals.forward)
+            assert np.array_equal(
+                before.teammate_detections.ranges, after.teammate_detections.ranges
+            )
+            assert np.array_equal(before.truth, after.truth)
+
+
+def test_a_spoilt_reading_is_uniform_over_what_can_be_seen(clean: WorldStreams) -> None:
+    spoilt = world_with(1.0, "reading")
+    assert kstest((joined(spoilt, "ranges") - 3.0) / 17.0, "uniform").pvalue > 1e-3
+    assert kstest(joined(spoilt, "bearings") / (2.0 * np.pi) + 0.5, "uniform").pvalue > 1e-3
+    assert kstest((joined(clean, "ranges") - 3.0) / 17.0, "uniform").pvalue < 1e-3
+
+
+def test_a_spoilt_identity_is_any_other_landmarks(clean: WorldStreams) -> None:
+    was, is_now = joined(clean, "ids"), joined(world_with(1.0, "identity"), "ids")
+    assert not np.any(was == is_now)
+    ahead = np.bincount((is_now.astype(int) - was.astype(int)) % 18, minlength=18)[1:]
+    assert ahead.min() > 0.8 * len(was) / 17
+    assert ahead.max() < 1.2 * len(was) / 17
+
+
+def test_a_world_without_garbage_is_as_it_was_whatever_its_kind(clean: WorldStreams) -> None:
+    for before, after in zip(clean.streams, world_with(0.0, "drop").streams, strict=True):
+        assert content(before) == content(after)
+
+
+def test_without_limits_of_sight_garbage_lies_within_the_place() -> None:
+    scenario = load("waypoints")
+    world = msgspec.structs.replace(
+        scenario.world, garbage=1.0, visible_to_m=None, visible_from_m=None, steps=50
+    )
+    for stream in streams_of(msgspec.structs.replace(scenario, world=world)).streams:
+        assert stream.landmark_detections.ranges.max() <= 100.0 * np.sqrt(2.0)
+
+
+def test_the_readings_that_stay_are_true() -> None:
+    world = world_with(0.3, "drop")
+    for stream in world.streams:
+        true_range, _ = true_detections(stream, world.landmarks)
+        assert np.abs(stream.landmark_detections.ranges - true_range).max() < 6 * 0.2
