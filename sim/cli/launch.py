@@ -1,11 +1,10 @@
-"""`teamslam launch` and `teamslam scenarios`."""
+"""`teamslam launch`."""
 
 import json
 import threading
 import time
 from contextlib import nullcontext
 from datetime import datetime
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,7 +21,6 @@ from sim.cli.options import (
     Robots,
     Seed,
     SpeedText,
-    counted,
     fail,
     over_tls,
     parsed_speed,
@@ -143,28 +141,6 @@ def launch(
         _conclude(resolved, outcome, json_file, report=report)
         if at is not None:
             _keep_showing(at.url, log)
-
-
-@app.command()
-def scenarios(
-    show: Annotated[
-        str | None, typer.Option(help="Print this one as TOML, to read or to begin with.")
-    ] = None,
-) -> None:
-    """List the built-in scenarios, or show one."""
-    from sim.scenarios.scenario import builtin_names, load
-
-    if show is not None:
-        if show not in builtin_names():
-            known = ", ".join(builtin_names())
-            fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
-        text = files("sim.scenarios.builtin").joinpath(f"{show}.toml").read_text("utf-8")
-        typer.echo(text, nl=False)
-        return
-    for name in builtin_names():
-        found = load(name)
-        team = counted(len(found.robots), "robot")
-        typer.echo(f"{name:12} {team:10} {found.estimator} with {found.fusion}")
 
 
 def _keep_showing(url: str, log: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.options import FAILED, WRONG_USE, counted, fail, refuse_existing
+from sim.cli.options import FAILED, WRONG_USE, LogArgument, counted, fail, refuse_existing
 from sim.cli.recorded import repair
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from team.recording.tables import Exported
     from team.wire.channels import Channel
 
-LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
 NewLog = Annotated[Path, typer.Option("--output", "-o", help="The new log.")]
 ChannelNames = Annotated[
     str | None, typer.Option(help="Channels, as odometry,submap; all without.", metavar="NAMES")
@@ -161,7 +160,8 @@ def export(
     channels: ChannelNames = None,
 ) -> None:
     """Write a log as tables, its paths for evo, or its readings and truth as a UTIAS data set."""
-    from sim.recorded.utias_set import export_tum, export_utias
+    from central.desk.export.tum import export_tum
+    from sim.recorded.utias_set import export_utias
     from team.recording.reader import open_log
 
     opened = open_log(log)

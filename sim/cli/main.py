@@ -15,10 +15,11 @@ from sim.cli.launch import app as launch_commands  # noqa: E402
 from sim.cli.log import app as log_tools  # noqa: E402
 from sim.cli.nodes import app as node_commands  # noqa: E402
 from sim.cli.options import FAILED, WRONG_USE  # noqa: E402
-from sim.cli.recorded import app as log_commands  # noqa: E402
+from sim.cli.recorded import app as recorded_commands  # noqa: E402
 from sim.cli.rerun import app as rerun_commands  # noqa: E402
+from sim.cli.scenarios import app as scenario_commands  # noqa: E402
+from sim.cli.studies import add_studies  # noqa: E402
 from sim.cli.view import app as view_commands  # noqa: E402
-from sim.studies.experiment_command import app as experiment_commands  # noqa: E402
 
 app = typer.Typer(
     help="Multi-robot SLAM as real processes over Zenoh.",
@@ -28,12 +29,12 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 for _part in (
-    launch_commands, node_commands, key_commands, log_commands, rerun_commands, view_commands,
-    calibrate_commands,
+    launch_commands, scenario_commands, node_commands, key_commands, recorded_commands,
+    rerun_commands, view_commands, calibrate_commands,
 ):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)
-app.add_typer(experiment_commands)
+add_studies(app)
 
 
 @app.callback(invoke_without_command=True)

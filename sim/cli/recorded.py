@@ -1,34 +1,27 @@
-"""Commands on logs: replay, report, repair, limit; and simulate, which writes a data set."""
+"""Commands on a recorded run: replay, report, repair."""
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sim.cli.options import (
-    FAILED,
     LOOPBACK,
     WRONG_USE,
     Keys,
-    Robots,
-    ScenarioArgument,
-    Seed,
+    LogArgument,
     SpeedText,
     connected,
     fail,
     parsed_speed,
     refuse_existing,
     refuse_open_door,
-    scenario_of,
 )
-from sim.scenarios.scenario import with_options
 
 if TYPE_CHECKING:
     from central.desk.ledger import Ledger
     from team.recording.reader import Log
-
-LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
 
 LONG_BYTES = 5_000_000
 """A report of a log of this size takes a while, and says so."""
@@ -163,53 +156,6 @@ def repair(
     typer.echo(f"{output}: {result.messages} messages{until}")
     for damage in result.damaged:
         typer.echo(f"lost: {damage}", err=True)
-
-
-@app.command()
-def limit(
-    log: LogArgument,
-    noise: Annotated[
-        Literal["white", "profile"],
-        typer.Option(
-            help="white: each reading's error is its own, no sightings of teammates; profile: the "
-            "scenario's errors that persist, biases, and sightings."
-        ),
-    ] = "white",
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
-) -> None:
-    """The batch MAP over all raw readings of a log: the limit that a team can reach."""
-    from sim.studies.batch_reference.reference import LimitError, batch_map
-    from team.recording.reader import open_log
-
-    try:
-        result = batch_map(open_log(log).samples(), noise)
-    except LimitError as error:
-        fail(str(error), FAILED)
-    figures = result.to_json()
-    typer.echo(json.dumps(figures, indent=2))
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n")
-
-
-@app.command()
-def simulate(
-    scenario: ScenarioArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")],
-    robots: Robots = None,
-    seed: Seed = None,
-) -> None:
-    """Write a scenario's world as a data set in the UTIAS format, with a scenario that runs it."""
-    from sim.datasets.utias_writer import write_utias
-    from sim.scenarios.source import streams_of
-    from sim.scenarios.toml import data_set_scenario
-
-    if output.exists() and any(output.iterdir()):
-        fail(f"{output} is not empty: give a new folder", WRONG_USE)
-    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed)
-    write_utias(streams_of(resolved), output)
-    beside = output / "scenario.toml"
-    beside.write_text(data_set_scenario(resolved), encoding="utf-8")
-    typer.echo(f"wrote {output}; `teamslam launch {beside}` runs the team on it")
 
 
 def _hint_if_cut(log: "Log") -> None:

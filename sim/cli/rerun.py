@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.options import FAILED, WRONG_USE, EstimatorOption, FusionOption, fail
+from sim.cli.options import FAILED, WRONG_USE, EstimatorOption, FusionOption, LogArgument, fail
 from sim.recorded.changes import Changes
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ app = typer.Typer()
 OFFENDERS = 20
 """Offenders that are printed; the JSON file has all."""
 
-LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
 
 

@@ -1,1 +1,1 @@
-"""A log computed again: as it was, or under other conditions."""
+"""A recorded run as a world again: its streams, a data set of them, a run with changes."""

@@ -1,13 +1,11 @@
-"""A log as what other programs read: a UTIAS data set, paths in the TUM format."""
+"""A log written as a data set in the UTIAS MRCLAM format."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.export.tum import write_trajectories
-from sim.calibration.source import world_of
 from sim.datasets.utias_writer import write_utias
 from sim.publisher.node import FIRST_EPOCH
+from sim.recorded.streams import recorded_streams
 from team.recording.reader import Log, LogError
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -33,24 +31,12 @@ def export_utias(log: Log, folder: Path) -> list[str]:
         what = f"it sights {', '.join(sorted(sighted - robots))}, of whom it has no readings"
         raise LogError(log.path, what, "`teamslam log merge` puts the robots' logs together")
     try:
-        world = world_of(messages, log.path.name)
+        world = recorded_streams(messages, log.path.name)
     except ValueError as error:
         remedy = "the format needs readings without gaps: `teamslam log cut` to a part without"
         raise LogError(log.path, str(error), remedy) from None
     write_utias(world, folder)
     return [stream.robot for stream in world.streams]
-
-
-def export_tum(log: Log, folder: Path) -> list[Path]:
-    """Write every robot's paths in the TUM format; what was written.
-
-    Raises `LogError` for a log that has no path, as one of sensor readings alone.
-    """
-    written = write_trajectories(evaluate(log.samples()), folder)
-    if not written:
-        remedy = "`teamslam rerun` computes them, `--format csv` writes what there is"
-        raise LogError(log.path, "no robot's path in it", remedy)
-    return written
 
 
 def _sound(log: Log) -> Iterator[m.Message]:

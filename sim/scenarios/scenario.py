@@ -1,18 +1,17 @@
 """A scenario: the world, the team's robots with their models, the centre and the seed.
 
-Users write TOML (`sim.scenarios.document` says how); processes hand the resolved scenario on as JSON
-(`dumps`, `loads`).
+Users write TOML (`sim.scenarios.document` says how); processes hand the resolved scenario on as
+JSON (`dumps`, `loads`).
 """
 
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import Meta
 
-from central.config import CentralConfig
+from central.team_config import TeamConfig
 from sim.scenarios.checks import ScenarioError, check_fields, plain
 from sim.scenarios.document import (
     MAX_ROBOTS,
@@ -24,7 +23,7 @@ from sim.scenarios.document import (
     resolved,
 )
 from sim.world.config import SimulatedWorld, UtiasWorld, World
-from team.config import Estimator, Exchange, FusionRule, RobotConfig
+from team.config import Estimator, Exchange, FusionRule
 from team.pairs import PAIRS, named_pairs, rules_for
 
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
@@ -32,25 +31,11 @@ __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "loa
 
 WORLDS: dict[str, type[World]] = {"simulated": SimulatedWorld, "utias": UtiasWorld}
 
-KeyChunk = Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{1,64}$")]
 
+class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A resolved scenario: what the team is told, and its world."""
 
-class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A resolved scenario: the robots and the centre carry the seed, the estimator and the rule.
-
-    team: the chunk of the keys `team/<team>/…` that keeps two teams on one network apart.
-    exchange: with "rendezvous" a robot sends its submaps only when it sees a teammate or is seen.
-    """
-
-    name: KeyChunk
-    team: KeyChunk
     world: World
-    robots: tuple[RobotConfig, ...]
-    central: CentralConfig = CentralConfig()
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
-    estimator: Estimator = "hybrid"
-    fusion: FusionRule = "join"
-    exchange: Exchange = "continuous"
 
 
 def load(name_or_path: str | Path) -> Scenario:

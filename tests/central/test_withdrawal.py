@@ -41,7 +41,9 @@ def scenario(robots: int = 3, steps: int = 60, **central: object) -> Scenario:
     )
     team = tuple(RobotConfig(f"r{i + 1}", MOTION, SENSOR, front, pose_s=1e4) for i in range(robots))
     centre = CentralConfig(tick_s=10.0, broadcast_s=10.0, **central)
-    return with_options(Scenario("small", "small", world, team, centre), seed=3)
+    return with_options(
+        Scenario(name="small", team="small", world=world, robots=team, central=centre), seed=3
+    )
 
 
 def run(of: Scenario, wrong: str = "") -> list[Sample]:

@@ -37,7 +37,7 @@ def scenario(seed: int = 1, robots: int = 1) -> Scenario:
         visible_to_m=12.0,
     )
     names = tuple(RobotConfig(f"r{i}", motion, sensor) for i in range(1, robots + 1))
-    return with_options(Scenario("small", "small", world, names), seed=seed)
+    return with_options(Scenario(name="small", team="small", world=world, robots=names), seed=seed)
 
 
 def streams(of: Scenario) -> WorldStreams:

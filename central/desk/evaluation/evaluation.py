@@ -25,8 +25,7 @@ from central.desk.evaluation.errors import (
 )
 from central.desk.evaluation.log import Collected, Traffic, collected
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
-from sim.scenarios.checks import ScenarioError
-from sim.scenarios.scenario import Scenario, loads
+from central.team_config import TeamConfig, team_config
 from team import translate
 from team.estimation.gaussian import Matrix
 from team.pairs import PAIRS
@@ -114,7 +113,7 @@ class Evaluation:
     unsound: samples that are no sound message.
     """
 
-    scenario: Scenario | None
+    scenario: TeamConfig | None
     map: MapResult | None
     robots: Mapping[str, RobotResult]
     true_landmarks: Float[np.ndarray, "T 2"]
@@ -137,7 +136,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         else (np.empty(0, np.uint32), np.empty((0, 2)))
     )
     fused = _map_result(log, ids, positions)
-    uplink = None if scenario is None else UPLINK[PAIRS[scenario.estimator, scenario.fusion]]
+    uplink = None if scenario is None else _uplink(scenario)
     robots = {
         robot: _robot_result(
             robot_log(log, robot),
@@ -272,14 +271,20 @@ def _robot_json(robot: RobotResult) -> dict[str, Any]:
     }
 
 
-def _scenario(log: Collected) -> Scenario | None:
+def _scenario(log: Collected) -> TeamConfig | None:
     message = log.sound(log.last(ch.WORLD_CONFIG))
     if not isinstance(message, m.Configured):
         return None
     try:
-        return loads(message.configuration)
-    except ScenarioError:
+        return team_config(message.configuration)
+    except ValueError:
         return None
+
+
+def _uplink(team: TeamConfig) -> tuple[ch.Channel, ...] | None:
+    """The channels that the team's rule consumes; None for a pair that no team can have."""
+    named = PAIRS.get((team.estimator, team.fusion))
+    return None if named is None else UPLINK[named]
 
 
 def _bytes(log: Collected, uplink: tuple[ch.Channel, ...] | None, robot: str) -> int | None:

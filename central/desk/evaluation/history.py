@@ -1,7 +1,7 @@
 """A run over its team time: honesty, traffic, latency and events, from one pass over its log.
 
-`central.desk.evaluation` says what a run was worth in the end; this is how it came to that. Nothing is kept
-of a message but the numbers that are shown: some tens of bytes a message.
+`evaluation` says what a run was worth in the end; this is how it came to that. Nothing is kept of a
+message but the numbers that are shown: some tens of bytes a message.
 """
 
 from array import array

@@ -1,1 +1,1 @@
-"""What other programs read: logs as data sets, paths as files."""
+"""Recorded runs for other programs: paths as files."""

@@ -9,8 +9,9 @@ from pathlib import Path as FilePath
 import numpy as np
 
 from central.desk.evaluation.errors import Path
-from central.desk.evaluation.evaluation import Evaluation
+from central.desk.evaluation.evaluation import Evaluation, evaluate
 from central.desk.evaluation.trajectories import associated
+from team.recording.reader import Log, LogError
 
 KINDS = ("smoothed", "online")
 
@@ -45,4 +46,16 @@ def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePat
             if len(path.stamps_ns):
                 written.append(folder / f"{name}.{kind}.tum")
                 write_tum(path, written[-1])
+    return written
+
+
+def export_tum(log: Log, folder: FilePath) -> list[FilePath]:
+    """Write every robot's paths in the TUM format; what was written.
+
+    Raises `LogError` for a log that has no path, as one of sensor readings alone.
+    """
+    written = write_trajectories(evaluate(log.samples()), folder)
+    if not written:
+        remedy = "`teamslam rerun` computes them, `--format csv` writes what there is"
+        raise LogError(log.path, "no robot's path in it", remedy)
     return written

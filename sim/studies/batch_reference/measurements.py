@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64, UInt32
 from msgspec import structs
 
 from central.desk.evaluation.errors import Path, on_circle
-from sim.scenarios.scenario import Scenario
+from central.team_config import TeamConfig
 from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import Matrix
@@ -65,7 +65,7 @@ class Chain:
 
 
 def chains_of(
-    samples: Iterable[Sample], scenario: Scenario, *, sightings: bool = False
+    samples: Iterable[Sample], scenario: TeamConfig, *, sightings: bool = False
 ) -> list[Chain]:
     """The chains of all robots by (robot, epoch); readings in the order of their counter, once.
 

@@ -8,8 +8,8 @@ Levenberg-Marquardt starts from the joined solution, so what it finds is never w
 three ways to fill the paths between its poses (under the noise `profile` from the best of them).
 Under the noise `white` every reading's error is its own and sightings of teammates are not used;
 under `profile` the sensor's errors persist as the scenario says, biases are estimated and sightings
-are factors (`sim.studies.batch_reference.errors`). Not modelled: an error of the odometry's scale at speeds that the
-profile has not seen.
+are factors (`errors`). Not modelled: an error of the odometry's scale at speeds that the profile
+has not seen.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -21,9 +21,9 @@ from sim.calibration.motion import creep, fit_motion
 from sim.calibration.scenario import scenario_toml
 from sim.calibration.sensor import UNITS as SENSOR_UNITS
 from sim.calibration.sensor import fit_sensor
-from sim.calibration.source import world_of
 from sim.cli.main import app
 from sim.datasets.utias_writer import write_utias
+from sim.recorded.streams import recorded_streams
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.world.config import SimulatedWorld
 from sim.world.streams import (
@@ -255,7 +255,7 @@ def test_too_little_motion_or_too_few_readings_are_said(bases: list[Reference]) 
 def test_the_readings_of_a_log_are_the_worlds() -> None:
     team = scenario(robots=2)
     told = streams(team)
-    read = world_of([opened(sample)[2] for sample in world_log(team)], "a log")
+    read = recorded_streams([opened(sample)[2] for sample in world_log(team)], "a log")
     assert [each.robot for each in read.streams] == [each.robot for each in told.streams]
     np.testing.assert_array_equal(read.landmarks, told.landmarks)
     for found, expected in zip(read.streams, told.streams, strict=True):
@@ -377,7 +377,9 @@ def slipping() -> tuple[Scenario, WorldStreams]:
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01)
     front_end = FrontEnd(window_s=5.0, particles=30, keyframe_s=0.5)
     robots = tuple(RobotConfig(f"r{i}", motion, sensor, front_end) for i in (1, 2))
-    team = with_options(Scenario("slipping", "slipping", world, robots), seed=3)
+    team = with_options(
+        Scenario(name="slipping", team="slipping", world=world, robots=robots), seed=3
+    )
     told = streams(team)
     less = tuple(
         replace(each, intervals=replace(each.intervals, forward=each.intervals.forward / 1.1))

@@ -37,7 +37,7 @@ def fast_team(biases: tuple[Bias, ...]) -> Scenario:
         visible_to_m=6.0,
     )
     robots = tuple(RobotConfig(f"r{i}", motion, sensor, front_end, pose_s=1e6) for i in (1, 2, 3))
-    return with_options(Scenario("fast", "fast", world, robots), seed=3)
+    return with_options(Scenario(name="fast", team="fast", world=world, robots=robots), seed=3)
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,10 @@ UTIAS = 'world = { kind = "utias" }\n'
         ),
         (SMALL + "[defaults.front_end]\npartcles = 5", "did you mean `particles`?"),
         (SMALL + "wold = 3", "unknown field `wold` at world; known: steps, size_m"),
-        ("sead = 3\n" + SMALL, "unknown field `sead` at the top; known: name, team, world, robots"),
+        (
+            "sead = 3\n" + SMALL,
+            "unknown field `sead` at the top; known: name, team, robots, central",
+        ),
         (
             SMALL + '[central]\nfusion = "kalman"',
             "`fusion` is said once for the whole team, at the top of the file",

@@ -1,0 +1,38 @@
+"""What a team is told before it starts: its robots, its centre, and what they have in common."""
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from central.config import CentralConfig
+from team.config import Estimator, Exchange, FusionRule, RobotConfig
+
+KeyChunk = Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{1,64}$")]
+"""A part of a key, between two slashes."""
+
+
+class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """A team without its world: every robot and the centre carry the seed, estimator and rule.
+
+    name: of the scenario. team: the chunk of the keys `team/<team>/…` that keeps two teams on one
+    network apart. exchange: with "rendezvous" a robot sends its submaps only when it sees a
+    teammate or is seen. Fields that only a world has are ignored when one is decoded.
+    """
+
+    name: KeyChunk
+    team: KeyChunk
+    robots: tuple[RobotConfig, ...]
+    central: CentralConfig = CentralConfig()
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
+    estimator: Estimator = "hybrid"
+    fusion: FusionRule = "join"
+    exchange: Exchange = "continuous"
+
+
+def team_config(text: str) -> TeamConfig:
+    """The team of a resolved scenario in JSON; raises ValueError."""
+    try:
+        return msgspec.json.decode(text, type=TeamConfig)
+    except (msgspec.MsgspecError, UnicodeEncodeError) as error:
+        raise ValueError(f"not a team's configuration in JSON: {error}") from None

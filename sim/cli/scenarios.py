@@ -1,0 +1,61 @@
+"""Commands on scenarios: scenarios, simulate."""
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim.cli.options import (
+    WRONG_USE,
+    Robots,
+    ScenarioArgument,
+    Seed,
+    counted,
+    fail,
+    scenario_of,
+)
+from sim.scenarios.scenario import builtin_names, load, with_options
+
+app = typer.Typer()
+
+
+@app.command()
+def scenarios(
+    show: Annotated[
+        str | None, typer.Option(help="Print this one as TOML, to read or to begin with.")
+    ] = None,
+) -> None:
+    """List the built-in scenarios, or show one."""
+    if show is not None:
+        if show not in builtin_names():
+            known = ", ".join(builtin_names())
+            fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
+        text = files("sim.scenarios.builtin").joinpath(f"{show}.toml").read_text("utf-8")
+        typer.echo(text, nl=False)
+        return
+    for name in builtin_names():
+        found = load(name)
+        team = counted(len(found.robots), "robot")
+        typer.echo(f"{name:12} {team:10} {found.estimator} with {found.fusion}")
+
+
+@app.command()
+def simulate(
+    scenario: ScenarioArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")],
+    robots: Robots = None,
+    seed: Seed = None,
+) -> None:
+    """Write a scenario's world as a data set in the UTIAS format, with a scenario that runs it."""
+    from sim.datasets.utias_writer import write_utias
+    from sim.scenarios.source import streams_of
+    from sim.scenarios.toml import data_set_scenario
+
+    if output.exists() and any(output.iterdir()):
+        fail(f"{output} is not empty: give a new folder", WRONG_USE)
+    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed)
+    write_utias(streams_of(resolved), output)
+    beside = output / "scenario.toml"
+    beside.write_text(data_set_scenario(resolved), encoding="utf-8")
+    typer.echo(f"wrote {output}; `teamslam launch {beside}` runs the team on it")

@@ -1,0 +1,42 @@
+"""The command `teamslam batch-reference`."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from sim.cli.options import FAILED, LogArgument, fail
+
+Noise = Annotated[
+    Literal["white", "profile"],
+    typer.Option(
+        help="white: each measurement's error is its own, no inter-robot measurements; profile: "
+        "the scenario's errors that persist, biases, and inter-robot measurements."
+    ),
+]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures.")]
+app = typer.Typer()
+
+
+@app.command(name="batch-reference")
+def batch_reference(log: LogArgument, noise: Noise = "white", json_file: JsonFile = None) -> None:
+    """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
+    from sim.studies.batch_reference.reference import LimitError, batch_map
+    from team.recording.reader import open_log
+
+    try:
+        result = batch_map(open_log(log).samples(), noise)
+    except LimitError as error:
+        fail(str(error), FAILED)
+    figures = result.to_json()
+    typer.echo(json.dumps(figures, indent=2))
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+@app.command(name="limit", hidden=True)
+def limit(log: LogArgument, noise: Noise = "white", json_file: JsonFile = None) -> None:
+    """The former name of `batch-reference`."""
+    typer.echo("`teamslam limit` is called `teamslam batch-reference` now", err=True)
+    batch_reference(log, noise, json_file)
