@@ -27,7 +27,7 @@ REMIND_S = 10.0
 """Wall time between two lines of a node that waits."""
 WAIT_S = 0.05
 """How long a shell waits for input before it looks at its other duties."""
-RECORDER_S = 10.0
+RECORDER_S = 30.0
 """A process leaves this long after its end, though the recorder still lacks something of it."""
 BACK_S = 1.5
 """A recorder that is back fetches from the publishers' caches what it has missed."""

@@ -2,6 +2,7 @@
 
 import logging
 import re
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -62,8 +63,17 @@ def router(
     own = None if keys is None else (own_keys(keys, "router"), load_roster(keys))
     at = over_tls(listen) if keys else listen
     with process("router", endless=True) as stop, zenoh_router(at, own) as endpoint:
+        if own is not None and own[1].revoked:
+            _LOG.info("revoked, and not let in: %s", ", ".join(sorted(own[1].revoked)))
         typer.echo(f"listening at {endpoint}")
-        stop.wait()
+        while not stop.wait(1.0):
+            if own is not None and time.time() > own[0].ends.timestamp():
+                fail(
+                    f"{own[0].certificate} has expired, so every link is closed: renew it by "
+                    f"`teamslam keys {own[0].team} -o DIR --renew router`, copy it, and start the "
+                    "router again",
+                    FAILED,
+                )
 
 
 @app.command()

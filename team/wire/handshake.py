@@ -38,9 +38,31 @@ def why_refused(connect: str, keys: Credentials | None) -> str | None:
         return _without_keys(link, connect) if keys is None else _with(link, host, connect, keys)
 
 
+def router_ends(connect: str, keys: Credentials) -> float | None:
+    """When the router's certificate ends [s since 1970]; None: it can not be learnt now."""
+    at = _ENDPOINT.match(connect)
+    if at is None:
+        return None
+    host, port = at["host"].strip("[]"), int(at["port"])
+    try:
+        with (
+            socket.create_connection((host, port), TIMEOUT_S) as link,
+            keys.context().wrap_socket(link, server_hostname=host) as tls,
+        ):
+            shown = tls.getpeercert()
+    except OSError:
+        return None
+    ends = None if shown is None else shown.get("notAfter")
+    return ssl.cert_time_to_seconds(ends) if isinstance(ends, str) else None
+
+
 def _with(link: socket.socket, host: str, connect: str, keys: Credentials) -> str | None:
     try:
-        tls = keys.context().wrap_socket(link, server_hostname=host)
+        context = keys.context()
+    except OSError as error:
+        return f"{keys.certificate} or its key can not be read any more: {error.strerror or error}"
+    try:
+        tls = context.wrap_socket(link, server_hostname=host)
     except ssl.SSLCertVerificationError as error:
         return (
             f"{connect}: the router's certificate is not good: {error.verify_message}. If the host "

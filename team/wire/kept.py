@@ -23,16 +23,17 @@ class Kept:
     _orders: dict[str, bytes] = field(default_factory=dict, init=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
-    def token(self, node: str, *, alive: bool) -> None:
-        """A node's liveliness token appears or goes."""
+    def token(self, node: str, *, alive: bool) -> bool:
+        """A node's liveliness token appears or goes; whether it went without a last word."""
         with self._lock:
             if alive:
                 self._there.add(node)
                 self._silent.add(node)
-                return
+                return False
             self._there.discard(node)
             if not self._there:
                 self._orders.clear()
+            return node in self._silent
 
     def last_word(self, node: str) -> None:
         """A process of this node ends as it should, and knows what it needs to."""

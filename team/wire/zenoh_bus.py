@@ -53,7 +53,7 @@ from team.wire.channels import (
     row_of,
 )
 from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded
-from team.wire.handshake import why_refused
+from team.wire.handshake import router_ends, why_refused
 from team.wire.kept import Kept
 from team.wire.messages import FinalWanted, Liveliness, Message, Tally
 
@@ -64,6 +64,12 @@ _HEARTBEAT_S = 0.25
 _ALIVE_TIMEOUT_S = 5.0
 FIRST_LOOK_S = 3.0
 """A client that has not come in for so long looks why."""
+LINK_S = 1.0
+"""Between two looks whether the router still lets a node with keys in."""
+DEAF = 4
+"""Looks in a row at which a router with a link is not heard: then it lets us hear nothing."""
+DOOR = "router/door"
+"""Where a router with keys holds a token, which every node that it lets in can see."""
 REFUSALS = "error,zenoh_link_tls=warn"
 """What of Zenoh's log a router with keys shows: whom it refuses, and why."""
 _ADVANCED = "/@adv/pub/"  # in the key of what an advanced publisher says beside its publications
@@ -158,6 +164,7 @@ class ZenohBus:
         self._closed = threading.Event()
         self._keys = keys
         self._session = _client(connect, patience_s, keys)
+        self._door = None if keys is None else _Door(self._session, connect, keys)
 
     def __enter__(self) -> Self:
         return self
@@ -298,6 +305,8 @@ class ZenohBus:
         been missing for a while is asked for; it comes as it arrives, behind what came after it.
         """
         self._check_open()
+        if self._door is not None:
+            self._door.look(time.monotonic())
         samples: list[Sample] = []
         until = time.monotonic() + timeout_s
         with suppress(Empty):
@@ -525,6 +534,54 @@ class ZenohBus:
             )
 
 
+class _Door:
+    """Whether a router with keys still lets this node in: Zenoh would try for ever, silently.
+
+    A router that is gone is waited for. One that does not take us any more, or that we do not take,
+    is asked why by a handshake; one that gives us a link but lets us hear nothing has a roster
+    without our certificate: there is nothing else on the key that it holds a token on.
+    """
+
+    def __init__(self, session: zenoh.Session, connect: str, keys: Credentials) -> None:
+        self._session = session
+        self._connect = connect
+        self._keys = keys
+        self._due = self._heard_at = 0.0
+        self._router_ends = router_ends(connect, keys)
+        self._heard = True
+        self._deaf = 0
+
+    def look(self, now_s: float) -> None:
+        """Look every LINK_S; raises BusError with the reason."""
+        if now_s < self._due:
+            return
+        self._due = now_s + LINK_S
+        linked = bool(self._session.info.routers_zid())
+        self._deaf = 0 if self._heard or not linked else self._deaf + 1
+        self._heard_at = now_s if self._heard else self._heard_at
+        # A link that comes up again just before the end Zenoh may keep behind it.
+        ended = self._router_ends is not None and time.time() > self._router_ends
+        if ended or now_s - self._heard_at > FIRST_LOOK_S:
+            refused = why_refused(self._connect, self._keys)
+            if refused is not None:
+                raise BusError(refused)
+            self._router_ends = router_ends(self._connect, self._keys)
+        if self._deaf > DEAF:
+            raise BusError(
+                f"{self._connect}: the router gives {self._keys.certificate} a link, but lets it "
+                "hear and say nothing: it is revoked, or the router has another roster. Copy the "
+                f"newest {self._keys.node}.pem and .key, and roster.json to the router, and start "
+                "both again"
+            )
+        self._heard = False
+
+        def hear(reply: zenoh.Reply) -> None:
+            self._heard = self._heard or reply.ok is not None
+
+        key = f"team/{self._keys.team}/{DOOR}"
+        self._session.liveliness().get(key, Callback(hear, indirect=False), timeout=LINK_S)
+
+
 def _every(channel: Channel, name: str) -> str:
     """All names: a node's or a view's may have several parts."""
     return "**" if name == "*" and "{robot}" not in channel.template else name
@@ -658,11 +715,13 @@ def router(
         ) from error
     with session:
         _Keeper(session)
+        door = keys and session.liveliness().declare_token(f"team/{keys[1].team}/{DOOR}")
         replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
         locators = [json.loads(r.ok.payload.to_string())["locators"] for r in replies if r.ok]
         if not (locators and locators[0]):
             raise BusError(f"the router at {listen} does not tell its endpoint")
         yield str(locators[0][0])
+        del door  # held until here
 
 
 class _Keeper:
@@ -696,8 +755,14 @@ class _Keeper:
 
     def _token(self, sample: zenoh.Sample) -> None:
         kept, key = self._of(sample.key_expr)
-        if (node := ALIVE.owner(key)) is not None:
-            kept.token(node, alive=sample.kind == zenoh.SampleKind.PUT)
+        node = ALIVE.owner(key)
+        if node is not None and kept.token(node, alive=sample.kind == zenoh.SampleKind.PUT):
+            _LOG.warning(
+                "%s of %s has gone without a last word: it was killed or cut off, or its "
+                "certificate has ended or is revoked",
+                node,
+                str(sample.key_expr).split("/", 2)[1],
+            )
 
     def _final(self, query: zenoh.Query) -> None:
         with query:

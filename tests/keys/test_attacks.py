@@ -8,12 +8,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 
+from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
-from team.keys.roster import load_roster
+from team.keys.roster import load_roster, nodes_of
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire import zenoh_bus
@@ -234,3 +237,59 @@ def test_each_side_names_a_certificate_that_it_refuses(
     with router() as plain:
         told, _ = refusal(plain.replace("tcp/", "tls/"), keys.own)
         assert "speaks no TLS" in told
+
+
+def shut_out(bus: ZenohBus) -> tuple[str, float]:
+    """What a node that is in says when it is let in no more, and after how long."""
+    began = time.monotonic()
+    while time.monotonic() - began < 20.0:
+        try:
+            bus.receive(0.05)
+        except BusError as error:
+            return str(error), time.monotonic() - began
+    return "nothing", time.monotonic() - began
+
+
+def test_a_router_whose_certificate_ends_is_named_by_who_is_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh_bus, "FIRST_LOOK_S", 0.3)
+    make_keys(tmp_path, TEAM, nodes_of(["r1"]))
+    ended = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=4)
+    make_keys(tmp_path, TEAM, [], renew=["router"], days=1.0, now=ended)
+    own = credentials_of(tmp_path, "router"), load_roster(tmp_path)
+    with (
+        router("tls/127.0.0.1:0", own) as endpoint,
+        ZenohBus(TEAM, endpoint, 20.0, credentials_of(tmp_path, "robot-r1", TEAM)) as bus,
+    ):
+        told, took = shut_out(bus)
+    assert "the router's certificate is not good: certificate has expired" in told
+    assert took < 4.0 + 10.0
+
+
+def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its link comes up again, and it hears nothing: the others, who are not revoked, do."""
+    monkeypatch.setattr(zenoh_bus, "LINK_S", 0.3)
+    home, carried = tmp_path / "home", tmp_path / "carried"
+    make_keys(home, TEAM, nodes_of(["r1", "r2"]))
+    copytree(home, carried)
+    own = credentials_of(carried, "router"), load_roster(carried)
+    with router("tls/127.0.0.1:0", own) as endpoint:
+        gone, kept = (
+            ZenohBus(TEAM, endpoint, 20.0, credentials_of(carried, f"robot-{name}", TEAM))
+            for name in ("r1", "r2")
+        )
+        for _ in range(20):
+            assert gone.receive(0.05) == kept.receive(0.05) == []
+    assert make_keys(home, TEAM, [], revoke=["robot-r1"]).revoked == ("robot-r1",)
+    with router(endpoint, (credentials_of(carried, "router"), load_roster(home))):
+        told, took = shut_out(gone)
+        assert "robot-r1.pem a link, but lets it hear and say nothing: it is revoked" in told
+        assert took < 10.0
+        until = time.monotonic() + 3.0
+        while time.monotonic() < until:
+            kept.receive(0.05)
+        for bus in (gone, kept):
+            bus.close()

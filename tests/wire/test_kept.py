@@ -20,9 +20,10 @@ def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone() -> None:
 def test_who_never_said_a_last_word_has_missed_the_end_and_is_told_so_once() -> None:
     kept = Kept()
     for node in ("killed", "well", "late"):
-        kept.token(node, alive=True)
-        kept.token(node, alive=False)
+        assert not kept.token(node, alive=True)
     kept.last_word("well")
+    gone = [node for node in ("killed", "well", "late") if kept.token(node, alive=False)]
+    assert gone == ["killed", "late"]
     assert kept.answer("killed", 0.0) is None
     kept.end(b"final", 10.0)
     kept.last_word("late")
