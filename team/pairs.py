@@ -53,3 +53,19 @@ def rules_for(estimator: Estimator) -> list[FusionRule]:
 def named_pairs() -> str:
     """The valid pairs as a user writes them: `hybrid + join, …`."""
     return ", ".join(f"{estimator} + {fusion}" for estimator, fusion in PAIRS)
+
+
+_RUNNING = "team.robot.baselines.running:running_estimator"
+ESTIMATORS: Mapping[Estimator, str] = MappingProxyType(
+    {
+        "hybrid": "team.robot.hybrid:HybridEstimator",
+        "hybrid-thesis": _RUNNING,
+        "hybrid-thesis-coded": _RUNNING,
+        "ekf-slam": _RUNNING,
+        "fastslam1": _RUNNING,
+        "fastslam2": _RUNNING,
+        "localisation": _RUNNING,
+        "dead-reckoning": _RUNNING,
+    }
+)
+"""Estimator → what makes one (`team.robot.estimator.Factory`), found by `team.registry`."""

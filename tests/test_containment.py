@@ -16,8 +16,8 @@ from sim.in_memory.team import final_map
 from team.containment import Boundary
 from team.recording.recorder import Recorder
 from team.recording.shell import RecordLoop
+from team.robot.hybrid import HybridEstimator
 from team.robot.main import RobotShell
-from team.robot.member import HybridMember
 from team.robot.node import SET_ASIDE, RobotNode
 from team.shell import FaultyRunError, Shell
 from team.wire import channels as ch
@@ -36,16 +36,16 @@ BROKEN_NS = 17_000_000_000
 @pytest.fixture
 def brittle(monkeypatch: pytest.MonkeyPatch) -> None:
     """An estimator that raises at one odometry, in the middle of what it changes."""
-    whole = HybridMember.drive
+    whole = HybridEstimator.drive
 
     def drive(self, stamp_ns, duration_ns, forward, yaw_rate, **how):  # type: ignore[no-untyped-def]
         if stamp_ns == BROKEN_NS:
-            self.sequence += 7
-            self._segmenter = None
+            self._slam.sequence += 7
+            self._slam._segmenter = None
             raise ZeroDivisionError("no way")
         return whole(self, stamp_ns, duration_ns, forward, yaw_rate, **how)
 
-    monkeypatch.setattr(HybridMember, "drive", drive)
+    monkeypatch.setattr(HybridEstimator, "drive", drive)
 
 
 def faults(samples: list[Sample]) -> list[m.Fault]:

@@ -7,13 +7,13 @@ from contextlib import suppress
 import numpy as np
 
 from central.baselines.measurement_rules import ReadingRule, Told
-from central.baselines.team_keyframes import RobotEpoch
+from central.baselines.team_keyframes import RobotKeyframe
 from central.config import CentralConfig
 from team import translate
 from team.config import RobotConfig
 from team.estimation.baselines import batch
 from team.estimation.baselines.batch import Batch
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Pose
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
@@ -38,8 +38,8 @@ class BatchRule(ReadingRule):
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
         super().__init__(config, digest, robots)
-        self._waiting: list[Turn] = []
-        self._newest: dict[str, RobotEpoch] = {}
+        self._waiting: list[RobotStep] = []
+        self._newest: dict[str, RobotKeyframe] = {}
         self._stamps: dict[str, list[int]] = defaultdict(list)
         self._findings: list[str] = []
 
@@ -62,7 +62,7 @@ class BatchRule(ReadingRule):
         self._batch = batch.begun(starts, self._config.robust_c)
         self._findings += taken_as_white(self._robots)
 
-    def _take(self, step: Sequence[RobotEpoch], turns: Sequence[Turn]) -> list[Outgoing]:
+    def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
         self._waiting += turns
         for each in step:
             self._newest[each.robot] = each

@@ -6,12 +6,12 @@ from contextlib import suppress
 import numpy as np
 
 from central.baselines.measurement_rules import ReadingRule, Told
-from central.baselines.team_keyframes import RobotEpoch
+from central.baselines.team_keyframes import RobotKeyframe
 from central.config import CentralConfig
 from team.config import RobotConfig
 from team.estimation.baselines import joint_fastslam
 from team.estimation.baselines.joint_fastslam import JointFastSlam
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
 from team.estimation.geometry import Pose, tangent
 from team.estimation.models import Increment
@@ -55,7 +55,7 @@ class JointFastSlamRule(ReadingRule):
         if turns:
             self._state = joint_fastslam.stepped(self._state, turns, self._generator)
 
-    def _take(self, step: Sequence[RobotEpoch], turns: Sequence[Turn]) -> list[Outgoing]:
+    def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
         blind = [turn.blind for turn in turns]
         for some in (turns, blind):  # at the last the particles stay where they are
             with suppress(NotACovarianceError, np.linalg.LinAlgError), np.errstate(all="ignore"):
@@ -78,10 +78,10 @@ class JointFastSlamRule(ReadingRule):
         return Told(joint_fastslam.landmark_gaussian(self._state))
 
 
-def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> Turn:
+def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> RobotStep:
     """A start with this covariance in (x, y, θ): a motion by nothing with its noise."""
     G = tangent(pose[2])
     own = G.T @ covariance @ G
     nothing = np.empty(0)
     start = Increment(np.zeros(3), 0.5 * (own + own.T))
-    return Turn(robot, start, config.sensor, np.empty(0, np.uint32), nothing, nothing)
+    return RobotStep(robot, start, config.sensor, np.empty(0, np.uint32), nothing, nothing)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from central.baselines.team_keyframes import RobotEpoch, TeamEpochs
+from central.baselines.team_keyframes import RobotKeyframe, TeamKeyframes
 from central.config import CentralConfig
 from central.fused import START_POSES, fused_message
 from central.roll import Roll
 from team import translate
 from team.config import RobotConfig
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.geometry import Pose
 from team.estimation.plausible import start_beyond
@@ -49,7 +49,7 @@ class ReadingRule(ABC):
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
         self._config = config
         self._config_digest = digest
-        self._epochs = TeamEpochs(robots)
+        self._epochs = TeamKeyframes(robots)
         self._robots: dict[str, RobotConfig] = {}
         self._members: dict[str, m.Member] = {}
         self._pose_ns: dict[str, int] = {}
@@ -65,7 +65,7 @@ class ReadingRule(ABC):
         """The robots' start poses; covariances in (x, y, θ), None: exactly known."""
 
     @abstractmethod
-    def _take(self, step: Sequence[RobotEpoch], turns: Sequence[Turn]) -> list[Outgoing]:
+    def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
         """One step of the team, which the members already name; the poses that it gives."""
 
     @abstractmethod
@@ -164,11 +164,11 @@ class ReadingRule(ABC):
         value = translate.start_of(start)
         return value is not None and start_beyond(value, self._config.bounds) is None
 
-    def _take_step(self, step: Sequence[RobotEpoch]) -> list[Outgoing]:
+    def _take_step(self, step: Sequence[RobotKeyframe]) -> list[Outgoing]:
         if not step:
             return []
         turns = [
-            Turn(
+            RobotStep(
                 each.robot,
                 each.epoch.increment,
                 self._robots[each.robot].sensor,
@@ -184,12 +184,12 @@ class ReadingRule(ABC):
             self._members[each.robot] = m.Member(each.robot, epoch, each.reading)
         return self._take(step, turns)
 
-    def _pose_is_due(self, each: RobotEpoch) -> bool:
+    def _pose_is_due(self, each: RobotKeyframe) -> bool:
         last_ns = self._pose_ns.get(each.robot)
         pose_ns = self._robots[each.robot].pose_s * 1e9
         return last_ns is None or each.stamp_ns - last_ns >= pose_ns
 
-    def _pose(self, each: RobotEpoch, pose: PoseGaussian) -> Outgoing:
+    def _pose(self, each: RobotKeyframe, pose: PoseGaussian) -> Outgoing:
         """The pose at the end of an epoch."""
         self._pose_ns[each.robot] = each.stamp_ns
         epoch = self._members[each.robot].epoch

@@ -8,19 +8,19 @@ from typing import NamedTuple
 
 from team import translate
 from team.config import Bounds, RobotConfig
-from team.estimation.hybrid_slam.keyframes import Epoch, Segmenter
+from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.stream.inbox import Inbox
 from team.stream.judge import SPEED, StreamJudge
 from team.wire import messages as m
 
 
-class RobotEpoch(NamedTuple):
+class RobotKeyframe(NamedTuple):
     """One robot's motion and what it saw at its end; `reading`: the counter that closed it."""
 
     stamp_ns: int
     robot: str
     reading: int
-    epoch: Epoch
+    epoch: Keyframe
 
 
 @dataclass
@@ -36,7 +36,7 @@ class _Stream:
     segmenter: Segmenter | None = None
     judge: StreamJudge = field(default_factory=lambda: StreamJudge(Bounds()))
     start: m.Start | None = None
-    waiting: deque[RobotEpoch] = field(default_factory=deque)
+    waiting: deque[RobotKeyframe] = field(default_factory=deque)
     covered_ns: float = float("-inf")
     broken: bool = False
     end: m.StreamEnd | None = None
@@ -89,11 +89,11 @@ class _Stream:
             case _:
                 pass
 
-    def _file(self, epochs: Sequence[Epoch], reading: int) -> None:
-        self.waiting += [RobotEpoch(e.stamp_ns, self.robot, reading, e) for e in epochs]
+    def _file(self, epochs: Sequence[Keyframe], reading: int) -> None:
+        self.waiting += [RobotKeyframe(e.stamp_ns, self.robot, reading, e) for e in epochs]
 
 
-class TeamEpochs:
+class TeamKeyframes:
     """The team's epochs by (stamp, robot), as far as every robot's stream is known.
 
     So the sequence is a function of the streams alone. A stream that begins anew at an unknown pose
@@ -141,12 +141,12 @@ class TeamEpochs:
         """Whether every reading of every stream has been taken."""
         return all(stream.complete for stream in self._streams.values())
 
-    def steps(self) -> Iterator[list[RobotEpoch]]:
+    def steps(self) -> Iterator[list[RobotKeyframe]]:
         """The epochs whose turn has come, those of one team time together."""
         for stream in self._streams.values():
             stream.take()
         horizon = min(stream.covered_ns for stream in self._streams.values())
-        ready: list[RobotEpoch] = []
+        ready: list[RobotKeyframe] = []
         for stream in self._streams.values():
             while stream.waiting and stream.waiting[0].stamp_ns < horizon:
                 ready.append(stream.waiting.popleft())

@@ -20,6 +20,8 @@ from sim.world.streams import (
 )
 from team.config import RobotConfig
 from team.estimation.geometry import compose
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -30,7 +32,6 @@ from team.estimation.map_joining.joining import (
     folded,
     started,
 )
-from team.robot.member import ClosedWindow, HybridMember
 
 LONGEST_NS = 250_000_000
 """Intervals of an arc are merged up to this: a window ends with one."""
@@ -104,22 +105,22 @@ def config_of(robot: str, scenario: Scenario) -> RobotConfig:
 
 
 def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
-    member = HybridMember(config, 1)
+    slam = HybridSlam(config, 1)
     tracks: list[_Track] = []
     stamps: list[int] = []
-    window = member.window
+    window = slam.window
     for reading in _merged(stream, LONGEST_NS if config.motion.kind != "turn-then-drive" else 0):
         if isinstance(reading, ObservationReading):
-            member.observe(reading.stamp_ns, (reading.ids, reading.ranges, reading.bearings))
+            slam.observe(reading.stamp_ns, (reading.ids, reading.ranges, reading.bearings))
             continue
-        closed = member.drive(*reading).closed
+        closed = slam.drive(*reading)
         if closed is not None:
             tracks.append(_track(closed, stamps, window))
             stamps = []
-        window = member.window
-        if member.last_epoch_ns is not None:
-            stamps += [member.last_epoch_ns] * (len(window.paths) - len(stamps))
-    last = member.finish()[0].closed
+        window = slam.window
+        if slam.last_keyframe_ns is not None:
+            stamps += [slam.last_keyframe_ns] * (len(window.paths) - len(stamps))
+    last, _ = slam.finish()
     return tracks if last is None else [*tracks, _track(last, stamps, window)]
 
 

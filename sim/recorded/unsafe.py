@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from team import translate
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.map_joining.conditioning import RobotPrior
 from team.estimation.map_joining.whole_map import WholeMap, begun, joined
 from team.estimation.submap import LocalMap
-from team.robot.member import ClosedWindow
 from team.robot.node import RobotNode
 from team.wire.arrays import check_packed_covariance
 from team.wire.bus import Outgoing

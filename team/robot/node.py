@@ -14,15 +14,26 @@ import numpy as np
 from team import translate
 from team.config import Exchange, RobotConfig
 from team.door import absurd
-from team.estimation.gaussian import NotACovarianceError
+from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.pipeline import NOT_USED
 from team.estimation.hybrid_slam.pose_grid import NO_NODE
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond, start_beyond
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
-from team.robot.baselines.filters import NOTHING_KNOWN, KnownMap
-from team.robot.member import ClosedWindow, Driven
-from team.robot.members import Member, member_of
+from team.robot.estimator import (
+    AT_ORIGIN,
+    NOTHING_KNOWN,
+    NOTHING_NEW,
+    AbsorbsMaps,
+    Estimates,
+    InitialPose,
+    KnownMap,
+    MakesSubmaps,
+    RobotEstimator,
+    estimator_of,
+)
 from team.robot.pace import Pace
 from team.robot.rendezvous import Held
 from team.robot.sent import Sent
@@ -74,7 +85,9 @@ class RobotNode:
         self._pace = Pace(config.fusion in FEEDBACK, self._consumer == "submap")
         self._known = NOTHING_KNOWN if config.estimator not in NEEDS_MAP else None
         self._known_ns: int | None = None
-        self._member: Member = member_of(config, 0)
+        self._estimator: RobotEstimator
+        self._windows: MakesSubmaps | None
+        self._begin_estimator(0, AT_ORIGIN)
         self._locals: list[LocalMap] = []
         self._prior: m.Prior | None = None
         self._team_map = TeamMap()
@@ -171,15 +184,15 @@ class RobotNode:
             local = translate.local_map_of(submap)
             self._locals.append(local)
             closed = ClosedWindow(
-                submap.sequence,
-                submap.first_reading,
-                submap.last_reading,
-                submap.start_ns,
-                submap.stamp_ns,
-                local,
+                sequence=submap.sequence,
+                first_reading=submap.first_reading,
+                last_reading=submap.last_reading,
+                start_ns=submap.start_ns,
+                end_ns=submap.stamp_ns,
+                local=local,
             )
             self._closed.append(closed)
-            self._member.resume(closed)
+            self._submap_estimator.resume(closed)
         last = submaps[-1]
         self._ledger["in a submap"] = self._consumed = last.last_reading + 1
         self._pace.acknowledged = len(submaps)
@@ -255,11 +268,11 @@ class RobotNode:
             "readings": float(self._inbox.next_reading),
             "submaps": float(self.submaps),
             "particles": float(self.config.front_end.particles),
-            "landmarks": float(len(self._member.own_map().ids)),
+            "landmarks": float(len(self._estimator.own_map().ids)),
             "pose_sigma_m": self._pose_sigma,
             "withheld": float(self.withheld),
         }
-        nis = self._member.innovation
+        nis = self._estimator.innovation
         if self._held.waits:
             figures["held_submaps"] = float(self._held.submaps)
         if nis.per_dof is not None:
@@ -293,16 +306,15 @@ class RobotNode:
         return self._sound(self._go_on())
 
     def _put_back(self, start: m.Start) -> None:
-        self._member = member_of(self.config, start.epoch, self._known or NOTHING_KNOWN)
-        self._member.start(*self._believed(start))
-        self._member.consumed(start.reading)
+        self._begin_estimator(start.epoch, self._believed(start))
+        self._goes_in(start)
         for closed in self._closed:
-            self._member.resume(closed)
+            self._submap_estimator.resume(closed)
         self._judge = StreamJudge(
             self.config.bounds, self._closed[-1].end_ns if self._closed else None
         )
         for reading in self._window:
-            self._member.consumed(reading.reading)
+            self._goes_in(reading)
             match reading:
                 case m.Odometry():
                     self._go(reading)
@@ -388,11 +400,10 @@ class RobotNode:
         return reading.stamp_ns
 
     def _begin_epoch(self, start: m.Start) -> None:
-        pose, covariance = self._believed(start)
+        initial = self._believed(start)
         self._judge = StreamJudge(self.config.bounds)
-        self._member = member_of(self.config, start.epoch, self._known or NOTHING_KNOWN)
-        self._member.start(pose, covariance)
-        self._member.consumed(start.reading)
+        self._begin_estimator(start.epoch, initial)
+        self._goes_in(start)
         self._sent.take(start)
         self._locals = []
         self._start, self._closed, self._window, self._aside = start, [], [], 0
@@ -405,14 +416,32 @@ class RobotNode:
         self._now_ns = max(self._now_ns, start.stamp_ns)
         self._passed_ns = start.stamp_ns - 1
 
-    def _believed(self, start: m.Start) -> tuple[np.ndarray | None, np.ndarray | None]:
+    def _begin_estimator(self, incarnation: int, initial: InitialPose) -> None:
+        known = self._known or NOTHING_KNOWN
+        estimator = estimator_of(self.config, incarnation, initial, known)
+        self._estimator = estimator
+        self._windows = estimator if isinstance(estimator, MakesSubmaps) else None
+
+    @property
+    def _submap_estimator(self) -> MakesSubmaps:
+        """The estimator, which is to go on from a submap; raises ValueError where it has none."""
+        if self._windows is None:
+            raise ValueError(f"the estimator {self.config.estimator} has no submaps to resume from")
+        return self._windows
+
+    def _goes_in(self, reading: m.Reading) -> None:
+        """The open window, if there is one, names the reading among its inputs."""
+        if self._windows is not None:
+            self._windows.consumed(reading.reading)
+
+    def _believed(self, start: m.Start) -> InitialPose:
         """The initial pose and its covariance; one beyond the bounds is taken as unknown."""
         value = translate.start_of(start)
         why = None if value is None else start_beyond(value, self.config.bounds)
         if why is not None:
             self.warnings.append(f"the initial pose is refused, taken as unknown: {why}")
-            return None, None
-        return translate.pose_of(start)
+            return InitialPose(None, None)
+        return InitialPose(*translate.pose_of(start))
 
     def _sensible(self, known: KnownMap) -> KnownMap:
         """A known map without the landmarks beyond the bounds."""
@@ -422,12 +451,12 @@ class RobotNode:
         return KnownMap(known.ids[inside], known.landmarks[inside])
 
     def _observe(self, reading: m.Observations) -> None:
-        self._member.consumed(reading.reading)
+        self._goes_in(reading)
         reason = self._look(reading)
-        self._ledger[self._member.used if reason is None else f"rejected: {reason}"] += 1
+        self._ledger[self._estimator.used if reason is None else f"rejected: {reason}"] += 1
 
     def _sight(self, reading: m.Sightings) -> list[Outgoing]:
-        self._member.consumed(reading.reading)
+        self._goes_in(reading)
         reason = self._see(reading)
         if reason is None:
             self._sighted.add(reading.reading)
@@ -437,7 +466,7 @@ class RobotNode:
     def _drive(self, reading: m.Odometry) -> list[Outgoing]:
         self._steps += 1
         self.steps += 1
-        self._member.consumed(reading.reading)
+        self._goes_in(reading)
         driven = self._go(reading)
         if driven.closed is None:
             self._used(reading)
@@ -453,7 +482,7 @@ class RobotNode:
             reason = RANGE
         if reason is None:
             ids, ranges, bearings = (each[near] for each in scan)
-            reason = self._member.observe(reading.stamp_ns, (ids, ranges, bearings))
+            reason = self._estimator.observe(reading.stamp_ns, (ids, ranges, bearings))
         return reason
 
     def _see(self, reading: m.Sightings) -> str | None:
@@ -466,15 +495,20 @@ class RobotNode:
         if reason is None:
             seen = tuple(name for name, is_near in zip(teammates, near, strict=True) if is_near)
             looks = seen, ranges[near], bearings[near]
-            reason = self._member.sight(reading.stamp_ns, reading.reading, looks)
+            windows = self._windows
+            reason = (
+                NOT_USED
+                if windows is None
+                else windows.sight(reading.stamp_ns, reading.reading, looks)
+            )
         return reason
 
-    def _go(self, reading: m.Odometry) -> Driven:
+    def _go(self, reading: m.Odometry) -> Estimates:
         motion = translate.motion_of(reading, self.config.clock_offset_s)
         self._unused = self._judge.odometry(*motion)
         if self._unused not in {None, SPEED}:
-            return Driven()
-        return self._member.drive(*motion, measured=self._unused is None)
+            return NOTHING_NEW
+        return self._estimator.drive(*motion, measured=self._unused is None)
 
     # What goes out.
 
@@ -485,17 +519,18 @@ class RobotNode:
     def _used(self, reading: m.Reading) -> None:
         """The ledger has an interval of odometry; it is used, or rejected with its reason."""
         unused = self._unused
-        self._ledger[self._member.used if unused is None else f"rejected: {unused}"] += 1
+        self._ledger[self._estimator.used if unused is None else f"rejected: {unused}"] += 1
         self._taken(reading)
 
-    def _told(self, driven: Driven) -> list[Outgoing]:
+    def _told(self, driven: Estimates) -> list[Outgoing]:
         """What there is to say of what the estimator has given."""
         if driven.closed is not None:
-            return self._send(driven.closed)
+            cloud = self._speaker.cloud(driven.closed.end_ns, driven.cloud)
+            return [*cloud, *self._send(driven.closed)]
         out = self._poses(driven.pose_ns)
         if driven.judged is not None:
             judged, stamp_ns = driven.judged
-            out.append(self._speaker.innovation(stamp_ns, self._member.sequence, judged))
+            out.append(self._speaker.innovation(stamp_ns, self._estimator.sequence, judged))
         if driven.map_ns is None:
             return out
         out += self._speaker.cloud(driven.map_ns, driven.cloud)
@@ -509,28 +544,27 @@ class RobotNode:
             self._used(self._taking)
         self._sighted_in(closed)
         if closed.late:
-            self._ledger[self._member.used] -= closed.late
+            self._ledger[self._estimator.used] -= closed.late
             self._ledger[LATE] += closed.late
         self._locals.append(closed.local)
         self._judge = StreamJudge(self.config.bounds, closed.end_ns)
         if closed.unsolved:
-            self._ledger[self._member.used] -= closed.unsolved
+            self._ledger[self._estimator.used] -= closed.unsolved
             self._ledger[f"rejected: {UNSOLVED}"] += closed.unsolved
         plain = ClosedWindow(
-            closed.sequence,
-            closed.first_reading,
-            closed.last_reading,
-            closed.start_ns,
-            closed.end_ns,
-            closed.local,
+            sequence=closed.sequence,
+            first_reading=closed.first_reading,
+            last_reading=closed.last_reading,
+            start_ns=closed.start_ns,
+            end_ns=closed.end_ns,
+            local=closed.local,
         )
         self._closed.append(plain)
         self._window, self._aside = [], 0
         released = self._held.put(said)
         self._sent.note(released)
         self._pending += released
-        out = self._speaker.cloud(closed.end_ns, closed.cloud)
-        out.append(self._speaker.innovation(closed.end_ns, closed.sequence, closed.innovation))
+        out = [self._speaker.innovation(closed.end_ns, closed.sequence, closed.innovation)]
         self._gated += closed.gated
         out += self._poses(closed.end_ns)
         out += self._mapped(closed.end_ns)
@@ -583,20 +617,20 @@ class RobotNode:
 
     def _exchange_map(self, stamp_ns: int) -> list[Outgoing]:
         self._exchange_ns = stamp_ns
-        self._last_map = self._member.sequence
+        self._last_map = self._estimator.sequence
         if self._pace.lockstep:
             self._pace.sent_map()
         return [self._own_map(stamp_ns)]
 
     def _own_map(self, stamp_ns: int) -> Outgoing:
-        landmarks = self._member.own_map()
-        joint = self._consumer == "own/map" and self._member.joint
+        landmarks = self._estimator.own_map()
+        joint = self._consumer == "own/map" and self._estimator.joint
         if joint and len(landmarks.ids) > JOINT_LANDMARKS:
             joint = False
             self.warnings.append("the own map is too large for a joint covariance")
         return self._speaker.own_map(
             stamp_ns,
-            self._member.sequence,
+            self._estimator.sequence,
             self._pace.awaited,
             landmarks,
             "joint" if joint else "blocks",
@@ -609,12 +643,12 @@ class RobotNode:
         ):
             return []
         self._pose_ns = stamp_ns
-        window = self._member.open_window()
-        own = self._member.own_pose(window)
+        own = self._estimator.own_pose()
         out = [self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, own)]
         prior = self._prior
         if prior is None or prior.epoch != self._epoch:
             return out
+        window = None if self._windows is None else self._windows.open_window()
         try:
             with np.errstate(all="ignore"):  # what is no number is withheld
                 posed = self._team_map.pose(prior, self._locals, window).pose
@@ -631,7 +665,7 @@ class RobotNode:
         digest: bytes,
         pose: tuple[np.ndarray, np.ndarray],
     ) -> Outgoing:
-        return self._speaker.pose(channel, stamp_ns, self._member.sequence, digest, pose)
+        return self._speaker.pose(channel, stamp_ns, self._estimator.sequence, digest, pose)
 
     def _progress(self) -> Outgoing:
         self._pace.unreported = 0
@@ -655,9 +689,13 @@ class RobotNode:
             self.finished, self.final = True, fused
             return []
         if self._pace.answered(fused.exchange):
+            estimator: object = self._estimator
+            if not isinstance(estimator, AbsorbsMaps):
+                raise ValueError(f"the estimator {self.config.estimator} absorbs no map")
             ids, means = translate.landmarks_of(fused)
+            joint = translate.landmark_covariance_of(fused)
             try:
-                self._member.absorb(ids, means, translate.landmark_covariance_of(fused))
+                estimator.absorb(LandmarkGaussian(ids, means, joint))
             except (NotACovarianceError, np.linalg.LinAlgError) as error:
                 self.warnings.append(f"the fused map can not be absorbed: {error}")
         return []
@@ -686,12 +724,12 @@ class RobotNode:
         self._end = mine[0] if mine else m.StreamEnd(self.robot, self.epoch, 0)
 
     def _close_epoch(self) -> list[Outgoing]:
-        driven, uncovered = self._member.finish()
+        driven, uncovered = self._estimator.finish()
         out = self._told(driven)
         if driven.closed is None:
             self._sighted_in(None)
         if uncovered:
-            self._ledger[self._member.used] -= uncovered
+            self._ledger[self._estimator.used] -= uncovered
             self._ledger["rejected: no odometry covers it"] += uncovered
         return out
 

@@ -8,10 +8,11 @@ from jaxtyping import Float
 
 from team import translate
 from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
 from team.estimation.inter_robot import Sighting
-from team.robot.member import ClosedWindow, Cloud
+from team.robot.estimator import Cloud
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids

@@ -3,7 +3,7 @@
 import numpy as np
 
 from team.config import Sensor
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.geometry import compose, exponential
 from team.estimation.models import Increment
 
@@ -35,6 +35,6 @@ def team_run(seed, starts=STARTS, steps=8, seen=None):
             ranges = ranges[near] + sensor.range_sigma * random.standard_normal(len(near))
             bearings = np.arctan2(d[near, 1], d[near, 0]) - truth[robot][2]
             bearings = wrap(bearings + sensor.bearing_sigma * random.standard_normal(len(near)))
-            turns.append(Turn(robot, MOTION, sensor, near.astype(np.uint32), ranges, bearings))
+            turns.append(RobotStep(robot, MOTION, sensor, near.astype(np.uint32), ranges, bearings))
         rounds.append(turns)
     return rounds, truth

@@ -26,6 +26,11 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
         12,
         (*WINDOW, "estimation/hybrid_slam/test_correlated_readings.py"),
     ),
+    "team/estimation/hybrid_slam/moments.py": (6, WINDOW),
+    "team/estimation/hybrid_slam/landmarks_along_paths.py": (
+        8,
+        (*WINDOW, "estimation/hybrid_slam/test_correlated_readings.py"),
+    ),
     "team/estimation/hybrid_slam/fastslam.py": (
         8,
         ("estimation/hybrid_slam/test_fastslam.py", *WINDOW),

@@ -11,7 +11,7 @@ from team.config import RobotConfig
 from team.containment import Boundary
 from team.estimation.hybrid_slam.pose_grid import NO_NODE
 from team.pairs import FEEDBACK
-from team.robot.member import HybridMember
+from team.robot.hybrid import HybridEstimator
 from team.robot.node import LATE, RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -204,7 +204,7 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
             scans = [n for n in said if isinstance(readings[n], m.Observations)]
             scans = [n for n in scans if not said[n].startswith("rejected")]
             said |= dict.fromkeys(scans[-took.pop(LATE) :], LATE)
-            said[counter] = HybridMember.used
+            said[counter] = HybridEstimator.used
         else:
             said[counter] = next(iter(took), "lost")
     if said and done is not None:

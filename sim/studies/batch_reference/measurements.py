@@ -14,7 +14,7 @@ from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Pose, between, compose
-from team.estimation.hybrid_slam.keyframes import Epoch, Segmenter
+from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
 from team.estimation.models import Increment
 from team.wire import channels as ch
@@ -105,7 +105,7 @@ def _chain(
     segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s, grid)
     segmenter.begin(first_ns)
     start: tuple[Pose | None, Matrix | None] = (None, None)
-    epochs: list[Epoch] = []
+    epochs: list[Keyframe] = []
     for reading in readings:
         match reading:
             case m.Start():
@@ -121,7 +121,7 @@ def _chain(
     if rest.mean.any() or rest.covariance.any():
         none = np.empty(0)
         nothing = np.empty(0, np.uint32)
-        epochs.append(Epoch(last_ns, rest, nothing, none, none))
+        epochs.append(Keyframe(last_ns, rest, nothing, none, none))
     return Chain(
         config,
         epoch,

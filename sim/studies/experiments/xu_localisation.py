@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.baselines.team_keyframes import RobotEpoch, TeamEpochs
+from central.baselines.team_keyframes import RobotKeyframe, TeamKeyframes
 from central.desk.evaluation.evaluation import evaluate
 from central.desk.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
 from sim.in_memory.team import run_team
@@ -180,7 +180,7 @@ class _Run:
     """What a robot hears in a run, the map that it is told, and where it truly is."""
 
     scenario: Scenario
-    epochs: list[RobotEpoch]
+    epochs: list[RobotKeyframe]
     start: np.ndarray
     ids: np.ndarray
     landmarks: Float[np.ndarray, "L 2"]
@@ -191,7 +191,7 @@ def _heard(world: Mapping[str, Any]) -> _Run:
     scenario = loads(msgspec.json.encode(world).decode())
     config = scenario.robots[0]
     samples = list(run_team(scenario, streams_of(scenario)))
-    cut = TeamEpochs([config.id])
+    cut = TeamKeyframes([config.id])
     cut.configure(config.id, config)
     for message in (opened(sample)[2] for sample in samples):
         match message:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.estimation.baselines import batch_factors as factors_of
 from team.estimation.baselines.batch_factors import Factors, Linear, Motions, Readings, Starts
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian, information
 from team.estimation.geometry import Pose, compose, tangent
 from team.estimation.models import located, variances
@@ -213,7 +213,7 @@ def _start_information(pose: Pose, covariance: Matrix | None) -> Matrix:
     return information(0.5 * (own + own.T), "a start pose")
 
 
-def extended(batch: Batch, turns: Sequence[Turn]) -> Batch:
+def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
     """The batch with more turns, in the given order.
 
     A new pose is dead-reckoned from the robot's newest one, a new landmark is where its first

@@ -16,7 +16,7 @@ from team.config import Sensor
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.window import moments
+from team.estimation.hybrid_slam.moments import moments
 from team.estimation.models import Increment
 
 

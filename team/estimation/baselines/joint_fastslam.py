@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.estimation.baselines.plain_fastslam import landmark_moments, pose_moments
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
@@ -58,7 +58,7 @@ def begun(
 
 
 def stepped(
-    state: JointFastSlam, turns: Sequence[Turn], generator: np.random.Generator
+    state: JointFastSlam, turns: Sequence[RobotStep], generator: np.random.Generator
 ) -> JointFastSlam:
     """One step of the team: resample if the particles are thin, then the robots' turns in order.
 

@@ -16,7 +16,7 @@ from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
-from team.estimation.hybrid_slam.window import moments
+from team.estimation.hybrid_slam.moments import moments
 from team.estimation.models import Increment
 
 

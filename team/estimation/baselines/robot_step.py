@@ -9,7 +9,7 @@ from team.config import Sensor
 from team.estimation.models import Increment
 
 
-class Turn(NamedTuple):
+class RobotStep(NamedTuple):
     """A robot's motion since its last turn, then its readings at the end of it.
 
     ranges [m] and bearings [rad] are corrected by the calibration of its sensor.
@@ -23,7 +23,7 @@ class Turn(NamedTuple):
     bearings: Float[np.ndarray, " n"]
 
     @property
-    def blind(self) -> "Turn":
+    def blind(self) -> "RobotStep":
         """The motion alone."""
         none = slice(0)
         return self._replace(

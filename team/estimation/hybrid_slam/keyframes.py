@@ -17,7 +17,7 @@ UNMEASURED = (1.0, 0.5)
 
 
 @dataclass(frozen=True)
-class Epoch:
+class Keyframe:
     """The motion since the last epoch and what was seen at its end (accepted and calibrated).
 
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
@@ -110,7 +110,7 @@ class Segmenter:
         yaw_rate: float,
         *,
         measured: bool = True,
-    ) -> list[Epoch]:
+    ) -> list[Keyframe]:
         """Integrate one odometry interval; the epochs that lie in it, in order.
 
         Where its motion was not measured (what came could not be) the last speeds go on, with
@@ -140,7 +140,7 @@ class Segmenter:
             epochs.append(self._close_keyframe(stamp_ns))
         return epochs
 
-    def cut(self, stamp_ns: int) -> tuple[list[Epoch], Increment]:
+    def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
         """A window ends here: its last epoch if one is open, and the motion after it.
 
         That motion's shift by an error of the scale of speed is `rest_forward`.
@@ -166,7 +166,7 @@ class Segmenter:
         """Scans that wait for odometry that covers their time."""
         return len(self._waiting)
 
-    def _nodes(self, until_ns: int, forward: float, yaw_rate: float) -> list[Epoch]:
+    def _nodes(self, until_ns: int, forward: float, yaw_rate: float) -> list[Keyframe]:
         """The grid times up to until_ns; sightings up to there find their node."""
         epochs = []
         grid = self._grid
@@ -207,13 +207,13 @@ class Segmenter:
         ids: UInt32[np.ndarray, " n"],
         ranges: Float[np.ndarray, " n"],
         bearings: Float[np.ndarray, " n"],
-    ) -> Epoch:
-        epoch = Epoch(stamp_ns, self._increment, ids, ranges, bearings, forward=self._forward)
+    ) -> Keyframe:
+        epoch = Keyframe(stamp_ns, self._increment, ids, ranges, bearings, forward=self._forward)
         self._increment = Increment.identity()
         self._forward = np.zeros(3)
         return epoch
 
-    def _close_keyframe(self, stamp_ns: int) -> Epoch:
+    def _close_keyframe(self, stamp_ns: int) -> Keyframe:
         points: dict[int, list[tuple[float, float]]] = {}
         for scan in self._keyframe:
             back = geometry.between(self._scan_motion, scan.pose)
@@ -229,6 +229,20 @@ class Segmenter:
         return self._epoch(
             stamp_ns, np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
         )
+
+
+def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most: int) -> Keyframe:
+    """The keyframe without the new landmarks that are too many for a submap; the nearest stay."""
+    ids, ranges = keyframe.ids, keyframe.ranges
+    if len(known) + len(ids) <= most:
+        return keyframe
+    unknown = ~np.isin(ids, known)
+    new, first = np.unique(ids[unknown], return_index=True)
+    nearest = new[np.argsort(ranges[unknown][first], kind="stable")[: max(most - len(known), 0)]]
+    taken = ~unknown | np.isin(ids, nearest)
+    return replace(
+        keyframe, ids=ids[taken], ranges=ranges[taken], bearings=keyframe.bearings[taken]
+    )
 
 
 def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.ndarray, "3 3"]:

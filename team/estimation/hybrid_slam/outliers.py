@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int64, UInt32
 
 from team.config import Sensor
 from team.estimation.hybrid_slam.consensus import agreeing, confirmed
-from team.estimation.hybrid_slam.keyframes import Epoch
+from team.estimation.hybrid_slam.keyframes import Keyframe
 from team.estimation.models import Increment
 
 
-class Gate:
+class OutlierGate:
     """Lets readings pass that agree with others of the same window; it forgets at its end.
 
     While the window is open a reading passes if earlier ones (or some beside it) agree with it; for
@@ -23,23 +23,30 @@ class Gate:
     def __init__(self, sensor: Sensor, garbage: float) -> None:
         self._sensor = sensor
         self._garbage = garbage
-        self._epochs: list[Epoch] = []
+        self._epochs: list[Keyframe] = []
         self.gated = 0
+
+    @property
+    def judges(self) -> bool:
+        """Whether there may be outliers; else all measurements pass."""
+        return self._garbage > 0.0
 
     def begin(self) -> None:
         """A window begins."""
         self._epochs = []
         self.gated = 0
 
-    def admitted(self, epoch: Epoch) -> Epoch:
+    def admitted(self, epoch: Keyframe) -> Keyframe:
         """The epoch with those of its readings that agree with what was read up to it."""
+        if not self.judges:
+            return epoch
         self._epochs.append(epoch)
         if not len(epoch.ids):
             return epoch
         taken = agreeing(*self._all(), self._sensor, self._garbage)
         return _with(epoch, taken[-len(epoch.ids) :])
 
-    def settled(self) -> Sequence[Epoch]:
+    def settled(self) -> Sequence[Keyframe]:
         """All epochs of the window with the readings that are confirmed; counts the others."""
         taken = confirmed(*self._all(), self._sensor, self._garbage)
         self.gated = int(np.count_nonzero(~taken))
@@ -68,7 +75,7 @@ class Gate:
         )
 
 
-def _with(epoch: Epoch, taken: Bool[np.ndarray, " n"]) -> Epoch:
+def _with(epoch: Keyframe, taken: Bool[np.ndarray, " n"]) -> Keyframe:
     return replace(
         epoch, ids=epoch.ids[taken], ranges=epoch.ranges[taken], bearings=epoch.bearings[taken]
     )

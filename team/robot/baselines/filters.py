@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from team import translate
 from team.config import Estimator, RobotConfig, Sensor
@@ -25,33 +24,16 @@ from team.estimation.geometry import tangent
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import Increment
+from team.robot.estimator import InitialPose, KnownMap
 
 IN_MAP = "in the running map"
 IN_POSE = "in the running pose"
 """The dispositions of a reading that such an estimator takes."""
 
 
-class KnownMap(NamedTuple):
-    """Landmarks that a robot is told: ids ascending, positions [m] in the team's frame."""
-
-    ids: UInt32[np.ndarray, " L"]
-    landmarks: Float[np.ndarray, "L 2"]
-
-
-NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
-
-
-class Start(NamedTuple):
-    """Where an estimator begins: a pose (None: unknown), its covariance (None: exact), a map."""
-
-    pose: Float[np.ndarray, "3"] | None
-    covariance: Matrix | None
-    known: KnownMap
-
-
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray]
 """The motion since the last epoch; landmark ids, ranges [m] and bearings [rad] at its end."""
-Begun = Callable[[RobotConfig, Start, np.random.Generator], Any]
+Begun = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
 Judged = Callable[[Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray], Innovation]
 
@@ -90,8 +72,10 @@ def _random(stepped: Callable[..., Any]) -> Stepped:
 def _exact(begun: Callable[..., Any], stepped: Callable[..., Any]) -> tuple[Begun, Stepped]:
     """Start and step of an estimator that draws none."""
 
-    def start(config: RobotConfig, start: Start, generator: np.random.Generator) -> Any:
-        return _with_start(begun, stepped, start)
+    def start(
+        config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+    ) -> Any:
+        return _with_start(begun, stepped, initial)
 
     def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
         increment, *scan = step
@@ -101,10 +85,10 @@ def _exact(begun: Callable[..., Any], stepped: Callable[..., Any]) -> tuple[Begu
 
 
 def _thesis_begun(
-    config: RobotConfig, start: Start, generator: np.random.Generator
+    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> hybrid_thesis.ThesisState:
     """The thesis knows the start exactly."""
-    return hybrid_thesis.started(np.zeros(3) if start.pose is None else start.pose)
+    return hybrid_thesis.started(np.zeros(3) if initial.pose is None else initial.pose)
 
 
 def _thesis_stepped(
@@ -138,9 +122,11 @@ def _thesis_absorbed(
     return hybrid_thesis.absorbed(state, ids, means, translate.blocks_of(covariance))
 
 
-def _coded_begun(config: RobotConfig, start: Start, generator: np.random.Generator) -> CodedState:
+def _coded_begun(
+    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+) -> CodedState:
     """The start is known exactly, as in the thesis."""
-    pose = np.zeros(3) if start.pose is None else start.pose
+    pose = np.zeros(3) if initial.pose is None else initial.pose
     return hybrid_thesis_coded.started(pose, config.front_end.particles)
 
 
@@ -156,19 +142,19 @@ S = TypeVar("S")
 def _with_start(
     begun: Callable[[np.ndarray], S],
     stepped: Callable[..., S],
-    start: Start,
+    initial: InitialPose,
     *generator: np.random.Generator,
 ) -> S:
     """The state at a start N(pose, covariance): a first motion by nothing, with that noise.
 
     The noise is turned into the pose's own axes: C = GᵀPG, G = blkdiag(R(θ), 1).
     """
-    at = np.zeros(3) if start.pose is None else start.pose
+    at = np.zeros(3) if initial.pose is None else initial.pose
     state = begun(at)
-    if start.covariance is None:
+    if initial.covariance is None:
         return state
     G = tangent(at[2])
-    own = G.T @ start.covariance @ G
+    own = G.T @ initial.covariance @ G
     nothing = np.empty(0)
     still = Increment(np.zeros(3), 0.5 * (own + own.T))
     return stepped(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
@@ -177,13 +163,15 @@ def _with_start(
 def _plain(proposal: Proposal) -> Filter:
     """FastSLAM over the whole stream, whatever the front end's own proposal is."""
 
-    def begun(config: RobotConfig, start: Start, generator: np.random.Generator) -> PlainFastSlam:
+    def begun(
+        config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+    ) -> PlainFastSlam:
         front = config.front_end
 
         def at(pose: np.ndarray) -> PlainFastSlam:
             return plain_fastslam.begun(pose, front.particles, proposal, front.resample_below)
 
-        return _with_start(at, plain_fastslam.stepped, start, generator)
+        return _with_start(at, plain_fastslam.stepped, initial, generator)
 
     return Filter(
         begun,
@@ -196,15 +184,15 @@ def _plain(proposal: Proposal) -> Filter:
 
 
 def _localisation_begun(
-    config: RobotConfig, start: Start, generator: np.random.Generator
+    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> Localisation:
     """At an unknown start anywhere from where the sensor may see a landmark of the known map.
 
     That is the map's box widened by the sensor's reach, at most by half the box's longer side.
     """
-    front, known = config.front_end, start.known
+    front = config.front_end
     landmarks = known.landmarks
-    if start.pose is None and len(landmarks):
+    if initial.pose is None and len(landmarks):
         lowest, highest = landmarks.min(axis=0), landmarks.max(axis=0)
         reach = min(config.sensor.max_range, 0.5 * float((highest - lowest).max()))
         state = localisation.begun_anywhere(
@@ -216,7 +204,7 @@ def _localisation_begun(
         state = localisation.begun(pose, front.particles, *known)
         return replace(state, resample_below=front.resample_below)
 
-    return _with_start(at, localisation.stepped, start, generator)
+    return _with_start(at, localisation.stepped, initial, generator)
 
 
 FILTERS: Mapping[Estimator, Filter] = {

@@ -4,30 +4,27 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from team.config import RobotConfig
 from team.estimation.gaussian import (
     LandmarkGaussian,
-    Matrix,
     NotACovarianceError,
     PoseGaussian,
 )
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.pose_grid import Looks
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
-from team.estimation.submap import LocalMap
-from team.robot.baselines.filters import FILTERS, KnownMap, Start, Step
-from team.robot.member import NOT_USED, ClosedWindow, Cloud, Driven, thinned
+from team.pairs import FEEDBACK
+from team.robot.baselines.filters import FILTERS, Step
+from team.robot.estimator import Cloud, Estimates, InitialPose, KnownMap, Scan, thinned
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 """Added to a running pose's covariance [m², m², rad²], which may be singular: an exactly known
 start, a motion without lateral noise, fewer than four particles that differ."""
 
 
-class RunningMember:
+class RunningEstimator:
     """The state after every epoch so far; its map is said once per window, or at every epoch.
 
     It makes no submaps, so it can not be resumed: a robot that was started again takes its stream
@@ -35,18 +32,18 @@ class RunningMember:
     """
 
     def __init__(
-        self, config: RobotConfig, epoch: int, known: KnownMap, *, maps_at_epochs: bool
+        self, config: RobotConfig, incarnation: int, initial: InitialPose, known: KnownMap
     ) -> None:
         self._config = config
-        self._known = known
         self._filter = FILTERS[config.estimator]
-        self._map_every_ns = 0 if maps_at_epochs else round(config.front_end.window_s * 1e9)
+        maps_at_keyframes = config.fusion in FEEDBACK
+        self._map_every_ns = 0 if maps_at_keyframes else round(config.front_end.window_s * 1e9)
         self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
-        self._generator = generator(config.seed, config.id, epoch, 0)
+        self._generator = generator(config.seed, config.id, incarnation, 0)
         self._map_ns: int | None = None
         self._innovation = NOTHING
         self._unsaid = NOTHING
-        self._state: Any = self._begun(np.zeros(3), None)
+        self._state: Any = self._filter.begun(config, initial, known, self._generator)
         self.sequence = 0
         self.unsolved = 0
         self.last_epoch_ns: int | None = None
@@ -66,31 +63,11 @@ class RunningMember:
         """Of all epochs so far."""
         return self._innovation.plus(self._unsaid)
 
-    def start(self, pose: Float[np.ndarray, "3"] | None, covariance: Matrix | None) -> None:
-        """The start pose, if it is known; without one the map's frame is the start itself."""
-        self._state = self._begun(pose, covariance)
-
-    def _begun(self, pose: Float[np.ndarray, "3"] | None, covariance: Matrix | None) -> Any:
-        return self._filter.begun(
-            self._config, Start(pose, covariance, self._known), self._generator
-        )
-
-    def resume(self, closed: ClosedWindow) -> None:
-        """It sends no submaps, so there is none to go on from."""
-        raise ValueError(f"the estimator {self._config.estimator} has no submaps to resume from")
-
-    def consumed(self, reading: int) -> None:
-        """Its messages name no interval of readings: they hang on all of them so far."""
-
-    def observe(self, stamp_ns: int, scan: tuple[np.ndarray, np.ndarray, np.ndarray]) -> str | None:
+    def observe(self, stamp_ns: int, scan: Scan) -> str | None:
         """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
         if not self._filter.looks:
             return "this estimator uses no landmarks"
         return self._segmenter.observe(stamp_ns, *scan)
-
-    def sight(self, stamp_ns: int, reading: int, looks: Looks) -> str | None:
-        """Sightings of teammates are for submaps."""
-        return NOT_USED
 
     def drive(
         self,
@@ -100,7 +77,7 @@ class RunningMember:
         yaw_rate: float,
         *,
         measured: bool = True,
-    ) -> Driven:
+    ) -> Estimates:
         """Take one odometry interval and run the epochs that lie in it."""
         if self._segmenter.now_ns is None:
             self._segmenter.begin(stamp_ns - duration_ns)
@@ -115,21 +92,21 @@ class RunningMember:
             self._advance(stamp_ns, rest, np.empty(0, np.uint32), nothing, nothing)
         return self._driven(before, last=False)
 
-    def _driven(self, before: int, *, last: bool) -> Driven:
+    def _driven(self, before: int, *, last: bool) -> Estimates:
         """What is new since `before` epochs; the map if it is due, or was not said at the end."""
         now_ns = self.last_epoch_ns
         if now_ns is None or self._map_ns is None:
-            return Driven()
+            return Estimates()
         pose_ns = now_ns if self.sequence > before else None
         fresh = self.sequence > before or (last and now_ns != self._map_ns)
         if not fresh or not (last or now_ns - self._map_ns >= self._map_every_ns):
-            return Driven(None, pose_ns)
+            return Estimates(pose_ns=pose_ns)
         self._map_ns = now_ns
         judged, self._unsaid = self._unsaid, NOTHING
         self._innovation = self._innovation.plus(judged)
         map_ns = now_ns if self._filter.maps else None
         said = (judged, now_ns) if judged.dof else None
-        return Driven(None, pose_ns, map_ns, self._cloud(map_ns), said)
+        return Estimates(pose_ns=pose_ns, map_ns=map_ns, cloud=self._cloud(map_ns), judged=said)
 
     def _cloud(self, map_ns: int | None) -> Cloud | None:
         """The particles, where there are any and a map is said."""
@@ -174,7 +151,7 @@ class RunningMember:
         finite = np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()
         return (state, judged) if finite else None
 
-    def finish(self) -> tuple[Driven, int]:
+    def finish(self) -> tuple[Estimates, int]:
         """The stream has ended: the last keyframe and map; how many scans no odometry covered."""
         uncovered = self._segmenter.uncovered
         before = self.sequence
@@ -185,11 +162,7 @@ class RunningMember:
                 )
         return self._driven(before, last=True), uncovered
 
-    def open_window(self) -> LocalMap | None:
-        """It has no windows."""
-        return None
-
-    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+    def own_pose(self) -> PoseGaussian:
         """The pose at the last epoch."""
         pose = self._filter.pose(self._state)
         return PoseGaussian(pose.mean, pose.covariance + POSE_FLOOR)
@@ -198,8 +171,20 @@ class RunningMember:
         """The landmarks so far."""
         return self._filter.landmarks(self._state)
 
-    def absorb(self, ids: np.ndarray, means: Float[np.ndarray, "L 2"], covariance: Matrix) -> None:
-        """Replace the landmarks by the fused ones; raises ValueError where it has no meaning."""
-        if self._filter.absorbed is None:
-            raise ValueError(f"the estimator {self._config.estimator} absorbs no map")
-        self._state = self._filter.absorbed(self._state, ids, means, covariance)
+
+class AbsorbingEstimator(RunningEstimator):
+    """One whose landmarks the fused ones replace, under a rule with feedback."""
+
+    def absorb(self, landmarks: LandmarkGaussian) -> None:
+        """Replace the landmarks by the fused ones."""
+        assert self._filter.absorbed is not None
+        self._state = self._filter.absorbed(self._state, *landmarks)
+
+
+def running_estimator(
+    config: RobotConfig, incarnation: int, initial: InitialPose, known: KnownMap
+) -> RunningEstimator:
+    """The estimator that the configuration names."""
+    absorbs = FILTERS[config.estimator].absorbed is not None
+    made = AbsorbingEstimator if absorbs else RunningEstimator
+    return made(config, incarnation, initial, known)

@@ -11,7 +11,7 @@ from central.config import CentralConfig
 from central.node import CentralNode
 from team import translate
 from team.estimation.baselines import joint_fastslam
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.models import increment_of
 from team.estimation.randomness import generator
 from team.wire import channels as ch
@@ -87,7 +87,7 @@ def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_epochs():
             step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
             increment = increment_of(CONFIGS[name].motion, *map(float, step))
             looks = (*(x[rows] for x in seen), each.landmark_detections.bearings[rows])
-            turns.append(Turn(name, increment, CONFIGS[name].sensor, *looks))
+            turns.append(RobotStep(name, increment, CONFIGS[name].sensor, *looks))
         state = joint_fastslam.stepped(state, turns, drawn)
         for turn in turns:
             poses[turn.robot].append(joint_fastslam.pose_gaussian(state, turn.robot).mean)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team.estimation.baselines import joint_fastslam, plain_fastslam
-from team.estimation.baselines.robot_step import Turn
+from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.models import Increment
@@ -121,7 +121,7 @@ def test_standing_robots_readings_of_one_landmark_are_fused_as_gaussians():
     ):
         d = LANDMARKS[0] - pose[:2]
         r, b = np.hypot(*d) + error, np.arctan2(d[1], d[0]) - pose[2]
-        turns.append(Turn(robot, STANDING, sensor, sees, np.array([r]), np.array([wrap(b)])))
+        turns.append(RobotStep(robot, STANDING, sensor, sees, np.array([r]), np.array([wrap(b)])))
         e = np.array([np.cos(b + pose[2]), np.sin(b + pose[2])])
         G = np.stack((e, r * np.array([-e[1], e[0]])), axis=1)
         P = G @ np.diag([sensor.range_sigma, sensor.bearing_sigma]) ** 2 @ G.T
@@ -173,7 +173,7 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least):
         state = joint_fastslam.begun(starts, 200, "fastslam1", 0.5)
         rounds = [
             [
-                Turn(robot.id, e.increment, robot.sensor, e.ids, e.ranges, e.bearings)
+                RobotStep(robot.id, e.increment, robot.sensor, e.ids, e.ranges, e.bearings)
                 for robot, e in zip(robots, epochs, strict=True)
             ]
             for epochs in teams

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from team.estimation.hybrid_slam.window import Noise, landmarks_along_paths
+from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
+from team.estimation.hybrid_slam.sensitivity import Noise
 from team.estimation.models import landmark_jacobian, predicted
 
 PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 0.5]])

@@ -11,7 +11,7 @@ from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor
-from team.estimation.hybrid_slam.window import moments
+from team.estimation.hybrid_slam.moments import moments
 from team.estimation.models import Increment, increment_of
 
 quick = settings(deadline=None, max_examples=60)

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.keyframes import Segmenter
+from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.models import Increment
-from team.robot.member import HybridMember
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
 
@@ -147,17 +147,16 @@ def test_a_window_begins_without_the_sightings_of_the_one_before():
     assert grid.sightings() == ()
 
 
-def test_a_member_closes_its_windows_with_their_nodes_and_sightings():
+def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
     front = msgspec.structs.replace(config().front_end, node_s=1.5, sighting_s=0.5)
-    member = HybridMember(config(front_end=front), 1)
-    member.start(np.zeros(3), None)
+    slam = HybridSlam(config(front_end=front), 1)
     closed = []
     for k in range(1, 7):
-        member.consumed(k)
+        slam.consumed(k)
         if k > 1:
-            reason = member.sight(k * SECOND - 500_000_000, k, look())
+            reason = slam.sight(k * SECOND - 500_000_000, k, look())
             assert reason == ("no pose node near it" if k == 4 else None), "its node was the end"
-        window = member.drive(k * SECOND, SECOND, 0.5, 0.1).closed
+        window = slam.drive(k * SECOND, SECOND, 0.5, 0.1)
         closed += [] if window is None else [window]
     assert [w.local.node_stamps.tolist() for w in closed] == [
         [1_500_000_000, 3 * SECOND],
@@ -169,6 +168,6 @@ def test_a_member_closes_its_windows_with_their_nodes_and_sightings():
     ]
 
 
-def test_a_member_without_nodes_does_not_use_sightings():
-    member = HybridMember(config(), 1)
-    assert member.sight(SECOND, 1, look()) == "sightings are not used by this estimator"
+def test_a_slam_without_nodes_does_not_use_sightings():
+    slam = HybridSlam(config(), 1)
+    assert slam.sight(SECOND, 1, look()) == "sightings are not used by this estimator"

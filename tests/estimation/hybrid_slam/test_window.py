@@ -15,6 +15,7 @@ from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.moments import moments, sample_factor
 from team.estimation.models import Increment, increment_of
 from team.estimation.randomness import generator
 
@@ -176,7 +177,7 @@ def test_solving_the_landmarks_again_takes_out_the_bias_of_the_first_reading():
         local = windows.gaussian(window)
         truth = np.concatenate((run.truth, run.landmarks[local.ids].ravel()))
         order, particles = np.argsort(window.particles.ids), window.particles
-        mean, P = windows.moments(
+        mean, P = moments(
             particles.poses,
             np.exp(particles.log_weights),
             particles.means[:, order],
@@ -349,7 +350,7 @@ def test_the_information_of_few_particles_is_right_on_average_and_that_of_their_
     ids=["twenty equal", "unequal ones count for fewer", "ten", "two", "one"],
 )
 def test_the_scatter_of_particles_is_taken_times_its_sample_factor(weights, factor):
-    assert windows.sample_factor(np.array(weights)) == pytest.approx(factor)
+    assert sample_factor(np.array(weights)) == pytest.approx(factor)
 
 
 def test_headings_about_half_a_turn_have_their_mean_there():

@@ -10,9 +10,15 @@ from team.estimation.gaussian import NO_LANDMARKS
 from team.estimation.models import Increment, corrected, increment_of
 from team.estimation.randomness import generator
 from team.pairs import LOCALISERS, MAPPERS, PAIRS, rules_for
-from team.robot.baselines.filters import NOTHING_KNOWN, KnownMap
 from team.robot.baselines.running import POSE_FLOOR
-from team.robot.members import member_of
+from team.robot.estimator import (
+    NOTHING_KNOWN,
+    AbsorbsMaps,
+    InitialPose,
+    KnownMap,
+    MakesSubmaps,
+    estimator_of,
+)
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -25,6 +31,7 @@ KNOWN = KnownMap(np.arange(1, len(LANDMARKS) + 1, dtype=np.uint32), LANDMARKS)
 TOLD = m.KnownMap(0, from_ids(KNOWN.ids), from_floats(KNOWN.landmarks))
 ALL = sorted({estimator for estimator, _ in PAIRS})
 WHOLE = sorted({*MAPPERS, *LOCALISERS} - {"hybrid", "hybrid-thesis"})
+UNKNOWN = InitialPose(None, None)
 SPREAD = np.diag([0.2, 0.1, 0.02])
 
 
@@ -92,12 +99,10 @@ def plain(front, proposal):
 @pytest.mark.parametrize("estimator", WHOLE)
 def test_a_member_gives_what_its_estimator_gives_on_the_streams_epochs(estimator, start):
     robot = of_name(estimator)
-    member = member_of(robot, 1, KNOWN)
-    # The generator is keyed by the epoch; the state before the start was drawn from another one.
-    member.start(np.zeros(3), start)
+    member = estimator_of(robot, 1, InitialPose(np.zeros(3), start), KNOWN)
     fed(member)
     pose, landmarks = by_hand(estimator, robot, start)
-    mine = member.own_pose(None)
+    mine = member.own_pose()
     np.testing.assert_allclose(mine.mean, pose.mean, atol=1e-12)
     np.testing.assert_allclose(mine.covariance, pose.covariance + POSE_FLOOR, atol=1e-12)
     own = member.own_map()
@@ -108,17 +113,16 @@ def test_a_member_gives_what_its_estimator_gives_on_the_streams_epochs(estimator
 
 def test_an_uncertain_start_is_turned_into_the_axes_of_the_pose():
     """A start that is uncertain across the heading alone stays so, wherever it points."""
-    member = member_of(of_name("ekf-slam"), 1)
     turned = np.array([3.0, 1.0, np.pi / 2])
-    member.start(turned, np.diag([4.0, 1e-4, 1e-4]))
+    initial = InitialPose(turned, np.diag([4.0, 1e-4, 1e-4]))
+    member = estimator_of(of_name("ekf-slam"), 1, initial)
     np.testing.assert_allclose(
-        member.own_pose(None).covariance, np.diag([4.0, 1e-4, 1e-4]) + POSE_FLOOR, atol=1e-12
+        member.own_pose().covariance, np.diag([4.0, 1e-4, 1e-4]) + POSE_FLOOR, atol=1e-12
     )
 
 
 def test_a_map_is_said_once_per_window_and_at_the_end():
-    member = member_of(of_name("ekf-slam"), 1)
-    member.start(np.zeros(3), None)
+    member = estimator_of(of_name("ekf-slam"), 1)
     said = [each.map_ns for each in fed(member, READINGS[:-2]) if each.map_ns is not None]
     assert said == [3_000_000_000, 6_000_000_000, 9_000_000_000]
     ended, _ = member.finish()
@@ -151,8 +155,7 @@ def test_a_node_says_how_well_its_readings_were_predicted(estimator):
 @pytest.mark.parametrize("keyframe_s", [0.0, 2.5])
 def test_the_last_keyframe_is_used_at_the_end(keyframe_s):
     front = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
-    member = member_of(of_name("ekf-slam", front_end=front), 1)
-    member.start(np.zeros(3), None)
+    member = estimator_of(of_name("ekf-slam", front_end=front), 1)
     fed(member, READINGS[:-2])
     before = member.sequence
     ended, uncovered = member.finish()
@@ -192,15 +195,13 @@ def test_localisation_waits_for_the_map_that_it_is_told():
 def test_localisation_finds_itself_from_an_unknown_start():
     front = msgspec.structs.replace(config().front_end, particles=50_000)
     robot = of_name("localisation", front_end=front)
-    member = member_of(robot, 1, KNOWN)
-    member.start(None, None)
+    member = estimator_of(robot, 1, UNKNOWN, KNOWN)
     fed(member)
     end = STREAM.truth[-1]
-    assert np.hypot(*(member.own_pose(None).mean - end)[:2]) < 0.5
-    blind = member_of(robot, 1, NOTHING_KNOWN)
-    blind.start(None, None)
+    assert np.hypot(*(member.own_pose().mean - end)[:2]) < 0.5
+    blind = estimator_of(robot, 1, UNKNOWN, NOTHING_KNOWN)
     fed(blind)
-    assert np.isfinite(blind.own_pose(None).mean).all(), "without a map it is dead reckoning"
+    assert np.isfinite(blind.own_pose().mean).all(), "without a map it is dead reckoning"
 
 
 def test_the_last_word_names_the_last_map():
@@ -215,9 +216,9 @@ def test_the_last_word_names_the_last_map():
 
 @pytest.mark.parametrize("estimator", ["ekf-slam", "dead-reckoning"])
 def test_what_has_no_meaning_is_refused_with_the_estimators_name(estimator):
-    member = member_of(of_name(estimator), 1)
-    with pytest.raises(ValueError, match=f"{estimator} absorbs no map"):
-        member.absorb(KNOWN.ids, KNOWN.landmarks, np.eye(2 * len(KNOWN.ids)))
+    member = estimator_of(of_name(estimator), 1)
+    assert not isinstance(member, AbsorbsMaps)
+    assert not isinstance(member, MakesSubmaps)
     node = RobotNode(of_name(estimator))
     (submap,) = of(driven(RobotNode(config()), READINGS), ch.SUBMAP)[:1]
     with pytest.raises(ValueError, match="no submaps to resume from"):

@@ -35,7 +35,8 @@ from sim.world.streams import (
     robot_stream,
 )
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.robot.member import Driven, HybridMember
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.wire.bus import opened
 from tests.sim.logs import scenario, streams, world_log
 
@@ -318,12 +319,12 @@ def test_one_command_logged_many_times_is_one_interval(monkeypatch: pytest.Monke
     world = logged_often(streams(team), 8)
     drives = []
 
-    def counted(self: HybridMember, *interval: float) -> Driven:
+    def counted(self: HybridSlam, *interval: float) -> ClosedWindow | None:
         drives.append(interval)
         return drive(self, *interval)  # type: ignore[arg-type]
 
-    drive = HybridMember.drive
-    monkeypatch.setattr(HybridMember, "drive", counted)
+    drive = HybridSlam.drive
+    monkeypatch.setattr(HybridSlam, "drive", counted)
     merged = joined_team(world, team)
     count = len(drives)
     monkeypatch.setattr(join, "LONGEST_NS", 0)

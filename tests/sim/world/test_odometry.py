@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from central.baselines.team_keyframes import TeamEpochs
+from central.baselines.team_keyframes import TeamKeyframes
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load
 from sim.scenarios.source import streams_of
@@ -169,7 +169,7 @@ def test_a_centre_that_takes_raw_readings_puts_the_clock_right_too() -> None:
 
 def team_epochs(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
     """Stamp, motion and ranges of each epoch of the first robot, as the centre cuts them."""
-    epochs = TeamEpochs([robot.id])
+    epochs = TeamKeyframes([robot.id])
     epochs.configure(robot.id, robot)
     readings = published(world.streams[0])
     for reading in readings:

@@ -12,8 +12,9 @@ from sim.scenarios.source import streams_of
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig
 from team.estimation.consistency import chi2_interval, nees
-from team.robot.member import HybridMember
-from team.robot.members import member_of
+from team.estimation.gaussian import LandmarkGaussian
+from team.robot.estimator import InitialPose, estimator_of
+from team.robot.hybrid import HybridEstimator
 from team.wire import messages as m
 from tests.teams import config, published, stream
 
@@ -23,7 +24,8 @@ READINGS = published(stream("r1", 12, off_ns=300_000_000))
 def fed(member, readings):
     closed = []
     for reading in readings:
-        member.consumed(reading.reading)
+        if isinstance(member, HybridEstimator):
+            member.consumed(reading.reading)
         if isinstance(reading, m.Observations):
             member.observe(reading.stamp_ns, translate.scan_of(reading))
         if isinstance(reading, m.Odometry):
@@ -35,9 +37,7 @@ def fed(member, readings):
 
 
 def begun():
-    member = HybridMember(config(), 1)
-    member.start(np.zeros(3), None)
-    return member
+    return HybridEstimator(config(), 1)
 
 
 def same(a, b):
@@ -98,13 +98,13 @@ def test_a_window_does_not_depend_on_what_was_read_before_it():
     assert all(same(a, b) for a, b in zip(one[1:], two[1:], strict=True))
 
 
-@pytest.mark.parametrize("other", [HybridMember(config(seed=2), 1), HybridMember(config("r2"), 1)])
+@pytest.mark.parametrize("other", [config(seed=2), config("r2")])
 def test_a_window_depends_on_its_seed_and_its_robot(other):
-    assert not same(fed(other, READINGS)[0], fed(begun(), READINGS)[0])
+    assert not same(fed(HybridEstimator(other, 1), READINGS)[0], fed(begun(), READINGS)[0])
 
 
 def test_a_window_depends_on_its_epoch():
-    assert not same(fed(HybridMember(config(), 2), READINGS)[0], fed(begun(), READINGS)[0])
+    assert not same(fed(HybridEstimator(config(), 2), READINGS)[0], fed(begun(), READINGS)[0])
 
 
 def test_what_no_odometry_covers_is_counted_at_the_end():
@@ -128,14 +128,15 @@ def test_a_member_without_odometry_has_no_window_and_covers_nothing():
 
 
 def test_the_thesis_member_starts_where_it_is_told_and_replaces_what_it_absorbs():
-    member = member_of(config(estimator="hybrid-thesis", fusion="kalman-per-axis"), 1)
-    member.start(np.array([1.0, 2.0, 0.5]), None)
-    np.testing.assert_array_equal(member.own_pose(None).mean, [1.0, 2.0, 0.5])
+    robot = config(estimator="hybrid-thesis", fusion="kalman-per-axis")
+    member = estimator_of(robot, 1, InitialPose(np.array([1.0, 2.0, 0.5]), None))
+    np.testing.assert_array_equal(member.own_pose().mean, [1.0, 2.0, 0.5])
     fed(member, READINGS[1:])
     assert member.sequence == sum(isinstance(r, m.Observations) for r in READINGS)
     before = member.own_map()
     assert len(before.ids) > 0
-    member.absorb(before.ids[:1], np.array([[50.0, 60.0]]), 4.0 * np.eye(2))
+    told = LandmarkGaussian(before.ids[:1], np.array([[50.0, 60.0]]), 4.0 * np.eye(2))
+    member.absorb(told)
     after = member.own_map()
     np.testing.assert_array_equal(after.means, [[50.0, 60.0], *before.means[1:]])
     np.testing.assert_array_equal(after.covariance[:2, :2], 4.0 * np.eye(2))
@@ -152,8 +153,7 @@ def test_over_a_whole_run_the_own_map_is_over_confident_in_some_runs_by_nature()
         scenario = with_options(load("thesis-b"), seed=seed)
         streams = streams_of(scenario)
         first = streams.streams[0]
-        member = HybridMember(scenario.robots[0], 1)
-        member.start(first.start.pose, None)
+        member = HybridEstimator(scenario.robots[0], 1, InitialPose(first.start.pose, None))
         fed(member, published(first))
         own = member.own_map()
         error = (own.means - streams.landmarks[own.ids.astype(int) - 1]).ravel()
@@ -165,8 +165,7 @@ def test_over_a_whole_run_the_own_map_is_over_confident_in_some_runs_by_nature()
 def standing(window_m):
     """A member that stands for 45 s, then drives for 15 s, in odometry intervals of a second."""
     front_end = FrontEnd(particles=8, window_s=10.0, window_m=window_m, standing_s=30.0, node_s=5.0)
-    member = HybridMember(RobotConfig("r1", motion=NOISY, front_end=front_end), 1)
-    member.start(np.zeros(3), None)
+    member = HybridEstimator(RobotConfig("r1", motion=NOISY, front_end=front_end), 1)
     closed = []
     for second in range(1, 61):
         looks = ("r2",), np.array([2.0]), np.array([0.1])

@@ -1,0 +1,32 @@
+"""What a window becomes at its end: a submap with the names of its inputs."""
+
+from dataclasses import dataclass
+
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from team.estimation.hybrid_slam.pose_grid import NodeSighting
+from team.estimation.submap import LocalMap
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedWindow:
+    """A submap with the names of its inputs, and the inter-robot measurements from its pose nodes.
+
+    particles: those at its end. innovation: of the window's measurements that were predicted.
+    gated: measurements that no others of the window confirmed, and that are not in the submap.
+    late: scans of the interval that are stamped behind the window's end; they are rejected.
+    unsolved: scans that led to no Gaussian, of which only the odometry's motion is in the submap.
+    """
+
+    sequence: int
+    first_reading: int
+    last_reading: int
+    start_ns: int
+    end_ns: int
+    local: LocalMap
+    sightings: tuple[NodeSighting, ...] = ()
+    particles: Particles | None = None
+    innovation: Innovation = NOTHING
+    gated: int = 0
+    late: int = 0
+    unsolved: int = 0

@@ -1,0 +1,81 @@
+"""Moment matching: a mixture of particles becomes one Gaussian, headings on the circle."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.compiled import compiled
+from team.estimation.geometry import wrapped
+
+POSE_DEGREES = 5.0
+"""q + 2 of a pose's q = 3 numbers; see `sample_factor`."""
+MOST_SQUARE = 0.1
+"""Σ wᵢ² of ten particles of equal weight; see `sample_factor`."""
+
+
+@compiled
+def mean_direction(angles: Float[np.ndarray, " M"], weights: Float[np.ndarray, " M"]) -> float:
+    """The direction of Σ wᵢ (cos aᵢ, sin aᵢ)."""
+    sine, cosine = 0.0, 0.0
+    for i in range(len(angles)):
+        sine += weights[i] * math.sin(angles[i])
+        cosine += weights[i] * math.cos(angles[i])
+    return math.atan2(sine, cosine)
+
+
+def sample_factor(weights: Float[np.ndarray, " M"]) -> float:
+    """What the scatter of particles is to be taken times for its inverse to be right on average.
+
+    N = 1/Σ wᵢ² particles estimate their own mean, and the inverse of the covariance of such a
+    sample of q-dimensional normals is too large by ν/(ν − q − 1), ν = N − 1 (Anderson 2003, section
+    7.7): the factor is N/(N − q − 2), with the q = 3 numbers of a pose, the directions in which no
+    particle has a covariance of its own. Fewer than ten particles are taken for ten.
+    """
+    return 1.0 / (1.0 - POSE_DEGREES * min(float(np.sum(weights * weights)), MOST_SQUARE))
+
+
+@compiled
+def moments(
+    poses: Float[np.ndarray, "M p"],
+    weights: Float[np.ndarray, " M"],
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+    between: float = 1.0,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """Mean and covariance of the mixture Σ wᵢ N(μᵢ, blkdiag(0, Σ₁, …, Σ_L)), n = p + 2L.
+
+    Each particle has p/3 poses (x, y, theta), one behind the other. The scatter between the
+    particles is taken times `between`: 1 for the mixture itself, see `sample_factor`.
+    """
+    count, p = poses.shape
+    n = p + 2 * means.shape[1]
+    deviations = np.empty((count, n))
+    deviations[:, :p] = poses
+    deviations[:, p::2] = means[:, :, 0]
+    deviations[:, p + 1 :: 2] = means[:, :, 1]
+    mean = np.zeros(n)
+    for i in range(count):
+        for j in range(n):
+            mean[j] += weights[i] * deviations[i, j]
+    for heading in range(2, p, 3):
+        mean[heading] = mean_direction(poses[:, heading], weights)
+    P = np.zeros((n, n))
+    for i in range(count):
+        for j in range(n):
+            deviations[i, j] -= mean[j]
+        for heading in range(2, p, 3):
+            deviations[i, heading] = wrapped(deviations[i, heading])
+        for j in range(n):
+            scaled = between * weights[i] * deviations[i, j]
+            for k in range(j + 1):
+                P[j, k] += scaled * deviations[i, k]
+        for landmark in range(means.shape[1]):
+            j = p + 2 * landmark
+            P[j, j] += weights[i] * covariances[i, landmark, 0]
+            P[j + 1, j] += weights[i] * covariances[i, landmark, 1]
+            P[j + 1, j + 1] += weights[i] * covariances[i, landmark, 2]
+    for j in range(n):
+        for k in range(j):
+            P[k, j] = P[j, k]
+    return mean, P

@@ -1,0 +1,27 @@
+"""Finds by name what a table only names: the one way to what can be left out of an installation."""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+
+class NotInstalledError(Exception):
+    """A method's module is not there: this installation goes without what is for comparison."""
+
+
+def is_installed(place: str) -> bool:
+    """Whether the module of `package.module:name` is there; nothing of it is imported."""
+    module = place.partition(":")[0]
+    package, _, _ = module.rpartition(".")
+    try:
+        return find_spec(package) is not None and find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def loaded(place: str, what: str) -> Any:
+    """The `name` of `package.module:name`; raises NotInstalledError that says `what` lacks."""
+    module, _, name = place.partition(":")
+    if not is_installed(place):
+        raise NotInstalledError(f"{what} is not installed: {module} is not here")
+    return getattr(import_module(module), name)

@@ -1,0 +1,157 @@
+"""What a robot's estimator is to its node: one small interface, and what some can do beside it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from team.config import RobotConfig
+from team.estimation import geometry
+from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.hybrid_slam.pose_grid import Looks
+from team.estimation.submap import LocalMap
+from team.pairs import ESTIMATORS
+from team.registry import loaded
+
+CLOUD_PARTICLES = 32
+"""Particles in a cloud for viewers."""
+Scan = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Landmark ids, ranges [m] and bearings [rad] of one message."""
+
+
+class InitialPose(NamedTuple):
+    """Where a stream begins: a pose (None: unknown) and its covariance (None: exact)."""
+
+    pose: Float[np.ndarray, "3"] | None
+    covariance: Matrix | None
+
+
+class KnownMap(NamedTuple):
+    """Landmarks that a robot is told: ids ascending, positions [m] in the team's frame."""
+
+    ids: UInt32[np.ndarray, " L"]
+    landmarks: Float[np.ndarray, "L 2"]
+
+
+AT_ORIGIN = InitialPose(np.zeros(3), None)
+NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
+
+
+class Cloud(NamedTuple):
+    """A thinned particle cloud in the own map's frame: P poses and their weights, summing to 1."""
+
+    poses: Float[np.ndarray, "P 3"]
+    weights: Float[np.ndarray, " P"]
+
+
+def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
+    """Every so many particles, in their order; origin: their frame's pose in the own map's."""
+    every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
+    logs = particles.log_weights[::every]
+    weights = np.exp(logs - logs.max())
+    poses = [geometry.compose(origin, pose) for pose in particles.poses[::every]]
+    return Cloud(np.array(poses), weights / weights.sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimates:
+    """What an odometry interval gave: a submap; the stamps of a new running pose and map.
+
+    cloud: the particles, where there are any. judged: how well an estimator without windows
+    predicted what it measured since it last said so, and when.
+    """
+
+    closed: ClosedWindow | None = None
+    pose_ns: int | None = None
+    map_ns: int | None = None
+    cloud: Cloud | None = None
+    judged: tuple[Innovation, int] | None = None
+
+
+NOTHING_NEW = Estimates()
+
+
+@runtime_checkable
+class RobotEstimator(Protocol):
+    """One incarnation of a robot's stream: measurements in, running poses and maps out.
+
+    sequence: by what its running poses and maps are named. used: the disposition of a measurement
+    that it takes. joint: whether its map has a joint covariance. innovation: of all that it
+    predicted.
+    """
+
+    @property
+    def sequence(self) -> int: ...  # noqa: D102
+    @property
+    def used(self) -> str: ...  # noqa: D102
+    @property
+    def joint(self) -> bool: ...  # noqa: D102
+    @property
+    def innovation(self) -> Innovation: ...  # noqa: D102
+
+    def observe(self, stamp_ns: int, scan: Scan) -> str | None:
+        """Take a scan of landmarks; the reason if it is rejected."""
+
+    def drive(
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        *,
+        measured: bool = True,
+    ) -> Estimates:
+        """Take one odometry interval, or its time alone (not measured); what it gave."""
+
+    def finish(self) -> tuple[Estimates, int]:
+        """The stream has ended: what that gave, and how many scans no odometry covered."""
+
+    def own_pose(self) -> PoseGaussian:
+        """The running pose from own measurements alone."""
+
+    def own_map(self) -> LandmarkGaussian:
+        """The running map from own measurements (and what was absorbed)."""
+
+
+@runtime_checkable
+class MakesSubmaps(Protocol):
+    """An estimator whose windows become submaps; it can be put back to its last one."""
+
+    def consumed(self, measurement: int) -> None:
+        """The measurement with this counter belongs to the open window."""
+
+    def resume(self, closed: ClosedWindow) -> None:
+        """Go on behind a submap of an earlier life."""
+
+    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> str | None:
+        """Take inter-robot measurements; the reason if they are rejected."""
+
+    def open_window(self) -> LocalMap | None:
+        """The Gaussian since the last submap, if there is a keyframe in it."""
+
+
+@runtime_checkable
+class AbsorbsMaps(Protocol):
+    """An estimator that takes the team's map back in (rules with feedback)."""
+
+    def absorb(self, landmarks: LandmarkGaussian) -> None:
+        """The fused landmarks replace the own ones."""
+
+
+Factory = Callable[[RobotConfig, int, InitialPose, KnownMap], RobotEstimator]
+
+
+def estimator_of(
+    config: RobotConfig,
+    incarnation: int,
+    initial: InitialPose = AT_ORIGIN,
+    known: KnownMap = NOTHING_KNOWN,
+) -> RobotEstimator:
+    """The estimator that the configuration names, at the beginning of an incarnation."""
+    made: Factory = loaded(ESTIMATORS[config.estimator], f"the estimator {config.estimator}")
+    return made(config, incarnation, initial, known)

@@ -1,0 +1,139 @@
+"""Hybrid-SLAM as a robot runs it: the front end's submaps, and the own whole map made of them.
+
+The own map is what the robot knows by itself: its submaps joined one by one (Brooks & Bailey's back
+end). No submap depends on it.
+"""
+
+import numpy as np
+
+from team.config import RobotConfig
+from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.hybrid_slam.pipeline import HybridSlam
+from team.estimation.hybrid_slam.pose_grid import Looks
+from team.estimation.map_joining.conditioning import pose_now
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.map_joining.whole_map import WholeMap, absorbed, begun, joined
+from team.estimation.plausible import are_landmarks
+from team.estimation.submap import LocalMap
+from team.robot.estimator import (
+    AT_ORIGIN,
+    NOTHING_KNOWN,
+    Estimates,
+    InitialPose,
+    KnownMap,
+    Scan,
+    thinned,
+)
+
+
+class HybridEstimator:
+    """One incarnation of a robot's stream, from its initial pose or from its last submap."""
+
+    used = "in a submap"
+    joint = True
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        incarnation: int,
+        initial: InitialPose = AT_ORIGIN,
+        known: KnownMap = NOTHING_KNOWN,
+    ) -> None:
+        self._slam = HybridSlam(config, incarnation)
+        origin = np.zeros(3) if initial.pose is None else initial.pose
+        self.whole: WholeMap = begun(origin, initial.covariance)
+        self._open: tuple[LocalMap | None] | None = None
+
+    @property
+    def sequence(self) -> int:
+        """Of the window that is open."""
+        return self._slam.sequence
+
+    @property
+    def innovation(self) -> Innovation:
+        """Of every window of this incarnation, since this process consumes it."""
+        return self._slam.innovation
+
+    def consumed(self, measurement: int) -> None:
+        """The measurement belongs to the open window (or was rejected while it was open)."""
+        self._slam.consumed(measurement)
+
+    def resume(self, closed: ClosedWindow) -> None:
+        """Go on behind a submap of an earlier life: the next window begins where it ended."""
+        self.whole, self._open = self._joined(closed.local), None
+        self._slam.resume(closed)
+
+    def observe(self, stamp_ns: int, scan: Scan) -> str | None:
+        """Take a scan of landmarks; the reason if it is rejected."""
+        return self._slam.observe(stamp_ns, scan)
+
+    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> str | None:
+        """Take inter-robot measurements; the reason if they are rejected."""
+        return self._slam.sight(stamp_ns, measurement, looks)
+
+    def drive(
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        *,
+        measured: bool = True,
+    ) -> Estimates:
+        """Take one odometry interval; the submap that it closes, if it does."""
+        self._open, before_ns = None, self._slam.last_keyframe_ns
+        closed = self._slam.drive(stamp_ns, duration_ns, forward, yaw_rate, measured=measured)
+        if closed is not None:
+            return self._with_submap(closed)
+        now_ns = self._slam.last_keyframe_ns
+        return Estimates(pose_ns=now_ns if now_ns != before_ns else None)
+
+    def finish(self) -> tuple[Estimates, int]:
+        """The stream has ended: the last submap, and how many scans no odometry covered."""
+        self._open = None
+        closed, uncovered = self._slam.finish()
+        return Estimates() if closed is None else self._with_submap(closed), uncovered
+
+    def _with_submap(self, closed: ClosedWindow) -> Estimates:
+        """The pose and the map are new with a submap."""
+        begun_at = self.whole.mean[:3]
+        cloud = None if closed.particles is None else thinned(closed.particles, begun_at)
+        self.whole = self._joined(closed.local)
+        return Estimates(closed=closed, pose_ns=closed.end_ns, map_ns=closed.end_ns, cloud=cloud)
+
+    def open_window(self) -> LocalMap | None:
+        """The open window's Gaussian at its last keyframe, if it has one; kept until it changes."""
+        if self._open is None:
+            self._open = (self._slam.running(),)
+        return self._open[0]
+
+    def own_pose(self) -> PoseGaussian:
+        """The pose of the own whole map, times the open window; its motion if they contradict."""
+        window = self.open_window()
+        try:
+            with np.errstate(all="ignore"):
+                return pose_now(self.whole, window).pose
+        except UNSOLVABLE:
+            return pose_now(self.whole, None if window is None else window.motion).pose
+
+    def own_map(self) -> LandmarkGaussian:
+        """The landmarks of the own whole map."""
+        whole = self.whole
+        return LandmarkGaussian(whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:])
+
+    def absorb(self, landmarks: LandmarkGaussian) -> None:
+        """The fused landmarks replace those of the own whole map; submaps never see it."""
+        self.whole = absorbed(self.whole, *landmarks)
+
+    def _joined(self, local: LocalMap) -> WholeMap:
+        """The own map with a submap; of one that contradicts it beyond all numbers, its motion."""
+        try:
+            with np.errstate(all="ignore"):
+                after = joined(self.whole, local)
+        except (NotACovarianceError, np.linalg.LinAlgError):
+            after = None
+        if after is not None and are_landmarks(after.covariance[3:, 3:]):
+            return after
+        return joined(self.whole, local.motion)
