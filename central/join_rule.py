@@ -143,14 +143,12 @@ class JoinRule:
 
     def advance(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
         """Fold what the watermark allows; a broadcast when one is due."""
-        taken = self._ticks.take_until(watermark_ns)
+        self._ticks.take_until(watermark_ns)
         said = self._withdrawals(newest_ns)
         since = None if self._broadcast_ns is None else newest_ns - self._broadcast_ns
         due = since is None or since >= self._config.broadcast_s * 1e9
-        if said or (taken and due):
-            if self._has_all_that_was_published(self._ticks.fold):
-                return [*said, *self._broadcast(self._ticks.fold, "closed", newest_ns)]
-            return [*said, *self._broadcast(self._ticks.provisional(), "provisional", newest_ns)]
+        if said or (due and self._lacks(self._published, watermark_ns)):
+            return [*said, *self._broadcast(*self._newest(watermark_ns), newest_ns)]
         if not any(self._entered.values()):
             return []
         if self._quiet_ns is None:
@@ -164,6 +162,29 @@ class JoinRule:
     def _heard(self) -> int:
         """Submaps that are in the fold's reach, and robots that were withdrawn by an order."""
         return sum(self._entered.values()) + len(self._orders)
+
+    def _lacks(self, members: Mapping[Stream, int], watermark_ns: float) -> bool:
+        """Whether the watermark has passed a submap that is in reach and not among these."""
+        gone = self._ticks.withdrawn
+        following = ((s, members.get(s, -1) + 1) for s in self._entered if s[0] not in gone)
+        return any(
+            k < self._entered[s] and self._set.streams[s][k].stamp_ns <= watermark_ns
+            for s, k in following
+        )
+
+    def _newest(self, watermark_ns: float) -> tuple[Fold, Tail]:
+        """The fold over all that the watermark has passed; over all that is here if that is more.
+
+        What a teammate has just closed is worth most to who sees the same landmarks, so it does not
+        wait for the end of its tick.
+        """
+        closed = self._ticks.fold
+        lacks = self._lacks(self._ticks.members(closed), watermark_ns)
+        if self._has_all_that_was_published(closed) and not lacks:
+            return closed, "closed"
+        fold = self._ticks.provisional()
+        ahead = any(each.end_ns > watermark_ns for each in fold.contributions[-1:])
+        return fold, "provisional" if ahead else "closed"
 
     def _has_all_that_was_published(self, fold: Fold) -> bool:
         """Whether a map of this fold holds every submap of the last one: none steps back.

@@ -79,6 +79,26 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
         assert decoded(encoded(each)) == each
 
 
+def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
+    """Windows of 3 s, ticks of 100 s: what r1 and r2 have closed does not wait for the tick."""
+    found, maps = rule(CentralConfig(tick_s=100.0, broadcast_s=3.0)), []
+    for k in range(3):
+        for name, behind_ns in (("r1", 3_000_000_000), ("r2", 0)):
+            submap = SUBMAPS[name][k]
+            found.take_submap(submap)
+            said = of(found.advance(submap.stamp_ns - behind_ns, submap.stamp_ns), ch.FUSED_MAP)
+            assert bool(said) == (name == "r2"), "r1's waits for r2's, nothing is said twice"
+            maps += said
+    assert [each.members for each in maps] == [
+        (m.Member("r1", 1, k), m.Member("r2", 1, k)) for k in range(3)
+    ]
+    assert not any(each.provisional for each in maps)
+    for submap in ALL:
+        found.take_submap(submap)
+    config = CentralConfig(tick_s=100.0, broadcast_s=3.0)
+    assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
+
+
 def test_no_map_has_less_than_the_one_before_it():
     """r2 is slow: a map goes ahead of the watermark, then r2 comes, two windows behind r1."""
     found, maps = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0)), []

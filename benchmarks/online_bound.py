@@ -1,0 +1,184 @@
+"""What online poses could be: everything that the whole team has measured by then, at once.
+
+    python benchmarks/online_bound.py [SCENARIO …] [--seeds FIRST-LAST]
+
+The batch smoother of all robots' measurements up to t, marginalised to the poses at t, linearised
+at the truth: an extended Kalman filter over all robots' poses and all landmarks whose Jacobians are
+taken at the true state. No delay, no submaps, no error of linearisation: no estimator that has to
+linearise where it believes to be does better on average. Its errors come from the same noise, so a
+robot's RMSE over this one's says how much of it the estimator owes, and how much the world.
+Simulated worlds with known initial poses, one noise per second; the models are written again here.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from statistics import fmean, median
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.source import streams_of
+from sim.world import streams as s
+from sim.world.streams import RobotStream, WorldStreams
+from team.config import RobotConfig
+
+UNKNOWN_M2 = 1e6
+"""The variance of a landmark that nobody has seen."""
+
+
+class Bounded(NamedTuple):
+    """A robot's poses: errors (x, y, θ) and covariances at stamps_ns."""
+
+    stamps_ns: np.ndarray
+    errors: np.ndarray
+    covariances: np.ndarray
+
+    def rmse_m(self, stamps_ns: np.ndarray) -> float:
+        """Of the positions at these stamps."""
+        at = np.isin(self.stamps_ns, stamps_ns)
+        return float(np.sqrt(np.mean(np.sum(self.errors[at, :2] ** 2, axis=1))))
+
+    def sigma_m(self, stamps_ns: np.ndarray) -> float:
+        """What this RMSE is expected to be."""
+        at = np.isin(self.stamps_ns, stamps_ns)
+        variances = self.covariances[at, 0, 0] + self.covariances[at, 1, 1]
+        return float(np.sqrt(np.mean(variances)))
+
+    def nees_per_dof(self, stamps_ns: np.ndarray) -> float:
+        """Of these poses; 1 on average."""
+        at = np.isin(self.stamps_ns, stamps_ns)
+        solved = np.linalg.solve(self.covariances[at], self.errors[at, :, np.newaxis])[:, :, 0]
+        return float(np.mean(np.sum(self.errors[at] * solved, axis=1)) / 3.0)
+
+
+def bounds(scenario: Scenario, world: WorldStreams) -> dict[str, Bounded]:
+    """Of each robot, after each odometry interval."""
+    filter_ = _AtTruth(world)
+    found: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {
+        config.id: [] for config in scenario.robots
+    }
+    robots, counters = world.order()
+    seen: dict[tuple[int, int], int] = {}
+    for robot, counter in zip(robots.tolist(), counters.tolist(), strict=True):
+        stream, config = world.streams[robot], scenario.robots[robot]
+        stamp_ns = int(stream.stamps_ns[counter])
+        if stream.kinds[counter] == s.OBSERVATIONS:
+            seen[robot, stamp_ns] = counter
+        elif stream.kinds[counter] == s.ODOMETRY:
+            filter_.drive(robot, stream, counter, config)
+            if (robot, stamp_ns) in seen:
+                filter_.look(robot, stream, seen[robot, stamp_ns], config)
+            found[config.id].append((stamp_ns, *filter_.pose(robot)))
+    return {
+        name: Bounded(*(np.array(part) for part in zip(*rows, strict=True)))
+        for name, rows in found.items()
+    }
+
+
+class _AtTruth:
+    """The error e = estimate − truth of (all poses, all landmarks) and its covariance."""
+
+    def __init__(self, world: WorldStreams) -> None:
+        assert world.landmarks is not None
+        self._landmarks = world.landmarks
+        self._place = {int(id_): k for k, id_ in enumerate(world.landmark_ids)}
+        self._poses = 3 * len(world.streams)
+        n = self._poses + 2 * len(world.landmarks)
+        self._error = np.zeros(n)
+        self._P = np.zeros((n, n))
+        at = np.arange(self._poses, n)
+        self._P[at, at] = UNKNOWN_M2
+
+    def pose(self, robot: int) -> tuple[np.ndarray, np.ndarray]:
+        at = slice(3 * robot, 3 * robot + 3)
+        return self._error[at].copy(), self._P[at, at].copy()
+
+    def drive(self, robot: int, stream: RobotStream, counter: int, config: RobotConfig) -> None:
+        """(x, y, θ) → (x + d cos(θ + φ), y + d sin(θ + φ), θ + φ), with errors of d and φ."""
+        o = stream.odometry(counter)
+        after, before = _true(stream, o.stamp_ns), _true(stream, o.stamp_ns - o.duration_ns)
+        seconds = o.duration_ns * 1e-9
+        way = after[:2] - before[:2]
+        heading = before[2] + _around(after[2] - before[2])
+        distance = float(way @ [np.cos(heading), np.sin(heading)])
+        noise = np.array(
+            [
+                o.forward * seconds - distance,
+                _around(o.yaw_rate * seconds - (after[2] - before[2])),
+            ]
+        )
+        F, G = np.eye(3), np.zeros((3, 2))
+        F[:2, 2] = G[:2, 1] = -distance * np.sin(heading), distance * np.cos(heading)
+        G[:2, 0] = np.cos(heading), np.sin(heading)
+        G[2, 1] = 1.0
+        Q = np.diag([config.motion.forward.per_s**2, config.motion.turn.per_s**2]) * seconds
+        at = slice(3 * robot, 3 * robot + 3)
+        self._error[at] = F @ self._error[at] + G @ noise
+        self._P[at] = F @ self._P[at]
+        self._P[:, at] = self._P[:, at] @ F.T
+        self._P[at, at] += G @ Q @ G.T
+
+    def look(self, robot: int, stream: RobotStream, counter: int, config: RobotConfig) -> None:
+        """Ranges and bearings of landmarks, from where the robot truly is."""
+        scan = stream.observations(counter)
+        pose = _true(stream, scan.stamp_ns)
+        R = np.diag([config.sensor.range_sigma**2, config.sensor.bearing_sigma**2])
+        for id_, measured, bearing in zip(scan.ids, scan.ranges, scan.bearings, strict=True):
+            place = self._place[int(id_)]
+            dx, dy = self._landmarks[place] - pose[:2]
+            r = float(np.hypot(dx, dy))
+            noise = np.array([measured - r, _around(bearing + pose[2] - np.arctan2(dy, dx))])
+            H = np.zeros((2, len(self._error)))
+            of_landmark = np.array([[dx, dy], [-dy / r, dx / r]]) / r
+            H[:, 3 * robot : 3 * robot + 2] = -of_landmark
+            H[1, 3 * robot + 2] = -1.0
+            at = self._poses + 2 * place
+            H[:, at : at + 2] = of_landmark
+            PH = self._P @ H.T
+            gain = np.linalg.solve(H @ PH + R, PH.T).T
+            self._error += gain @ (noise - H @ self._error)
+            I_KH = np.eye(len(self._error)) - gain @ H
+            self._P = I_KH @ self._P @ I_KH.T + gain @ R @ gain.T
+
+
+def _true(stream: RobotStream, stamp_ns: int) -> np.ndarray:
+    assert stream.truth is not None
+    assert stream.truth_ns is not None
+    return np.asarray(stream.truth[np.searchsorted(stream.truth_ns, stamp_ns)])
+
+
+def _around(angle: float) -> float:
+    """In (−π, π]."""
+    return float(np.angle(np.exp(1j * angle)))
+
+
+def runs(name: str, seeds: range, silent_s: float) -> Iterator[dict[str, float]]:
+    """The bound's figures of each robot and seed, without the first silent_s."""
+    for seed in seeds:
+        scenario = with_options(load(name), seed=seed)
+        for robot in bounds(scenario, streams_of(scenario)).values():
+            at = robot.stamps_ns[robot.stamps_ns >= silent_s * 1e9]
+            yield {"rmse_m": robot.rmse_m(at), "sigma_m": robot.sigma_m(at)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("scenarios", nargs="*", default=("thesis", "thesis-b"))
+    parser.add_argument("--seeds", default="1000-1019", help="FIRST-LAST, both in it")
+    parser.add_argument("--from-s", type=float, default=24.0, help="when the first prior is there")
+    told = parser.parse_args()
+    first, _, last = told.seeds.partition("-")
+    for name in told.scenarios:
+        found = list(runs(name, range(int(first), int(last or first) + 1), told.from_s))
+        errors = [each["rmse_m"] for each in found]
+        expected = fmean(each["sigma_m"] ** 2 for each in found) ** 0.5
+        ratio = max(errors) / median(errors)
+        print(f"{name}, seeds {told.seeds}: median {median(errors):.3f} m, worst {max(errors):.3f}")
+        print(f"  worst over median {ratio:.2f}, expected RMSE {expected:.3f} m")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
