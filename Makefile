@@ -3,6 +3,7 @@
 #   make run        a team maps a random place; what `make test` needs is not installed for it
 #   make test       all tests
 #   make check      format, lint, strict types, the direction of imports
+#   make docs       the documentation site, docs/_build/site/index.html, and the pictures of its gallery
 #   make setup      what all of these need
 #   make constraints    writes constraints.txt anew from what .venv holds
 #   make clean      removes what any of these made
@@ -22,7 +23,7 @@ export MKL_NUM_THREADS := 1
 .DEFAULT_GOAL := run
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: run test check setup constraints clean
+.PHONY: run test check docs setup constraints clean
 
 run: $(VENV)/.runtime
 	$(BIN)/teamslam launch waypoints --speed max
@@ -38,6 +39,20 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The pictures are made once; `make clean` lets them be made anew.
+PICTURES := docs/generated
+docs: $(VENV)/.dev $(PICTURES)/run/report.html $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs docs/_build/site
+	@echo "docs/_build/site/index.html"
+
+$(PICTURES)/run/report.html: | $(VENV)/.dev
+	rm -rf $(@D)
+	$(BIN)/teamslam launch waypoints --speed max --output $(@D)
+
+$(PICTURES)/%.png: examples/%.py | $(VENV)/.dev
+	mkdir -p $(@D)
+	$(BIN)/python $< $@
+
 setup: $(VENV)/.dev
 
 constraints: $(VENV)/.dev
@@ -46,8 +61,8 @@ constraints: $(VENV)/.dev
 	mv $@.new $@.txt
 
 clean:
-	rm -rf $(VENV) build dist runs *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find team central sim tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) build dist runs docs/_build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find team central sim tests benchmarks docs examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A Python that is too old, that is only a launcher's stub or that can not make environments is
 # passed over. PYTHON=/path/to/python chooses one.

@@ -127,7 +127,7 @@ def test_the_wheel_holds_the_three_packages_their_scenarios_and_nothing_else(
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES
         for path in (ROOT / package).rglob("*")
-        if path.suffix in {".py", ".toml", ".html", ".js", ".css", ".svg"}
+        if path.suffix in {".py", ".pyi", ".toml", ".html", ".js", ".css", ".svg"}
         or path.name == "py.typed"
     }
     assert shipped == expected

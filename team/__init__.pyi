@@ -1,0 +1,3 @@
+"""The names that `team.__getattr__` gives."""
+
+from team.library import *  # noqa: F403 - whatever the library names
