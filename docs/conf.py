@@ -13,6 +13,7 @@ from pathlib import Path
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # a kernel is then the function that is written there
 HERE = Path(__file__).parent
+STUDIES = ("experiments", "studies")
 GENERATED = HERE / "generated"
 sys.path.insert(0, str(HERE.parent))
 
@@ -46,9 +47,12 @@ apidoc_modules = [
         "separate_modules": False,
         "module_first": True,
         "automodule_options": {"members"},
+        # Studies reproduce the sources' tables: programs, and no part of what others build on.
+        "exclude_patterns": [str(HERE.parent / "sim" / name) for name in STUDIES],
     }
     for package in ("team", "central", "sim")
 ]
+suppress_warnings = ["ref.python"]  # a type's short name may be that of two classes
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True

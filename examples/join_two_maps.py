@@ -48,7 +48,7 @@ def drive(pose: np.ndarray, yaw_rate: float, keyframes: int) -> tuple[np.ndarray
                 ids=seen.astype(np.uint32),
                 ranges=z[seen, 0],
                 bearings=z[seen, 1],
-            )  # fmt: skip
+            )
         )
     return np.array(path), measured
 

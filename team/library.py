@@ -17,19 +17,22 @@ from jaxtyping import Float, UInt32
 
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation import batch as batches
-from team.estimation import joining, marginals
-from team.estimation import window as windows
 from team.estimation.contribution import Contribution, Start, Stream, named
-from team.estimation.fastslam import Particles, Proposal, StepInfo, propagated_and_updated
-from team.estimation.fastslam import at_poses as particles_at
-from team.estimation.gauss_newton import JoinSettings
 from team.estimation.geometry import compose, inverse
-from team.estimation.marginals import LandmarkMap, Trajectory
+from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.fastslam import (
+    Particles,
+    Proposal,
+    StepInfo,
+    propagated_and_updated,
+)
+from team.estimation.hybrid_slam.fastslam import at_poses as particles_at
+from team.estimation.map_joining import joining, marginals
+from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.marginals import LandmarkMap, Trajectory
 from team.estimation.models import Increment, acceptable, corrected, increment_of, located
 from team.estimation.models import predicted as measurement_of
 from team.estimation.submap import LocalMap
-from team.estimation.turn import Turn
 from team.recording.reader import Log, LogError, open_log
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -263,11 +266,17 @@ def batch_map(
     Each robot needs an initial pose. Raises ValueError for one that has none.
     Dellaert and Kaess 2006, Square root SAM.
     """
+    from team.estimation.baselines import batch as batches  # what compares can be left out
+    from team.estimation.baselines.robot_step import Turn
+
     starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
+    robots = sorted(keyframes)
     steps = [
-        _measured(robot, keyframe.calibrated(sensors[robot]), sensors[robot])
-        for row in zip_longest(*(_of_one(robot, keyframes[robot]) for robot in sorted(keyframes)))
-        for robot, keyframe in filter(None, row)
+        Turn(robot, at.increment, sensors[robot], at.ids, at.ranges, at.bearings)
+        for row in zip_longest(*(keyframes[robot] for robot in robots))
+        for robot, keyframe in zip(robots, row, strict=True)
+        if keyframe is not None
+        for at in (keyframe.calibrated(sensors[robot]),)
     ]
     grown = batches.extended(batches.begun(starts, robust_c), steps)
     solution = batches.solved(grown, _BATCH_ITERATIONS, _BATCH_DECREMENT)
@@ -281,14 +290,6 @@ def batch_map(
         dof=solution.dof,
         converged=solution.converged(_BATCH_DECREMENT),
     )
-
-
-def _of_one(robot: str, keyframes: Sequence[Keyframe]) -> Iterator[tuple[str, Keyframe]]:
-    return ((robot, keyframe) for keyframe in keyframes)
-
-
-def _measured(robot: str, keyframe: Keyframe, sensor: Sensor) -> Turn:
-    return Turn(robot, keyframe.increment, sensor, keyframe.ids, keyframe.ranges, keyframe.bearings)
 
 
 def submap_in(payload: bytes) -> tuple[str, int, LocalMap]:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import threadpoolctl
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -47,6 +48,7 @@ WORDED = {
 
 REVIEWED = {
     "eclipse-zenoh": "EPL-2.0 OR Apache-2.0, its NOTICE says; we take Apache-2.0",
+    "docutils": "public domain, BSD-2-Clause; GPL only an Emacs mode that we do not use; docs only",
     "certifi": "MPL-2.0, unchanged; only for check-jsonschema, never shipped",
     "hypothesis": "MPL-2.0, unchanged; only for tests, never shipped",
     "pathspec": "MPL-2.0, unchanged; only for mypy, never shipped",
@@ -182,6 +184,18 @@ def test_constraints_pin_every_distribution_by_version_alone() -> None:
     pinned = {canonicalize_name(pin.partition("==")[0]) for pin in pins}
     assert set(closure("teamslam[dev]")) - pinned == set()
     assert {"pip", "setuptools"} <= pinned
+
+
+def test_the_citation_is_sound_and_tells_of_this_version() -> None:
+    page = ROOT / "CITATION.cff"
+    command = [Path(sys.executable).with_name("check-jsonschema"), page]
+    command += ["--builtin-schema", "vendor.citation-file-format"]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert checked.returncode == 0, checked.stdout
+    cited = yaml.safe_load(page.read_text())
+    assert cited["cff-version"] == "1.2.0"
+    assert (cited["version"], cited["license"]) == (PROJECT["version"], PROJECT["license"])
+    assert cited["authors"] == PROJECT["authors"]
 
 
 def test_no_path_of_a_machine_is_committed() -> None:
