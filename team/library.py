@@ -267,12 +267,12 @@ def batch_map(
     Dellaert and Kaess 2006, Square root SAM.
     """
     from team.estimation.baselines import batch as batches  # what compares can be left out
-    from team.estimation.baselines.robot_step import Turn
+    from team.estimation.baselines.robot_step import RobotStep
 
     starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
     robots = sorted(keyframes)
     steps = [
-        Turn(robot, at.increment, sensors[robot], at.ids, at.ranges, at.bearings)
+        RobotStep(robot, at.increment, sensors[robot], at.ids, at.ranges, at.bearings)
         for row in zip_longest(*(keyframes[robot] for robot in robots))
         for robot, keyframe in zip(robots, row, strict=True)
         if keyframe is not None
