@@ -124,23 +124,29 @@ class _AtTruth:
         """Ranges and bearings of landmarks, from where the robot truly is."""
         scan = stream.observations(counter)
         pose = _true(stream, scan.stamp_ns)
-        R = np.diag([config.sensor.range_sigma**2, config.sensor.bearing_sigma**2])
+        R = np.array([config.sensor.range_sigma**2, config.sensor.bearing_sigma**2])
         for id_, measured, bearing in zip(scan.ids, scan.ranges, scan.bearings, strict=True):
             place = self._place[int(id_)]
             dx, dy = self._landmarks[place] - pose[:2]
             r = float(np.hypot(dx, dy))
-            noise = np.array([measured - r, _around(bearing + pose[2] - np.arctan2(dy, dx))])
-            H = np.zeros((2, len(self._error)))
-            of_landmark = np.array([[dx, dy], [-dy / r, dx / r]]) / r
-            H[:, 3 * robot : 3 * robot + 2] = -of_landmark
-            H[1, 3 * robot + 2] = -1.0
+            noise = measured - r, _around(bearing + pose[2] - np.arctan2(dy, dx))
+            to = np.array([[dx, dy], [-dy / r, dx / r]]) / r
             at = self._poses + 2 * place
-            H[:, at : at + 2] = of_landmark
-            PH = self._P @ H.T
-            gain = np.linalg.solve(H @ PH + R, PH.T).T
-            self._error += gain @ (noise - H @ self._error)
-            I_KH = np.eye(len(self._error)) - gain @ H
-            self._P = I_KH @ self._P @ I_KH.T + gain @ R @ gain.T
+            for row in range(2):
+                H = np.zeros(len(self._error))
+                H[3 * robot : 3 * robot + 2] = -to[row]
+                H[3 * robot + 2] = -float(row)
+                H[at : at + 2] = to[row]
+                self._condition(H, noise[row], R[row])
+
+    def _condition(self, H: np.ndarray, noise: float, variance: float) -> None:
+        """Joseph's form of P with one number that reads H x and has an error of this variance."""
+        PH = self._P @ H
+        total = float(H @ PH) + variance
+        gain = PH / total
+        self._error += gain * (noise - float(H @ self._error))
+        self._P -= np.outer(gain, PH) + np.outer(PH, gain)
+        self._P += total * np.outer(gain, gain)
 
 
 def _true(stream: RobotStream, stamp_ns: int) -> np.ndarray:

@@ -56,8 +56,10 @@ def run(scenario_name: str, seed: int) -> list[dict[str, Any]]:
     bound = bounds(scenario, streams)
     for sample in run_team(scenario, streams, robot):
         samples.append(sample)
-        channel, name, message = opened(sample)
-        if channel is ch.TEAM_POSE and isinstance(message, m.PoseEstimate):
+        found = ch.channel_of(sample.key)
+        if found is not None and found[0] is ch.TEAM_POSE:
+            _, name, message = opened(sample)
+            assert isinstance(message, m.PoseEstimate)
             # The node speaks in bunches: of each bunch the warnings are those at its end.
             warned[name, message.stamp_ns] = bool(nodes[name].status().warnings)
     found = []
