@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from central.desk.drawing import (
+    BLUE,
+    TRUTH_COLOUR,
+    VERMILION,
+    draw_ellipses,
+    landmark_blocks,
+)
 from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
-from central.desk.pictures.run import DPI, ellipse_of
+from central.desk.pictures.run import DPI
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-RECORDED_COLOUR = "#0072B2"
-CHANGED_COLOUR = "#D55E00"
-TRUTH_COLOUR = "#7a7a7a"
+RECORDED_COLOUR, CHANGED_COLOUR = BLUE, VERMILION
 Row = tuple[str, str, str]
 
 
@@ -88,17 +93,10 @@ def comparison_picture(recorded: Evaluation, changed: Evaluation, path: Path) ->
 
 
 def _draw(axis: "Axes", fused: MapResult, colour: str, label: str, marker: str) -> None:
-    from matplotlib.patches import Ellipse
-
     axis.plot(
         *fused.means.T, marker, color=colour, markersize=8, markerfacecolor="none", label=label
     )
-    for k, mean in enumerate(fused.means):
-        block = fused.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
-        width, height, turn_deg = ellipse_of(block)
-        centre = (float(mean[0]), float(mean[1]))
-        ellipse = Ellipse(centre, width, height, angle=turn_deg, fill=False, edgecolor=colour)
-        axis.add_patch(ellipse)
+    draw_ellipses(axis, fused.means, landmark_blocks(fused.covariance), colour)
 
 
 def _of_errors(fused: MapResult | None, name: str, form: str) -> str:

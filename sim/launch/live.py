@@ -12,7 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from central.desk.evaluation.events import without_figures
+from central.desk.evaluation.events import without_decimals
 from sim.launch.truth import LiveErrors
 from sim.launch.watch import Watch
 from team.wire import messages as m
@@ -90,9 +90,9 @@ class _Lines:
 
     def _warn(self, watch: Watch, settled_s: float) -> None:
         now, warnings = time.monotonic(), _warnings(watch)
-        self._since = {w: self._since.get(w, now) for w in map(without_figures, warnings)}
+        self._since = {w: self._since.get(w, now) for w in map(without_decimals, warnings)}
         for warning in warnings:
-            key = without_figures(warning)
+            key = without_decimals(warning)
             lasting = warning in watch.failures or now - self._since[key] >= settled_s
             if lasting and key not in self._said:
                 self._said.add(key)

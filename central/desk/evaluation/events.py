@@ -1,130 +1,161 @@
-"""The events of a run in words: who came and went, what was joined, refused, warned of."""
+"""What happens to a team, in words: who joined, was lost, was refused, and what nodes warn of."""
 
 import re
 from dataclasses import dataclass, field
+from typing import Literal
 
-from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.channels import robot_node
 
-KINDS = ("came", "lost", "restarted", "map", "warning", "ended")
+Kind = Literal[
+    "joined", "restarted", "lost", "left", "map", "withdrawn", "refused", "warning", "done"
+]
 MOST = 2000
-"""Events that are kept; a node that warns of something new every second says no more by then."""
-_FIGURE = re.compile(r"\d+\.\d+")
+"""Events of a run that are kept; a node that warns anew every second says no more by then."""
+FIRST = 1
+"""The incarnation with which every stream begins."""
+_NUMBER = re.compile(r"\d+\.\d+")
 _AWAITED = ("waiting for ", "has not appeared yet", "no readings of this team yet")
 """Nobody is there at once: that is no event."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened: team time [ns], of which node, one of KINDS, in words."""
+    """Something that happened: team time [ns], of which kind, to which node, in words."""
 
     stamp_ns: int
+    kind: Kind
     node: str
-    kind: str
     text: str
+
+    @property
+    def of(self) -> str:
+        """The robot's name, or the node's where it is no robot's."""
+        return self.node.removeprefix("robot/")
 
 
 @dataclass
-class EventLog:
-    """Takes the messages of a log in its order; `events` in the order of team time."""
+class EventTeller:
+    """Turns the messages of a run, in their order, into events; each is told once."""
 
-    found: list[Event] = field(default_factory=list)
-    alive: dict[str, bool] = field(default_factory=dict)
-    epochs: dict[str, int] = field(default_factory=dict)
-    joined: dict[str, int] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
-    warned: set[tuple[str, str]] = field(default_factory=set)
-    done: set[str] = field(default_factory=set)
+    _alive: dict[str, bool] = field(default_factory=dict)
+    _incarnations: dict[str, int] = field(default_factory=dict)
+    _done: set[str] = field(default_factory=set)
+    _members: set[str] = field(default_factory=set)
+    _withdrawn: set[str] = field(default_factory=set)
+    _reasons: dict[str, str] = field(default_factory=dict)
+    _warned: set[tuple[str, str]] = field(default_factory=set)
+    _refused: int = 0
+    _ended: bool = False
 
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """All of them; equal times in the order of the log."""
-        return tuple(sorted(self.found, key=lambda event: event.stamp_ns))
-
-    def take(self, channel: ch.Channel, name: str, message: m.Message) -> None:
-        """Take one message; most are no event."""
+    def take(self, message: m.Message, now_ns: int) -> list[Event]:
+        """The events that a message brings; `now_ns` is the team time."""
         match message:
             case m.Liveliness():
-                self._take_liveliness(message)
-            case m.Configured() if channel is ch.ROBOT_CONFIG:
-                self._take_epoch(message)
-            case m.Start() if message.epoch > self.epochs.get(message.robot, message.epoch):
-                self.epochs[message.robot] = message.epoch
-                text = f"its stream of readings begins anew, epoch {message.epoch}"
-                self._add(message.stamp_ns, message.robot, "restarted", text)
+                return self._liveliness(message, now_ns)
+            case m.Configured():
+                return self._configured(message, now_ns)
             case m.Start():
-                self.epochs[message.robot] = message.epoch
+                return self._incarnation(message, now_ns)
+            case m.Done() if robot_node(message.robot) not in self._done:
+                node = robot_node(message.robot)
+                self._done.add(node)
+                text = (
+                    f"{message.robot} used all its {message.readings:,} readings, "
+                    f"{message.submaps} submaps"
+                )
+                return [Event(now_ns, "done", node, text)]
+            case m.End() if not self._ended:
+                self._ended = True
+                notes = [Event(now_ns, "warning", "world", note) for note in message.notes]
+                return [*notes, Event(now_ns, "done", "world", "the world has ended")]
+            case m.Withdrawal() if message.robot not in self._withdrawn:
+                self._withdrawn.add(message.robot)
+                by = "centre" if message.by == "central" else message.by
+                text = f"{message.robot} is withdrawn by the {by}: {message.reason}"
+                return [Event(now_ns, "withdrawn", robot_node(message.robot), text)]
             case m.FusedMap():
-                self._take_map(message)
+                return self._map(message, now_ns)
             case m.Status():
-                self._take_status(name, message)
-            case m.Done():
-                self._take_done(message)
-            case m.End():
-                for note in message.notes:
-                    self._add(message.stamp_ns, "world", "warning", note)
-                self._add(message.stamp_ns, "world", "ended", "every reading is published")
+                return self._status(message, now_ns)
             case _:
-                pass
+                return []
 
-    def _add(self, stamp_ns: int, node: str, kind: str, text: str) -> None:
-        if len(self.found) < MOST:
-            self.found.append(Event(stamp_ns, node.removeprefix("robot/"), kind, text))
-
-    def _take_liveliness(self, message: m.Liveliness) -> None:
-        node, before = message.node, self.alive.get(message.node)
-        self.alive[node] = message.alive
-        if before == message.alive:
-            return
+    def _liveliness(self, message: m.Liveliness, now_ns: int) -> list[Event]:
+        node, name = message.node, message.node.removeprefix("robot/")
+        before = self._alive.get(node)
+        self._alive[node] = message.alive
+        if before is message.alive:
+            return []
         if message.alive:
-            again = before is False
-            kind, text = ("restarted", "is there again") if again else ("came", "is there")
-        elif node in self.done:
-            return
-        else:
-            kind, text = "lost", "is lost"
-        self._add(message.stamp_ns, node, kind, text)
+            if before is None:
+                return [Event(now_ns, "joined", node, f"{name} joined")]
+            return [Event(now_ns, "restarted", node, f"{name} came back")]
+        if node in self._done or self._ended:
+            return [Event(now_ns, "left", node, f"{name} left")]
+        return [Event(now_ns, "lost", node, f"{name} was lost")]
 
-    def _take_epoch(self, message: m.Configured) -> None:
+    def _configured(self, message: m.Configured, now_ns: int) -> list[Event]:
         """A robot announces its configuration once per life of its process."""
-        if self.alive.get(message.node) is False:
-            self._add(message.stamp_ns, message.node, "restarted", "announces itself again")
+        if self._alive.get(message.node) is not False or not message.node.startswith("robot/"):
+            return []
+        name = message.node.removeprefix("robot/")
+        return [Event(now_ns, "restarted", message.node, f"{name} announces itself again")]
 
-    def _take_map(self, fused: m.FusedMap) -> None:
+    def _incarnation(self, start: m.Start, now_ns: int) -> list[Event]:
+        before = self._incarnations.get(start.robot, FIRST)
+        self._incarnations[start.robot] = max(before, start.epoch)
+        if start.epoch <= before:
+            return []
+        text = f"the stream of {start.robot} begins anew, incarnation {start.epoch}"
+        return [Event(now_ns, "restarted", robot_node(start.robot), text)]
+
+    def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
         """What a map says of who is in it, where that changes."""
-        for member in fused.members:
-            if member.robot not in self.joined:
-                self.joined[member.robot] = member.sequence
-                text = f"its submaps are in the team's map, frame {fused.frame or '–'}"
-                self._add(fused.stamp_ns, member.robot, "map", text)
-        said = {without_figures(reason): reason for reason in fused.reasons}
-        for shape in sorted(said.keys() - self.reasons.keys()):
-            self._add(fused.stamp_ns, "central", "map", said[shape])
-        for shape in sorted(self.reasons.keys() - said.keys()):
-            self._add(fused.stamp_ns, "central", "map", f"no longer: {self.reasons[shape]}")
-        self.reasons = said
+        members = {member.robot for member in fused.members}
+        events = [
+            Event(now_ns, "map", robot_node(robot), f"{robot} is in the team's map")
+            for robot in sorted(members - self._members)
+        ]
+        events += [
+            Event(now_ns, "withdrawn", robot_node(robot), f"{robot} was withdrawn from the map")
+            for robot in sorted((self._members & {*fused.withdrawn}) - self._withdrawn)
+        ]
+        self._members = members
+        reasons = {without_decimals(reason): reason for reason in fused.reasons}
+        events += [
+            Event(now_ns, "warning", "central", reasons[shape])
+            for shape in sorted(reasons.keys() - self._reasons.keys())
+        ]
+        events += [
+            Event(now_ns, "map", "central", f"no longer: {self._reasons[shape]}")
+            for shape in sorted(self._reasons.keys() - reasons.keys())
+        ]
+        self._reasons = reasons
         if fused.final:
-            text = f"the final map, {len(fused.ids) // 4} landmarks"
-            self._add(fused.stamp_ns, "central", "ended", text)
-            self.done |= set(self.alive)
+            count = len(fused.ids) // 4
+            events.append(Event(now_ns, "done", "central", f"final map of {count} landmarks"))
+            self._done |= set(self._alive)
+        return events
 
-    def _take_status(self, node: str, status: m.Status) -> None:
-        """A warning once, whatever the figures in it; that someone is awaited is none."""
+    def _status(self, status: m.Status, now_ns: int) -> list[Event]:
+        """A warning once, whatever the decimals in it; that someone is awaited is none."""
+        events = []
+        refused = int(status.figures.get("refused", 0.0))
+        if refused > self._refused and status.node == "central":
+            text = f"the centre refused {refused - self._refused} submaps"
+            events.append(Event(now_ns, "refused", "central", text))
+            self._refused = refused
         for warning in status.warnings:
-            name = (node, without_figures(warning))
-            awaited = any(text in warning for text in _AWAITED)
-            if name not in self.warned and not awaited:
-                self.warned.add(name)
-                self._add(status.stamp_ns, node, "warning", warning)
-
-    def _take_done(self, done: m.Done) -> None:
-        node = ch.robot_node(done.robot)
-        if node not in self.done:
-            self.done.add(node)
-            text = f"has used its {done.readings:,} readings, {done.submaps} submaps"
-            self._add(done.stamp_ns, node, "ended", text)
+            gist = (status.node, without_decimals(warning))
+            if gist in self._warned or any(text in warning for text in _AWAITED):
+                continue
+            self._warned.add(gist)
+            kind: Kind = "refused" if "refused" in warning else "warning"
+            events.append(Event(now_ns, kind, status.node, f"{status.node}: {warning}"))
+        return events
 
 
-def without_figures(text: str) -> str:
+def without_decimals(text: str) -> str:
     """The text without its decimals: the same finding with other figures is nothing new."""
-    return _FIGURE.sub("#", text)
+    return _NUMBER.sub("#", text)

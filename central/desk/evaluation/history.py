@@ -11,11 +11,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
+from jaxtyping import Float, Int64
 
-from central.desk.evaluation.events import Event, EventLog
+from central.desk.evaluation.events import MOST, Event, EventTeller
 from central.desk.evaluation.log import head_of
-from team import translate
+from central.desk.evaluation.running import TrueLandmarks
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -24,7 +24,7 @@ from team.wire.codec import WireError
 _NO_SPAN = (2**63 - 1, -(2**63))
 _LOOKED_AT = (
     ch.START, ch.SUBMAP, ch.FUSED_MAP, ch.FINAL_MAP, ch.INNOVATION, ch.TRUTH_LANDMARKS, ch.STATUS,
-    ch.ALIVE, ch.ROBOT_CONFIG, ch.ROBOT_DONE, ch.END,
+    ch.ALIVE, ch.ROBOT_CONFIG, ch.ROBOT_DONE, ch.WITHDRAWAL, ch.END,
 )  # fmt: skip
 _COST = "joint_cost_per_dof."
 
@@ -154,7 +154,8 @@ class _Gathering:
     map_nees: _Column = field(default_factory=_Column)
     map_cost: _Column = field(default_factory=_Column)
     robot_cost: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
-    events: EventLog = field(default_factory=EventLog)
+    teller: EventTeller = field(default_factory=EventTeller)
+    events: list[Event] = field(default_factory=list)
     published: dict[tuple[str, int], _Clocks] = field(default_factory=lambda: defaultdict(_Clocks))
     unused: dict[tuple[str, int], dict[int, _Submap]] = field(
         default_factory=lambda: defaultdict(dict)
@@ -162,8 +163,7 @@ class _Gathering:
     latencies: dict[str, list[tuple[int, float, float]]] = field(
         default_factory=lambda: defaultdict(list)
     )
-    true_ids: UInt32[np.ndarray, " T"] = field(default_factory=lambda: np.empty(0, np.uint32))
-    positions: Float[np.ndarray, "T 2"] = field(default_factory=lambda: np.empty((0, 2)))
+    truth: TrueLandmarks = field(default_factory=TrueLandmarks)
     span: tuple[int, int] = _NO_SPAN
 
     def take(self, sample: Sample, channel: ch.Channel | None) -> None:
@@ -176,7 +176,8 @@ class _Gathering:
             _, name, message = opened(sample)
         except WireError:
             return  # the evaluation counts it
-        self.events.take(channel, name, message)
+        self.events += self.teller.take(message, sample.stamp_ns)
+        del self.events[MOST:]
         match message:
             case m.Submap():
                 interval = _Submap(message.stamp_ns, message.first_reading, message.last_reading)
@@ -186,7 +187,7 @@ class _Gathering:
             case m.Innovation():
                 self.innovations[message.robot].append(message)
             case m.TruthLandmarks():
-                self.true_ids, self.positions = translate.landmarks_of(message)
+                self.truth = TrueLandmarks.of(message)
             case m.Status() if name == "central":
                 for figure, value in message.figures.items():
                     if figure.startswith(_COST):
@@ -205,23 +206,13 @@ class _Gathering:
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
         if fused.dof > 0:
             self.map_cost.take(fused.stamp_ns, fused.chi2 / fused.dof)
-        self._judge(fused)
+        if (fit := self.truth.fit(fused)) is not None:
+            self.map_nees.take(fused.stamp_ns, fit.nees_per_dof)
         for member in fused.members:
             waiting = self.unused[member.robot, member.epoch]
             for sequence in [k for k in waiting if k <= member.sequence]:
                 submap = waiting.pop(sequence)
                 self._arrived(member.robot, member.epoch, submap, wall_ns)
-
-    def _judge(self, fused: m.FusedMap) -> None:
-        ids, means = translate.landmarks_of(fused)
-        known = np.isin(ids, self.true_ids)
-        if not known.any():
-            return
-        errors = means[known] - self.positions[np.searchsorted(self.true_ids, ids[known])]
-        blocks = translate.landmark_blocks_of(fused)[known]
-        solved = np.linalg.solve(blocks, errors[:, :, np.newaxis])[:, :, 0]
-        nees = np.einsum("ki,ki->k", errors, solved)
-        self.map_nees.take(fused.stamp_ns, float(nees.mean()) / 2.0)
 
     def _arrived(self, robot: str, epoch: int, submap: _Submap, wall_ns: int) -> None:
         clocks = self.published[robot, epoch]
@@ -257,7 +248,7 @@ def history(samples: Iterable[Sample]) -> History:
             key: Traffic(series.stamps_ns, series.values.astype(np.int64))
             for key, series in ((k, found.traffic[k].series) for k in sorted(found.traffic))
         },
-        found.events.events,
+        tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
     )
 
 

@@ -7,21 +7,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from central.desk.drawing import (
+    MAP_COLOUR,
+    TRUE_LANDMARK_COLOUR,
+    TRUTH_COLOUR,
+    draw_ellipses,
+    landmark_blocks,
+    robot_colours,
+)
 from central.desk.evaluation.errors import Path
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 
-if (
-    TYPE_CHECKING
-):  # Matplotlib takes half a second to import: a run that draws nothing has no use for it
+# Matplotlib takes half a second to import: a run that draws nothing has no use for it
+if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ROBOT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-"""Told apart by colour-blind people too (Okabe & Ito 2008); the seventh robot takes the first."""
-TRUTH_COLOUR = "#7a7a7a"
-MAP_COLOUR = "#111111"
-ELLIPSE_CHI2 = 5.991
-"""95 % of a Gaussian in the plane lie within this squared Mahalanobis distance."""
 DRAWN_ROBOTS = 12
 """Rows of the error picture at the most."""
 DRAWN_POINTS = 4000
@@ -38,8 +39,9 @@ def map_picture(evaluation: Evaluation, path: FilePath) -> bool:
         return False
     figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
+    colours = robot_colours(evaluation.robots)
     for i, (name, robot) in enumerate(evaluation.robots.items()):
-        _draw_paths(axis, name, robot, ROBOT_COLOURS[i % len(ROBOT_COLOURS)], first=i == 0)
+        _draw_paths(axis, name, robot, colours[name], first=i == 0)
     _draw_landmarks(axis, evaluation)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
@@ -70,9 +72,9 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
         return False
     start_ns = min(_first_ns(shown[name]) for name in names)
     figure, axes = new_figure(13.0, 1.0 + 2.3 * len(names), len(names), 3)
+    colours = robot_colours(evaluation.robots)
     for row, name in enumerate(names):
-        colour = ROBOT_COLOURS[row % len(ROBOT_COLOURS)]
-        _draw_errors(axes[row], shown[name], colour, start_ns)
+        _draw_errors(axes[row], shown[name], colours[name], start_ns)
         axes[row][0].set_ylabel(f"{name}\nerror [m]")
         axes[row][2].set_ylabel("error [°]")
     for axis, title in zip(axes[0], ("x", "y", "heading"), strict=True):
@@ -123,13 +125,11 @@ def _draw_paths(axis: "Axes", name: str, robot: RobotResult, colour: str, *, fir
 
 
 def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
-    from matplotlib.patches import Ellipse
-
     truth, fused = evaluation.true_landmarks, evaluation.map
     if len(truth):
         axis.plot(
             *truth.T, linestyle="", marker="x", markersize=8, markeredgewidth=1.6,
-            color="#C00000", label="true landmarks", zorder=6,
+            color=TRUE_LANDMARK_COLOUR, label="true landmarks", zorder=6,
         )  # fmt: skip
     if fused is None or not len(fused.ids):
         return
@@ -137,21 +137,8 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
         *fused.means.T, linestyle="", marker=".", markersize=6, color=MAP_COLOUR,
         label="landmarks of the map, 95 % ellipses", zorder=7,
     )  # fmt: skip
-    for k, mean in enumerate(fused.means):
-        block = fused.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
-        width, height, turn_deg = ellipse_of(block)
-        axis.add_patch(
-            Ellipse(
-                (float(mean[0]), float(mean[1])),
-                width,
-                height,
-                angle=turn_deg,
-                fill=False,
-                edgecolor=MAP_COLOUR,
-                linewidth=1.1,
-                zorder=7,
-            )
-        )
+    blocks = landmark_blocks(fused.covariance)
+    draw_ellipses(axis, fused.means, blocks, MAP_COLOUR, width=1.1, zorder=7)
     if len(fused.ids) <= LABELLED_LANDMARKS:
         for landmark, mean, offset in zip(
             fused.ids, fused.means, label_offsets(fused.means), strict=True
@@ -182,14 +169,6 @@ def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
         length = float(np.hypot(*away))
         offsets[i] = 18.0 * away / length if length > 0.0 else (11.0, 9.0)
     return offsets
-
-
-def ellipse_of(covariance: Float[np.ndarray, "2 2"]) -> tuple[float, float, float]:
-    """Full axes [m] and the first one's direction [°] of the 95 % ellipse of a 2 × 2 covariance."""
-    variances, directions = np.linalg.eigh(covariance)
-    width, height = 2.0 * np.sqrt(ELLIPSE_CHI2 * variances[::-1])
-    turn = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
-    return float(width), float(height), float(turn)
 
 
 def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_ns: int) -> None:

@@ -7,9 +7,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from central.desk.drawing import (
+    BLUE,
+    GREEN,
+    GREY,
+    MAP_COLOUR,
+    ORANGE,
+    PURPLE,
+    RED,
+    ROBOT_COLOURS,
+    VERMILION,
+    colour_of,
+    robot_colours,
+)
 from central.desk.evaluation.evaluation import Evaluation
 from central.desk.evaluation.history import History, Traffic
-from central.desk.pictures.run import DPI, MAP_COLOUR, ROBOT_COLOURS, new_figure, thinning
+from central.desk.pictures.run import DPI, new_figure, thinning
 from team.estimation.consistency import chi2_interval
 from team.wire import channels as ch
 from team.wire.channels import channel_of
@@ -27,8 +40,9 @@ LOGARITHMIC_FROM = 12.0
 """A NEES beyond this needs a logarithmic axis to be seen at all."""
 SHOWN_KEYS = 8
 EVENT_STYLES = {
-    "came": ("o", "#009E73"), "lost": ("X", "#C00000"), "restarted": ("^", "#E69F00"),
-    "map": ("D", "#0072B2"), "warning": ("v", "#D55E00"), "ended": ("s", "#7a7a7a"),
+    "joined": ("o", GREEN), "lost": ("X", RED), "restarted": ("^", ORANGE), "left": ("<", GREY),
+    "map": ("D", BLUE), "withdrawn": ("P", PURPLE), "refused": ("*", RED),
+    "warning": ("v", VERMILION), "done": ("s", GREY),
 }  # fmt: skip
 
 
@@ -80,7 +94,8 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     axis.axhspan(low, high, color=BAND_COLOUR, zorder=0, label="95 % of single poses")
     axis.axhline(1.0, color="#888888", linewidth=0.8)
     largest = 0.0
-    for k, (name, robot) in enumerate(evaluation.robots.items()):
+    colours = robot_colours(evaluation.robots)
+    for name, robot in evaluation.robots.items():
         if robot.online is None:
             continue
         centres, (sums, counts) = binned(
@@ -89,7 +104,7 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
             robot.online.nees / 3.0,
             np.ones(len(robot.online.nees)),
         )
-        axis.plot(centres, sums / counts, color=_colour(k), linewidth=1.2, label=name)
+        axis.plot(centres, sums / counts, color=colours[name], linewidth=1.2, label=name)
         largest = max(largest, float((sums / counts).max()))
     nees = history.map_nees
     if len(nees.values):
@@ -103,7 +118,8 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
 
 def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     largest, lows, highs = 0.0, [], []
-    for k, (name, of) in enumerate(history.innovations.items()):
+    colours = robot_colours(evaluation.robots)
+    for name, of in history.innovations.items():
         centres, (squared, dof) = binned(
             history, of.stamps_ns, of.squared, of.dof.astype(np.float64)
         )
@@ -111,7 +127,9 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         if not told.any():
             continue
         values = squared[told] / dof[told]
-        axis.plot(centres[told], values, color=_colour(k), linewidth=1.2, label=name)
+        axis.plot(
+            centres[told], values, color=colours.get(name, MAP_COLOUR), linewidth=1.2, label=name
+        )
         largest = max(largest, float(values.max()))
         low, high = chi2_interval(int(np.median(dof[told])), BAND, 1)
         lows.append(low)
@@ -129,15 +147,16 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
 
 def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     axis.axhline(1.0, color="#888888", linewidth=0.8)
-    for level, colour, name in ((WARN, "#E69F00", "warns"), (FAIL, "#C00000", "fails")):
+    for level, colour, name in ((WARN, ORANGE, "warns"), (FAIL, RED, "fails")):
         axis.axhline(
             level, color=colour, linewidth=0.9, linestyle="--", label=f"{name} above {level}"
         )
     largest = FAIL
-    for k, (name, of) in enumerate(history.robot_cost.items()):
+    colours = robot_colours(evaluation.robots)
+    for name, of in history.robot_cost.items():
         axis.plot(
-            history.seconds(of.stamps_ns), of.values, color=_colour(k), linewidth=1.0,
-            marker=".", markersize=3, label=name,
+            history.seconds(of.stamps_ns), of.values, color=colours.get(name, MAP_COLOUR),
+            linewidth=1.0, marker=".", markersize=3, label=name,
         )  # fmt: skip
         largest = max(largest, float(of.values.max(initial=0.0)))
     cost = history.map_cost
@@ -192,7 +211,7 @@ def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Tr
         centres, (total,) = binned(history, stamps, sizes)
         style = "-" if k < len(ROBOT_COLOURS) else "--"
         axis.plot(
-            centres, total / width_s, color=_colour(k), linestyle=style, linewidth=1.2, label=name
+            centres, total / width_s, color=colour_of(k), linestyle=style, linewidth=1.2, label=name
         )
     _log_scale(axis)
     axis.grid(color="#eeeeee", linewidth=0.6)
@@ -217,14 +236,15 @@ def latency_picture(history: History, path: FilePath) -> bool:
         return False
     figure, axes = new_figure(9.0, 3.6, 1, 1)
     axis = axes[0][0]
-    for k, (name, of) in enumerate(history.latencies.items()):
+    colours = robot_colours({*history.innovations, *history.latencies})
+    for name, of in history.latencies.items():
         kept = thinning(len(of.stamps_ns))
         seconds = history.seconds(of.stamps_ns[kept])
         axis.plot(
-            seconds, of.last_s[kept], color=_colour(k), linewidth=0.8, marker="o", markersize=3,
+            seconds, of.last_s[kept], color=colours[name], linewidth=0.8, marker="o", markersize=3,
             label=name,
         )  # fmt: skip
-        axis.plot(seconds, of.first_s[kept], color=_colour(k), linewidth=0.8, linestyle=":")
+        axis.plot(seconds, of.first_s[kept], color=colours[name], linewidth=0.8, linestyle=":")
     axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last reading")
     axis.plot([], [], color="#555555", linestyle=":", label="from its first reading")
     if all((of.last_s > 0.0).all() for of in history.latencies.values()):
@@ -240,7 +260,7 @@ def latency_picture(history: History, path: FilePath) -> bool:
 
 def timeline_picture(history: History, path: FilePath) -> bool:
     """A row for each node, a mark for each of its events."""
-    nodes = list(dict.fromkeys(event.node for event in history.events))
+    nodes = list(dict.fromkeys(event.of for event in history.events))
     if not nodes:
         return False
     nodes = sorted(nodes, key=lambda node: (node in ("world", "central", "recorder"), node))
@@ -252,7 +272,7 @@ def timeline_picture(history: History, path: FilePath) -> bool:
         events = [event for event in history.events if event.kind == kind]
         if events:
             stamps = np.array([event.stamp_ns for event in events], np.int64)
-            rows = [nodes.index(event.node) for event in events]
+            rows = [nodes.index(event.of) for event in events]
             axis.plot(
                 history.seconds(stamps), rows, linestyle="", marker=marker, color=colour,
                 markersize=7, alpha=0.85, label=kind,
@@ -287,7 +307,3 @@ def speaker(key: str) -> str | None:
 
 def _bytes(parts: Sequence[Traffic]) -> int:
     return sum(int(part.sizes.sum()) for part in parts)
-
-
-def _colour(k: int) -> str:
-    return ROBOT_COLOURS[k % len(ROBOT_COLOURS)]

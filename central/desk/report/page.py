@@ -240,7 +240,7 @@ def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     if not events:
         return []
     rows = [
-        ("before" if s < 0.0 else f"{s:.1f} s", event.node, event.text)
+        ("before" if s < 0.0 else f"{s:.1f} s", event.of, event.text)
         for event in events[:LISTED_EVENTS]
         for s in ((event.stamp_ns - run.history.start_ns) * 1e-9,)
     ]

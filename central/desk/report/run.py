@@ -65,7 +65,7 @@ def run_figures(run: Run) -> dict[str, Any]:
             for robot, of in run.trajectories().items()
         },
         "events": [
-            {"team_time_s": s, "node": event.node, "kind": event.kind, "text": event.text}
+            {"team_time_s": s, "node": event.of, "kind": event.kind, "text": event.text}
             for event in history.events
             for s in ((event.stamp_ns - history.start_ns) * 1e-9,)
         ],

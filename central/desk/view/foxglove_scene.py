@@ -11,7 +11,8 @@ import numpy as np
 from foxglove import messages as fox
 from jaxtyping import Float
 
-from central.desk.view.drawn import Landmarks, ellipses
+from central.desk.drawing import ellipses
+from central.desk.view.drawn import Landmarks
 from team.wire.views import MAP_FRAME
 
 Shade = tuple[str, float]
@@ -50,12 +51,13 @@ def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> fox.
 
 
 def true_landmarks_entity(
-    stamp_ns: int, truth: Iterable[tuple[float, float]], size_m: float
+    stamp_ns: int, truth: Float[np.ndarray, "T 2"], size_m: float
 ) -> fox.SceneEntity:
     """The true landmarks, as small squares."""
     edge = fox.Vector3(x=0.25 * size_m, y=0.25 * size_m, z=_FLAT_M)
     cubes = [
-        fox.CubePrimitive(pose=_pose(x, y, 0.0), size=edge, color=_colour(TRUTH)) for x, y in truth
+        fox.CubePrimitive(pose=_pose(x, y, 0.0), size=edge, color=_colour(TRUTH))
+        for x, y in truth.tolist()
     ]
     return _entity(stamp_ns, "true landmarks", cubes=cubes)
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 
-from central.desk.view.drawn import colour_of, in_order
+from central.desk.drawing import colour_of, in_order
 from team.wire import views
 from team.wire.views import MAP_FRAME
 

@@ -13,15 +13,16 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from central.desk.drawing import colour_of, in_order
 from central.desk.evaluation.errors import PoseErrors
+from central.desk.evaluation.events import Event, EventTeller
+from central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from central.desk.view import foxglove_scene as fox
-from central.desk.view.drawn import Landmarks, Track, colour_of, in_order, landmarks_of
-from central.desk.view.errors import RunningErrors, map_fit
-from central.desk.view.events import Chronicle, Event
+from central.desk.view.drawn import Landmarks, Track, landmarks_of
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire import views
-from team.wire.arrays import floats, ids
+from team.wire.arrays import floats
 from team.wire.channels import Channel
 
 PERIOD_NS = 1_000_000_000
@@ -116,10 +117,11 @@ class ViewerNode:
         self._robots: dict[str, _Robot] = {}
         self._maps: deque[m.FusedMap] = deque()
         self._landmarks: Landmarks | None = None
-        self._truth: dict[int, tuple[float, float]] = {}
+        self._truth = TrueLandmarks()
+        self._fused: m.FusedMap | None = None
         self._map_is_new = False
         self._status: dict[str, float] = {}
-        self._chronicle = Chronicle()
+        self._teller = EventTeller()
         self._now_ns: int | None = None
         self._turn = 0
         self._reach = (math.inf, math.inf, -math.inf, -math.inf)
@@ -132,7 +134,7 @@ class ViewerNode:
 
     def handle(self, channel: Channel, message: m.Message) -> list[Shown]:
         """Take one message of a channel; the views that are due, one per period of team time."""
-        out = [_logged(event) for event in self._chronicle.take(message, self.now_ns)]
+        out = [_logged(event) for event in self._teller.take(message, self.now_ns)]
         self._take(channel, message)
         reached = self._reached_ns()
         if reached is None:
@@ -165,10 +167,8 @@ class ViewerNode:
             case m.Truth():
                 self._of(message.robot).errors.take_truth(message)
             case m.TruthLandmarks():
-                places = floats(message.positions, "positions").reshape(-1, 2)
-                names = ids(message.ids, "ids").tolist()
-                self._truth = {n: (x, y) for n, (x, y) in zip(names, places.tolist(), strict=True)}
-                self._extend(places)
+                self._truth = TrueLandmarks.of(message)
+                self._extend(self._truth.positions)
                 self._map_is_new = True
             case m.FusedMap():
                 self._maps.append(message)
@@ -253,7 +253,8 @@ class ViewerNode:
         """Everything is as it was at this time; at the last view, the final map is there, too."""
         self._now_ns = now_ns
         while self._maps and (last or self._maps[0].stamp_ns <= now_ns):
-            self._landmarks = landmarks_of(self._maps.popleft())
+            self._fused = self._maps.popleft()
+            self._landmarks = landmarks_of(self._fused)
             self._extend(self._landmarks.means)
             self._map_is_new = True
         for robot in self._robots.values():
@@ -264,8 +265,9 @@ class ViewerNode:
     def _of_map(self, now_ns: int, size_m: float) -> list[Shown]:
         out = []
         entities = []
-        if self._truth:
-            entities.append(fox.true_landmarks_entity(now_ns, self._truth.values(), size_m))
+        if len(self._truth.ids):
+            true = self._truth.positions
+            entities.append(fox.true_landmarks_entity(now_ns, true, size_m))
         if self._landmarks is not None:
             entities.append(fox.landmarks_entity(now_ns, self._landmarks, size_m))
             names = self._landmarks.ids.astype(np.float64)
@@ -315,7 +317,7 @@ class ViewerNode:
         return out
 
     def _team(self, now_ns: int) -> views.TeamFigures:
-        fit = None if self._landmarks is None else map_fit(self._landmarks, self._truth)
+        fit = None if self._fused is None else self._truth.fit(self._fused)
         return views.TeamFigures(
             now_ns * 1e-9,
             0 if self._landmarks is None else len(self._landmarks.ids),

@@ -17,13 +17,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from central.desk.view.drawn import PALETTE, landmarks_of
-from central.desk.view.errors import RunningErrors, map_fit
-from central.desk.view.events import Chronicle
+from central.desk.drawing import ROBOT_COLOURS
+from central.desk.evaluation.events import EventTeller
+from central.desk.evaluation.running import RunningErrors, TrueLandmarks
+from central.desk.view.drawn import landmarks_of
 from central.desk.view.node import FORGET_NS
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.arrays import floats, ids, stamps
+from team.wire.arrays import floats, stamps
 from team.wire.bus import Sample
 
 SPACING_NS = 100_000_000
@@ -67,8 +68,8 @@ class PageFrames:
         self._origin_ns: int | None = None
         self._streams: dict[str, _Stream] = defaultdict(_Stream)
         self._traffic: dict[tuple[str, int], list[int]] = {}
-        self._chronicle = Chronicle()
-        self._truth: dict[int, tuple[float, float]] = {}
+        self._teller = EventTeller()
+        self._truth = TrueLandmarks()
         self._map_ns: int | None = None
         self._figures_s: dict[str, int] = {}
         self._newest_ns = 0
@@ -76,7 +77,7 @@ class PageFrames:
     def hello(self, team: str, metadata: Mapping[str, str], name: str, *, live: bool) -> None:
         """The first frame; live: the log is being recorded."""
         title = title_of(team, metadata, name)
-        self._say("hello", team=team, title=title, colours=PALETTE, live=live)
+        self._say("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
     def take(self, sample: Sample, said: tuple[ch.Channel, m.Message] | None) -> None:
         """Take one sample of the log, and what a viewer hears in it."""
@@ -129,7 +130,7 @@ class PageFrames:
             self._newest_ns = max(self._newest_ns, message.stamp_ns)
         timeless = isinstance(message, m.Liveliness | m.Status)
         at_ns = self._newest_ns if timeless else message.stamp_ns
-        for event in self._chronicle.take(message, at_ns):
+        for event in self._teller.take(message, at_ns):
             self._say("ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text)
         match message:
             case m.PoseEstimate():
@@ -141,10 +142,9 @@ class PageFrames:
             case m.Status():
                 self._take_status(message)
             case m.TruthLandmarks():
-                places = floats(message.positions, "positions").reshape(-1, 2).tolist()
-                names = ids(message.ids, "ids").tolist()
-                self._truth = {n: (x, y) for n, (x, y) in zip(names, places, strict=True)}
-                self._say("truth_map", ids=names, xy=[v for place in places for v in place])
+                self._truth = TrueLandmarks.of(message)
+                places = self._truth.positions.ravel().tolist()
+                self._say("truth_map", ids=self._truth.ids.tolist(), xy=places)
             case m.ParticleCloud():
                 points = floats(message.poses, "poses").reshape(-1, 3)[:, :2]
                 t = self._t(message.stamp_ns)
@@ -195,7 +195,7 @@ class PageFrames:
             return
         self._map_ns = message.stamp_ns
         landmarks = landmarks_of(message)
-        fit = map_fit(landmarks, self._truth)
+        fit = self._truth.fit(message)
         self._say(
             "map",
             t=self._t(message.stamp_ns),

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from central.desk.drawing import BLUE, ORANGE, SKY, VERMILION
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.studies.experiments import downs_printed
 from sim.studies.experiments.accuracy_utias import team_on
@@ -318,7 +319,7 @@ def _test_table(compared: Compared | None, tests: Mapping[str, Figures]) -> Tabl
 
 
 HIS, OURS = "his protocol", "ours"
-_COLOURS = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9")
+_COLOURS = (VERMILION, ORANGE, BLUE, SKY)
 _ROBOTS = ("r1", "r2", "r3", "r4", "r5")
 _HIS_EKF, _OUR_EKF = partial(_ekf, his=True), partial(_ekf, his=False)
 _DIFFERS = (

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import Bounds, differential_evolution
 
+from central.desk.drawing import BLUE, VERMILION
 from sim.scenarios.scenario import load, with_options
 from sim.studies.experiments.downs_joined import spherical_task
 from sim.studies.experiments.drawing import figure, ruled
@@ -221,8 +222,8 @@ def _draw(found: dict[str, Figures], path: Path) -> None:
     picture = figure(9.0, 4.0)
     degrees = np.linspace(-180.0, 180.0, GRID, endpoint=False)
     kinds: Sequence[tuple[str, str, str]] = (
-        ("profile", "identity, as Downs has it", "#0072B2"),
-        ("profile_with_covariances", "the maps' covariances", "#D55E00"),
+        ("profile", "identity, as Downs has it", BLUE),
+        ("profile_with_covariances", "the maps' covariances", VERMILION),
     )
     axes = picture.subplots(1, 2, sharey=True)
     for axis, (key, title, colour) in zip(axes, kinds, strict=True):

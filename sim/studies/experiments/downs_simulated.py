@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from scipy.stats import ttest_rel
 
-from central.desk.pictures.run import TRUTH_COLOUR
+from central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, RED, TRUTH_COLOUR, VERMILION
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.studies.experiments.downs_joined import spherical_task, whole_run_task
 from sim.studies.experiments.drawing import draw_map, figure, ruled, spread
@@ -57,11 +57,11 @@ def _ekf(scenario: Scenario) -> Task:
     return whole_run_task(with_options(scenario, estimator="ekf-slam", fusion="alone"))
 
 
-EKF = Simulated("EKF", _ekf, 1, "#D55E00", robot=True)
-HIS_JOINED = Simulated("joined, his protocol", spherical_task, TEAM, "#E69F00", robot=True)
-OUR_JOINED = Simulated("joined, ours", team_task, 1, "#0072B2")
-HIS_TEAM = Simulated("team, his protocol", spherical_task, TEAM, "#009E73", part="team")
-OUR_TEAM = Simulated("team, ours", team_task, TEAM, "#111111")
+EKF = Simulated("EKF", _ekf, 1, VERMILION, robot=True)
+HIS_JOINED = Simulated("joined, his protocol", spherical_task, TEAM, ORANGE, robot=True)
+OUR_JOINED = Simulated("joined, ours", team_task, 1, BLUE)
+HIS_TEAM = Simulated("team, his protocol", spherical_task, TEAM, GREEN, part="team")
+OUR_TEAM = Simulated("team, ours", team_task, TEAM, BLACK)
 
 
 class SimulatedTable(NamedTuple):
@@ -188,7 +188,7 @@ def _draw_sample(title: str, sample: Figures, path: Path) -> None:
         axis.plot(*np.array(sample[key]).reshape(-1, 2).T, color=colour, linewidth=1.0, label=label)
     axis.plot(
         *np.array(sample["landmarks"]).reshape(-1, 2).T, linestyle="", marker="x",
-        color="#C00000", label="true landmarks",
+        color=RED, label="true landmarks",
     )  # fmt: skip
     draw_map(axis, sample["means"], sample["blocks"], label="map, 95 %")
     axis.set_aspect("equal", adjustable="datalim")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.pictures.run import MAP_COLOUR, ellipse_of
+from central.desk.drawing import MAP_COLOUR, draw_ellipses
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
@@ -101,16 +101,9 @@ def draw_map(
 
     label: of the dots, in a legend.
     """
-    from matplotlib.patches import Ellipse
-
     dots = np.array(means, dtype=np.float64).reshape(-1, 2)
     axis.plot(*dots.T, linestyle="", marker=".", color=colour, zorder=5, label=label)
-    for mean, block in zip(means, blocks, strict=True):
-        width, height, turn_deg = ellipse_of(np.array(block))
-        axis.add_patch(
-            Ellipse((mean[0], mean[1]), width, height, angle=turn_deg, fill=False,
-                    edgecolor=colour, zorder=5)
-        )  # fmt: skip
+    draw_ellipses(axis, dots, np.array(blocks).reshape(-1, 2, 2), colour, zorder=5)
 
 
 def ruled(axis: "Axes") -> None:

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION
 from central.desk.evaluation.errors import Path, pose_errors
 from central.desk.evaluation.evaluation import evaluate
 from sim.scenarios.scenario import Scenario, load, loads, with_options
@@ -38,11 +39,11 @@ START_SIGMA = 1e-3
 """Of the program's initial covariance [m, rad]."""
 PARTICLES = 100
 """The program's default; the report does not say."""
-DEAD_RECKONING = Method("dead reckoning", "dead-reckoning", "alone", 1, "#D55E00", PARTICLES)
-SINGLE = Method("single FastSLAM", "fastslam1", "alone", 1, "#0072B2", PARTICLES)
-MULTI_3 = Method("multi, 3 robots", "dead-reckoning", "joint-fastslam", 3, "#E69F00", PARTICLES)
-MULTI_5 = MULTI_3._replace(name="multi, 5 robots", robots=5, colour="#009E73")
-OURS = Method("hybrid + join, 5 robots", "hybrid", "join", 5, "#111111", None)
+DEAD_RECKONING = Method("dead reckoning", "dead-reckoning", "alone", 1, VERMILION, PARTICLES)
+SINGLE = Method("single FastSLAM", "fastslam1", "alone", 1, BLUE, PARTICLES)
+MULTI_3 = Method("multi, 3 robots", "dead-reckoning", "joint-fastslam", 3, ORANGE, PARTICLES)
+MULTI_5 = MULTI_3._replace(name="multi, 5 robots", robots=5, colour=GREEN)
+OURS = Method("hybrid + join, 5 robots", "hybrid", "join", 5, BLACK, None)
 """With the models and figures of the scenario `utias`; all others with the program's."""
 _COST_S = 4.0
 _LINE_POINTS = 1400

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from central.desk.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
+from central.desk.drawing import RED, SKY, TRUTH_COLOUR, colour_of
 from sim.studies.experiments.drawing import draw_map, figure, ruled
 from sim.studies.experiments.experiment import (
     Dataset,
@@ -25,7 +25,7 @@ from sim.studies.experiments.xu import Method
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
 
-CLOUD_COLOUR = "#56B4E9"
+CLOUD_COLOUR = SKY
 
 
 class PathFigure(NamedTuple):
@@ -109,7 +109,7 @@ class _Drawing:
 
 def _draw(axis: "Axes", run: Figures) -> None:
     for i, (name, robot) in enumerate(run["robots"].items()):
-        colour = ROBOT_COLOURS[i % len(ROBOT_COLOURS)]
+        colour = colour_of(i)
         axis.plot(*np.array(robot["truth"]).reshape(-1, 2).T, color=TRUTH_COLOUR, linewidth=0.9)
         axis.plot(
             *np.array(robot["line"]).reshape(-1, 2).T, color=colour, linewidth=1.2,
@@ -121,7 +121,7 @@ def _draw(axis: "Axes", run: Figures) -> None:
         axis.plot(*np.array(cloud).T, linestyle="", marker=".", markersize=3, color=CLOUD_COLOUR,
                   zorder=4)  # fmt: skip
     axis.plot(
-        *np.array(run["truth"]).T, linestyle="", marker="x", color="#C00000", label="true landmarks"
+        *np.array(run["truth"]).T, linestyle="", marker="x", color=RED, label="true landmarks"
     )
     if run["map"] is not None:
         draw_map(axis, run["map"]["means"], run["map"]["blocks"])

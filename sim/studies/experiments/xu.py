@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from central.desk.drawing import BLACK, BLUE, GREEN, PURPLE, VERMILION
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.studies.experiments.curves import curves_task
 from sim.studies.experiments.drawing import BAND, Curves, figure, ruled, spread
@@ -45,19 +46,17 @@ class Method(NamedTuple):
     particles: int | None = PARTICLES
 
 
-EKF = Method("EKF-SLAM", "ekf-slam", "alone", 1, "#009E73")
-FASTSLAM = Method("FastSLAM", "fastslam1", "alone", 1, "#D55E00")
-HYBRID = Method("Hybrid, as written", "hybrid-thesis", "alone", 1, "#0072B2")
-HYBRID_CODED = Method("Hybrid, as coded", "hybrid-thesis-coded", "alone", 1, "#CC79A7")
-OURS = Method("Hybrid, ours", "hybrid", "join", 1, "#111111", None)
-MULTI_FASTSLAM = Method("multi-FastSLAM", "dead-reckoning", "joint-fastslam", 2, "#009E73")
-SINGLE_HYBRID = HYBRID._replace(name="single Hybrid, as written", colour="#D55E00")
-SINGLE_HYBRID_CODED = HYBRID_CODED._replace(name="single Hybrid, as coded", colour="#D55E00")
-MULTI_HYBRID = Method("multi-Hybrid, as written", "hybrid-thesis", "kalman-per-axis", 2, "#0072B2")
-MULTI_CODED = Method(
-    "multi-Hybrid, as coded", "hybrid-thesis-coded", "kalman-per-axis", 2, "#0072B2"
-)
-OUR_TEAM = Method("multi-Hybrid, ours", "hybrid", "join", 2, "#111111", None)
+EKF = Method("EKF-SLAM", "ekf-slam", "alone", 1, GREEN)
+FASTSLAM = Method("FastSLAM", "fastslam1", "alone", 1, VERMILION)
+HYBRID = Method("Hybrid, as written", "hybrid-thesis", "alone", 1, BLUE)
+HYBRID_CODED = Method("Hybrid, as coded", "hybrid-thesis-coded", "alone", 1, PURPLE)
+OURS = Method("Hybrid, ours", "hybrid", "join", 1, BLACK, None)
+MULTI_FASTSLAM = Method("multi-FastSLAM", "dead-reckoning", "joint-fastslam", 2, GREEN)
+SINGLE_HYBRID = HYBRID._replace(name="single Hybrid, as written", colour=VERMILION)
+SINGLE_HYBRID_CODED = HYBRID_CODED._replace(name="single Hybrid, as coded", colour=VERMILION)
+MULTI_HYBRID = Method("multi-Hybrid, as written", "hybrid-thesis", "kalman-per-axis", 2, BLUE)
+MULTI_CODED = Method("multi-Hybrid, as coded", "hybrid-thesis-coded", "kalman-per-axis", 2, BLUE)
+OUR_TEAM = Method("multi-Hybrid, ours", "hybrid", "join", 2, BLACK, None)
 
 
 Reading = Literal["stated", "exact", "coded"]

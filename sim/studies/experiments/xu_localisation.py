@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from central.baselines.team_keyframes import RobotKeyframe, TeamKeyframes
+from central.desk.drawing import BLACK, BLUE, RED, ROBOT_COLOURS, TRUTH_COLOUR, VERMILION
 from central.desk.evaluation.evaluation import evaluate
-from central.desk.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, load, loads, with_options
 from sim.scenarios.source import streams_of
@@ -56,9 +56,9 @@ DRAWN = 2000
 STAGES = ("prediction", "update", "resampling")
 _COST_S = 1.0
 
-DEAD = Method("dead reckoning", "dead-reckoning", "alone", 1, "#D55E00", None)
-FEW = Method("localisation, 50 particles", "localisation", "alone", 1, "#0072B2", 50)
-MANY = Method("localisation, 1000 particles", "localisation", "alone", 1, "#111111", PARTICLES)
+DEAD = Method("dead reckoning", "dead-reckoning", "alone", 1, VERMILION, None)
+FEW = Method("localisation, 50 particles", "localisation", "alone", 1, BLUE, 50)
+MANY = Method("localisation, 1000 particles", "localisation", "alone", 1, BLACK, PARTICLES)
 ERRORS = ErrorFigure(
     "Thesis, section 3.5: pose error on the known map",
     "pose",
@@ -400,12 +400,10 @@ def _scatter(axis: "Axes", cloud: Figures, label: str | None) -> None:
 
 
 def _draw_place(axis: "Axes", landmarks: list[list[float]], true: list[float]) -> None:
-    axis.plot(
-        *np.array(landmarks).T, linestyle="", marker="x", color="#C00000", label="known landmarks"
-    )
+    axis.plot(*np.array(landmarks).T, linestyle="", marker="x", color=RED, label="known landmarks")
     axis.plot(
         true[0], true[1], marker="o", markersize=10, markerfacecolor="none",
-        markeredgecolor="#111111", linestyle="", label="true position", zorder=6,
+        markeredgecolor=BLACK, linestyle="", label="true position", zorder=6,
     )  # fmt: skip
     axis.set_aspect("equal")
     axis.set_xlabel("x [m]")

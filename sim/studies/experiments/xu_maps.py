@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from central.desk.pictures.run import ROBOT_COLOURS, TRUTH_COLOUR
+from central.desk.drawing import RED, TRUTH_COLOUR, colour_of
 from sim.studies.experiments import xu_errors
 from sim.studies.experiments.drawing import draw_map, figure, ruled, sampled, spread
 from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table, combined
@@ -142,14 +142,14 @@ def _draw_shot(title: str, shot: Figures, landmarks: Sequence[Any], path: Path) 
 
 
 def _draw(axis: "Axes", shot: Figures, landmarks: np.ndarray) -> None:
-    axis.plot(*landmarks.T, linestyle="", marker="x", color="#C00000", label="true landmarks")
+    axis.plot(*landmarks.T, linestyle="", marker="x", color=RED, label="true landmarks")
     draw_map(axis, shot["means"], shot["blocks"], label="map, 95 %")
     _draw_paths(axis, shot)
 
 
 def _draw_paths(axis: "Axes", shot: Figures) -> None:
     for i, (name, lines) in enumerate(shot["paths"].items()):
-        colour = ROBOT_COLOURS[i % len(ROBOT_COLOURS)]
+        colour = colour_of(i)
         for kind, each, width in (("truth", TRUTH_COLOUR, 0.8), ("online", colour, 1.4)):
             points = np.array(lines[kind]).reshape(-1, 2)
             label = f"{name}, online" if kind == "online" else "true path" if not i else None

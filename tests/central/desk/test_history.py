@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from central.desk.evaluation.events import MOST, EventLog, without_figures
 from central.desk.evaluation.history import History, history
 from central.desk.pictures.time import BINS, binned, speaker
 from sim.in_memory.team import run_team
@@ -97,70 +96,6 @@ def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
     assert "r1" not in history([*log, at(fused(9, 1), 450)]).latencies
     absurd = samples([Outgoing(ch.ODOMETRY, "r1", m.Odometry(5, "r1", 0, 2**60, MS, 0.5, 0.1))])
     assert history([*log, *absurd]).end_ns == 19 * MS
-
-
-def events_of(*told: tuple[ch.Channel, str, m.Message]) -> list[str]:
-    log = EventLog()
-    for channel, name, message in told:
-        log.take(channel, name, message)
-    return [f"{e.node} {e.kind}: {e.text}" for e in log.events]
-
-
-def alive(t: int, node: str, there: bool) -> tuple[ch.Channel, str, m.Message]:
-    return ch.ALIVE, node, m.Liveliness(t, node, there)
-
-
-def mapped(t: int, **fields: object) -> tuple[ch.Channel, str, m.Message]:
-    return ch.FUSED_MAP, "", fused(t, 0, **fields).message
-
-
-def test_events_tell_who_came_was_lost_came_again_and_joined() -> None:
-    waits = "r2: 1 shared landmark, 2 needed"
-    assert events_of(
-        alive(0, "robot/r1", True),
-        alive(0, "robot/r1", True),
-        mapped(5, reasons=(waits,)),
-        mapped(6, reasons=(waits,)),
-        alive(7, "robot/r1", False),
-        alive(8, "robot/r1", True),
-        mapped(9, members=(m.Member("r1", 0, 3), m.Member("r2", 0, 0))),
-        (ch.ROBOT_DONE, "r1", m.Done(20, "r1", 0, 1200, 9, 4, ())),
-        alive(21, "robot/r1", False),
-    ) == [
-        "r1 came: is there",
-        "r1 map: its submaps are in the team's map, frame r1/0",
-        f"central map: {waits}",
-        "r1 lost: is lost",
-        "r1 restarted: is there again",
-        "r2 map: its submaps are in the team's map, frame r1/0",
-        f"central map: no longer: {waits}",
-        "r1 ended: has used its 1,200 readings, 4 submaps",
-    ]
-
-
-def status(t: int, *warnings: str) -> tuple[ch.Channel, str, m.Message]:
-    return ch.STATUS, "central", m.Status(t, "central", "joining", {}, warnings)
-
-
-def test_a_warning_is_one_event_whatever_its_figures_and_waiting_is_none() -> None:
-    assert events_of(
-        status(1, "waiting for r1", "r5: submap 20 disagrees, cost 8.8"),
-        status(2, "r5: submap 20 disagrees, cost 9.1", "r5: submap 21 disagrees, cost 9.1"),
-    ) == [
-        "central warning: r5: submap 20 disagrees, cost 8.8",
-        "central warning: r5: submap 21 disagrees, cost 9.1",
-    ]
-    assert without_figures("submap 20, cost 9.1") == "submap 20, cost #"
-
-
-def test_a_new_life_of_a_stream_is_an_event_and_their_number_is_bounded() -> None:
-    start = m.Start(1, "r1", 1, 0, b"", b"")
-    again = m.Start(9, "r1", 2, 0, b"", b"")
-    assert events_of((ch.START, "r1", start), (ch.START, "r1", start), (ch.START, "r1", again)) == [
-        "r1 restarted: its stream of readings begins anew, epoch 2"
-    ]
-    many = [alive(t, "robot/r1", t % 2 == 0) for t in range(MOST + 50)]
-    assert len(events_of(*many)) == MOST
 
 
 def test_bins_lose_nothing_and_take_what_lies_outside_at_the_ends(run: History) -> None:

@@ -3,22 +3,21 @@
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from central.desk.drawing import ELLIPSE_SCALE, colour_of, ellipses, in_order, robot_colours
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
 from central.desk.pictures.run import (
-    ELLIPSE_CHI2,
-    ellipse_of,
     error_picture,
     label_offsets,
     map_picture,
 )
 from central.desk.report.tables import summary_tables
-from sim.scenarios.scenario import with_options
 from team.wire import channels as ch
 from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
 
@@ -36,15 +35,21 @@ def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(
     a: float, b: float, share: float
 ) -> None:
     P = np.array([[a, share * np.sqrt(a * b)], [share * np.sqrt(a * b), b]])
-    width, height, turn_deg = ellipse_of(P)
-    turn = np.radians(turn_deg)
+    (major,), (minor,), (turn,) = ellipses(np.array([[P[0, 0], P[0, 1], P[1, 1]]]))
     ends = (
-        0.5 * width * np.array([np.cos(turn), np.sin(turn)]),
-        0.5 * height * np.array([-np.sin(turn), np.cos(turn)]),
+        major * np.array([np.cos(turn), np.sin(turn)]),
+        minor * np.array([-np.sin(turn), np.cos(turn)]),
     )
     for end in ends:
-        assert end @ np.linalg.solve(P, end) == pytest.approx(ELLIPSE_CHI2, rel=1e-6)
-    assert width >= height
+        assert end @ np.linalg.solve(P, end) == pytest.approx(ELLIPSE_SCALE**2, rel=1e-6)
+    assert major >= minor
+
+
+def test_a_robot_has_the_same_colour_in_the_report_and_on_the_page() -> None:
+    names = [f"r{i}" for i in range(1, 12)]
+    colours = robot_colours(sorted(names))
+    assert [colours[name] for name in in_order(names)] == [colour_of(i) for i in range(11)]
+    assert colours["r10"] != colours["r2"]
 
 
 def test_both_pictures_are_drawn(run: Evaluation, tmp_path: Path) -> None:
@@ -120,7 +125,7 @@ def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(
     absurd = replace(
         run,
         map=replace(run.map, errors=replace(run.map.errors, nees_per_dof=6e18)),
-        scenario=with_options(run.scenario, fusion=fusion),
+        scenario=msgspec.structs.replace(run.scenario, fusion=fusion),
     )
     console = Console(width=80, record=True, force_terminal=False)
     console.print(summary_tables(absurd)[0])

@@ -11,9 +11,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from central.desk.view.drawn import PATH_POINTS, Track, ellipses, in_order, landmarks_of
-from central.desk.view.errors import RunningErrors, map_fit
-from central.desk.view.events import Chronicle
+from central.desk.drawing import ellipses, in_order
+from central.desk.evaluation.running import RunningErrors, TrueLandmarks
+from central.desk.view.drawn import PATH_POINTS, Track, landmarks_of
 from central.desk.view.export import export_views, with_views
 from central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode
 from sim.in_memory.team import final_map, run_team
@@ -257,15 +257,14 @@ def test_truth_that_is_far_ahead_is_kept_for_the_estimates():
 
 
 def test_a_maps_nees_is_of_each_landmark():
-    found = landmarks_of(
-        m.FusedMap(
-            0, "join", bytes(8), "r1/1", False, False, 0, (), (), False, from_ids([4, 7]),
-            from_floats([1.0, 0.0, 5.0, 5.0]), from_floats([0.25, 0.0, 1.0] * 2), 0.0, 0,
-        )
+    fused = m.FusedMap(
+        0, "join", bytes(8), "r1/1", False, False, 0, (), (), False, from_ids([4, 7]),
+        from_floats([1.0, 0.0, 5.0, 5.0]), from_floats([0.25, 0.0, 1.0] * 2), 0.0, 0,
     )  # fmt: skip
-    fit = map_fit(found, {4: (0.0, 0.0)})
-    assert fit == (1, 1.0, 2.0)
-    assert map_fit(found, {}) is None
+    fit = TrueLandmarks(np.array([4], np.uint32), np.zeros((1, 2))).fit(fused)
+    assert fit is not None
+    assert (fit.landmarks, fit.rmse_m, fit.nees_per_dof) == (1, 1.0, 2.0)
+    assert TrueLandmarks().fit(fused) is None
 
 
 # Time.
@@ -310,63 +309,3 @@ def test_the_teams_pose_goes_before_the_robots_own():
     out = node.handle(ch.OWN_POSE, pose(2, 9.0)) + node.handle(ch.TEAM_POSE, pose(2, 8.0))
     figures = [json.loads(s.payload) for s in out if s.key == "view/robot/r1"]
     assert figures[-1]["x_m"] == 8.0
-
-
-# Events.
-
-
-def told(*messages: m.Message) -> list[tuple[str, str]]:
-    chronicle = Chronicle()
-    return [(e.kind, e.text) for message in messages for e in chronicle.take(message, 5)]
-
-
-def test_a_robot_joins_is_lost_and_comes_back():
-    alive, gone = (m.Liveliness(0, "robot/r1", x) for x in (True, False))
-    assert told(alive, gone, gone, alive) == [
-        ("joined", "r1 joined"), ("lost", "r1 was lost"), ("joined", "r1 came back"),
-    ]  # fmt: skip
-
-
-def test_a_robot_that_is_done_leaves():
-    came, gone = (m.Liveliness(0, "robot/r1", x) for x in (True, False))
-    assert told(came, m.Done(0, "r1", 1, 10, 5, 1, ()), gone)[1:] == [
-        ("done", "r1 used all its 10 readings"), ("left", "r1 left"),
-    ]  # fmt: skip
-
-
-def fused(
-    robots: list[str], reasons: tuple[str, ...] = (), withdrawn: tuple[str, ...] = ()
-) -> m.FusedMap:
-    members = tuple(m.Member(robot, 1, 0) for robot in robots)
-    return m.FusedMap(
-        0, "join", bytes(8), "r1/1", False, False, 0, members, (), False, b"", b"", b"", 0.0, 0,
-        reasons, (), (), withdrawn,
-    )  # fmt: skip
-
-
-def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once():
-    why = "r2: 1 shared landmark, 2 needed"
-    alone = fused(["r1"], (why,))
-    assert told(alone, alone, fused(["r1", "r2"]), fused(["r1"], (), ("r2",))) == [
-        ("map", "r1 is in the team's map"), ("warning", why), ("map", "r2 is in the team's map"),
-        ("withdrawn", "r2 was withdrawn from the map"),
-    ]  # fmt: skip
-
-
-def test_a_withdrawal_is_told_once_with_its_reason():
-    said = m.Withdrawal(3, "r2", "central", "its wheels slip")
-    assert told(fused(["r1", "r2"]), said, fused(["r1"]))[2:] == [
-        ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
-    ]  # fmt: skip
-
-
-def test_a_warning_whose_figures_move_is_told_once_and_a_refusal_is_one():
-    def status(refused: int, *warnings: str) -> m.Status:
-        return m.Status(0, "central", "joining", {"refused": float(refused)}, warnings)
-
-    begun = pose(0, 0)
-    said = (status(0, "cost 1.2"), status(0, "cost 1.3"), status(2, "refused: overlap"))
-    assert told(status(0, "waits"), begun, *said) == [
-        ("warning", "central: cost 1.2"),
-        ("refused", "the centre refused 2 submaps"), ("refused", "central: refused: overlap"),
-    ]  # fmt: skip

@@ -138,7 +138,7 @@ export class Store {
     let i = this.events.length;
     while (i > 0 && this.events[i - 1].t > event.t) i--;
     this.events.splice(i, 0, event);
-    if (event.n.startsWith('robot/') && ['joined', 'lost', 'left', 'done'].includes(event.e)) {
+    if (event.n.startsWith('robot/') && ['joined', 'restarted', 'lost', 'left', 'done'].includes(event.e)) {
       const robot = this.robot(event.n.slice(6));
       robot.states.push(event.e);
       robot.stateTimes.push(event.t);

@@ -1,0 +1,90 @@
+"""One palette, one colour per robot and one ellipse, for the pictures, the page and Foxglove."""
+
+import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
+)  # fmt: skip
+"""Okabe and Ito's colours, told apart by the colour-blind: of methods and kinds of events."""
+RED, BLACK, GREY = "#C00000", "#111111", "#7a7a7a"
+MAP_COLOUR, TRUTH_COLOUR, TRUE_LANDMARK_COLOUR = BLACK, GREY, RED
+ROBOT_COLOURS = (
+    "#3b9dff", "#ff7a33", "#19c37d", "#e667b3", "#f2c230", "#9a7bff", "#33c7d9", "#ff5d6c",
+    "#a3c644", "#c79a6b",
+)  # fmt: skip
+"""Robots' colours in the order of their names; told apart on dark and on light ground."""
+ELLIPSE_SCALE = float(np.sqrt(5.991))
+"""95 % of a Gaussian in the plane lie within this Mahalanobis distance."""
+_DIGITS = re.compile("([0-9]+)")
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Robots' names as people count them: r2 before r10."""
+    return sorted(
+        names, key=lambda name: [int(p) if p.isdigit() else p for p in _DIGITS.split(name)]
+    )
+
+
+def colour_of(number: int) -> str:
+    """The colour of the robot with this number, as #rrggbb; the eleventh takes the first again."""
+    return ROBOT_COLOURS[number % len(ROBOT_COLOURS)]
+
+
+def robot_colours(names: Iterable[str]) -> dict[str, str]:
+    """The colour of each robot of a team; the same team has the same colours everywhere."""
+    return {name: colour_of(number) for number, name in enumerate(in_order(names))}
+
+
+def ellipses(
+    blocks: Float[np.ndarray, "L 3"],
+) -> tuple[Float[np.ndarray, " L"], Float[np.ndarray, " L"], Float[np.ndarray, " L"]]:
+    """95 % ellipses of covariances (xx, xy, yy) [m²].
+
+    Returns the half axes, major and minor [m], and the direction of the major one [rad].
+    """
+    xx, xy, yy = blocks.T
+    middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    root = np.hypot(half, xy)
+    return (
+        ELLIPSE_SCALE * np.sqrt(middle + root),
+        ELLIPSE_SCALE * np.sqrt(np.maximum(middle - root, 0.0)),
+        0.5 * np.arctan2(xy, half),
+    )
+
+
+def draw_ellipses(
+    axis: "Axes",
+    means: Float[np.ndarray, "L 2"],
+    covariances: Float[np.ndarray, "L 2 2"],
+    colour: str,
+    *,
+    width: float = 1.0,
+    zorder: float = 1.0,
+) -> None:
+    """Draw the 95 % ellipse of each point."""
+    from matplotlib.patches import Ellipse
+
+    major, minor, direction = ellipses(covariances[:, (0, 0, 1), (0, 1, 1)])
+    for (x, y), a, b, turn in zip(means.tolist(), major, minor, direction, strict=True):
+        axis.add_patch(
+            Ellipse(
+                (x, y), 2.0 * float(a), 2.0 * float(b), angle=float(np.degrees(turn)),
+                fill=False, edgecolor=colour, linewidth=width, zorder=zorder,
+            )
+        )  # fmt: skip
+
+
+def landmark_blocks(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "L 2 2"]:
+    """The 2 × 2 covariance of each landmark out of the joint one, n = 2 L."""
+    at = np.arange(0, len(covariance), 2)
+    rows = at[:, np.newaxis] + np.arange(2)
+    blocks: Float[np.ndarray, "L 2 2"] = covariance[rows[:, :, np.newaxis], rows[:, np.newaxis, :]]
+    return blocks

@@ -1,0 +1,183 @@
+"""Errors of running estimates against the truth, as soon as the truth is there."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt32
+
+from central.desk.evaluation.errors import (
+    BAND,
+    Path,
+    PoseErrors,
+    distance_rmse,
+    interpolated,
+    pose_errors,
+)
+from team import translate
+from team.estimation.consistency import chi2_quantile
+from team.wire import messages as m
+from team.wire.arrays import floats, stamps
+
+SPACING_NS = 100_000_000
+"""Of the estimates that are compared."""
+WAITING = 4_096
+"""Poses of a robot that wait for their truth, at the most; the oldest are given up first."""
+BATCHES = 20_000
+"""Batches of a robot's truth that are kept, the newest."""
+
+
+class MapFit(NamedTuple):
+    """A map against the truth, as it lies: the landmarks that have truth, and their errors.
+
+    rmse_m: of their positions. nees: eᵀ P⁻¹ e of each in its own covariance, 2 degrees of freedom.
+    """
+
+    rmse_m: float
+    nees: Float[np.ndarray, " K"]
+
+    @property
+    def landmarks(self) -> int:
+        """How many have truth."""
+        return len(self.nees)
+
+    @property
+    def nees_per_dof(self) -> float:
+        """The mean of NEES/2; 1 where the covariances are right."""
+        return float(self.nees.mean()) / 2.0
+
+
+@dataclass(frozen=True)
+class TrueLandmarks:
+    """The true positions [m] of the landmarks by id, ascending."""
+
+    ids: UInt32[np.ndarray, " T"] = field(default_factory=lambda: np.empty(0, np.uint32))
+    positions: Float[np.ndarray, "T 2"] = field(default_factory=lambda: np.empty((0, 2)))
+
+    @classmethod
+    def of(cls, message: m.TruthLandmarks) -> "TrueLandmarks":
+        """The landmarks that a world tells its evaluators."""
+        return cls(*translate.landmarks_of(message))
+
+    def known(self, ids: UInt32[np.ndarray, " L"]) -> Bool[np.ndarray, " L"]:
+        """Of which landmarks the truth is known."""
+        return np.isin(ids, self.ids)
+
+    def at(self, ids: UInt32[np.ndarray, " L"]) -> Float[np.ndarray, "L 2"]:
+        """The true positions of landmarks that are all known."""
+        return self.positions[np.searchsorted(self.ids, ids)]
+
+    def fit(self, fused: m.FusedMap) -> MapFit | None:
+        """The errors of a map's landmarks; None where the truth of none is known."""
+        ids, means = translate.landmarks_of(fused)
+        known = self.known(ids)
+        if not known.any():
+            return None
+        true = self.at(ids[known])
+        errors = means[known] - true
+        blocks = translate.landmark_blocks_of(fused)[known]
+        solved = np.linalg.solve(blocks, errors[:, :, np.newaxis])[:, :, 0]
+        return MapFit(distance_rmse(means[known], true), np.einsum("ki,ki->k", errors, solved))
+
+
+@dataclass
+class NeesTally:
+    """Squared errors in units of their covariance: Σ NEES/dof, how many, how many within 95 %."""
+
+    nees_per_dof: float = 0.0
+    count: int = 0
+    inside: int = 0
+
+    def take(self, nees: Float[np.ndarray, " n"], dof: int) -> None:
+        """So many more, each of `dof` degrees of freedom."""
+        self.nees_per_dof += float(nees.sum()) / dof
+        self.count += len(nees)
+        self.inside += int(np.count_nonzero(nees <= chi2_quantile(BAND, dof)))
+
+    @property
+    def mean(self) -> float | None:
+        """NEES per degree of freedom, 1 where the covariances are right; None without any."""
+        return self.nees_per_dof / self.count if self.count else None
+
+    @property
+    def coverage(self) -> float | None:
+        """The share within 95 %; None without any."""
+        return self.inside / self.count if self.count else None
+
+
+@dataclass
+class RunningErrors:
+    """The errors of one robot's running poses; truth and poses may come in either order.
+
+    spacing_ns: team time between two poses that are compared; nearer ones are left out.
+    """
+
+    spacing_ns: int = SPACING_NS
+    last_ns: int | None = None
+    _poses: deque[tuple[int, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]] = field(
+        default_factory=lambda: deque(maxlen=WAITING)
+    )
+    _truth: deque[Path] = field(default_factory=lambda: deque(maxlen=BATCHES))
+
+    def take_truth(self, message: m.Truth) -> None:
+        """Take a batch of truth."""
+        poses = floats(message.poses, "poses").astype(np.float64).reshape(-1, 3)
+        times = stamps(message.stamps, "stamps").astype(np.int64)
+        if len(times):
+            self._truth.append(Path(times, poses))
+
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether a pose of this time is far enough from the last."""
+        return self.last_ns is None or stamp_ns >= self.last_ns + self.spacing_ns
+
+    def take_pose(self, message: m.PoseEstimate) -> None:
+        """Take an estimate, if it is not too near to the last."""
+        if not self.is_due(message.stamp_ns):
+            return
+        self.last_ns = message.stamp_ns
+        pose = floats(message.pose, "pose").astype(np.float64)
+        P = floats(message.covariance, "covariance").astype(np.float64).reshape(3, 3)
+        self._poses.append((message.stamp_ns, pose, P))
+
+    def known(self) -> PoseErrors | None:
+        """The errors of the poses that the truth has reached since the last time."""
+        until = int(self._truth[-1].stamps_ns[-1]) if self._truth else None
+        due = []
+        while until is not None and self._poses and self._poses[0][0] <= until:
+            due.append(self._poses.popleft())
+        if not due:
+            return None
+        times, poses, covariances = zip(*due, strict=True)
+        path = Path(np.array(times, dtype=np.int64), np.array(poses))
+        return pose_errors(path, np.array(covariances), self._path(times[-1]))
+
+    def truth_at(self, stamp_ns: int) -> Float[np.ndarray, "3"] | None:
+        """The true pose at a time; None where it is not known."""
+        poses, known = interpolated(self._path(stamp_ns), np.array([stamp_ns]))
+        return poses[0] if known[0] else None
+
+    def forget(self, before_ns: int) -> None:
+        """Forget what is older, but for the last batch of truth before it."""
+        while len(self._truth) > 1 and int(self._truth[1].stamps_ns[0]) < before_ns:
+            self._truth.popleft()
+        while self._poses and self._poses[0][0] < before_ns:
+            self._poses.popleft()
+
+    def forget_poses(self) -> None:
+        """Forget the poses that wait for their truth: others take their place."""
+        self._poses.clear()
+        self.last_ns = None
+
+    def _path(self, until_ns: int) -> Path:
+        """The truth up to the first batch that reaches beyond a time, in order."""
+        batches: list[Path] = []
+        for batch in self._truth:
+            batches.append(batch)
+            if batch.stamps_ns[-1] > until_ns:
+                break
+        if not batches:
+            return Path(np.zeros(0, np.int64), np.zeros((0, 3)))
+        times = np.concatenate([batch.stamps_ns for batch in batches])
+        times, first = np.unique(times, return_index=True)
+        return Path(times, np.concatenate([batch.poses for batch in batches])[first])

@@ -1,0 +1,111 @@
+"""The events of a run in words: each is told once, when it happens, to the report and the page."""
+
+from central.desk.evaluation.events import MOST, EventTeller, without_decimals
+from central.desk.evaluation.history import history
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from tests.sim.logs import samples
+
+
+def told(*messages: m.Message) -> list[tuple[str, str]]:
+    teller = EventTeller()
+    return [(e.kind, e.text) for message in messages for e in teller.take(message, 5)]
+
+
+def alive(there: bool, node: str = "robot/r1") -> m.Liveliness:
+    return m.Liveliness(0, node, there)
+
+
+def test_a_robot_joins_is_lost_and_comes_back() -> None:
+    assert told(alive(True), alive(False), alive(False), alive(True)) == [
+        ("joined", "r1 joined"),
+        ("lost", "r1 was lost"),
+        ("restarted", "r1 came back"),
+    ]
+
+
+def test_a_robot_that_is_done_leaves() -> None:
+    done = m.Done(0, "r1", 1, 1200, 5, 4, ())
+    assert told(alive(True), done, done, alive(False))[1:] == [
+        ("done", "r1 used all its 1,200 readings, 4 submaps"),
+        ("left", "r1 left"),
+    ]
+
+
+def fused(
+    robots: list[str],
+    reasons: tuple[str, ...] = (),
+    withdrawn: tuple[str, ...] = (),
+    final: bool = False,
+) -> m.FusedMap:
+    return m.FusedMap(
+        0, "join", bytes(8), "r1/1", final, False, 0,
+        tuple(m.Member(robot, 1, 0) for robot in robots), (), False, b"", b"", b"", 0.0, 0,
+        reasons, (), (), withdrawn,
+    )  # fmt: skip
+
+
+def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once() -> None:
+    why = "r2: 1 shared landmark, cost 2.5"
+    alone = fused(["r1"], (why,))
+    moved = fused(["r1"], (why.replace("2.5", "2.6"),))
+    assert told(alone, moved, fused(["r1", "r2"]), fused(["r1"], (), ("r2",))) == [
+        ("map", "r1 is in the team's map"),
+        ("warning", why),
+        ("map", "r2 is in the team's map"),
+        ("map", f"no longer: {why.replace('2.5', '2.6')}"),
+        ("withdrawn", "r2 was withdrawn from the map"),
+    ]
+
+
+def test_a_withdrawal_is_told_once_with_its_reason() -> None:
+    said = m.Withdrawal(3, "r2", "central", "its wheels slip")
+    assert told(fused(["r1", "r2"]), said, said, fused(["r1"]))[2:] == [
+        ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
+    ]
+
+
+def status(refused: int, *warnings: str) -> m.Status:
+    return m.Status(0, "central", "joining", {"refused": float(refused)}, warnings)
+
+
+def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_is_one() -> None:
+    said = (
+        status(0, "waiting for r1", "submap 20: cost 1.2"),
+        status(0, "submap 20: cost 1.3", "submap 21: cost 1.3"),
+        status(2, "refused: overlap"),
+    )
+    assert told(*said) == [
+        ("warning", "central: submap 20: cost 1.2"),
+        ("warning", "central: submap 21: cost 1.3"),
+        ("refused", "the centre refused 2 submaps"),
+        ("refused", "central: refused: overlap"),
+    ]
+    assert without_decimals("submap 20, cost 9.1") == "submap 20, cost #"
+
+
+def test_another_incarnation_and_another_life_of_a_process_are_events() -> None:
+    first, again = (m.Start(9, "r1", n, 0, b"", b"") for n in (1, 2))
+    configured = m.Configured(0, "robot/r1", 0, bytes(8), "{}")
+    assert told(first, first, again, again) == [
+        ("restarted", "the stream of r1 begins anew, incarnation 2")
+    ]
+    assert told(configured, alive(True), alive(False), configured)[2:] == [
+        ("restarted", "r1 announces itself again")
+    ]
+
+
+def test_the_end_of_the_world_and_its_notes_are_told_once() -> None:
+    end = m.End(9, (), ("a row was repaired",))
+    assert told(end, end, fused([], final=True), alive(True, "recorder")) == [
+        ("warning", "a row was repaired"),
+        ("done", "the world has ended"),
+        ("done", "final map of 0 landmarks"),
+        ("joined", "recorder joined"),
+    ]
+
+
+def test_the_number_of_events_of_a_run_is_bounded() -> None:
+    many = [Outgoing(ch.ALIVE, "robot/r1", alive(t % 2 == 0)) for t in range(MOST + 50)]
+    assert len(history(samples(many)).events) == MOST
