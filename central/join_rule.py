@@ -1,14 +1,14 @@
 """The rule `join`: the team's map is a pure function of the set of submaps."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 
-from central.config import CentralConfig
 from central.fused import JOINT_LANDMARKS, receivable
 from central.monitor import NOTHING, finding, miscalibrations
-from central.submap_set import Stream, SubmapSet
+from central.roll import Roll
+from central.rule import Inputs, Stream, Tail
+from central.submap_rule import SubmapRule
 from central.tick_fold import TickFold
 from team import translate
 from team.estimation.map_joining import marginals
@@ -20,8 +20,6 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded, unsound
 
-Tail = Literal["final", "closed", "provisional"]
-
 PRIOR_LANDMARKS = 100
 """Landmarks in a robot's prior at the most: the nearest ones."""
 
@@ -29,125 +27,82 @@ NAMED = 10
 """Landmarks that are left out of the map, and refusals, are named up to so many."""
 
 
-class JoinRule:
-    """Keeps the set and its fold; gives the messages of a broadcast and of the end."""
+class JoinRule(SubmapRule):
+    """Keeps the fold of its set; gives the messages of a broadcast and of the end."""
 
-    def __init__(self, config: CentralConfig, digest: bytes) -> None:
-        self._config = config
-        self._digest = digest
-        self._set = SubmapSet()
-        self._ticks = TickFold(config)
-        self._starts: dict[Stream, m.Start] = {}
-        self._entered: dict[Stream, int] = {}
-        self._refusals: dict[Stream, set[int]] = {}
-        self._broadcast_ns: int | None = None
+    unnamed = ("missing", "heard")
+
+    def _begin(self) -> None:
+        super()._begin()
+        self._ticks = TickFold(self._config)
         self._quiet_ns: int | None = None
         self._published: Mapping[Stream, int] = {}
-        self._orders: set[str] = set()
         self.finding = NOTHING
-        self.landmarks = 0
         self._announced: dict[str, str] = {}
-        self.warnings: list[str] = []
         self.reasons: tuple[str, ...] = ()
-        self.refused = 0
         self.not_folded = 0
 
-    def take_start(self, start: m.Start) -> None:
-        """A stream begins; its submaps wait for this."""
-        if (start.robot, start.epoch) not in self._starts:
-            self._starts[(start.robot, start.epoch)] = start
-            value = translate.start_of(start)
-            if value is not None:
-                self._ticks.know_start(value)
-            self._enter((start.robot, start.epoch))
+    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+        """The map of a set of submaps: law 2; a set that grows keeps the fold that there is.
 
-    def take_submap(self, submap: m.Submap) -> int:
-        """Admit a submap; how many of its stream have been dealt with."""
-        stream = (submap.robot, submap.epoch)
-        self._judge(submap, self._set.admit(submap))
-        self._enter(stream)
-        return self._dealt_with(stream, self._set.count(stream))
+        Who was withdrawn is an input: nobody is judged again by a part of the set.
+        """
+        shrunk = any(len(inputs.submaps.get(s, ())) < n for s, n in self._entered.items())
+        if shrunk or not self._orders <= inputs.withdrawals.keys():
+            self._begin()
+        self._ticks.convicts = False
+        for order in inputs.withdrawals.values():
+            self.take_withdrawal(order)
+        for stream, submaps in sorted(inputs.submaps.items()):
+            if stream in inputs.starts:
+                self.take_start(inputs.starts[stream])
+            for submap in submaps[self._entered.get(stream, 0) :]:
+                for sighting in inputs.sightings.get((*stream, submap.sequence), ()):
+                    self.take_sighting(sighting)
+                self.take_submap(submap)
+        if tail == "final":
+            return self._broadcast(self._ticks.solved(), tail, 0)
+        self._ticks.take_until(float("inf"))
+        return self._broadcast(self._ticks.fold, tail, 0)
 
-    def take_sighting(self, sighting: m.SightingFactor) -> int:
-        """Admit a sighting; how many submaps of its stream have been dealt with."""
-        stream = (sighting.robot, sighting.epoch)
-        self._judge(sighting, self._set.admit_sighting(sighting))
-        self._enter(stream)
-        return self._dealt_with(stream, self._set.count(stream))
+    def _began(self, start: m.Start) -> None:
+        value = translate.start_of(start)
+        if value is not None:
+            self._ticks.know_start(value)
 
-    def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
-        """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
-        robot, known = withdrawal.robot, self.withdrawn
+    def _enters(self, submap: m.Submap, sightings: Sequence[m.SightingFactor]) -> None:
+        named = translate.digest_of(encoded(submap), *(encoded(each) for each in sightings))
+        self._ticks.add(submap, named, sightings)
+
+    def _goes(self, robot: str) -> None:
         self._ticks.withdraw(robot)
-        self._orders.add(robot)
-        if robot not in known:
-            said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
-            self.warnings.append(said)
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
-        """The robots that the team goes on without, ascending."""
+        """The robots that the team goes on without, by an order or by what the fold found."""
         return self._ticks.withdrawn
 
-    def refuse(self, of: m.Submap | m.SightingFactor, why: str) -> int:
-        """What raised is not in the map; how many of its stream have been dealt with."""
-        self._judge(of, why)
-        return self.count((of.robot, of.epoch))
-
-    def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
-        """A refused submap, or one with a refused sighting, may never be in the map."""
-        if reason is not None:
-            self.refused += 1
-            self.warnings.append(f"refused: {reason}")
-            self._refusals.setdefault((of.robot, of.epoch), set()).add(of.sequence)
-
-    def _dealt_with(self, stream: Stream, count: int) -> int:
-        """`count`, unless the next one was refused: then nobody need wait for it.
-
-        What follows the refused one can not enter the map; it counts as far as it has come.
-        """
-        refused = self._refusals.get(stream, set())
-        if count not in refused:
-            return count
-        return max(*refused, *self._set.streams.get(stream, {}), count) + 1
-
-    def _enter(self, stream: Stream) -> None:
-        """Hand the fold what now is there without a gap."""
-        if stream not in self._starts:
-            return
-        chain = self._set.chain(stream)
-        for submap in chain[self._entered.get(stream, 0) :]:
-            sightings = self._set.sightings(submap)
-            named = translate.digest_of(encoded(submap), *(encoded(each) for each in sightings))
-            self._ticks.add(submap, named, sightings)
-        self._entered[stream] = len(chain)
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """Refused submaps, and what the monitor has found."""
+        return {"refused": float(self.refused + self.not_folded)} | self.finding.figures
 
     @property
-    def streams(self) -> list[Stream]:
-        """The streams that the set has submaps of."""
-        return sorted(self._set.streams)
+    def findings(self) -> tuple[str, ...]:
+        """The monitor's, and why robots are not joined or the map is to be doubted, in words."""
+        unconfirmed = self._hearsay.unconfirmed(self.withdrawn)
+        return (*self.finding.warnings, *self.reasons, *unconfirmed)
 
-    def count(self, stream: Stream) -> int:
-        """How many submaps of a stream are in the fold's reach, or will never be."""
-        return self._dealt_with(stream, self._entered.get(stream, 0))
+    def advance(self, roll: Roll) -> list[Outgoing]:
+        """A broadcast, when one is due."""
+        watermark_ns = roll.watermark_ns(self.dealt, self.count)
+        return self.broadcasts(watermark_ns, roll.now_ns)
 
-    def kept(self, robot: str) -> list[m.Message]:
-        """Of each epoch of one robot, the latest first: start, submaps without a gap, sightings."""
-        found: list[m.Message] = []
-        for stream in sorted((s for s in self._set.streams if s[0] == robot), reverse=True):
-            chain, start = self._set.chain(stream), self._starts.get(stream)
-            if chain and start is not None:
-                found += [start, *chain]
-                found += [each for submap in chain for each in self._set.sightings(submap)]
-        return found
-
-    def advance(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
+    def broadcasts(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
         """Fold what the watermark allows; a broadcast when one is due."""
         self._ticks.take_until(watermark_ns)
         said = self._withdrawals(newest_ns)
-        since = None if self._broadcast_ns is None else newest_ns - self._broadcast_ns
-        due = since is None or since >= self._config.broadcast_s * 1e9
-        if said or (due and self._lacks(self._published, watermark_ns)):
+        if said or (self._is_due(newest_ns) and self._lacks(self._published, watermark_ns)):
             return [*said, *self._broadcast(*self._newest(watermark_ns), newest_ns)]
         if not any(self._entered.values()):
             return []
@@ -218,16 +173,9 @@ class JoinRule:
             for robot in new
         ]
 
-    def retold(self, tail: Tail) -> list[Outgoing]:
-        """What a map of everything that is here says, whatever the watermark: law 2, for reruns."""
-        if tail == "final":
-            return self._broadcast(self._ticks.solved(), tail, 0)
-        self._ticks.take_until(float("inf"))
-        return self._broadcast(self._ticks.fold, tail, 0)
-
     def _broadcast(self, fold: Fold, tail: Tail, now_ns: int) -> list[Outgoing]:
         self._broadcast_ns = self._quiet_ns = now_ns
-        digest = self._ticks.digest(fold, self._digest, tail.encode())
+        digest = self._ticks.digest(fold, self._config_digest, tail.encode())
         fused = self._fused(fold, tail, digest)
         self._published = self._ticks.members(fold)
         if tail == "final":

@@ -11,8 +11,7 @@ import msgspec
 from central.config import CentralConfig
 from central.fused import fused_message
 from central.roll import Roll
-from central.rule import Refuses, rule_of
-from central.submap_rules import SubmapRule
+from central.rule import rule_of
 from team import translate
 from team.door import Door
 from team.estimation.gaussian import NO_LANDMARKS
@@ -76,8 +75,7 @@ class CentralNode:
         """
         out, self._credit = self._credit, []
         if out is None:
-            rule: object = self._rule
-            out = rule.refuse(message, why, self._roll.now_ns) if isinstance(rule, Refuses) else []
+            out = self._rule.refuse(message, why, self._roll.now_ns)
         if self._concluding and not self.finished:
             return out + self._conclude_anyway(why)
         return out + (self._advance() if self._is_over else [])
@@ -101,9 +99,7 @@ class CentralNode:
     def _advance(self) -> list[Outgoing]:
         if self.finished:
             return []
-        rule: object = self._rule
-        if isinstance(rule, Refuses):
-            self._roll.withdrawn = frozenset(rule.withdrawn)
+        self._roll.withdrawn = frozenset(self._rule.withdrawn)
         out = self._rule.advance(self._roll)
         maps = [o.message for o in out if isinstance(o.message, m.FusedMap)]
         self._broadcasts += bool(maps)
@@ -155,9 +151,7 @@ class CentralNode:
 
     def lacking(self) -> list[m.SubmapsWanted]:
         """What robots have sent by their own word and is not here: to be asked of them."""
-        if self.finished or not isinstance(self._rule, SubmapRule):
-            return []
-        return self._rule.lacking(self._roll)
+        return [] if self.finished else self._rule.lacking(self._roll)
 
     def status(self) -> m.Status:
         """What the centre is doing, for people."""

@@ -1,89 +1,140 @@
-"""What a fusion rule is to the centre's node, and which one has which name."""
+"""What a fusion rule is: a pure function from what the team has sent to its fused map.
 
+`fuse` is that function. The centre's node decides when it is asked: `take` files what comes,
+`advance` gives the maps that are due, `conclude` the final one. A rerun asks `fuse` for each
+recorded map with the inputs that the map names, and has to get the same bytes.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
 
-from central.baselines.batch_rule import BatchRule
-from central.baselines.joint_fastslam_rule import JointFastSlamRule
-from central.baselines.map_rules import AloneRule, ExchangeRule, LatestRule
 from central.config import CentralConfig
 from central.roll import Roll
-from central.submap_rules import submap_rule
-from team.pairs import FEEDBACK
+from team.pairs import RULES
+from team.registry import loaded
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 
+Stream = tuple[str, int]
+"""(robot, epoch)."""
+Tail = Literal["final", "closed", "provisional"]
+"""Which map it is: the last one; one that holds all submaps up to a time; one ahead of that."""
 
-@runtime_checkable
-class Rule(Protocol):
-    """Messages of the robots in, the team's maps out; the node keeps the roll.
 
-    listens: the channels whose messages it takes. landmarks: in its newest map. submaps: those
-    that it has dealt with. figures: for people. warnings: what went wrong, the newest last.
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What one map rests on.
+
+    starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
+    by (robot, epoch, sequence) of their submap. maps: the robots' own. withdrawals: whom the team
+    goes on without, by robot. heard: raw measurements, the robots' models and the end of the
+    streams, for rules that take these. exchange: the round, of rules in lockstep.
     """
 
-    @property
-    def landmarks(self) -> int: ...  # noqa: D102
-    @property
-    def listens(self) -> tuple[ch.Channel, ...]: ...  # noqa: D102
-    @property
-    def submaps(self) -> int: ...  # noqa: D102
-    @property
-    def figures(self) -> Mapping[str, float]: ...  # noqa: D102
-    @property
-    def findings(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def warnings(self) -> list[str]: ...  # noqa: D102
+    starts: Mapping[Stream, m.Start] = field(default_factory=dict)
+    submaps: Mapping[Stream, Sequence[m.Submap]] = field(default_factory=dict)
+    sightings: Mapping[tuple[str, int, int], Sequence[m.SightingFactor]] = field(
+        default_factory=dict
+    )
+    maps: Sequence[m.MapEstimate] = ()
+    withdrawals: Mapping[str, m.Withdrawal] = field(default_factory=dict)
+    heard: Sequence[m.Message] = ()
+    exchange: int = 0
+    stamp_ns: int = 0
 
+
+class FusionRule(ABC):
+    """Messages of the robots in, the team's maps out; the node keeps the roll.
+
+    listens: the channels whose messages it takes. unnamed: fields of its maps that rest on what it
+    knew beyond the inputs that a map names. landmarks: in its newest map. warnings: what went
+    wrong, the newest last.
+    """
+
+    listens: ClassVar[tuple[ch.Channel, ...]]
+    unnamed: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
+        self._config = config
+        self._config_digest = digest
+        self._team = tuple(sorted(robots))
+        self._broadcast_ns: int | None = None
+        self.landmarks = 0
+        self.warnings: list[str] = []
+
+    @abstractmethod
+    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+        """The map of these inputs, and what goes out with it; inputs that grow are cheap."""
+
+    @abstractmethod
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; the credit that it gives."""
 
-    def dealt(self, done: m.Done) -> bool:
-        """Whether everything that a robot's last word speaks of is here."""
-
-    def complete(self, end: m.End) -> bool:
-        """Whether everything of the streams that it needs itself is here."""
-
+    @abstractmethod
     def advance(self, roll: Roll) -> list[Outgoing]:
         """The maps that are due."""
 
+    @abstractmethod
     def conclude(self, now_ns: int) -> list[Outgoing]:
         """The last messages, the final map behind all others."""
 
-    def kept(self, robot: str) -> Sequence[m.Message]:
-        """What the robot's next life takes over: of each epoch, the latest first, its start, the
-        submaps without a gap, the sightings from them.
-        """
+    def dealt(self, done: m.Done) -> bool:
+        """Whether everything that a robot's last word speaks of is here."""
+        return True
 
-    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
-        """Readings that are missing and must be asked for at their source."""
-
-
-@runtime_checkable
-class Refuses(Protocol):
-    """A rule on submaps: it acknowledges them one by one, those too that it could not take.
-
-    withdrawn: the robots that the team goes on without.
-    """
+    def complete(self, end: m.End) -> bool:
+        """Whether everything of the streams that it needs itself is here."""
+        return True
 
     @property
-    def withdrawn(self) -> tuple[str, ...]: ...  # noqa: D102
+    def submaps(self) -> int:
+        """How many submaps it has dealt with."""
+        return 0
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """Figures for people."""
+        return {}
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What a reader of the map must know."""
+        return ()
+
+    @property
+    def withdrawn(self) -> tuple[str, ...]:
+        """The robots that the team goes on without."""
+        return ()
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
-        """Count a message as refused; the credit that this gives."""
+        """A message whose handling raised counts as refused; the credit that this gives."""
+        return []
+
+    def kept(self, robot: str) -> Sequence[m.Message]:
+        """What the robot's next life takes over; nothing: it begins its stream again.
+
+        Of each epoch, the latest first: its start, the submaps without a gap, their sightings.
+        """
+        return ()
+
+    def lacking(self, roll: Roll) -> list[m.SubmapsWanted]:
+        """What robots say that they have sent, and what is not here."""
+        return []
+
+    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
+        """Measurements that are missing and must be asked for at their source."""
+        return []
+
+    def _is_due(self, now_ns: int) -> bool:
+        """Whether broadcast_s of team time have gone by since the last broadcast."""
+        last_ns = self._broadcast_ns
+        return last_ns is None or now_ns - last_ns >= self._config.broadcast_s * 1e9
 
 
-def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> Rule:
-    """The rule that the configuration names."""
-    if config.fusion in FEEDBACK:
-        return ExchangeRule(config, digest)
-    if config.fusion == "latest":
-        return LatestRule(config, digest)
-    if config.fusion == "joint-fastslam":
-        return JointFastSlamRule(config, digest, robots)
-    if config.fusion == "batch":
-        return BatchRule(config, digest, robots)
-    if config.fusion == "alone":
-        return AloneRule(config, digest, robots)
-    return submap_rule(config, digest, robots)
+def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> FusionRule:
+    """The rule that the configuration names; raises NotInstalledError."""
+    made: type[FusionRule] = loaded(RULES[config.fusion], f"the fusion rule {config.fusion}")
+    return made(config, digest, robots)

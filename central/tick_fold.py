@@ -70,13 +70,13 @@ class _Taken:
 class TickFold:
     """Holds the contributions by tick and the fold after each tick that has been taken.
 
-    convicted: whom the fold found to be wrong, with the reason in words.
+    convicted: whom the fold found to be wrong, with the reason in words; nobody, unless `convicts`.
     """
 
     def __init__(self, config: CentralConfig) -> None:
         self._config = config
         self.settings = join_settings(config)
-        self._limit = config.withdraw_above
+        self.convicts = config.withdraw_above is not None
         self._ordered: set[str] = set()
         self.convicted: dict[str, str] = {}
         self._convicted_at = -math.inf
@@ -134,7 +134,7 @@ class TickFold:
         It convicts nobody.
         """
         other = TickFold(self._config)
-        other._limit = None
+        other.convicts = False
         other._ticks = defaultdict(dict, {t: dict(found) for t, found in self._ticks.items()})
         other._sightings, other._digests = dict(self._sightings), dict(self._digests)
         other._starts, other._ordered = dict(self._starts), self._gone | set(robots)
@@ -204,13 +204,14 @@ class TickFold:
 
     def _convict(self, fold: Fold, at: float) -> bool:
         """Whether somebody is wrong beyond doubt; he is left out from the first tick on."""
-        if self._limit is None or not fold.contributions:
+        limit = self._config.withdraw_above
+        if limit is None or not self.convicts or not fold.contributions:
             return False
         agreement = self.agreement(fold)
-        if not suspects(agreement, self._limit):
+        if not suspects(agreement, limit):
             return False
         self._taken[-1].tried = len(fold.contributions)
-        found = convicted(agreement, self._limit, self._agreement_without)
+        found = convicted(agreement, limit, self._agreement_without)
         if found is None:
             return False
         robot, reason = found

@@ -37,6 +37,10 @@ poses, so only the default and the cheapest are there. Any other pair has no mea
 makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis, and who
 only localises himself has no map to fuse.
 """
+CONSUMES: Mapping[FusionRule, Channel] = MappingProxyType(
+    {fusion: channel for fusion, (channel, _) in _CONSUMES.items()}
+)
+"""What each rule's map rests on."""
 FEEDBACK: frozenset[FusionRule] = frozenset(
     {"kalman", "kalman-per-axis", "covariance-intersection"}
 )
@@ -69,3 +73,19 @@ ESTIMATORS: Mapping[Estimator, str] = MappingProxyType(
     }
 )
 """Estimator → what makes one (`team.robot.estimator.Factory`), found by `team.registry`."""
+
+RULES: Mapping[FusionRule, str] = MappingProxyType(
+    {
+        "join": "central.join_rule:JoinRule",
+        "kalman": "central.baselines.map_rules:ExchangeRule",
+        "kalman-per-axis": "central.baselines.map_rules:ExchangeRule",
+        "covariance-intersection": "central.baselines.map_rules:ExchangeRule",
+        "latest": "central.baselines.map_rules:LatestRule",
+        "alone": "central.baselines.map_rules:AloneRule",
+        "svd-join": "central.baselines.svd_rule:SvdJoinRule",
+        "svd-join-spherical": "central.baselines.svd_rule:SvdJoinRule",
+        "joint-fastslam": "central.baselines.joint_fastslam_rule:JointFastSlamRule",
+        "batch": "central.baselines.batch_rule:BatchRule",
+    }
+)
+"""Rule → its `central.rule.FusionRule`, found by `team.registry`."""

@@ -19,9 +19,17 @@ def is_installed(place: str) -> bool:
         return False
 
 
+def absence(place: str, what: str) -> str | None:
+    """Why `what` can not be had, in words; None if it is installed."""
+    if is_installed(place):
+        return None
+    return f"{what} is not installed: {place.partition(':')[0]} is not here"
+
+
 def loaded(place: str, what: str) -> Any:
     """The `name` of `package.module:name`; raises NotInstalledError that says `what` lacks."""
     module, _, name = place.partition(":")
-    if not is_installed(place):
-        raise NotInstalledError(f"{what} is not installed: {module} is not here")
+    absent = absence(place, what)
+    if absent is not None:
+        raise NotInstalledError(absent)
     return getattr(import_module(module), name)

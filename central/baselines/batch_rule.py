@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from central.baselines.measurement_rules import ReadingRule, Told
+from central.baselines.measurement_rules import MeasurementRule, Told
 from central.baselines.team_keyframes import RobotKeyframe
 from central.config import CentralConfig
 from team import translate
@@ -27,7 +27,7 @@ FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
 """Of the final map; what is not there by then is said."""
 
 
-class BatchRule(ReadingRule):
+class BatchRule(MeasurementRule):
     """Every pose of every robot at its epochs and all landmarks, solved anew at each broadcast.
 
     Poses are said with the map, each robot's newest; with the final map the whole paths. Errors of

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from central.baselines.measurement_rules import ReadingRule, Told
+from central.baselines.measurement_rules import MeasurementRule, Told
 from central.baselines.team_keyframes import RobotKeyframe
 from central.config import CentralConfig
 from team.config import RobotConfig
@@ -24,7 +24,7 @@ POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 """Added to a pose's covariance [m², m², rad²]: fewer than four particles may differ."""
 
 
-class JointFastSlamRule(ReadingRule):
+class JointFastSlamRule(MeasurementRule):
     """One particle filter over all robots' paths and one map.
 
     The particles are those of FastSLAM 1.0, `particles` of them.

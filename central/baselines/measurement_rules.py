@@ -1,6 +1,6 @@
 """What rules on raw readings share: the team's epochs in, poses and the map out."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +11,7 @@ from central.baselines.team_keyframes import RobotKeyframe, TeamKeyframes
 from central.config import CentralConfig
 from central.fused import START_POSES, fused_message
 from central.roll import Roll
+from central.rule import FusionRule, Inputs, Tail
 from team import translate
 from team.config import RobotConfig
 from team.estimation.baselines.robot_step import RobotStep
@@ -35,7 +36,7 @@ class Told:
     before: tuple[Outgoing, ...] = ()
 
 
-class ReadingRule(ABC):
+class MeasurementRule(FusionRule):
     """An estimate over all robots' raw readings at the centre.
 
     The epochs of one team time are one step. The robots' models come with what they announce. A
@@ -44,21 +45,17 @@ class ReadingRule(ABC):
     """
 
     listens = (*ch.SENSORS, ch.ROBOT_CONFIG)
-    submaps = 0
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
-        self._config = config
-        self._config_digest = digest
+        super().__init__(config, digest, robots)
         self._epochs = TeamKeyframes(robots)
         self._robots: dict[str, RobotConfig] = {}
         self._members: dict[str, m.Member] = {}
         self._pose_ns: dict[str, int] = {}
         self._reasons: list[str] = []
         self._frame = START_POSES
-        self._broadcast_ns: int | None = None
         self._now_ns = 0
-        self.landmarks = 0
-        self.warnings: list[str] = []
+        self._fused = False
 
     @abstractmethod
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
@@ -72,15 +69,16 @@ class ReadingRule(ABC):
     def _told(self, *, final: bool) -> Told:
         """The map of all steps so far."""
 
-    @property
-    @abstractmethod
-    def figures(self) -> Mapping[str, float]:
-        """Figures for people."""
-
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """What a reader of the map must know; the final map says it too."""
-        return ()
+    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+        """Everything that the team's measurements give, at the first map that is asked for."""
+        if self._fused:
+            return []
+        self._fused = True
+        for message in inputs.heard:
+            self.take(message, 0)
+        out = self.advance(Roll.of(self._team))
+        ended = any(isinstance(message, m.End) for message in inputs.heard)
+        return out + self.conclude(0) if ended else out
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """File a reading, a robot's models or the last counters."""
@@ -103,10 +101,6 @@ class ReadingRule(ABC):
         else:
             self._epochs.configure(config.id, config)
 
-    def dealt(self, done: m.Done) -> bool:
-        """Nothing that the robot itself has sent is needed."""
-        return True
-
     def complete(self, end: m.End) -> bool:
         """Every reading of every stream has been used."""
         return self._epochs.complete
@@ -124,10 +118,6 @@ class ReadingRule(ABC):
     def conclude(self, now_ns: int) -> list[Outgoing]:
         """The map after the last step."""
         return self._said(final=True)
-
-    def kept(self, robot: str) -> Sequence[m.Message]:
-        """It keeps no submaps: a robot that was started again takes its stream from the start."""
-        return ()
 
     def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
         """Readings that the link has lost."""

@@ -14,8 +14,9 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.join_rule import JoinRule
-from central.submap_set import Stream
+from central.roll import Roll
+from central.rule import Inputs, Stream, Tail
+from central.submap_rule import SubmapRule
 from team import translate
 from team.estimation.baselines import svd_joining
 from team.estimation.baselines.svd_joining import (
@@ -52,47 +53,67 @@ class _Joined:
     refused: str = ""
 
 
-class SvdJoinRule(JoinRule):
-    """The set of `join`, another map of it: `svd-join` with the submaps' covariances, and
-    `svd-join-spherical` with Downs' identity instead of them.
+class SvdJoinRule(SubmapRule):
+    """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
     A later epoch of a robot is a stream of its own, in a frame of its own.
     """
 
-    def __init__(self, config: CentralConfig, digest: bytes) -> None:
-        super().__init__(config, digest)
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
+        super().__init__(config, digest, robots)
         self._weighting: Weighting = "full" if config.fusion == "svd-join" else "identity"
         self._joined: dict[Stream, _Joined] = {}
-        self._said_ns: int | None = None
 
-    def advance(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """Refused submaps."""
+        return {"refused": float(self.refused)}
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Orders that are not believed."""
+        return self._hearsay.unconfirmed(self.withdrawn)
+
+    def advance(self, roll: Roll) -> list[Outgoing]:
         """A broadcast of what is here, when one is due; a later one may put any of it elsewhere."""
-        since = None if self._said_ns is None else newest_ns - self._said_ns
-        if since is not None and since < self._config.broadcast_s * 1e9:
+        if not self._is_due(roll.now_ns):
             return []
-        chains = self._chains()
-        if not chains:
+        inputs = self._inputs()
+        if not inputs.submaps:
             return []
-        self._said_ns = newest_ns
-        return [Outgoing(ch.FUSED_MAP, "", self.retold_map(chains, final=False))]
+        self._broadcast_ns = roll.now_ns
+        return self.fuse(inputs, "closed")
 
-    def conclude(self, newest_ns: int) -> list[Outgoing]:
+    def conclude(self, now_ns: int) -> list[Outgoing]:
         """The map of all submaps."""
-        return [Outgoing(ch.FINAL_MAP, "", self.retold_map(self._chains(), final=True))]
+        return self.fuse(self._inputs(), "final")
 
-    def _chains(self) -> dict[Stream, list[m.Submap]]:
+    def _inputs(self) -> Inputs:
         found = {s: self._set.chain(s) for s in self.streams if s in self._starts}
-        return {stream: chain for stream, chain in found.items() if chain}
+        chains = {stream: chain for stream, chain in found.items() if chain}
+        return Inputs(starts=self._starts, submaps=chains)
 
-    def retold_map(self, chains: Mapping[Stream, Sequence[m.Submap]], *, final: bool) -> m.FusedMap:
+    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
         """The map of these submaps: a function of them and of the starts alone."""
+        channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
+        return [Outgoing(channel, "", self._fused(inputs, final=tail == "final"))]
+
+    def _fused(self, inputs: Inputs, *, final: bool) -> m.FusedMap:
+        chains = inputs.submaps
         if not chains:
             return fused_message(
-                self._config, self._digest, NO_LANDMARKS, (), stamp_ns=0, final=final, frame=""
+                self._config,
+                self._config_digest,
+                NO_LANDMARKS,
+                (),
+                stamp_ns=0,
+                final=final,
+                frame="",
             )
-        joined = {stream: self._extended(stream, chains[stream], final) for stream in chains}
+        initial = {stream: self._believed(inputs.starts[stream]) for stream in chains}
+        joined = {s: self._extended(s, chains[s], initial[s], final) for s in chains}
         told = {s: x.state for s, x in joined.items() if x.state.fold.contributions}
-        first = min(told or chains, key=lambda s: (self._believed(s) is None, s))
+        first = min(told or chains, key=lambda s: (initial[s] is None, s))
         maps = {s: svd_joining.landmark_gaussian(state) for s, state in told.items()}
         with np.errstate(all="ignore"):
             fused, reasons = tied(first, maps, full=self._weighting == "full")
@@ -100,7 +121,7 @@ class SvdJoinRule(JoinRule):
         self.landmarks = len(fused.ids)
         return fused_message(
             self._config,
-            translate.digest_of(self._digest, *(joined[s].digest for s in sorted(joined))),
+            translate.digest_of(self._config_digest, *(joined[s].digest for s in sorted(joined))),
             fused,
             tuple(m.Member(*stream, joined[stream].count - 1) for stream in sorted(joined)),
             stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
@@ -109,26 +130,27 @@ class SvdJoinRule(JoinRule):
             reasons=(*reasons, *refused),
         )
 
-    def _believed(self, stream: Stream) -> Pose | None:
+    def _believed(self, told: m.Start) -> Pose | None:
         """The initial pose of a stream, if it is known and within the bounds."""
-        start = translate.start_of(self._starts[stream])
+        start = translate.start_of(told)
         if start is None or start_beyond(start, self._config.bounds) is not None:
             return None
         return start.pose
 
-    def _extended(self, stream: Stream, chain: Sequence[m.Submap], final: bool) -> _Joined:
+    def _extended(
+        self, stream: Stream, chain: Sequence[m.Submap], told: Pose | None, final: bool
+    ) -> _Joined:
         """The map of a stream's chain, from the longest one that was made before.
 
         Running maps have the solution that each submap has moved on; the final one is solved to the
         end, wrong minima looked for.
         """
-        told = self._believed(stream)
         begin = svd_joining.begun(
             {stream[0]: np.zeros(3) if told is None else told}, self._weighting
         )
         before = self._joined.get(stream)
         if before is None or before.count > len(chain):
-            before = _Joined(0, begin, self._digest)
+            before = _Joined(0, begin, self._config_digest)
         state, digest, refused = before.state, before.digest, before.refused
         for submap in chain[before.count :]:
             digest = translate.digest_of(digest, encoded(submap))

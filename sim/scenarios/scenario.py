@@ -24,7 +24,8 @@ from sim.scenarios.document import (
 )
 from sim.world.config import SimulatedWorld, UtiasWorld, World
 from team.config import Estimator, Exchange, FusionRule
-from team.pairs import PAIRS, named_pairs, rules_for
+from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
+from team.registry import absence
 
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
            "with_options"]  # fmt: skip
@@ -142,6 +143,13 @@ def _filled(scenario: Scenario) -> Scenario:
             f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}, "
             f"but {' or '.join(rules_for(scenario.estimator))}; valid: {named_pairs()}"
         )
+    for what, place in (
+        (f"the estimator {scenario.estimator}", ESTIMATORS[scenario.estimator]),
+        (f"the fusion rule {scenario.fusion}", RULES[scenario.fusion]),
+    ):
+        absent = absence(place, what)
+        if absent is not None:
+            raise ScenarioError(absent)
     if scenario.exchange == "rendezvous" and PAIRS[scenario.estimator, scenario.fusion] != "submap":
         raise ScenarioError(
             f"the rule {scenario.fusion} needs a continuous exchange: at a rendezvous submaps are "

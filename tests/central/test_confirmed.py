@@ -85,7 +85,7 @@ def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
 
 def test_running_maps_and_priors_have_the_same_landmarks() -> None:
     found = rule({("r1", 3)}, landmark_submaps=2)
-    out = found.advance(END_NS, END_NS)
+    out = found.broadcasts(END_NS, END_NS)
     (fused,) = of(out, ch.FUSED_MAP)
     shown = ids(fused.ids, "ids").tolist()
     assert shown

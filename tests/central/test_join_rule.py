@@ -64,7 +64,7 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
         for name in ("r1", "r2"):
             found.take_submap(SUBMAPS[name][k])
         now_ns = (k + 1) * 3_000_000_000
-        out = found.advance(now_ns, now_ns)
+        out = found.broadcasts(now_ns, now_ns)
         maps += of(out, ch.FUSED_MAP)
         priors += of(out, ch.PRIOR)
     assert [each.stamp_ns // 10**9 for each in maps] == [3, 9, 15]
@@ -104,13 +104,13 @@ def test_no_map_has_less_than_the_one_before_it():
     found, maps = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0)), []
     for k in range(5):
         found.take_submap(SUBMAPS["r1"][k])
-        maps += of(found.advance(0.0, SUBMAPS["r1"][k].stamp_ns), ch.FUSED_MAP)
+        maps += of(found.broadcasts(0.0, SUBMAPS["r1"][k].stamp_ns), ch.FUSED_MAP)
     assert [each.provisional for each in maps] == [True]
     ahead = {each.robot: each.sequence for each in maps[-1].members}
     for k in range(5):
         found.take_submap(SUBMAPS["r2"][k])
         end_ns = SUBMAPS["r2"][k].stamp_ns
-        maps += of(found.advance(end_ns, END_NS + end_ns), ch.FUSED_MAP)
+        maps += of(found.broadcasts(end_ns, END_NS + end_ns), ch.FUSED_MAP)
     assert ahead["r1"] > 0
     assert len(maps) > 3
     for before, after in pairwise(maps):
@@ -128,13 +128,13 @@ def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_on
     out = []
     for submap in SUBMAPS["r1"]:
         found.take_submap(submap)
-        out += of(found.advance(float("-inf"), submap.stamp_ns), ch.FUSED_MAP)
+        out += of(found.broadcasts(float("-inf"), submap.stamp_ns), ch.FUSED_MAP)
     assert not out, "not before three broadcasts would have been due"
     late_ns = SUBMAPS["r1"][0].stamp_ns + 18_000_000_000
-    (fused,) = of(found.advance(float("-inf"), late_ns), ch.FUSED_MAP)
+    (fused,) = of(found.broadcasts(float("-inf"), late_ns), ch.FUSED_MAP)
     assert fused.provisional
     assert fused.members == (m.Member("r1", 1, 4),)
-    assert found.advance(float("-inf"), late_ns + 1) == []
+    assert found.broadcasts(float("-inf"), late_ns + 1) == []
     assert encoded(final(_completed(found))) == encoded(final(whole())), "it leaves no trace"
 
 
@@ -145,7 +145,7 @@ def _completed(found):
 
 
 def test_nothing_is_broadcast_before_there_is_anything():
-    assert rule().advance(float("-inf"), 10**18) == []
+    assert rule().broadcasts(float("-inf"), 10**18) == []
 
 
 def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():

@@ -212,7 +212,7 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Joi
         else:
             rule.take_sighting(message)
         if k in watermarks:
-            out += rule.advance(1e9 * watermarks[k], round(1e9 * watermarks[k]))
+            out += rule.broadcasts(1e9 * watermarks[k], round(1e9 * watermarks[k]))
     out += rule.conclude(10**12)
     return rule, encoded(out[-1].message)
 

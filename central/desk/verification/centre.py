@@ -1,209 +1,98 @@
-"""The centre's messages again: each recorded map from the set that it names."""
+"""The centre's messages again: each recorded map from the inputs that it names.
 
-from collections.abc import Callable, Iterator, Mapping
+The rule is the centre's own, and so is its function of the inputs (`central.rule`): what a rule
+knew beyond them when it spoke (`unnamed`) is taken from the recorded map.
+"""
+
+from collections.abc import Iterator
 
 import msgspec
 
-from central.baselines.feedback_rule import FeedbackRule
-from central.baselines.map_rules import AloneRule, LatestRule
-from central.baselines.svd_rule import SvdJoinRule
-from central.config import CentralConfig
 from central.desk.verification.recorded import Identity, Recorded, Stream, identity
-from central.join_rule import JoinRule, Tail
-from central.roll import Roll
-from central.rule import rule_of
-from team.config import FusionRule
-from team.pairs import FEEDBACK
+from central.rule import FusionRule, Inputs, Tail, rule_of
+from team.pairs import CONSUMES, Channel
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Outgoing
 
 
 def retold_centre(log: Recorded) -> dict[Identity, m.Message]:
-    """What the sets that the recorded maps name give, under the names of these inputs."""
-    maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
+    """What the inputs that the recorded maps name give, under the names of these inputs."""
     finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
+    maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
     if not maps and not finals:
         return {}
     config, digest = log.central_config()
-    retell = _exchanged if config.fusion in FEEDBACK else _RETOLD[config.fusion]
-    found: dict[Identity, m.Message] = {}
+    announced = {n.removeprefix("robot/") for n in log.configured if n.startswith("robot/")}
+    rule = rule_of(config, digest, sorted(announced.union(log.robots)))
+    inputs = _LogInputs(log, CONSUMES[config.fusion])
     lost = finals[-1].lost if finals else ()
-    for out in retell(log, config, digest, [*maps, *finals]):
-        message = out.message
-        if lost and isinstance(message, m.FusedMap) and message.final:  # the set does not say it
-            message = msgspec.structs.replace(message, provisional=True, lost=lost)
-        found.setdefault(identity(out.key, message), message)
+    found: dict[Identity, m.Message] = {}
+    for fused in (*sorted(maps, key=lambda f: f.exchange), *finals):
+        named = inputs.of(fused)
+        for out in [] if named is None else rule.fuse(named, _tail(fused)):
+            message = _as_known(out.message, fused, rule)
+            if lost and isinstance(message, m.FusedMap) and message.final:  # no input says it
+                message = msgspec.structs.replace(message, provisional=True, lost=lost)
+            found.setdefault(identity(out.key, message), message)
     return found
-
-
-def _joined(
-    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
-) -> Iterator[Outgoing]:
-    """Each map from its own version vector; a set that grows keeps the fold that there is.
-
-    Which submaps lie behind a gap and how much it had heard is what the centre knew when it spoke:
-    it says so in the map. So it does of who was withdrawn: nobody is judged again by a part of the
-    set.
-    """
-    config = msgspec.structs.replace(config, withdraw_above=None)
-    starts = {s: r.get(0) for s, r in log.readings.items()}
-    submaps, sightings = log.submaps(), log.sightings()
-    rule = JoinRule(config, digest)
-    inside: dict[Stream, int] = {}
-    gone: set[str] = set()
-    for fused in maps:
-        vector = {(x.robot, x.epoch): x.sequence for x in fused.members}
-        if not _complete(vector, submaps):
-            continue
-        shrunk = any(vector.get(stream, -1) < sequence for stream, sequence in inside.items())
-        if shrunk or not gone <= set(fused.withdrawn):
-            rule, inside = JoinRule(config, digest), {}
-        gone = set(fused.withdrawn)
-        for robot in fused.withdrawn:
-            if robot in log.withdrawals:
-                rule.take_withdrawal(log.withdrawals[robot])
-        for stream, sequence in sorted(vector.items()):
-            start = starts.get(stream)
-            if isinstance(start, m.Start):
-                rule.take_start(start)
-            for k in range(inside.get(stream, -1) + 1, sequence + 1):
-                for sighting in sightings.get((*stream, k), ()):
-                    rule.take_sighting(sighting)
-                rule.take_submap(submaps[stream][k])
-        inside = vector
-        for out in rule.retold(_tail(fused)):
-            yield Outgoing(out.channel, out.name, _as_known(out.message, fused))
-
-
-def _as_known(message: m.Message, fused: m.FusedMap) -> m.Message:
-    """With what the centre knew of the rest of the set when it said `fused`."""
-    if isinstance(message, m.FusedMap):
-        return msgspec.structs.replace(message, missing=fused.missing, heard=fused.heard)
-    if isinstance(message, m.Prior):
-        return msgspec.structs.replace(message, heard=fused.heard)
-    return message
 
 
 def _tail(fused: m.FusedMap) -> Tail:
     return "final" if fused.final else "provisional" if fused.provisional else "closed"
 
 
-def _complete(
-    vector: Mapping[Stream, int], submaps: Mapping[Stream, Mapping[int, m.Submap]]
-) -> bool:
-    return all(
-        k in submaps.get(stream, {}) for stream, last in vector.items() for k in range(last + 1)
-    )
+def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule) -> m.Message:
+    """With what the centre knew beyond the inputs when it said `fused`."""
+    if isinstance(message, m.FusedMap | m.Prior):
+        fields = set(rule.unnamed) & set(message.__struct_fields__)
+        return msgspec.structs.replace(message, **{name: getattr(fused, name) for name in fields})
+    return message
 
 
-def _exchanged(
-    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
-) -> Iterator[Outgoing]:
-    """Each round from the maps that it names; the rounds follow one another."""
-    own = {
-        (x.exchange, x.robot, x.epoch, x.sequence): x
-        for x in log.of(ch.OWN_MAP)
-        if isinstance(x, m.MapEstimate)
-    }
-    rule = FeedbackRule(config, digest)
-    for fused in sorted(maps, key=lambda f: (f.final, f.exchange)):
-        if fused.final:
-            yield from rule.conclude(fused.stamp_ns)
-            continue
-        for member in fused.members:
-            named = (fused.exchange, member.robot, member.epoch, member.sequence)
-            if named in own:
-                rule.take_map(own[named])
-        yield from rule.advance(lambda _robot, _round: False, [])
+class _LogInputs:
+    """The inputs that a map names, out of a log."""
 
+    def __init__(self, log: Recorded, consumed: Channel) -> None:
+        self._log, self._consumed = log, consumed
+        self._submaps, self._sightings = log.submaps(), log.sightings()
+        starts = {stream: readings.get(0) for stream, readings in log.readings.items()}
+        self._starts = {s: start for s, start in starts.items() if isinstance(start, m.Start)}
+        own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
+        self._maps = {(x.robot, x.epoch, x.sequence, x.exchange): x for x in own}
 
-def _latest(
-    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
-) -> Iterator[Outgoing]:
-    """Each map from the own maps that it names; who has no place was known when it was said."""
-    own = _own_maps(log)
-    for fused in maps:
-        rule = LatestRule(config, digest)
-        for out in rule.retold(_named(own, fused), final=fused.final):
-            yield _with_reasons(out, fused)
-
-
-def _alone(
-    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
-) -> Iterator[Outgoing]:
-    """The final map from the own maps that it names."""
-    own = _own_maps(log)
-    for fused in maps:
-        rule = AloneRule(config, digest, log.robots)
-        yield from rule.retold(_named(own, fused), fused.stamp_ns)
-
-
-def _tied(
-    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
-) -> Iterator[Outgoing]:
-    """Each map from the submaps of its own version vector."""
-    submaps = log.submaps()
-    rule = SvdJoinRule(config, digest)
-    for readings in log.readings.values():
-        start = readings.get(0)
-        if isinstance(start, m.Start):
-            rule.take_start(start)
-    for fused in maps:
+    def of(self, fused: m.FusedMap) -> Inputs | None:
+        """None where the log lacks a submap of the map's version vector."""
         vector = {(x.robot, x.epoch): x.sequence for x in fused.members}
-        if _complete(vector, submaps):
-            chains = {s: [submaps[s][k] for k in range(n + 1)] for s, n in vector.items()}
-            channel = ch.FINAL_MAP if fused.final else ch.FUSED_MAP
-            yield Outgoing(channel, "", rule.retold_map(chains, final=fused.final))
+        if self._consumed == "readings":
+            return Inputs(starts=self._starts, heard=tuple(self._heard()))
+        if self._consumed == "own/map":
+            named = ((*stream, k, fused.exchange) for stream, k in vector.items())
+            maps = [self._maps[name] for name in named if name in self._maps]
+            return Inputs(maps=maps, exchange=fused.exchange, stamp_ns=fused.stamp_ns)
+        chains: dict[Stream, list[m.Submap]] = {}
+        for stream, last in vector.items():
+            found = self._submaps.get(stream, {})
+            if not all(k in found for k in range(last + 1)):
+                return None
+            chains[stream] = [found[k] for k in range(last + 1)]
+        orders = self._log.withdrawals
+        return Inputs(
+            starts=self._starts,
+            submaps=chains,
+            sightings=self._sightings,
+            withdrawals={r: orders[r] for r in fused.withdrawn if r in orders},
+            stamp_ns=fused.stamp_ns,
+        )
 
-
-def _heard(
-    log: Recorded, config: CentralConfig, digest: bytes, maps: list[m.FusedMap]
-) -> Iterator[Outgoing]:
-    """Everything again from the raw readings and what the robots announced."""
-    nodes = sorted(node for node in log.configured if node.startswith("robot/"))
-    robots = [node.removeprefix("robot/") for node in nodes]
-    rule, roll = rule_of(config, digest, robots), Roll.of(robots)
-    ends = [m.StreamEnd(*stream, count) for stream, count in log.published.items()]
-    streams = (log.readings[stream] for stream in sorted(log.readings))
-    for message in (
-        *(log.configured[node] for node in nodes),
-        *(stream[counter] for stream in streams for counter in sorted(stream)),
-        *([m.End(0, tuple(ends))] if ends else []),
-    ):
-        rule.take(message, 0)
-    yield from rule.advance(roll)
-    if ends:
-        yield from rule.conclude(0)
-
-
-Named = tuple[str, int, int]
-"""(robot, epoch, sequence)."""
-
-
-def _own_maps(log: Recorded) -> dict[Named, m.MapEstimate]:
-    said = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
-    return {(x.robot, x.epoch, x.sequence): x for x in said}
-
-
-def _named(own: Mapping[Named, m.MapEstimate], fused: m.FusedMap) -> list[m.MapEstimate]:
-    names = [(x.robot, x.epoch, x.sequence) for x in fused.members]
-    return [own[name] for name in names if name in own]
-
-
-def _with_reasons(out: Outgoing, fused: m.FusedMap) -> Outgoing:
-    again = out.message
-    assert isinstance(again, m.FusedMap)
-    return Outgoing(out.channel, out.name, msgspec.structs.replace(again, reasons=fused.reasons))
-
-
-Retell = Callable[[Recorded, CentralConfig, bytes, list[m.FusedMap]], Iterator[Outgoing]]
-_RETOLD: Mapping[FusionRule, Retell] = {
-    "join": _joined,
-    "latest": _latest,
-    "alone": _alone,
-    "svd-join": _tied,
-    "svd-join-spherical": _tied,
-    "joint-fastslam": _heard,
-    "batch": _heard,
-}
+    def _heard(self) -> Iterator[m.Message]:
+        """The robots' models, every measurement by stream and counter, the end of the streams."""
+        log = self._log
+        for node in sorted(log.configured):
+            if node.startswith("robot/"):
+                yield log.configured[node]
+        for stream in sorted(log.readings):
+            readings = log.readings[stream]
+            yield from (readings[counter] for counter in sorted(readings))
+        ends = tuple(m.StreamEnd(*stream, count) for stream, count in log.published.items())
+        if ends:
+            yield m.End(0, ends)
