@@ -6,12 +6,14 @@
 ARG BASE=python:3.11-slim
 FROM ${BASE} AS build
 WORKDIR /src
-COPY pyproject.toml README.md LICENSE constraints.txt ./
+COPY pyproject.toml README.md LICENSE hashes-run.txt ./
 COPY team team
 COPY central central
 COPY sim sim
-RUN pip install --no-cache-dir --constraint constraints.txt pip \
- && PIP_BUILD_CONSTRAINT=/src/constraints.txt pip wheel --no-cache-dir --no-deps --wheel-dir /dist .
+# What is installed is known by its hash beforehand, what builds the wheel too.
+RUN sed -n '/^\(pip\|setuptools\)==/,/[^\\]$/p' hashes-run.txt > build.txt \
+ && pip install --no-cache-dir --require-hashes --no-deps --requirement build.txt \
+ && pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /dist .
 
 FROM ${BASE}
 # Kernels are compiled for the processor that they run on, so the cache is filled at the first start
@@ -19,8 +21,9 @@ FROM ${BASE}
 RUN useradd --system --uid 10001 --no-create-home teamslam \
  && install --directory --owner teamslam /logs /var/cache/teamslam
 RUN --mount=type=bind,from=build,source=/dist,target=/dist \
-    --mount=type=bind,source=constraints.txt,target=/constraints.txt \
-    pip install --no-cache-dir --constraint /constraints.txt /dist/*.whl
+    --mount=type=bind,source=hashes-run.txt,target=/hashes-run.txt \
+    pip install --no-cache-dir --require-hashes --no-deps --requirement /hashes-run.txt \
+ && pip install --no-cache-dir --no-deps /dist/*.whl
 ENV PYTHONUNBUFFERED=1 \
     OPENBLAS_NUM_THREADS=1 \
     OMP_NUM_THREADS=1 \

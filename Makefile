@@ -5,20 +5,27 @@
 #   make check      format, lint, strict types, the direction of imports
 #   make docs       the documentation site, docs/_build/site/index.html, and the pictures of its gallery
 #   make setup      what all of these need
-#   make constraints    writes constraints.txt anew from what .venv holds
+#   make constraints    writes constraints.txt and the hashes anew from what .venv holds
 #   make clean      removes what any of these made
 
 VENV := .venv
 BIN := $(VENV)/bin
 # The build of an editable install warns of folders named like its packages: here they are them.
-PIP := PYTHONWARNINGS=ignore PIP_BUILD_CONSTRAINT=constraints.txt \
-  $(BIN)/python -m pip --disable-pip-version-check --quiet
+OWN := PYTHONWARNINGS=ignore $(BIN)/python -m pip --disable-pip-version-check --quiet
+PIP := PIP_BUILD_CONSTRAINT=constraints.txt $(OWN)
+# Every distribution comes with a hash that is known beforehand; what a platform needs beyond the list
+# (none on Linux) is pinned by nothing and still installed by the step after it.
+LISTED := install --require-hashes --no-deps --requirement
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 # One BLAS thread per process: same bits everywhere, and robots do not take each other's cores.
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
+
+# All hashes of each version: of every platform's wheel and of the sources.
+HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
+  --no-annotate --no-header
 
 .DEFAULT_GOAL := run
 .NOTPARALLEL:
@@ -59,6 +66,10 @@ constraints: $(VENV)/.dev
 	@echo '# Made by `make constraints`: every distribution that a run, a test or a check takes.' > $@.new
 	$(BIN)/pip freeze --all --exclude-editable >> $@.new
 	mv $@.new $@.txt
+	$(BIN)/python -m venv $(VENV)/uv
+	$(VENV)/uv/bin/python -m pip install --quiet uv
+	$(HASHED) --no-deps constraints.txt --output-file hashes.txt
+	echo setuptools pip | tr ' ' '\n' | $(HASHED) --constraint constraints.txt pyproject.toml - --output-file hashes-run.txt
 
 clean:
 	rm -rf $(VENV) build dist runs docs/_build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
@@ -78,13 +89,16 @@ $(VENV)/.python:
 	fi; \
 	echo "Setting up $(VENV) with $$("$$found" --version)"; \
 	"$$found" -m venv --clear $(VENV)
-	$(PIP) install --constraint constraints.txt pip
+	sed -n '/^pip==/,/[^\\]$$/p' hashes-run.txt > $(VENV)/pip.txt
+	$(PIP) $(LISTED) $(VENV)/pip.txt
 	touch $@
 
-$(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/.python
-	$(PIP) install --constraint constraints.txt --editable .
+$(VENV)/.runtime: pyproject.toml constraints.txt hashes-run.txt | $(VENV)/.python
+	$(PIP) $(LISTED) hashes-run.txt
+	$(OWN) install --constraint constraints.txt --no-build-isolation --editable .
 	touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/.python
-	$(PIP) install --constraint constraints.txt --editable '.[dev]'
+$(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python
+	$(PIP) $(LISTED) hashes.txt
+	$(OWN) install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
 	touch $(VENV)/.runtime $@

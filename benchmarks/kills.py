@@ -2,11 +2,15 @@
 
     python benchmarks/kills.py --runs 20 --kills 3 --load 4
     python benchmarks/kills.py --runs 10 --stop 20 --what central,router
+    python benchmarks/kills.py --runs 6 --kills 1 --stop inf --end-silent 12
+    python benchmarks/kills.py --runs 10 --keys --verify
 
-Each run is a short world. The final map is compared, byte by byte, with that of the same team in
-memory, where nobody dies, and the log's content with the streams' own last counts. A row per run, a
-summary, and with --json everything for machines. Ends with 1 unless every run ended with 0, with
-this map, left no process, and no hole in its log that `teamslam log check` does not name.
+Each run is a short world; with --keys behind certificates. Who is stopped for ever stays so until
+`launch --end-silent` ends it. The final map is compared, byte by byte, with that of the same team
+in memory, where nobody dies, the log's content with the streams' own last counts; with --verify
+each log is computed again. A row per run, a summary, and with --json everything for machines. Ends
+with 1 unless every run ended with 0, with this map, left no process, and no hole in its log that
+`teamslam log check` does not name.
 """
 
 import argparse
@@ -25,6 +29,8 @@ from pathlib import Path
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import load
 from sim.scenarios.source import streams_of
+from team.keys.authority import make_keys
+from team.keys.roster import nodes_of
 from team.recording.reader import LogError, open_log
 from team.wire import messages as m
 from team.wire.bus import opened
@@ -47,6 +53,7 @@ class Run:
     equal: bool = False
     left: int = 0
     check: str = ""
+    verified: bool | None = None
     lacks: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
@@ -55,7 +62,8 @@ class Run:
     def good(self) -> bool:
         """As if nothing had happened."""
         unnamed = bool(self.lacks) and not self.check
-        return self.exit == 0 and self.equal and not self.left and not unnamed
+        sound = self.verified is not False
+        return self.exit == 0 and self.equal and not self.left and not unnamed and sound
 
 
 def children(launch: int, folder: Path) -> dict[int, list[str]]:
@@ -114,11 +122,14 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
     run = Run(number)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
+        more = ["--keys", str(options.keys_made)] if options.keys else []
+        if options.end_silent:
+            more += ["--end-silent", str(options.end_silent)]
         began = time.monotonic()
         with (folder / "said").open("wb") as said:
             launch = subprocess.Popen(
                 [*PROGRAM, "launch", scenario, "--speed", options.speed, "--no-report",
-                 "--output", "run", "--json", "result.json"],
+                 "--output", "run", "--json", "result.json", *more],
                 cwd=folder, stdout=said, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
             )  # fmt: skip
         await_start(folder, launch)
@@ -161,6 +172,13 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             cwd=folder, capture_output=True, text=True, check=False,
         )  # fmt: skip
         run.lacks = lacking(folder)
+        if options.verify:
+            again = subprocess.run(
+                [*PROGRAM, "rerun", "run/log.mcap", "--verify"],
+                cwd=folder, capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            run.verified = again.returncode == 0
+            (folder / "verified").write_text(again.stdout + again.stderr)
         run.check = "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
         if not run.good and options.keep:
             keep = Path(options.keep) / f"run{number}"
@@ -195,7 +213,7 @@ def hit(
     with suppress(ProcessLookupError):
         if options.stop:
             os.kill(pid, signal.SIGSTOP)
-            awake.append((time.monotonic() + options.stop, pid))
+            awake.append((time.monotonic() + options.stop, pid))  # at infinity: never
         else:
             os.kill(pid, signal.SIGKILL)
         robots = [word for word in there[pid] if word in ("r1", "r2", "r3")]
@@ -209,6 +227,9 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=3, help="in each run")
     parser.add_argument("--span", type=float, default=10.0, help="seconds in which they fall")
     parser.add_argument("--stop", type=float, default=0.0, help="stop for so long, do not kill")
+    parser.add_argument("--end-silent", type=float, help="launch ends who is silent so long [s]")
+    parser.add_argument("--keys", action="store_true", help="behind certificates")
+    parser.add_argument("--verify", action="store_true", help="compute each log again")
     parser.add_argument("--what", default="robot,central,router,record,world,viewer")
     parser.add_argument("--load", type=int, default=0, help="busy loops beside the team")
     parser.add_argument("--steps", type=int, default=60)
@@ -223,6 +244,9 @@ def main() -> int:
         scenario = Path(name) / "short.toml"
         scenario.write_text(f'base = "thesis"\n[world]\nsteps = {options.steps}\n')
         resolved = load(scenario)
+        options.keys_made = Path(name) / "keys"
+        if options.keys:
+            make_keys(options.keys_made, resolved.team, nodes_of([r.id for r in resolved.robots]))
         samples = run_team(resolved, streams_of(resolved))
         (expected,) = [s.payload for s in samples if s.key == FINAL_MAP.key()]
         busy = [
@@ -247,7 +271,8 @@ def main() -> int:
         f"map equal in {sum(r.equal for r in runs)}, exit 0 in {sum(r.exit == 0 for r in runs)}, "
         f"no process left in {sum(not r.left for r in runs)}, "
         f"log whole in {sum(not r.lacks for r in runs)}, with an unnamed hole in "
-        f"{sum(bool(r.lacks) and not r.check for r in runs)}"
+        f"{sum(bool(r.lacks) and not r.check for r in runs)}, "
+        f"verified {sum(r.verified is True for r in runs)}; load {os.getloadavg()[0]:.0f}"
     )
     if options.json:
         options.json.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
@@ -263,6 +288,7 @@ def row(run: Run) -> str:
         "map equal" if run.equal else "MAP DIFFERS",
         f"hit {what or 'nobody'}",
         *([f"{run.left} LEFT"] if run.left else []),
+        *(["NOT VERIFIED"] if run.verified is False else []),
         *([f"log lacks {', '.join(run.lacks)}"] if run.lacks else []),
         *([f"check: {run.check.splitlines()[0][:120]}"] if run.check else []),
         *([f"failures: {run.failures[0][:160]!r}"] if run.failures else []),

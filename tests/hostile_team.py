@@ -4,23 +4,32 @@ Everything is drawn from a NumPy generator, so that a seed names a session.
 """
 
 from collections.abc import Iterator, Sequence
+from random import Random
 
+import msgspec
 import numpy as np
 
 from central.config import CentralConfig
 from central.node import CentralNode
 from team.config import RobotConfig
 from team.robot.node import RobotNode
+from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing
 from team.wire.codec import WireError, decoded, encoded
+from tests.support import examples
 
 S = 1_000_000_000
 CONFIG = bytes(8)
 SCALES = (0.0, 1e-300, 1e-12, 1e-6, 1e-3, 1.0, 1.0, 1.0, 30.0, 1e3, 1e6, 1e9, 1e15, 1e200)
 SIGMAS = (1e-150, 1e-30, 1e-9, 1e-6, 1e-3, 0.1, 0.1, 0.1, 1.0, 30.0, 1e3, 1e6, 1e12, 1e140)
 ROBOTS = ("r1", "r2", "r3")
+PAIR = ("r1", "r2")
+"""The robots of the scenario that real processes run."""
+OF_THE_RUN = (m.FusedMap, m.End, m.Done, m.Withdrawal, m.WithdrawalHeard, m.GivenUp)
+"""What only keys can keep a stranger from: he ends the run, or makes it wait."""
+SKIPPED = (*ch.QUERIES, ch.VIEW, ch.ALIVE)
 
 
 def valid(message: m.Message) -> m.Message | None:
@@ -234,3 +243,66 @@ def robot_session(
     for each in [*out, Outgoing(out[0].channel, "", node.status())]:
         decoded(encoded(each.message), type(each.message))
     return node, out
+
+
+def payloads(rng: Random) -> Iterator[tuple[ch.Channel, str, bytes]]:
+    """Sound messages of every kind, and what hostile teams send, each on its channel."""
+    of_type: dict[type, list[ch.Channel]] = {}
+    for channel in ch.CHANNELS:
+        if channel not in SKIPPED:
+            of_type.setdefault(channel.message, []).append(channel)
+    while True:
+        numbers = np.random.default_rng(rng.getrandbits(32))
+        team = Team(numbers)
+        for _ in range(20):
+            team.grow()
+        robot = rng.choice(PAIR)
+        said = [*team.messages, *team.ends(), *hostile_stream(numbers, robot, 60)]
+        said += [found for _ in range(10) if (found := valid(prior(numbers, robot)))]
+        said += [elsewhere(rng, each) for each in examples()]
+        for message in said:
+            for channel in of_type.get(type(message), ()):
+                name = getattr(message, "robot", getattr(message, "node", robot)) or robot
+                named = "{" in channel.template
+                yield channel, name if named else "", encoded(message)
+
+
+def elsewhere(rng: Random, message: m.Message) -> m.Message:
+    """An example as one of the team's, with other numbers where it stays valid."""
+    changes: dict[str, object] = {}
+    for name in message.__struct_fields__:
+        value = getattr(message, name)
+        if name == "robot" and isinstance(value, str):
+            changes[name] = rng.choice(PAIR)
+        elif isinstance(value, int) and not isinstance(value, bool) and rng.random() < 0.3:
+            changes[name] = rng.choice([0, 1, 2, 7, 2**31, 2**53, 2**62, -1])
+        elif isinstance(value, float) and rng.random() < 0.3:
+            changes[name] = rng.choice([0.0, 1e-300, 1.0, -1.0, 1e9, 1e300])
+    try:
+        changed = msgspec.structs.replace(message, **changes)
+        return valid(changed) or message
+    except (ValueError, TypeError):
+        return message
+
+
+def mutated(rng: Random, payload: bytes) -> bytes:
+    """Bytes flipped, cut, doubled, or put in from elsewhere."""
+    data = bytearray(payload)
+    for _ in range(rng.choice([1, 1, 1, 2, 5, 20])):
+        if not data:
+            break
+        at = rng.randrange(len(data))
+        match rng.randrange(6):
+            case 0:
+                data[at] ^= 1 << rng.randrange(8)
+            case 1:
+                data[at] = rng.choice([0, 0x7F, 0x80, 0xC0, 0xC1, 0xCF, 0xDD, 0xDF, 0xFF])
+            case 2:
+                del data[at:]
+            case 3:
+                del data[at : at + rng.randrange(1, 9)]
+            case 4:
+                data[at:at] = rng.randbytes(rng.randrange(1, 9))
+            case _:
+                data[at : at + 8] = rng.choice([b"\0" * 8, b"\xff" * 8, b"\0\0\0\0\0\0\xf8\x7f"])
+    return bytes(data)

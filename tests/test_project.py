@@ -198,6 +198,26 @@ def test_the_citation_is_sound_and_tells_of_this_version() -> None:
     assert cited["authors"] == PROJECT["authors"]
 
 
+def test_every_pinned_distribution_has_its_hashes() -> None:
+    """`make setup` and the image install what they know the hash of, and nothing else."""
+    pin = re.compile(
+        r"^([\w.-]+==[\w.]+)(?: ;.*)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.M
+    )
+
+    def pins(name: str) -> set[str]:
+        text = (ROOT / name).read_text()
+        assert pin.sub("", text) == "", f"{name}: a line that is no pin with hashes"
+        names = (found[1].split("==") for found in pin.finditer(text))
+        return {f"{canonicalize_name(project)}=={version}" for project, version in names}
+
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    parts = (line.split("==") for line in lines if not line.startswith("#"))
+    wanted = {f"{canonicalize_name(project)}=={version}" for project, version in parts}
+    assert pins("hashes.txt") == wanted
+    runtime = {each.partition("==")[0] for each in pins("hashes-run.txt") & wanted}
+    assert {"pip", "setuptools", *closure("teamslam")} - {"teamslam"} <= runtime
+
+
 def test_no_path_of_a_machine_is_committed() -> None:
     machine = re.compile(
         rf"(?<![\w.}}])/(?:{'|'.join(['work', 'root', 'farm', 'home', 'Users'])})/"
