@@ -88,15 +88,16 @@ def lacking(folder: Path) -> list[str]:
             with suppress(WireError):
                 message = opened(sample)[2]
                 match message:
-                    case m.Reading():
-                        stream = ("readings", message.robot, message.epoch)
-                        counted.setdefault(stream, set()).add(message.reading)
+                    case m.Measurement():
+                        stream = ("measurements", message.robot, message.epoch)
+                        counted.setdefault(stream, set()).add(message.number)
                     case m.Submap():
                         stream = ("submaps", message.robot, message.epoch)
                         counted.setdefault(stream, set()).add(message.sequence)
                     case m.End():
                         said |= {
-                            ("readings", s.robot, s.epoch): s.readings for s in message.streams
+                            ("measurements", s.robot, s.epoch): s.measurements
+                            for s in message.streams
                         }
                     case m.Done():
                         said["submaps", message.robot, message.epoch] = message.submaps

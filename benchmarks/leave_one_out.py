@@ -14,7 +14,7 @@ import msgspec
 
 from sim.calibration.calibrate import calibrated
 from sim.calibration.scenario import scenario_toml
-from sim.calibration.source import readings_of
+from sim.calibration.source import measurements_of
 from sim.scenarios.scenario import load
 from sim.studies.experiments.accuracy_utias import set_figures
 from sim.studies.experiments.team_runs import Figures, team_run
@@ -24,7 +24,7 @@ SHOWN = ("aligned", "shape_nees", "coverage", "raw", "nees", "trajectory_raw")
 
 def left_out(path: Path, others: list[Path], folder: Path) -> Figures:
     """The figures of a set under the models learnt from the others."""
-    read = [(other.name, *readings_of(other)) for other in others]
+    read = [(other.name, *measurements_of(other)) for other in others]
     worlds = [(name, world) for name, world, _ in read]
     start = read[0][2]
     found = calibrated(worlds, start, lambda said: print(f"  {said}", file=sys.stderr))

@@ -38,7 +38,9 @@ _COMMAND = [sys.executable, "-m", "sim"]
 
 
 def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds: float) -> None:
-    """A publisher's process: each robot's readings at its time; prints what it published by key."""
+    """A publisher's process: each robot's measurements at its time; prints what it published by
+    key.
+    """
     rng = np.random.default_rng(0)
     period_ns = round(1e9 / hz)
     counts: dict[str, int] = {}
@@ -145,10 +147,10 @@ def _figures(log: Path, said: list[dict[str, Any]], cpu: float, memory: float) -
     }
     took_s = max(each["took_s"] for each in said)
     total, size = sum(published.values()), sum(c.bytes for c in counts.values())
-    readings = set(published)
+    measurements = set(published)
     return {
         "published": total,
-        "recorded": sum(counts[key].messages for key in readings if key in counts),
+        "recorded": sum(counts[key].messages for key in measurements if key in counts),
         "lost": lost,
         "findings": [str(f) for f in checked(opened)],
         "messages_per_s": total / took_s,

@@ -2,9 +2,9 @@
 
     python benchmarks/rerun_rate.py LOG … [--json FILE]
 
-For each log: `rerun --verify` in readings per second and as a multiple of real time, and the rate
-at which the mcap library alone reads the same file's messages (one core each, file in the cache).
-Exit status 1 if anything differs or if five robots are computed slower than 20 × real time.
+For each log: `rerun --verify` in measurements per second and as a multiple of real time, and the
+rate at which the mcap library alone reads the same file's messages (one core each, file in the
+cache). Exit status 1 if anything differs or if five robots are computed slower than 20 × real time.
 """
 
 import argparse
@@ -33,22 +33,22 @@ def plain(path: Path) -> tuple[int, float]:
 
 def figures(path: Path) -> dict[str, Any]:
     """Of one log; CPU time of this process, which is that of one core."""
-    messages, reading_s = plain(path)
+    messages, measurement_s = plain(path)
     began = time.process_time()
     result = verify(open_log(path))
     rerun_s = time.process_time() - began
     return {
         "log": path.name,
         "team_time_s": result.span_s,
-        "readings": result.readings,
+        "measurements": result.measurements,
         "verified": result.messages,
         "equal": result.first is None,
         "rerun_cpu_s": rerun_s,
         "times_real_time": result.span_s / rerun_s,
-        "readings_per_s": result.readings / rerun_s,
+        "measurements_per_s": result.measurements / rerun_s,
         "plain_messages": messages,
-        "plain_messages_per_s": messages / reading_s,
-        "share_of_plain": (result.readings / rerun_s) / (messages / reading_s),
+        "plain_messages_per_s": messages / measurement_s,
+        "share_of_plain": (result.measurements / rerun_s) / (messages / measurement_s),
     }
 
 

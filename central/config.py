@@ -35,15 +35,15 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     fusion: `join` keeps a set of submaps and joins them by least squares; `team.pairs` says what
     the others consume. Under rules with feedback the robots absorb the map again: their covariance
-    counts readings more than once, save that of `covariance-intersection`.
+    counts measurements more than once, save that of `covariance-intersection`.
     tick_s: the fold takes the submaps of this much team time at once.
     broadcast_s: at least this much team time lies between two broadcasts of the fused map.
     robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2)
-    of each reading (a range and a bearing); absent: plain squares.
+    of each measurement (a range and a bearing); absent: plain squares.
     landmark_submaps: a landmark enters the map once so many submaps have it and are believed; above
-    1 where readings may have nothing to do with what is there.
+    1 where measurements may have nothing to do with what is there.
     covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors
-    are independent from reading to reading.
+    are independent from measurement to measurement.
     normal_scale: what the covariance scale of the monitor is where the covariances are right. 1
     where the errors of windows are independent; less where part of them lasts for longer than a
     window, since what two windows have in common does not set them apart.

@@ -18,7 +18,7 @@ from team.wire.patience import Patience
 LOST_S = 3.0
 """A robot whose token went for so long holds up no broadcast; the final map still waits for it."""
 GAP_PATIENCE_S = 0.5
-"""A reading that is missing for so long is asked for at its source."""
+"""A measurement that is missing for so long is asked for at its source."""
 ASK_TIMEOUT_S = 10.0
 FAREWELL_S = 10.0
 """The centre leaves after the others, at most this long after its final map."""
@@ -138,7 +138,9 @@ class CentralShell:
         return tuple(said)
 
     def _mend(self) -> None:
-        """Ask for readings that have been missing for GAP_PATIENCE_S (rules on raw readings)."""
+        """Ask for measurements that have been missing for GAP_PATIENCE_S (rules on raw
+        measurements).
+        """
         wanted, now = self.node.wanted(), time.monotonic()
         if not wanted:
             self._gap_since = None
@@ -166,15 +168,15 @@ class CentralShell:
             )
             self._bus.request(ch.SENT, stream[0], wanted[stream])
 
-    def _ask(self, wanted: m.ReadingsWanted) -> None:
-        named = f"readings {wanted.first} to {wanted.last} of {wanted.robot}"
+    def _ask(self, wanted: m.MeasurementsRequest) -> None:
+        named = f"measurements {wanted.first} to {wanted.last} of {wanted.robot}"
         _LOG.warning("%s are missing: asked for", named)
         try:
-            replies = self._bus.ask(ch.READINGS, wanted.robot, wanted, ASK_TIMEOUT_S)
+            replies = self._bus.ask(ch.MEASUREMENTS, wanted.robot, wanted, ASK_TIMEOUT_S)
         except BusError as error:
             _LOG.warning("%s", error)
             return
-        self._shell.take_replies(ch.READINGS, wanted.robot, replies, m.Reading)
+        self._shell.take_replies(ch.MEASUREMENTS, wanted.robot, replies, m.Measurement)
 
     def _leave_last(self) -> None:
         """Robots and world leave at the final map; whoever missed it may still ask for it."""

@@ -1,6 +1,6 @@
 """The centre's node: messages in, messages out; no I/O, no clock.
 
-It listens to what its rule consumes (submaps, own maps or raw readings), to progress and
+It listens to what its rule consumes (submaps, own maps or raw measurements), to progress and
 liveliness, and to nothing that holds the fused map.
 """
 
@@ -140,8 +140,8 @@ class CentralNode:
         self.final = final
         return [*out[:-1], Outgoing(ch.FINAL_MAP, "", final)]
 
-    def wanted(self) -> list[m.ReadingsWanted]:
-        """The readings that are missing and must be asked for at their source."""
+    def wanted(self) -> list[m.MeasurementsRequest]:
+        """The measurements that are missing and must be asked for at their source."""
         return [] if self.finished else self._rule.wanted(self._roll.now_ns)
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:

@@ -83,15 +83,18 @@ class Roll:
 
     def contradicts(self, end: m.End) -> str | None:
         """Why this can not be the end of the team's streams, in words."""
-        ends = {(s.robot, s.epoch): s.readings for s in end.streams}
+        ends = {(s.robot, s.epoch): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
             return f"an end that does not know of {', '.join(silent)}"
         for name, robot in self.robots.items():
             said = robot.progress
             last = None if said is None else ends.get((name, said.epoch))
-            if said is not None and last is not None and last < said.readings:
-                return f"ends with reading {last} of {name}, which has consumed {said.readings}"
+            if said is not None and last is not None and last < said.measurements:
+                return (
+                    f"ends with measurement {last} of {name}, which has consumed "
+                    f"{said.measurements}"
+                )
         return None
 
     def settled(self, name: str, dealt: Dealt) -> bool:

@@ -124,7 +124,7 @@ class FusionRule(ABC):
         """What robots say that they have sent, and what is not here."""
         return []
 
-    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
+    def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
         """Measurements that are missing and must be asked for at their source."""
         return []
 

@@ -1,8 +1,8 @@
 """The set of submaps: a union, so duplicates and any order of arrival change nothing.
 
 A submap is complete when the sightings from it, of which it says how many there are, are here too.
-Admission is the ledger's gate: a submap whose readings overlap another's, or that says something
-else under a name that is taken, is refused with its reason.
+Admission is the ledger's gate: a submap whose measurements overlap another's, or that says
+something else under a name that is taken, is refused with its reason.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,9 @@ Stream = tuple[str, int]
 class SubmapSet:
     """Submaps by stream and sequence, as they came; sightings by stream, sequence, what and when.
 
-    used: the sighting that each reading of a stream went into, by (reading, teammate). chains: of
-    each stream, as far as `chain` has found it; what is in a set stays there, so it only grows.
+    used: the sighting that each measurement of a stream went into, by (measurement, teammate).
+    chains: of each stream, as far as `chain` has found it; what is in a set stays there, so it only
+    grows.
     """
 
     streams: dict[Stream, dict[int, Submap]] = field(default_factory=dict)
@@ -32,7 +33,7 @@ class SubmapSet:
     def admit(self, submap: Submap) -> str | None:
         """Take a submap; the reason if it is refused. One that is in the set already is accepted.
 
-        The nearest ones in sequence bound the readings: law 1 says that each is used once.
+        The nearest ones in sequence bound the measurements: law 1 says that each is used once.
         """
         stream = self.streams.setdefault((submap.robot, submap.epoch), {})
         name = f"submap {submap.sequence} of {submap.robot}, epoch {submap.epoch}"
@@ -44,13 +45,15 @@ class SubmapSet:
                 continue
             other = stream[sequence]
             first, second = sorted((submap, other), key=lambda s: s.sequence)
-            if second.first_reading <= first.last_reading:
+            if second.first_measurement <= first.last_measurement:
                 return (
-                    f"{name} uses readings {submap.first_reading}-{submap.last_reading}, which "
-                    f"overlap submap {sequence}'s {other.first_reading}-{other.last_reading}"
+                    f"{name} uses measurements "
+                    f"{submap.first_measurement}-{submap.last_measurement}, which "
+                    f"overlap submap {sequence}'s "
+                    f"{other.first_measurement}-{other.last_measurement}"
                 )
             adjacent = second.sequence == first.sequence + 1
-            ends, begins = first.last_reading + 1, second.first_reading
+            ends, begins = first.last_measurement + 1, second.first_measurement
             continues = (ends, first.stamp_ns) == (begins, second.start_ns)
             if not (continues if adjacent else first.stamp_ns <= second.start_ns):
                 return f"{name} does not continue submap {sequence}"
@@ -69,11 +72,11 @@ class SubmapSet:
         if submap is not None and len(from_submap) >= submap.sightings:
             return f"{name} is one more than submap {sighting.sequence} has"
         used = self.used.setdefault(stream, {})
-        twice = next((n for n in sighting.readings if (n, teammate) in used), None)
+        twice = next((n for n in sighting.measurements if (n, teammate) in used), None)
         if twice is not None:
-            return f"{name} uses reading {twice}, which another one has used"
+            return f"{name} uses measurement {twice}, which another one has used"
         from_submap[sighting.stamp_ns, teammate] = sighting
-        used |= {(reading, teammate): sighting for reading in sighting.readings}
+        used |= {(measurement, teammate): sighting for measurement in sighting.measurements}
         return None
 
     def sightings(self, submap: Submap) -> list[SightingFactor]:

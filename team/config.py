@@ -125,16 +125,16 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A range-bearing sensor: true range = (reading − range_offset)/range_scale.
+    """A range-bearing sensor: true range = (measurement − range_offset)/range_scale.
 
     Range sigma at a predicted range r is hypot(range_sigma, range_sigma_per_m · r); the predicted
     range is used, not the measured one (else maps shrink: Peelle's puzzle).
-    Readings outside [min_range, max_range] or more than field_of_view/2 from the axis are rejected.
-    range_white and bearing_white are the shares of the two variances that are independent from
-    reading to reading; the rest is one error per landmark, constant within a window (a camera that
-    mismeasures a marker does so again a moment later). In a simulated world the rest is a
-    first-order Gauss-Markov process for each landmark (and each teammate), whose correlation falls
-    to 1/e in range_correlation_s or bearing_correlation_s.
+    Measurements outside [min_range, max_range] or more than field_of_view/2 from the axis are
+    rejected. range_white and bearing_white are the shares of the two variances that are independent
+    from measurement to measurement; the rest is one error per landmark, constant within a window (a
+    camera that mismeasures a marker does so again a moment later). In a simulated world the rest is
+    a first-order Gauss-Markov process for each landmark (and each teammate), whose correlation
+    falls to 1/e in range_correlation_s or bearing_correlation_s.
     A teammate's marker reads marker_range_offset [m] too long after this calibration, and lies
     marker_sigma [m] from the pose that its robot tracks.
     """
@@ -168,10 +168,10 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window, so that sightings of teammates are factors between poses; 0: none, sightings unused.
     sighting_s: a sighting is used if such a time is no farther from it than this. teammate_speed:
     how fast a teammate may move in between [m/s].
-    garbage: the share of readings that may have nothing to do with their landmark; above 0 a window
-    takes only readings that others of it confirm (`team.estimation.hybrid_slam.consensus`).
-    biases: the errors shared by all of the robot's windows that the centre estimates; each submap
-    carries its derivative by each of them.
+    garbage: the share of measurements that may have nothing to do with their landmark; above 0 a
+    window takes only measurements that others of it confirm
+    (`team.estimation.hybrid_slam.consensus`). biases: the errors shared by all of the robot's
+    windows that the centre estimates; each submap carries its derivative by each of them.
     """
 
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 100
@@ -218,7 +218,7 @@ class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that a robot's estimate depends on beside its readings.
+    """Everything that a robot's estimate depends on beside its measurements.
 
     exchange_s: under a rule with feedback, the least team time between two exchanges of maps (at
     window ends; for `hybrid-thesis` at epochs). pose_s: the least team time between two running

@@ -18,7 +18,7 @@ EARLY_NS = 86_400 * 10**9
 LATE_NS = 400 * EARLY_NS
 """A stream's messages lie within a day before and 400 days after its initial pose's stamp."""
 OF_ROBOTS = (
-    m.Reading, m.Submap, m.SightingFactor, m.MapEstimate, m.Progress, m.Done, m.Rendezvous,
+    m.Measurement, m.Submap, m.SightingFactor, m.MapEstimate, m.Progress, m.Done, m.Rendezvous,
     m.Innovation,
 )  # fmt: skip
 """Messages about a stream: they carry its robot and its incarnation."""
@@ -91,19 +91,19 @@ def _lives(message: m.Message) -> Iterator[int]:
 
 def _counts(message: m.Message) -> Iterator[int]:
     match message:
-        case m.Reading():
-            yield message.reading
+        case m.Measurement():
+            yield message.number
         case m.Submap():
-            yield from (message.sequence, message.last_reading, message.sightings)
+            yield from (message.sequence, message.last_measurement, message.sightings)
         case m.SightingFactor():
-            yield from (message.sequence, *message.readings)
+            yield from (message.sequence, *message.measurements)
         case m.Progress():
-            yield from (message.readings, message.submaps)
+            yield from (message.measurements, message.submaps)
         case m.Done():
-            yield from (message.readings, message.submaps, message.steps)
+            yield from (message.measurements, message.submaps, message.steps)
         case m.MapEstimate():
             yield from (message.sequence, message.exchange)
         case m.End():
-            yield from (stream.readings for stream in message.streams)
+            yield from (stream.measurements for stream in message.streams)
         case _:
             pass

@@ -6,7 +6,7 @@ from typing import Literal
 
 from team.config import Estimator, FusionRule
 
-Channel = Literal["submap", "own/map", "readings"]
+Channel = Literal["submap", "own/map", "measurements"]
 
 MAPPERS: tuple[Estimator, ...] = ("hybrid", "hybrid-thesis", "ekf-slam", "fastslam1", "fastslam2")
 AS_CODED: Estimator = "hybrid-thesis-coded"
@@ -20,8 +20,8 @@ _CONSUMES: Mapping[FusionRule, tuple[Channel, tuple[Estimator, ...]]] = {
     "alone": ("own/map", (*MAPPERS, AS_CODED, *LOCALISERS)),
     "svd-join": ("submap", ("hybrid",)),
     "svd-join-spherical": ("submap", ("hybrid",)),
-    "joint-fastslam": ("readings", ("hybrid", "dead-reckoning")),
-    "batch": ("readings", ("hybrid", "dead-reckoning")),
+    "joint-fastslam": ("measurements", ("hybrid", "dead-reckoning")),
+    "batch": ("measurements", ("hybrid", "dead-reckoning")),
 }
 
 PAIRS: Mapping[tuple[Estimator, FusionRule], Channel] = MappingProxyType(
@@ -31,11 +31,11 @@ PAIRS: Mapping[tuple[Estimator, FusionRule], Channel] = MappingProxyType(
         for estimator in estimators
     }
 )
-"""(estimator, rule) → what the centre subscribes to. `submap`: independent, each reading once.
-`own/map`: whole maps. `readings`: the sensor channels; what the robots run is then for their own
-poses, so only the default and the cheapest are there. Any other pair has no meaning: only `hybrid`
-makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis, and who
-only localises himself has no map to fuse.
+"""(estimator, rule) → what the centre subscribes to. `submap`: independent, each measurement once.
+`own/map`: whole maps. `measurements`: the sensor channels; what the robots run is then for their
+own poses, so only the default and the cheapest are there. Any other pair has no meaning: only
+`hybrid` makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis,
+and who only localises himself has no map to fuse.
 """
 CONSUMES: Mapping[FusionRule, Channel] = MappingProxyType(
     {fusion: channel for fusion, (channel, _) in _CONSUMES.items()}

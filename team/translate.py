@@ -90,7 +90,7 @@ def submap_message(
     robot: str,
     epoch: int,
     sequence: int,
-    readings: tuple[int, int],
+    measurements: tuple[int, int],
     span_ns: tuple[int, int],
     config: bytes,
     local: LocalMap,
@@ -103,8 +103,8 @@ def submap_message(
         robot,
         epoch,
         sequence,
-        readings[0],
-        readings[1],
+        measurements[0],
+        measurements[1],
         span_ns[0],
         config,
         from_ids(local.ids),
@@ -139,7 +139,7 @@ def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
 
 
 def sighting_message(
-    sighting: Sighting, config: bytes, readings: tuple[int, ...]
+    sighting: Sighting, config: bytes, measurements: tuple[int, ...]
 ) -> m.SightingFactor:
     """A sighting with the names of its inputs."""
     return m.SightingFactor(
@@ -149,10 +149,10 @@ def sighting_message(
         sighting.sequence,
         config,
         sighting.teammate,
-        float(sighting.reading[0]),
-        float(sighting.reading[1]),
+        float(sighting.measurement[0]),
+        float(sighting.measurement[1]),
         from_floats(packed(sighting.covariance)),
-        readings,
+        measurements,
     )
 
 

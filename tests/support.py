@@ -184,5 +184,5 @@ def examples() -> Iterator[m.Message]:
     )  # fmt: skip
     yield m.Liveliness(0, "robot/alpha", True)
     yield m.Tally(9_000, "robot/alpha", 10**18, ("robot/alpha/submap",), (6,))
-    yield m.ReadingsWanted(0, "alpha", 1, 5, -1)
+    yield m.MeasurementsRequest(0, "alpha", 1, 5, -1)
     yield m.SubmapsWanted(0, "alpha")

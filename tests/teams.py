@@ -110,21 +110,23 @@ def world_of(*streams: RobotStream) -> WorldStreams:
     return WorldStreams(streams, ids, LANDMARKS, "a test")
 
 
-def published(each: RobotStream) -> list[m.Reading]:
-    """The readings of one stream as the world publishes them."""
+def published(each: RobotStream) -> list[m.Measurement]:
+    """The measurements of one stream as the world publishes them."""
     world = WorldNode(world_of(each), frozenset(), m.Configured(0, "world", 0, bytes(8), "{}"))
     out: list[Outgoing] = []
     while not world.ended:
         out += world.publish(0.0)
-    return [o.message for o in out if isinstance(o.message, m.Reading)]
+    return [o.message for o in out if isinstance(o.message, m.Measurement)]
 
 
-def driven(node: RobotNode, readings: Sequence[m.Message], *, end: bool = True) -> list[Outgoing]:
-    """What a robot says to these readings, without a centre; `end` with the last counter."""
-    out = [o for reading in readings for o in node.handle(reading, 0)]
+def driven(
+    node: RobotNode, measurements: Sequence[m.Message], *, end: bool = True
+) -> list[Outgoing]:
+    """What a robot says to these measurements, without a centre; `end` with the last counter."""
+    out = [o for measurement in measurements for o in node.handle(measurement, 0)]
     if end:
-        last = readings[-1]
-        ends = (m.StreamEnd(node.robot, last.epoch, last.reading + 1),)
+        last = measurements[-1]
+        ends = (m.StreamEnd(node.robot, last.epoch, last.number + 1),)
         out += node.handle(m.End(last.stamp_ns, ends), 0)
     return out
 
@@ -234,10 +236,10 @@ class Team:
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
             wanted = node.wanted()
             if wanted is None and not node.finished and not node._inbox.waiting:
-                wanted = m.ReadingsWanted(0, node.robot, node.epoch, node.next_reading, -1)
+                wanted = m.MeasurementsRequest(0, node.robot, node.epoch, node.next_measurement, -1)
             if wanted is None:
                 continue
-            for reply in self.world.readings(encoded(wanted)):
+            for reply in self.world.measurements(encoded(wanted)):
                 found = True
                 self.send(name, node.handle(decoded(reply), 0))
         return found

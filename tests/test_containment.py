@@ -27,7 +27,7 @@ from team.wire.codec import encoded
 from tests.sim.reruns import messages, team_samples, thesis, written
 from tests.support import submap
 from tests.teams import config, published, stream
-from tests.test_laws import CENTRE, assert_each_reading_once
+from tests.test_laws import CENTRE, assert_each_measurement_once
 
 BROKEN_NS = 17_000_000_000
 """r1's and r2's odometry that ends here, in their second window, can not be handled."""
@@ -54,7 +54,7 @@ def faults(samples: list[Sample]) -> list[m.Fault]:
 
 
 @pytest.mark.usefixtures("brittle")
-def test_a_reading_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_been_there(
+def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_been_there(
     tmp_path: Path,
 ) -> None:
     samples = list(team_samples(thesis(45)))
@@ -67,11 +67,11 @@ def test_a_reading_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_b
     }
     for fault in told:
         assert re.fullmatch(r"team\.robot\.node:RobotNode\._go:\d+", fault.place)
-    assert_each_reading_once(samples)
+    assert_each_measurement_once(samples)
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)
         assert isinstance(done, m.Done)
-        assert {d.disposition: d.readings for d in done.ledger}[SET_ASIDE] == 1
+        assert {d.disposition: d.measurements for d in done.ledger}[SET_ASIDE] == 1
     assert {x.robot for x in final_map(samples).members} == {"r1", "r2"}
     (r1, r2), evaluation = told, evaluate(samples)
     assert evaluation.faults == 2
@@ -83,18 +83,18 @@ def test_a_reading_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_b
 
 
 @pytest.mark.usefixtures("brittle")
-def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_reading() -> None:
-    readings = published(stream("r1", 30))
-    broken = next(r for r in readings if isinstance(r, m.Odometry) and r.stamp_ns == BROKEN_NS)
+def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measurement() -> None:
+    measurements = published(stream("r1", 30))
+    broken = next(r for r in measurements if isinstance(r, m.Odometry) and r.stamp_ns == BROKEN_NS)
     node, without = RobotNode(config()), RobotNode(config())
     boundary = Boundary("robot/r1")
     said: list[list[m.Message]] = [[], []]
-    for reading in readings:
-        said[0] += submaps(boundary.give(node, reading))
-        if reading is broken:
-            without._inbox.next_reading += 1
+    for measurement in measurements:
+        said[0] += submaps(boundary.give(node, measurement))
+        if measurement is broken:
+            without._inbox.next_measurement += 1
         else:
-            said[1] += submaps(without.handle(reading, 0))
+            said[1] += submaps(without.handle(measurement, 0))
     assert boundary.faults == 1
     assert said[0] == said[1]
     assert len(said[0]) > 5
@@ -200,7 +200,7 @@ def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_
     centre, viewer = MemoryBus(network), MemoryBus(network)
     start = m.Start(0, "r1", 1, 0, b"", b"")
     centre.answer(ch.SUBMAPS, "", lambda _: [encoded(start)])
-    centre.answer(ch.READINGS, "r1", lambda _: [encoded(submap(0))])
+    centre.answer(ch.MEASUREMENTS, "r1", lambda _: [encoded(submap(0))])
     for channel in (ch.FAULT, ch.ROBOT_CONFIG):
         viewer.subscribe(channel)
     stop = threading.Event()
@@ -208,7 +208,7 @@ def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_
     robot = RobotShell(MemoryBus(network), config("r1"), stop, patience_s=0.0)
     with pytest.raises(FaultyRunError, match=r"central/submaps: \w+ at team\.robot"):
         robot.run()
-    assert robot.node.next_reading == 0
+    assert robot.node.next_measurement == 0
     assert len(faults([s for s in viewer.receive() if s.key.endswith("fault")])) == 1
 
 

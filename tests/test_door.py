@@ -20,7 +20,7 @@ from tests.teams import of, published, stream, submaps_of, world_of
 
 HUGE = 2**62
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
-READINGS = {name: published(each) for name, each in STREAMS.items()}
+MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
 SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
 END = m.End(0, tuple(m.StreamEnd(n, 1, len(s)) for n, s in STREAMS.items()))
 FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
@@ -36,8 +36,8 @@ def given(
     return [out for each in said for out in boundary.take(node, sample(*each))]
 
 
-def progress(robot: str, readings: int, submaps: int, stamp_s: float = 12.0) -> m.Progress:
-    return m.Progress(round(stamp_s * 1e9), f"robot/{robot}", robot, 1, readings, submaps)
+def progress(robot: str, measurements: int, submaps: int, stamp_s: float = 12.0) -> m.Progress:
+    return m.Progress(round(stamp_s * 1e9), f"robot/{robot}", robot, 1, measurements, submaps)
 
 
 def run() -> list[tuple[ch.Channel, str, m.Message]]:
@@ -45,12 +45,12 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
     said: list[tuple[ch.Channel, str, m.Message]] = []
     for name, submaps in SUBMAPS.items():
         here = m.Liveliness(0, f"robot/{name}", True)
-        count = len(READINGS[name])
-        said += [(ch.ALIVE, f"robot/{name}", here), (ch.START, name, READINGS[name][0])]
+        count = len(MEASUREMENTS[name])
+        said += [(ch.ALIVE, f"robot/{name}", here), (ch.START, name, MEASUREMENTS[name][0])]
         said += [(ch.SUBMAP, name, submap) for submap in submaps]
         said.append((ch.ROBOT_PROGRESS, name, progress(name, count, len(submaps))))
     for name, submaps in SUBMAPS.items():
-        done = m.Done(12 * 10**9, name, 1, len(READINGS[name]), 12, len(submaps), ())
+        done = m.Done(12 * 10**9, name, 1, len(MEASUREMENTS[name]), 12, len(submaps), ())
         said.append((ch.ROBOT_DONE, name, done))
     return [*said, (ch.END, "", END)]
 
@@ -66,7 +66,7 @@ ATTACKS = [
     (ch.ROBOT_PROGRESS, "r1", progress("r2", 5, 1), "a message of 'r2' on the key"),
     (ch.ROBOT_PROGRESS, "r1", m.Progress(0, "central", "r1", 1, 5, 1), "a message of 'central'"),
     (ch.END, "", m.End(0, ()), "an end that does not know of r1, r2"),
-    (ch.END, "", m.End(0, tuple(m.StreamEnd(n, 1, 3) for n in STREAMS)), "ends with reading 3 of"),
+    (ch.END, "", m.End(0, tuple(m.StreamEnd(n, 1, 3) for n in STREAMS)), "ends with measurement 3"),
     (ch.END, "", m.End(0, (*END.streams, m.StreamEnd("r9", 1, 3))), "of r9, not in this team"),
     (ch.ORDER, "r1", m.Withdrawal(0, "r1", "central", "so"), "a message of 'central' on the key"),
     (ch.ORDER, "r9", m.Withdrawal(0, "r9", "operator", "so"), "of r9, not in this team"),
@@ -103,31 +103,31 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
         return Boundary("robot/r1"), RobotNode(RobotConfig("r1"))
 
     channel_of = {channel.message: channel for channel in ch.SENSORS}
-    readings = [(channel_of[type(each)], "r1", each) for each in READINGS["r1"]]
+    measurements = [(channel_of[type(each)], "r1", each) for each in MEASUREMENTS["r1"]]
     plain, node = robot()
-    wanted = given(plain, node, *readings, (ch.END, "", END))
+    wanted = given(plain, node, *measurements, (ch.END, "", END))
     assert plain.refused == 0, plain.last_refused
     boundary, node = robot()
-    out = given(boundary, node, *readings[:8])
-    odometry = next(each for each in READINGS["r1"][8:] if isinstance(each, m.Odometry))
+    out = given(boundary, node, *measurements[:8])
+    odometry = next(each for each in MEASUREMENTS["r1"][8:] if isinstance(each, m.Odometry))
     far = msgspec.structs.replace(odometry, stamp_ns=odometry.stamp_ns + 2 * LATE_NS)
     acknowledged = m.Progress(0, "central", "r1", 1, 0, 10**6)
     attacks = [
         (ch.START, m.Start(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
         (ch.START, m.Start(0, "r1", 100, 0, b"", b""), "of incarnation 100, while 1 is in"),
-        (ch.ODOMETRY, msgspec.structs.replace(odometry, reading=HUGE), f"counts to {HUGE}"),
+        (ch.ODOMETRY, msgspec.structs.replace(odometry, number=HUGE), f"counts to {HUGE}"),
         (ch.ODOMETRY, far, "days after its stream began"),
         (ch.CENTRAL_PROGRESS, acknowledged, "acknowledges 1000000 submaps of"),
         (ch.END, m.End(0, ()), "an end that does not know of r1"),
-        (ch.END, m.End(0, (m.StreamEnd("r1", 1, 2),)), "ends with reading 2 of r1"),
+        (ch.END, m.End(0, (m.StreamEnd("r1", 1, 2),)), "ends with measurement 2 of r1"),
     ]
     for count, (channel, message, why) in enumerate(attacks, 1):
         out += given(boundary, node, (channel, "r1", message))
         assert (boundary.refused, why in boundary.last_refused) == (count, True), why
     reply = encoded(msgspec.structs.replace(odometry, robot="r2"))
-    out += boundary.take_reply(node, "source/r1/readings", reply, m.Reading)
-    assert "a reading of r2" in boundary.last_refused
-    out += given(boundary, node, *readings[8:], (ch.END, "", END))
+    out += boundary.take_reply(node, "source/r1/measurements", reply, m.Measurement)
+    assert "a measurement of r2" in boundary.last_refused
+    out += given(boundary, node, *measurements[8:], (ch.END, "", END))
     assert [encoded(each) for each in of(out, ch.SUBMAP)] == [
         encoded(each) for each in of(wanted, ch.SUBMAP)
     ]

@@ -1,7 +1,7 @@
 """The four laws of the design, held against whole teams.
 
-1 a reading is used once; 2 a map is a pure function of a set of submaps; 3 every message names its
-inputs; 4 a node does no I/O and reads no clock.
+1 a measurement is used once; 2 a map is a pure function of a set of submaps; 3 every message names
+its inputs; 4 a node does no I/O and reads no clock.
 """
 
 import ast
@@ -45,22 +45,22 @@ def team_of(streams, rng, **options):
 @pytest.fixture
 def scarce(monkeypatch):
     """Little credit and small portions, so that everybody waits for somebody."""
-    monkeypatch.setattr(sim.publisher.node, "CREDIT_READINGS", 16)
+    monkeypatch.setattr(sim.publisher.node, "CREDIT_MEASUREMENTS", 16)
     monkeypatch.setattr(sim.publisher.node, "BATCH", 5)
-    monkeypatch.setattr(team.robot.pace, "PROGRESS_READINGS", 4)
+    monkeypatch.setattr(team.robot.pace, "PROGRESS_MEASUREMENTS", 4)
     monkeypatch.setattr(team.robot.pace, "CREDIT_SUBMAPS", 1)
 
 
 # Law 1.
 
 
-def assert_each_reading_once(samples):
-    """Submaps part each robot's readings, and its ledger adds up to what was published."""
+def assert_each_measurement_once(samples):
+    """Submaps part each robot's measurements, and its ledger adds up to what was published."""
     messages = [opened(sample) for sample in samples]
     counted = {}
     for _, name, message in messages:
-        if isinstance(message, m.Reading):
-            counted.setdefault(name, set()).add((message.epoch, message.reading))
+        if isinstance(message, m.Measurement):
+            counted.setdefault(name, set()).add((message.epoch, message.number))
     submaps = {name: [] for name in counted}
     for _, name, message in messages:
         if isinstance(message, m.Submap):
@@ -68,18 +68,18 @@ def assert_each_reading_once(samples):
     dones = [message for _, _, message in messages if isinstance(message, m.Done)]
     assert sorted(done.robot for done in dones) == sorted(counted)
     for done in dones:
-        assert done.readings == len(counted[done.robot])
-        assert sum(entry.readings for entry in done.ledger) == done.readings
+        assert done.measurements == len(counted[done.robot])
+        assert sum(entry.measurements for entry in done.ledger) == done.measurements
         mine = submaps[done.robot]
         assert [each.sequence for each in mine] == list(range(done.submaps))
-        assert mine[0].first_reading == 0
+        assert mine[0].first_measurement == 0
         for before, after in pairwise(mine):
-            assert (after.first_reading, after.start_ns) == (
-                before.last_reading + 1,
+            assert (after.first_measurement, after.start_ns) == (
+                before.last_measurement + 1,
                 before.stamp_ns,
             )
-        outside = done.readings - mine[-1].last_reading - 1
-        rejected = [e.readings for e in done.ledger if e.disposition.startswith("rejected")]
+        outside = done.measurements - mine[-1].last_measurement - 1
+        rejected = [e.measurements for e in done.ledger if e.disposition.startswith("rejected")]
         assert 0 <= outside <= sum(rejected)
 
 
@@ -99,15 +99,15 @@ def thesis(steps=45):
     return msgspec.structs.replace(scenario, world=world)
 
 
-def test_a_simulated_teams_readings_are_each_used_once():
+def test_a_simulated_teams_measurements_are_each_used_once():
     scenario = thesis()
-    assert_each_reading_once(run_team(scenario, streams_of(scenario)))
+    assert_each_measurement_once(run_team(scenario, streams_of(scenario)))
 
 
-def test_a_data_sets_readings_are_each_used_once(utias):
+def test_a_data_sets_measurements_are_each_used_once(utias):
     streams = streams_of(utias)
     samples = list(run_team(utias, streams))
-    assert_each_reading_once(samples)
+    assert_each_measurement_once(samples)
     ends = {int(t) for each in streams.streams for t in each.intervals.end_ns}
     seen = {int(t) for each in streams.streams for t in each.landmark_detections.stamps_ns}
     assert seen - ends, "some are between the stamps of the odometry"
@@ -129,12 +129,12 @@ def test_a_robots_submaps_are_the_same_bytes_without_a_centre(utias):
 def test_a_rule_with_feedback_breaks_law_1_and_this_can_be_seen():
     """The mutant: what the centre sends does change what such a robot publishes for fusion."""
     robot = config(fusion="kalman")
-    readings = published(PAIR.streams[0])
+    measurements = published(PAIR.streams[0])
     maps = []
     for shift in (0.0, 1.0):
         node, out = RobotNode(robot), []
-        for reading in readings:
-            new = node.handle(reading, 0)
+        for measurement in measurements:
+            new = node.handle(measurement, 0)
             while new:
                 out += new
                 new = [

@@ -108,14 +108,14 @@ def test_a_run_with_sightings_is_computed_again_to_the_last_bit(samples, tmp_pat
     assert all(total == equal for total, equal in counts.values())
 
 
-def test_each_reading_of_a_run_with_sightings_has_one_disposition(samples, tmp_path):
+def test_each_measurement_of_a_run_with_sightings_has_one_disposition(samples, tmp_path):
     found = ledger(recorded(written(tmp_path / "log.mcap", samples)))
     assert found.offenders == ()
     used = {
         (x.robot, n)
         for robot in SCENARIO.robots
         for x in messages(samples, ch.SIGHTING_FACTOR, robot.id)
-        for n in x.readings
+        for n in x.measurements
     }
     assert found.totals()[IN_SIGHTING] == len(used) > 0
 
@@ -123,18 +123,18 @@ def test_each_reading_of_a_run_with_sightings_has_one_disposition(samples, tmp_p
 def test_sightings_whose_node_never_comes_are_rejected_at_the_end():
     """The stream ends half a second before the node: the sighting is not in a factor."""
     config = SCENARIO.robots[0]
-    readings = published(STREAMS.streams[0])
+    measurements = published(STREAMS.streams[0])
     wanted = next(
         k
-        for k, r in enumerate(readings)
+        for k, r in enumerate(measurements)
         if isinstance(r, m.Sightings) and r.stamp_ns % 5_000_000_000 == 4_000_000_000
     )
-    out = driven(RobotNode(config), readings[: wanted + 2])
+    out = driven(RobotNode(config), measurements[: wanted + 2])
     (done,) = of(out, ch.ROBOT_DONE)
-    told = {d.disposition: d.readings for d in done.ledger}
+    told = {d.disposition: d.measurements for d in done.ledger}
     assert told["rejected: no pose node near it"] >= 1
-    assert sum(told.values()) == done.readings
-    used = {n for x in of(out, ch.SIGHTING_FACTOR) for n in x.readings}
+    assert sum(told.values()) == done.measurements
+    used = {n for x in of(out, ch.SIGHTING_FACTOR) for n in x.measurements}
     assert told.get(IN_SIGHTING, 0) == len(used)
 
 

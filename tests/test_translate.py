@@ -42,7 +42,7 @@ def test_a_submap_survives_the_wire_bit_for_bit(ids, seed):
     assert found.covariance.tobytes() == local.covariance.tobytes()
     again = translate.submap_message("r1", 2, 5, (10, 19), (1_000, 2_000), b"settings", found)
     assert encoded(again) == encoded(message)
-    assert (there.first_reading, there.last_reading) == (10, 19)
+    assert (there.first_measurement, there.last_measurement) == (10, 19)
     assert (there.start_ns, there.stamp_ns) == (1_000, 2_000)
     assert translate.contribution_of(there).key == (2_000, "r1", 2, 5)
 
@@ -65,7 +65,7 @@ def test_pose_nodes_and_sightings_survive_the_wire_bit_for_bit():
         over_the_wire(translate.sighting_message(seen, b"settings", (3, 4)))
     )
     assert (again.key, again.sequence) == (seen.key, 5)
-    assert again.reading.tobytes() == seen.reading.tobytes()
+    assert again.measurement.tobytes() == seen.measurement.tobytes()
     assert again.covariance.tobytes() == seen.covariance.tobytes()
 
 

@@ -1,4 +1,4 @@
-"""The rule `batch`: the batch MAP over all robots' raw readings, while they come."""
+"""The rule `batch`: the batch MAP over all robots' raw measurements, while they come."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

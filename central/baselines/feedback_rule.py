@@ -2,7 +2,7 @@
 
 Each round takes the map that every robot sent for it. What comes back replaces the robots' own
 landmarks, so the next round's maps hold this round's: under `kalman` and `kalman-per-axis` the same
-readings are counted again and again, and the covariance that they give is worth nothing.
+measurements are counted again and again, and the covariance that they give is worth nothing.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ RULES: Mapping[FusionRule, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussi
     "kalman-per-axis": kalman_per_axis,
     "covariance-intersection": covariance_intersection,
 }
-_NOT_VALID = "this rule counts readings more than once: its covariance is not valid"
+_NOT_VALID = "this rule counts measurements more than once: its covariance is not valid"
 
 
 class FeedbackRule:

@@ -1,9 +1,9 @@
 """Rules that fuse whole maps which the robots then absorb: kept because users compare them.
 
 `kalman_per_axis` and `kalman` treat the maps as independent. They are not once a robot has absorbed
-a fused map and sends its own again: every reading is then counted again with each exchange, and the
-covariance loses its meaning. Covariance intersection stays consistent for any correlation of the
-landmarks that it fuses, at the price of what the maps truly have in addition.
+a fused map and sends its own again: every measurement is then counted again with each exchange, and
+the covariance loses its meaning. Covariance intersection stays consistent for any correlation of
+the landmarks that it fuses, at the price of what the maps truly have in addition.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +34,7 @@ def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """Full-covariance Kalman fusion in the given order, as if the maps were independent.
 
     K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's further landmarks follow
-    by regression on c. Counts readings again when its result is absorbed and sent once more.
+    by regression on c. Counts measurements again when its result is absorbed and sent once more.
     """
     return _one_by_one(_kalman_pair, maps)
 
@@ -43,7 +43,8 @@ def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """The thesis' fusion: each coordinate by itself, correlations dropped (Xu, eq. 5.1-5.4).
 
     TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and
-    S = S^A S^B/(S^A + S^B). Counts readings again when its result is absorbed and sent once more.
+    S = S^A S^B/(S^A + S^B). Counts measurements again when its result is absorbed and sent once
+    more.
     """
     return _one_by_one(_per_axis_pair, maps)
 

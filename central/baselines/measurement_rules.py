@@ -1,4 +1,4 @@
-"""What rules on raw readings share: the team's epochs in, poses and the map out."""
+"""What rules on raw measurements share: the team's epochs in, poses and the map out."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -37,11 +37,11 @@ class Told:
 
 
 class MeasurementRule(FusionRule):
-    """An estimate over all robots' raw readings at the centre.
+    """An estimate over all robots' raw measurements at the centre.
 
     The epochs of one team time are one step. The robots' models come with what they announce. A
     robot whose start pose is not known is left out; where no start is known the first robot's is
-    the frame. A map's members name each robot's last reading in it.
+    the frame. A map's members name each robot's last measurement in it.
     """
 
     listens = (*ch.SENSORS, ch.ROBOT_CONFIG)
@@ -81,9 +81,9 @@ class MeasurementRule(FusionRule):
         return out + self.conclude(0) if ended else out
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """File a reading, a robot's models or the last counters."""
+        """File a measurement, a robot's models or the last counters."""
         match message:
-            case m.Reading():
+            case m.Measurement():
                 self._epochs.put(message)
             case m.Configured() if message.node.startswith("robot/"):
                 self._configure(message)
@@ -102,7 +102,7 @@ class MeasurementRule(FusionRule):
             self._epochs.configure(config.id, config)
 
     def complete(self, end: m.End) -> bool:
-        """Every reading of every stream has been used."""
+        """Every measurement of every stream has been used."""
         return self._epochs.complete
 
     def advance(self, roll: Roll) -> list[Outgoing]:
@@ -119,8 +119,8 @@ class MeasurementRule(FusionRule):
         """The map after the last step."""
         return self._said(final=True)
 
-    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
-        """Readings that the link has lost."""
+    def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
+        """Measurements that the link has lost."""
         return self._epochs.wanted(now_ns)
 
     def _begin(self) -> bool:
@@ -171,7 +171,7 @@ class MeasurementRule(FusionRule):
         self._now_ns = step[-1].stamp_ns
         for each in step:
             epoch = self._members[each.robot].epoch
-            self._members[each.robot] = m.Member(each.robot, epoch, each.reading)
+            self._members[each.robot] = m.Member(each.robot, epoch, each.number)
         return self._take(step, turns)
 
     def _pose_is_due(self, each: RobotKeyframe) -> bool:
@@ -184,7 +184,7 @@ class MeasurementRule(FusionRule):
         self._pose_ns[each.robot] = each.stamp_ns
         epoch = self._members[each.robot].epoch
         message = translate.pose_message(
-            each.stamp_ns, each.robot, epoch, each.reading, translate.NO_MAP, *pose
+            each.stamp_ns, each.robot, epoch, each.number, translate.NO_MAP, *pose
         )
         return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 
@@ -199,7 +199,7 @@ class MeasurementRule(FusionRule):
 
     @property
     def _digest(self) -> bytes:
-        """The name of the readings so far."""
+        """The name of the measurements so far."""
         members = (self._members[robot] for robot in sorted(self._members))
         named = b"".join(f"{x.robot}/{x.epoch}/{x.sequence} ".encode() for x in members)
         return translate.digest_of(self._config_digest, named)

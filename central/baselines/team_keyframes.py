@@ -1,4 +1,4 @@
-"""All robots' raw readings as one sequence of epochs, the same for any order of arrival."""
+"""All robots' raw measurements as one sequence of epochs, the same for any order of arrival."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -15,19 +15,21 @@ from team.wire import messages as m
 
 
 class RobotKeyframe(NamedTuple):
-    """One robot's motion and what it saw at its end; `reading`: the counter that closed it."""
+    """One robot's motion and what it saw at its end; `number`: that of the measurement that closed
+    it.
+    """
 
     stamp_ns: int
     robot: str
-    reading: int
+    number: int
     epoch: Keyframe
 
 
 @dataclass
 class _Stream:
-    """The readings of one robot, from its start pose on.
+    """The measurements of one robot, from its start pose on.
 
-    covered_ns: no epoch before this team time can still come. start: reading 0.
+    covered_ns: no epoch before this team time can still come. start: measurement 0.
     """
 
     robot: str
@@ -43,40 +45,40 @@ class _Stream:
 
     @property
     def complete(self) -> bool:
-        """Every reading of it has been taken."""
+        """Every measurement of it has been taken."""
         end = self.end
         return self.broken or (end is not None and self.inbox.complete(end))
 
     def take(self) -> None:
-        """Cut the readings whose turn has come into epochs."""
+        """Cut the measurements whose turn has come into epochs."""
         if self.config is None:
             return
-        for reading in self.inbox.taken():
+        for measurement in self.inbox.taken():
             if not self.broken:
-                self._take(reading, self.config)
+                self._take(measurement, self.config)
         if self.complete and self.covered_ns != float("inf"):
             segmenter = self.segmenter
             if segmenter is not None and segmenter.now_ns is not None and not self.broken:
-                self._file(segmenter.cut(segmenter.now_ns)[0], self.inbox.next_reading - 1)
+                self._file(segmenter.cut(segmenter.now_ns)[0], self.inbox.next_measurement - 1)
             self.covered_ns = float("inf")
 
-    def _take(self, reading: m.Reading, config: RobotConfig) -> None:
-        match reading:
+    def _take(self, measurement: m.Measurement, config: RobotConfig) -> None:
+        match measurement:
             case m.Start() if self.start is None:
-                self.start = reading
+                self.start = measurement
                 keyframe_s = config.front_end.keyframe_s
                 self.segmenter = Segmenter(config.motion, config.sensor, keyframe_s)
                 self.judge = StreamJudge(config.bounds)
             case m.Start():
                 self.broken = True  # a later life of the stream begins who knows where
             case m.Observations() if self.segmenter is not None:
-                ids, ranges, bearings = translate.scan_of(reading)
+                ids, ranges, bearings = translate.scan_of(measurement)
                 near = self.judge.near(ranges)
-                if self.judge.time(reading.stamp_ns) is None and (near.any() or not len(near)):
+                if self.judge.time(measurement.stamp_ns) is None and (near.any() or not len(near)):
                     scan = ids[near], ranges[near], bearings[near]
-                    self.segmenter.observe(reading.stamp_ns, *scan)
+                    self.segmenter.observe(measurement.stamp_ns, *scan)
             case m.Odometry() if self.segmenter is not None:
-                motion = translate.motion_of(reading, config.clock_offset_s)
+                motion = translate.motion_of(measurement, config.clock_offset_s)
                 reason = self.judge.odometry(*motion)
                 if reason not in {None, SPEED}:
                     return
@@ -84,13 +86,13 @@ class _Stream:
                 if self.segmenter.now_ns is None:
                     self.segmenter.begin(end_ns - duration_ns)
                 epochs = self.segmenter.drive(*motion, measured=reason is None)
-                self._file(epochs, reading.reading)
+                self._file(epochs, measurement.number)
                 self.covered_ns = end_ns
             case _:
                 pass
 
-    def _file(self, epochs: Sequence[Keyframe], reading: int) -> None:
-        self.waiting += [RobotKeyframe(e.stamp_ns, self.robot, reading, e) for e in epochs]
+    def _file(self, epochs: Sequence[Keyframe], measurement: int) -> None:
+        self.waiting += [RobotKeyframe(e.stamp_ns, self.robot, measurement, e) for e in epochs]
 
 
 class TeamKeyframes:
@@ -104,14 +106,14 @@ class TeamKeyframes:
         self._streams = {robot: _Stream(robot) for robot in sorted(robots)}
 
     def configure(self, robot: str, config: RobotConfig) -> None:
-        """The models of a robot; its readings wait for them."""
+        """The models of a robot; its measurements wait for them."""
         if robot in self._streams and self._streams[robot].config is None:
             self._streams[robot].config = config
 
-    def put(self, reading: m.Reading) -> None:
-        """Take a reading, in any order."""
-        if reading.robot in self._streams:
-            self._streams[reading.robot].inbox.put(reading)
+    def put(self, measurement: m.Measurement) -> None:
+        """Take a measurement, in any order."""
+        if measurement.robot in self._streams:
+            self._streams[measurement.robot].inbox.put(measurement)
 
     def end(self, end: m.End) -> None:
         """The last counters of the streams."""
@@ -138,7 +140,7 @@ class TeamKeyframes:
 
     @property
     def complete(self) -> bool:
-        """Whether every reading of every stream has been taken."""
+        """Whether every measurement of every stream has been taken."""
         return all(stream.complete for stream in self._streams.values())
 
     def steps(self) -> Iterator[list[RobotKeyframe]]:
@@ -155,11 +157,11 @@ class TeamKeyframes:
         for _, step in groupby(ready, key=lambda each: each.stamp_ns):
             yield list(step)
 
-    def wanted(self, now_ns: int) -> list[m.ReadingsWanted]:
-        """The readings that are missing and must be asked for at their source."""
+    def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
+        """The measurements that are missing and must be asked for at their source."""
         found = []
         for name, stream in self._streams.items():
             missing = stream.inbox.missing(stream.end)
             if missing is not None and not stream.broken:
-                found.append(m.ReadingsWanted(now_ns, name, *missing))
+                found.append(m.MeasurementsRequest(now_ns, name, *missing))
         return found

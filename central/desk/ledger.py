@@ -1,8 +1,9 @@
-"""The ledger of a log: every reading has exactly one disposition (law 1), every submap its maps.
+"""The ledger of a log: every measurement has exactly one disposition (law 1), every submap its
+maps.
 
-A submap names its interval of readings, a map its version vector. Which readings of an interval a
-robot rejected, and why, its node says when it consumes the recorded readings again. Of readings
-behind a robot's last submap those that it had consumed are open, the others lost.
+A submap names its interval of measurements, a map its version vector. Which measurements of an
+interval a robot rejected, and why, its node says when it consumes the recorded measurements again.
+Of measurements behind a robot's last submap those that it had consumed are open, the others lost.
 """
 
 from collections import Counter
@@ -20,14 +21,16 @@ IN_SUBMAP = "in a submap"
 OPEN = "open"
 LOST = "lost"
 MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
-"""Readings that are missing need memory too: so many, or so many times those that are there."""
+"""Measurements that are missing need memory too: so many, or so many times those that are there."""
 SubmapName = tuple[str, int, int]
 """(robot, epoch, sequence)."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What became of one reading; `submap`: the sequence of the submap whose interval holds it."""
+    """What became of one measurement; `submap`: the sequence of the submap whose interval holds
+    it.
+    """
 
     disposition: str
     submap: int | None
@@ -35,7 +38,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Ledger:
-    """Every reading's entry by stream and counter, every submap's maps, and what is wrong.
+    """Every measurement's entry by stream and counter, every submap's maps, and what is wrong.
 
     maps: the digests of the maps that used a submap, in the order of the log. withdrawn: the robots
     that the last map goes without; what is in their submaps is in no map any more.
@@ -47,12 +50,12 @@ class Ledger:
     withdrawn: tuple[str, ...] = ()
 
     @property
-    def readings(self) -> int:
-        """The readings of all robots."""
+    def measurements(self) -> int:
+        """The measurements of all robots."""
         return sum(len(entries) for entries in self.entries.values())
 
     def totals(self, robot: str | None = None) -> dict[str, int]:
-        """Readings by disposition, of one robot or of all."""
+        """Measurements by disposition, of one robot or of all."""
         counts = Counter(
             entry.disposition
             for (name, _), entries in sorted(self.entries.items())
@@ -64,7 +67,7 @@ class Ledger:
     def statement(self) -> str:
         """The proof in one sentence."""
         parts = ", ".join(f"{count:,} {name}" for name, count in self.totals().items())
-        said = f"each of {self.readings:,} readings has exactly one disposition: {parts}"
+        said = f"each of {self.measurements:,} measurements has exactly one disposition: {parts}"
         gone = sum(self.totals(robot).get(IN_SUBMAP, 0) for robot in self.withdrawn)
         if not self.withdrawn:
             return said
@@ -73,7 +76,7 @@ class Ledger:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Totals, offenders, and of each submap how many readings and which maps."""
+        """Totals, offenders, and of each submap how many measurements and which maps."""
         held = Counter(
             (*stream, entry.submap)
             for stream, entries in self.entries.items()
@@ -82,11 +85,17 @@ class Ledger:
         )
         robots = sorted({robot for robot, _ in self.entries})
         return {
-            "readings": self.readings,
+            "measurements": self.measurements,
             "dispositions": self.totals(),
             "robots": {robot: self.totals(robot) for robot in robots},
             "submaps": [
-                {"robot": n[0], "epoch": n[1], "sequence": n[2], "readings": held[n], "maps": maps}
+                {
+                    "robot": n[0],
+                    "epoch": n[1],
+                    "sequence": n[2],
+                    "measurements": held[n],
+                    "maps": maps,
+                }
                 for n, maps in sorted(self.maps.items())
             ],
             "withdrawn": self.withdrawn,
@@ -97,7 +106,7 @@ class Ledger:
 def ledger(log: Recorded) -> Ledger:
     """The ledger of a log; raises RerunError where a robot's configuration is missing."""
     offenders = [f"{_named(r)} is in the log twice, and not the same" for r in log.contradicted]
-    streams = sorted(log.readings.keys() | log.submaps().keys())
+    streams = sorted(log.measurements.keys() | log.submaps().keys())
     entries = {}
     for stream in streams:
         intervals, wrong = _intervals(log, stream)
@@ -113,8 +122,8 @@ def _withdrawn(log: Recorded) -> tuple[str, ...]:
     return last.withdrawn if isinstance(last, m.FusedMap) else ()
 
 
-def _named(reading: m.Reading) -> str:
-    return f"reading {reading.reading} of {reading.robot}, epoch {reading.epoch}"
+def _named(measurement: m.Measurement) -> str:
+    return f"measurement {measurement.number} of {measurement.robot}, epoch {measurement.epoch}"
 
 
 def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
@@ -134,38 +143,38 @@ def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]
 def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
-    """The entry of every reading that there is or should be; the offenders among them."""
+    """The entry of every measurement that there is or should be; the offenders among them."""
     robot, epoch = stream
-    readings = log.readings.get(stream, {})
-    count = max(log.published.get(stream, 0), max(readings, default=-1) + 1)
-    if count > max(MOST_LOST, MOST_LOST_SHARE * len(readings)):
+    measurements = log.measurements.get(stream, {})
+    count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
+    if count > max(MOST_LOST, MOST_LOST_SHARE * len(measurements)):
         raise RerunError(
-            f"{count:,} readings of {robot}, epoch {epoch}, are spoken of, "
-            f"{len(readings):,} are in the log: not believed"
+            f"{count:,} measurements of {robot}, epoch {epoch}, are spoken of, "
+            f"{len(measurements):,} are in the log: not believed"
         )
     holder: list[int | None] = [None] * count
     wrong = []
     for submap in submaps:
-        for counter in range(submap.first_reading, submap.last_reading + 1):
+        for counter in range(submap.first_measurement, submap.last_measurement + 1):
             if counter >= count:
                 name = f"submap {submap.sequence} of {robot}, epoch {epoch}"
-                wrong.append(f"{name} uses reading {counter}, which the log does not have")
+                wrong.append(f"{name} uses measurement {counter}, which the log does not have")
                 break
             if holder[counter] is not None:
                 wrong.append(
-                    f"reading {counter} of {robot}, epoch {epoch} is in two submaps: "
+                    f"measurement {counter} of {robot}, epoch {epoch} is in two submaps: "
                     f"{holder[counter]} and {submap.sequence}"
                 )
             holder[counter] = submap.sequence
     said = dispositions(log, robot, epoch)
-    last = max((s.last_reading for s in submaps), default=-1)
+    last = max((s.last_measurement for s in submaps), default=-1)
     consumed = log.reported.get(stream, 0)
     entries = []
     for counter in range(count):
-        name = f"reading {counter} of {robot}, epoch {epoch}"
-        held = counter in readings and holder[counter] is not None
+        name = f"measurement {counter} of {robot}, epoch {epoch}"
+        held = counter in measurements and holder[counter] is not None
         disposition = said.get(counter, IN_SUBMAP if held else LOST)
-        if counter not in readings and holder[counter] is not None:
+        if counter not in measurements and holder[counter] is not None:
             wrong.append(f"{name} is in submap {holder[counter]}, but not in the log")
         elif disposition in (IN_SUBMAP, IN_SIGHTING) and holder[counter] is None:
             if counter < last:
@@ -178,16 +187,20 @@ def _entries(
 def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -> Iterator[str]:
     """Where a robot's last word on an epoch differs from what the log gives.
 
-    A robot that was resumed counts all readings before as in submaps, so its sum only can differ.
+    A robot that was resumed counts all measurements before as in submaps, so its sum only can
+    differ.
     """
     for done in log.of(ch.ROBOT_DONE):
         if not isinstance(done, m.Done) or (done.robot, done.epoch) != stream:
             continue
-        told = {d.disposition: d.readings for d in done.ledger}
-        if sum(told.values()) != done.readings:
-            yield f"{done.robot}, epoch {done.epoch}: {done.readings} readings, {told} dispositions"
+        told = {d.disposition: d.measurements for d in done.ledger}
+        if sum(told.values()) != done.measurements:
+            yield (
+                f"{done.robot}, epoch {done.epoch}: {done.measurements} measurements, {told} "
+                "dispositions"
+            )
         resumed = "start pose" not in told
-        found = Counter(entry.disposition for entry in entries[: done.readings])
+        found = Counter(entry.disposition for entry in entries[: done.measurements])
         if not resumed and dict(found) != told:
             yield f"{done.robot}, epoch {done.epoch} says {told}, the log gives {dict(found)}"
 

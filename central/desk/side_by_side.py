@@ -1,4 +1,4 @@
-"""A recorded run beside the same readings under other conditions: figures, and one picture."""
+"""A recorded run beside the same measurements under other conditions: figures, and one picture."""
 
 from collections.abc import Callable
 from math import degrees

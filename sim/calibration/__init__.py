@@ -1,1 +1,1 @@
-"""Models' figures learnt from readings."""
+"""Models' figures learnt from measurements."""

@@ -1,4 +1,4 @@
-"""What readings say about odometry and sensor: with the truth, or by the team's own map.
+"""What measurements say about odometry and sensor: with the truth, or by the team's own map.
 
 With truth of poses and landmarks every figure is learnt by maximum likelihood against it. The range
 scale is then taken times the scale of the map that the team joins with these models: at the centre
@@ -61,7 +61,7 @@ def calibrated(
 ) -> Calibration:
     """Learn from all worlds together, beginning with the scenario's models (one for all robots).
 
-    Raises CalibrationError where the readings do not suffice.
+    Raises CalibrationError where the measurements do not suffice.
     """
     if all(world.landmarks is not None and true_paths(world.streams) for _, world in worlds):
         return _by_truth(worlds, scenario, progress)

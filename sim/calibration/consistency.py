@@ -1,6 +1,7 @@
 """How sure submaps are: maps of single robots against the rest of their team, without the truth.
 
-A robot's own map a and the map b of the others share no reading. Where the covariances are right,
+A robot's own map a and the map b of the others share no measurement. Where the covariances are
+right,
 
     D = min over rigid motions of (a − b)ᵀ (P_a + P_b)⁻¹ (a − b)
 

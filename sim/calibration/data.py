@@ -1,4 +1,6 @@
-"""What a calibration is learnt from: a robot's readings beside poses that they are held against."""
+"""What a calibration is learnt from: a robot's measurements beside poses that they are held
+against.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +18,7 @@ FASTEST_TURN_RAD_S = 3.0
 
 @dataclass(frozen=True)
 class Reference:
-    """One robot's odometry and landmark readings, and the poses and landmarks of reference.
+    """One robot's odometry and landmark measurements, and the poses and landmarks of reference.
 
     gap_ns: between poses of `path` that are at most this far apart it is interpolated.
     landmarks: position of each id in the path's frame; `teammates`: the paths of the others.
@@ -35,7 +37,7 @@ class Reference:
     turns_first: bool = False
 
     def between(self, begin_ns: int, end_ns: int) -> "Reference":
-        """The same with the odometry and the readings of [begin_ns, end_ns) only."""
+        """The same with the odometry and the measurements of [begin_ns, end_ns) only."""
         chosen = (self.intervals.end_ns >= begin_ns) & (self.intervals.end_ns < end_ns)
         intervals = Intervals(*(part[chosen] for part in vars(self.intervals).values()))
         seen, sighted = (_between(each, begin_ns, end_ns) for each in (self.seen, self.sighted))

@@ -1,4 +1,4 @@
-"""The team's map and paths from its own readings: the reference where there is no truth."""
+"""The team's map and paths from its own measurements: the reference where there is no truth."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from sim.scenarios.scenario import Scenario
 from sim.world.streams import (
     OBSERVATIONS,
     ODOMETRY,
-    ObservationReading,
-    OdometryReading,
+    ObservationMeasurement,
+    OdometryMeasurement,
     RobotStream,
     WorldStreams,
 )
@@ -109,11 +109,15 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
     tracks: list[_Track] = []
     stamps: list[int] = []
     window = slam.window
-    for reading in _merged(stream, LONGEST_NS if config.motion.kind != "turn-then-drive" else 0):
-        if isinstance(reading, ObservationReading):
-            slam.observe(reading.stamp_ns, (reading.ids, reading.ranges, reading.bearings))
+    for measurement in _merged(
+        stream, LONGEST_NS if config.motion.kind != "turn-then-drive" else 0
+    ):
+        if isinstance(measurement, ObservationMeasurement):
+            slam.observe(
+                measurement.stamp_ns, (measurement.ids, measurement.ranges, measurement.bearings)
+            )
             continue
-        closed = slam.drive(*reading)
+        closed = slam.drive(*measurement)
         if closed is not None:
             tracks.append(_track(closed, stamps, window))
             stamps = []
@@ -124,14 +128,16 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
     return tracks if last is None else [*tracks, _track(last, stamps, window)]
 
 
-def _merged(stream: RobotStream, longest_ns: int) -> Iterator[ObservationReading | OdometryReading]:
+def _merged(
+    stream: RobotStream, longest_ns: int
+) -> Iterator[ObservationMeasurement | OdometryMeasurement]:
     """The stream's scans and odometry; intervals of one command between two scans are made one.
 
     None is made longer than longest_ns. A command that is logged ten times is one arc, and noise of
     motion is a density: the estimate is the same, up to the correlation of the noises within an
     interval and to where a window ends.
     """
-    held: OdometryReading | None = None
+    held: OdometryMeasurement | None = None
     for counter in range(1, len(stream)):
         kind = stream.kinds[counter]
         if kind == ODOMETRY:
@@ -150,7 +156,7 @@ def _merged(stream: RobotStream, longest_ns: int) -> Iterator[ObservationReading
         yield held
 
 
-def _goes_on(one: OdometryReading, then: OdometryReading, longest_ns: int) -> bool:
+def _goes_on(one: OdometryMeasurement, then: OdometryMeasurement, longest_ns: int) -> bool:
     """Whether the other follows without a gap, by the same command, and both are short."""
     return (
         then.stamp_ns - then.duration_ns == one.stamp_ns

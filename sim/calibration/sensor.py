@@ -11,15 +11,15 @@ from central.desk.evaluation.errors import on_circle
 from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import CalibrationError, huber
 
-LEAST_READINGS = 100
+LEAST_MEASUREMENTS = 100
 ROUNDS = 4
 OUTLIER = 4.0
-"""Standard deviations beyond which a reading is no part of a spread or a correlation."""
+"""Standard deviations beyond which a measurement is no part of a spread or a correlation."""
 MAD_TO_SIGMA = 1.4826
 LAGS_S = np.geomspace(0.1, 30.0, 9)
 """Edges of the lags at which the errors of one landmark are correlated."""
 NEIGHBOURS = 64
-"""Pairs of readings of one landmark are taken up to so many readings apart."""
+"""Pairs of measurements of one landmark are taken up to so many measurements apart."""
 
 UNITS = {
     "range_offset": "m",
@@ -39,9 +39,9 @@ UNITS = {
 
 @dataclass(frozen=True)
 class _Rows:
-    """Readings with what they should have been: distances [m] and bearings [rad].
+    """Measurements with what they should have been: distances [m] and bearings [rad].
 
-    series: equal for readings of one landmark by one robot; the rows ascend by (series, time).
+    series: equal for measurements of one landmark by one robot; the rows ascend by (series, time).
     """
 
     series: Int64[np.ndarray, " n"]
@@ -78,17 +78,18 @@ def _rows(data: Sequence[Reference]) -> _Rows:
 
 
 def fit_sensor(data: Sequence[Reference]) -> Mapping[str, float]:
-    """The model of `Sensor` under which the readings are most likely.
+    """The model of `Sensor` under which the measurements are most likely.
 
     range = scale · distance + offset under Huber's loss in units of the noise, then the noise
     σ² = σ₀² + (σ₁ d)² by likelihood, in turn. Bearings: median and median absolute deviation, since
     outliers come in bursts. Shares: ρ(τ) = (1 − white) exp(−τ/T) fitted to the correlation of one
-    landmark's errors. Raises CalibrationError where there are too few readings.
+    landmark's errors. Raises CalibrationError where there are too few measurements.
     """
     rows = _rows(data)
-    if len(rows.series) < LEAST_READINGS:
+    if len(rows.series) < LEAST_MEASUREMENTS:
         raise CalibrationError(
-            f"{len(rows.series)} readings of landmarks from known poses, {LEAST_READINGS} needed"
+            f"{len(rows.series)} measurements of landmarks from known poses, "
+            f"{LEAST_MEASUREMENTS} needed"
         )
     affine, noise = np.array([1.0, 0.0]), np.array([0.05, 0.04])
     error = rows.ranges - rows.distances
@@ -155,7 +156,7 @@ def _persistence(rows: _Rows, relative: Float[np.ndarray, " n"]) -> tuple[float,
         counts += np.bincount(at[kept], minlength=len(counts))
         sums += np.bincount(at[kept], product[kept], minlength=len(counts))
         times += np.bincount(at[kept], lag[kept], minlength=len(counts))
-    filled = counts >= LEAST_READINGS
+    filled = counts >= LEAST_MEASUREMENTS
     if np.count_nonzero(filled) < 3:
         return 1.0, 0.0
     rho = sums[filled] / counts[filled] / variance
@@ -183,4 +184,4 @@ def _marker_offset(data: Sequence[Reference], affine: Float[np.ndarray, "2"]) ->
                 distance = np.hypot(*(there - here)[chosen, :2].T)
                 errors.append((seen.ranges[chosen] - affine[1]) / affine[0] - distance)
     found = np.concatenate(errors)
-    return float(np.median(found)) if len(found) >= LEAST_READINGS else None
+    return float(np.median(found)) if len(found) >= LEAST_MEASUREMENTS else None

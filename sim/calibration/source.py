@@ -1,4 +1,4 @@
-"""The readings to calibrate by: a data set's, or those of a log."""
+"""The measurements to calibrate by: a data set's, or those of a log."""
 
 from pathlib import Path
 
@@ -18,8 +18,8 @@ from team.wire.bus import Sample, opened
 CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
 
 
-def readings_of(path: Path) -> tuple[WorldStreams, Scenario]:
-    """The readings of a log (`.mcap`) with its scenario, or of a UTIAS set with `utias`.
+def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
+    """The measurements of a log (`.mcap`) with its scenario, or of a UTIAS set with `utias`.
 
     Of a log the first epoch of each robot is taken; of a set, all robots that it has files of.
     Raises DatasetError, LogError or ScenarioError.

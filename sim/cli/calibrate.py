@@ -1,4 +1,4 @@
-"""The command that learns the models' figures from readings: calibrate."""
+"""The command that learns the models' figures from measurements: calibrate."""
 
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +29,7 @@ def calibrate(
         Path | None, typer.Option("--json", help="Write the figures as JSON, too.")
     ] = None,
 ) -> None:
-    """Learn odometry and sensor models from readings; every figure with its uncertainty."""
+    """Learn odometry and sensor models from measurements; every figure with its uncertainty."""
     import json
     from dataclasses import asdict, replace
 
@@ -39,7 +39,7 @@ def calibrate(
     from sim.calibration.calibrate import calibrated
     from sim.calibration.figures import CalibrationError
     from sim.calibration.scenario import scenario_toml
-    from sim.calibration.source import readings_of
+    from sim.calibration.source import measurements_of
     from sim.cli.options import scenario_of
 
     if output is not None and output.suffix != ".toml":
@@ -47,7 +47,7 @@ def calibrate(
     read = []
     for path in source:
         typer.echo(f"reading {path}", err=True)
-        read.append((path.name, *readings_of(path)))
+        read.append((path.name, *measurements_of(path)))
     start = read[0][2] if scenario is None else scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
     try:

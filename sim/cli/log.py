@@ -66,7 +66,9 @@ def info(
     )
     if span is not None:
         first, last = (ns * 1e-9 for ns in span)
-        typer.echo(f"readings over {last - first:.3f} s of team time, {first:.3f} to {last:.3f} s")
+        typer.echo(
+            f"measurements over {last - first:.3f} s of team time, {first:.3f} to {last:.3f} s"
+        )
         console.print(_key_table(summary.keys, span[0], by_key=keys))
     for name, value in opened.metadata.items():
         console.print(Text(_line(f"{name}: {value}")), no_wrap=True, overflow="ellipsis")
@@ -107,10 +109,10 @@ def cut(
     log: LogArgument,
     output: NewLog,
     from_s: Annotated[
-        float | None, typer.Option("--from", help="Seconds after the first reading.")
+        float | None, typer.Option("--from", help="Seconds after the first measurement.")
     ] = None,
     to_s: Annotated[
-        float | None, typer.Option("--to", help="Seconds after the first reading, excluded.")
+        float | None, typer.Option("--to", help="Seconds after the first measurement, excluded.")
     ] = None,
     channels: ChannelNames = None,
 ) -> None:
@@ -159,7 +161,9 @@ def export(
     ] = Format.CSV,
     channels: ChannelNames = None,
 ) -> None:
-    """Write a log as tables, its paths for evo, or its readings and truth as a UTIAS data set."""
+    """Write a log as tables, its paths for evo, or its measurements and truth as a UTIAS data
+    set.
+    """
     from central.desk.export.tum import export_tum
     from sim.recorded.utias_set import export_utias
     from team.recording.reader import open_log

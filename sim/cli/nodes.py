@@ -83,17 +83,19 @@ def world(
     keys: Keys = None,
     speed: SpeedText = "1",
     recorder: Annotated[
-        bool, typer.Option(help="Wait for a recorder before the first reading.")
+        bool, typer.Option(help="Wait for a recorder before the first measurement.")
     ] = True,
     cache: Annotated[
         int | None,
-        typer.Option(help="Readings per robot that can be asked for again; default: all.", min=0),
+        typer.Option(
+            help="Measurements per robot that can be asked for again; default: all.", min=0
+        ),
     ] = None,
     robots: Robots = None,
     seed: Seed = None,
     dataset: Dataset = None,
 ) -> None:
-    """The world: a simulator or a data set that publishes every robot's readings."""
+    """The world: a simulator or a data set that publishes every robot's measurements."""
     from sim.publisher.main import run_world
     from sim.scenarios.source import streams_of
     from team.shell import process

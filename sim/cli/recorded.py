@@ -82,7 +82,7 @@ def report(
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
     ledger: Annotated[
         bool,
-        typer.Option(help="Prove the ledger: the robots consume the recorded readings again."),
+        typer.Option(help="Prove the ledger: the robots consume the recorded measurements again."),
     ] = True,
 ) -> None:
     """A page, pictures, tables and figures of a run, from its log alone."""

@@ -71,8 +71,8 @@ def rerun(
     """Compute a log again: to verify it, or under other conditions to compare.
 
     With --verify every message is computed again from the inputs that it names. Otherwise the
-    recorded readings run once more through the same nodes, with the changes asked for; without any
-    change, as they would have run with every message arriving at once.
+    recorded measurements run once more through the same nodes, with the changes asked for; without
+    any change, as they would have run with every message arriving at once.
     """
     changes = Changes(
         tuple(without or ()),
@@ -114,7 +114,9 @@ def _span(text: str, option: str) -> tuple[float, float]:
     except ValueError:
         begin, end = math.nan, math.nan
     if not 0.0 <= begin < end < math.inf:
-        fail(f"{option} {text}: give seconds since the log's first reading, as 60-120", WRONG_USE)
+        fail(
+            f"{option} {text}: give seconds since the log's first measurement, as 60-120", WRONG_USE
+        )
     return begin, end
 
 
@@ -245,7 +247,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     if not different and any(row.close for row in result.channels):
         verdict = "all equal within the tolerance"
     console.print(
-        f"{result.messages:,} messages from {result.readings:,} readings: {verdict}; "
+        f"{result.messages:,} messages from {result.measurements:,} measurements: {verdict}; "
         f"{elapsed_s:.1f} s for {result.span_s:.0f} s of team time, "
         f"{result.span_s / elapsed_s:.0f} × real time",
         highlight=False,
@@ -254,7 +256,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
 
 @app.command(name="verify-ledger")
 def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
-    """Prove that each reading of a log was used once: its disposition, its submap, its maps."""
+    """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
     from rich.console import Console
     from rich.table import Table
 

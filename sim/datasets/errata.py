@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class Erratum:
-    """A fault of one data set: readings of subject k are of subject subjects[k]."""
+    """A fault of one data set: measurements of subject k are of subject subjects[k]."""
 
     name: str
     subjects: Mapping[int, int]

@@ -28,12 +28,12 @@ SURVEY = ("subject", "x [m]", "y [m]", "x std-dev [m]", "y std-dev [m]")
 
 
 def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
-    """The readings of the robots r1, r2, … (the number is the data set's); raises DatasetError.
+    """The measurements of the robots r1, r2, … (the number is the data set's); raises DatasetError.
 
     Odometry row k acts from its time until the next row's, both odometry_delay_s and the robot's
     clock_offset_s later; the latter the robot puts right by itself. Stamps are
     the data set's, in nanoseconds since 1970. A robot's start pose is its ground truth at its first
-    reading, with the world's start sigmas.
+    measurement, with the world's start sigmas.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
@@ -101,12 +101,12 @@ def _landmarks(
 def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: int) -> RobotStream:
     robots = list(clocks)
     numbers = np.array([int(robot[1:]) for robot in robots], dtype=np.uint32)
-    log = log.without(log.readings.subjects == log.subject, "of itself")
-    subjects = log.readings.subjects
+    log = log.without(log.measurements.subjects == log.subject, "of itself")
+    subjects = log.measurements.subjects
     stranger = (subjects <= last_robot) & ~np.isin(subjects, numbers)
     log = log.without(stranger, "of a robot that is not in the team")
-    seen = log.readings.where(log.readings.subjects > last_robot)
-    met = log.readings.where(log.readings.subjects <= last_robot)
+    seen = log.measurements.where(log.measurements.subjects > last_robot)
+    met = log.measurements.where(log.measurements.subjects <= last_robot)
     index = (met.subjects[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
     return robot_stream(
         log.robot,
@@ -137,7 +137,7 @@ def _truth_notes(log: Log) -> list[str]:
     """What can not be known for want of ground truth in time."""
     notes = []
     if start_pose(log.truth_ns, log.truth, log.start_ns) is None:
-        notes.append("no ground truth at its first reading: its start pose is not known")
+        notes.append("no ground truth at its first measurement: its start pose is not known")
     ends = log.intervals.end_ns[-1:]
     if len(log.truth) and len(ends) and ends[0] - log.truth_ns[-1] > 10**9:
         seconds = (ends[0] - log.truth_ns[-1]) * 1e-9

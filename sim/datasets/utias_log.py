@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from sim.datasets.tables import DatasetError, File, optional_table
-from sim.datasets.utias_rows import Readings, counted, intervals_of, readings_of, truth_of
+from sim.datasets.utias_rows import Measurements, counted, intervals_of, measurements_of, truth_of
 from sim.world.streams import Intervals
 
 TRUTH = ("time [s]", "x [m]", "y [m]", "orientation [rad]")
@@ -18,22 +18,24 @@ MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
 
 @dataclass(frozen=True)
 class Log:
-    """Odometry, readings by subject and truth; start_ns: where the first of the readings begins."""
+    """Odometry, measurements by subject and truth; start_ns: where the first of the measurements
+    begins.
+    """
 
     robot: str
     subject: int
     start_ns: int
     intervals: Intervals
-    readings: Readings
+    measurements: Measurements
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]
 
     def without(self, dropped: Bool[np.ndarray, " R"], reason: str) -> "Log":
-        """The log without some readings, and a note that counts them."""
+        """The log without some measurements, and a note that counts them."""
         note = counted(int(np.count_nonzero(dropped)), "measurement", f"dropped: {reason}")
         notes = (*self.notes, note) if note else self.notes
-        return replace(self, readings=self.readings.where(~dropped), notes=notes)
+        return replace(self, measurements=self.measurements.where(~dropped), notes=notes)
 
     def until(self, end_ns: int) -> "Log":
         """The log up to the last odometry interval that ends at end_ns or before."""
@@ -49,7 +51,7 @@ class Log:
         return replace(
             self,
             intervals=intervals,
-            readings=self.readings.where(self.readings.stamps_ns <= last_ns),
+            measurements=self.measurements.where(self.measurements.stamps_ns <= last_ns),
             truth_ns=self.truth_ns[:samples],
             truth=self.truth[:samples],
         )
@@ -70,34 +72,34 @@ def log_of(
     if subject not in present:
         known = ", ".join(f"r{number}" for number in present)
         raise DatasetError(
-            f"the data set has no readings of a robot {robot}; it has {known}: give --robots, or a "
-            "scenario of its own, such as `teamslam simulate` writes beside it"
+            f"the data set has no measurements of a robot {robot}; it has {known}: give "
+            "--robots, or a scenario of its own, such as `teamslam simulate` writes beside it"
         )
     odometry = optional_table(files, f"Robot{subject}_Odometry.dat", ODOMETRY)
     measured = optional_table(files, f"Robot{subject}_Measurement.dat", MEASUREMENT)
     true_rows = optional_table(files, f"Robot{subject}_Groundtruth.dat", TRUTH)
     intervals, odometry_notes = intervals_of(odometry, delay_ns)
-    readings, reading_notes = readings_of(measured, subject_of)
+    measurements, measurement_notes = measurements_of(measured, subject_of)
     truth_ns, truth, truth_notes = truth_of(true_rows)
     missing = (
         "no odometry: only what it saw is given" if not len(intervals.end_ns) else "",
-        "no measurements: only its odometry is given" if not len(readings.stamps_ns) else "",
+        "no measurements: only its odometry is given" if not len(measurements.stamps_ns) else "",
         "no ground truth: its trajectory's error can not be computed" if not len(truth) else "",
     )
     if missing[0] and missing[1]:
         raise DatasetError(f"robot {robot}: neither odometry nor measurements in its files")
-    begins = (intervals.end_ns[:1] - intervals.duration_ns[:1], readings.stamps_ns[:1])
+    begins = (intervals.end_ns[:1] - intervals.duration_ns[:1], measurements.stamps_ns[:1])
     log = Log(
         robot=robot,
         subject=subject,
         start_ns=int(np.concatenate(begins).min()),
         intervals=intervals,
-        readings=readings,
+        measurements=measurements,
         truth_ns=truth_ns,
         truth=truth,
-        notes=(*filter(None, missing), *odometry_notes, *reading_notes, *truth_notes),
+        notes=(*filter(None, missing), *odometry_notes, *measurement_notes, *truth_notes),
     )
     if missing[0]:
         return log
-    late = readings.stamps_ns > intervals.end_ns[-1]
+    late = measurements.stamps_ns > intervals.end_ns[-1]
     return log.without(late, "after its last odometry, where its motion is not known")

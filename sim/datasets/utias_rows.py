@@ -1,4 +1,6 @@
-"""Rows of UTIAS tables → readings in order of time, with a note for all that is not handed out."""
+"""Rows of UTIAS tables → measurements in order of time, with a note for all that is not handed
+out.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,24 +14,24 @@ LONG_GAP_NS = 2_000_000_000
 """A gap in the odometry or the truth that is worth a note."""
 
 START_WINDOW_NS = 200_000_000
-"""The start pose comes from the ground truth within this time of the robot's first reading …"""
+"""The start pose comes from the ground truth within this time of the robot's first measurement …"""
 
 START_SPREAD_RAD = 0.2
 """… whose headings are within this of each other (the base turns at most 0.58 rad/s)."""
 
 
 @dataclass(frozen=True)
-class Readings:
-    """Range-bearing readings of one robot in order of time, by subject (landmark or robot)."""
+class Measurements:
+    """Range-bearing measurements of one robot in order of time, by subject (landmark or robot)."""
 
     stamps_ns: Int64[np.ndarray, " R"]
     subjects: UInt32[np.ndarray, " R"]
     ranges: Float[np.ndarray, " R"]
     bearings: Float[np.ndarray, " R"]
 
-    def where(self, chosen: Bool[np.ndarray, " R"]) -> "Readings":
+    def where(self, chosen: Bool[np.ndarray, " R"]) -> "Measurements":
         """The chosen ones."""
-        return Readings(
+        return Measurements(
             self.stamps_ns[chosen],
             self.subjects[chosen],
             self.ranges[chosen],
@@ -70,21 +72,21 @@ def intervals_of(
     return intervals, tuple(filter(None, notes))
 
 
-def readings_of(
+def measurements_of(
     rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
-) -> tuple[Readings, tuple[str, ...]]:
-    """Measurement rows (t, barcode, range, bearing) → readings by subject."""
+) -> tuple[Measurements, tuple[str, ...]]:
+    """Measurement rows (t, barcode, range, bearing) → measurements by subject."""
     rows, backward = _by_time(rows)
     codes = np.array(sorted(subject_of), dtype=np.float64)
     subjects = np.array([subject_of[int(code)] for code in codes], dtype=np.uint32)
     at = np.minimum(np.searchsorted(codes, rows[:, 1]), len(codes) - 1)
     known = codes[at] == rows[:, 1]
     positive = rows[:, 2] > 0.0
-    readings = Readings(
+    measurements = Measurements(
         nanoseconds(rows[:, 0]), subjects[at], rows[:, 2].copy(), _on_circle(rows[:, 3])
     )
     kept = known & positive
-    single = _first_of_each(readings.stamps_ns, readings.subjects, kept)
+    single = _first_of_each(measurements.stamps_ns, measurements.subjects, kept)
     notes = (
         counted(backward, "measurement", "earlier than the row before: sorted by time"),
         counted(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
@@ -97,7 +99,7 @@ def readings_of(
             "dropped: a second one of the same subject at the same time",
         ),
     )
-    return readings.where(single), tuple(filter(None, notes))
+    return measurements.where(single), tuple(filter(None, notes))
 
 
 def truth_of(
@@ -148,7 +150,7 @@ def _first_of_each(
     subjects: UInt32[np.ndarray, " R"],
     kept: Bool[np.ndarray, " R"],
 ) -> Bool[np.ndarray, " R"]:
-    """Of the kept readings, the first of each (stamp, subject)."""
+    """Of the kept measurements, the first of each (stamp, subject)."""
     rows = np.flatnonzero(kept)
     order = rows[np.lexsort((subjects[rows], stamps_ns[rows]))]
     again = (np.diff(stamps_ns[order]) == 0) & (np.diff(subjects[order].astype(np.int64)) == 0)

@@ -26,7 +26,7 @@ windows ahead of the news of its teammates."""
 
 @runtime_checkable
 class World(Protocol):
-    """Whatever publishes the readings: a scenario's world, or a log's."""
+    """Whatever publishes the measurements: a scenario's world, or a log's."""
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
@@ -40,7 +40,7 @@ class World(Protocol):
         """What it says first."""
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """The next readings; nothing when it waits or has ended."""
+        """The next measurements; nothing when it waits or has ended."""
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message."""

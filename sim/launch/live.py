@@ -106,10 +106,12 @@ class _Lines:
 
 
 def _done(watch: Watch) -> float:
-    """The share of the world's readings that the robots have taken; it may be far ahead of them."""
+    """The share of the world's measurements that the robots have taken; it may be far ahead of
+    them.
+    """
     total = watch.statuses["world"].figures.get("of", 0.0)
     robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
-    taken = sum(robot.figures.get("readings", 0.0) for robot in robots)
+    taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
     return min(taken / total, 1.0) if total else 0.0
 
 

@@ -11,7 +11,7 @@ from team.wire.codec import WireError
 from team.wire.newer import is_newer_map
 
 TURN_S = 0.1
-_PROGRESS = ("readings", "submaps", "messages")
+_PROGRESS = ("measurements", "submaps", "messages")
 """Figures of a status that grow as its node gets on."""
 
 

@@ -1,1 +1,1 @@
-"""The world's process: publishes readings as far as credit allows."""
+"""The world's process: publishes measurements as far as credit allows."""

@@ -30,7 +30,7 @@ def run_world(
     recorder: bool,
     cache: int | None = None,
 ) -> None:
-    """Publish every reading of the world, then wait for the final map."""
+    """Publish every measurement of the world, then wait for the final map."""
     robots = [robot.id for robot in scenario.robots]
     configured = translate.configured("world", 0, 0, scenario)
     node = WorldNode(
@@ -47,7 +47,7 @@ def run_world(
         bus.subscribe(channel)
     bus.watch_alive()
     for robot in robots:
-        shell.answer(ch.READINGS, robot, node.readings)
+        shell.answer(ch.MEASUREMENTS, robot, node.measurements)
     shell.look_for_the_end()
     if shell.going:
         shell.begin()
@@ -64,7 +64,7 @@ def run_world(
         shell.report()
     shell.report(last=True)
     shell.wait_for_recorder(lambda: node.unrecorded > 0, shell.take)
-    _LOG.info("published %d readings", int(node.status().figures["readings"]))
+    _LOG.info("published %d measurements", int(node.status().figures["measurements"]))
     shell.end(node.final)
 
 

@@ -1,7 +1,7 @@
-"""The world's node: publishes every robot's readings in team time, as far as credit allows.
+"""The world's node: publishes every robot's measurements in team time, as far as credit allows.
 
-It waits until everyone is there, never drops a reading, and ends with the last counters. It is the
-source of the streams, so it also answers for what a receiver missed.
+It waits until everyone is there, never drops a measurement, and ends with the last counters. It is
+the source of the streams, so it also answers for what a receiver missed.
 """
 
 from collections import deque
@@ -20,14 +20,14 @@ from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
 
-CREDIT_READINGS = 4096
-"""The world is at most this many readings ahead of the slowest living robot."""
+CREDIT_MEASUREMENTS = 4096
+"""The world is at most this many measurements ahead of the slowest living robot."""
 CREDIT_RECORDER = 16384
 """… and this many, of all robots together, ahead of a living recorder."""
 BATCH = 256
-"""Readings between two looks at what has come in."""
+"""Measurements between two looks at what has come in."""
 ANSWER = 8192
-"""Readings in one answer to a query; who wants more asks again."""
+"""Measurements in one answer to a query; who wants more asks again."""
 TRUTH_BATCH_NS = 1_000_000_000
 HELD_UP_S = 5.0
 """A node without whose progress the world can not go on is named after so long."""
@@ -38,7 +38,7 @@ FIRST_EPOCH = 1
 
 @dataclass
 class _Source:
-    """One robot's stream; its present epoch began at reading `base` of the whole."""
+    """One robot's stream; its present epoch began at measurement `base` of the whole."""
 
     stream: RobotStream
     epoch: int = FIRST_EPOCH
@@ -50,27 +50,29 @@ class _Source:
 
     @property
     def counter(self) -> int:
-        """Readings published in this epoch."""
+        """Measurements published in this epoch."""
         return self.published - self.base
 
-    def message(self, index: int) -> m.Reading:
-        """The reading at `index` of the whole stream, as this epoch counts it."""
-        robot, epoch, reading = self.stream.robot, self.epoch, index - self.base
+    def message(self, index: int) -> m.Measurement:
+        """The measurement at `index` of the whole stream, as this epoch counts it."""
+        robot, epoch, measurement = self.stream.robot, self.epoch, index - self.base
         stamp_ns = int(self.stream.stamps_ns[index])
-        if reading == 0 and epoch > FIRST_EPOCH:
+        if measurement == 0 and epoch > FIRST_EPOCH:
             return m.Start(stamp_ns, robot, epoch, 0, b"", b"")
         kind = self.stream.kinds[index]
         if kind == s.ODOMETRY:
             o = self.stream.odometry(index)
             stamp_ns -= self.stream.clock_offset_ns
-            return m.Odometry(stamp_ns, robot, epoch, reading, o.duration_ns, o.forward, o.yaw_rate)
+            return m.Odometry(
+                stamp_ns, robot, epoch, measurement, o.duration_ns, o.forward, o.yaw_rate
+            )
         if kind == s.OBSERVATIONS:
             z = self.stream.observations(index)
             return m.Observations(
                 stamp_ns,
                 robot,
                 epoch,
-                reading,
+                measurement,
                 from_ids(z.ids),
                 from_floats(z.ranges),
                 from_floats(z.bearings),
@@ -81,7 +83,7 @@ class _Source:
                 stamp_ns,
                 robot,
                 epoch,
-                reading,
+                measurement,
                 t.teammates,
                 from_floats(t.ranges),
                 from_floats(t.bearings),
@@ -90,7 +92,7 @@ class _Source:
         pose = b"" if start is None else from_floats(start.pose)
         known = start is not None and start.covariance is not None
         covariance = from_floats(start.covariance) if start is not None and known else b""
-        return m.Start(stamp_ns, robot, epoch, reading, pose, covariance)
+        return m.Start(stamp_ns, robot, epoch, measurement, pose, covariance)
 
 
 _CHANNEL_OF_KIND = {
@@ -105,12 +107,12 @@ _CHANNEL_OF_KIND = {
 class WorldNode:
     """`begin`, then `publish` again and again until `ended`; `handle` for what comes in.
 
-    expected: the nodes that must be alive before the first reading. speed: team seconds per second
-    of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's last
-    readings can be asked for again; None: all. Who asks for older ones gets a new epoch instead: a
-    start at an unknown pose, and readings that count from there. configurations: what the others
-    are to announce; the world does not begin while anyone has announced something else.
-    tells_map: the robots are told the landmarks, since they only localise themselves.
+    expected: the nodes that must be alive before the first measurement. speed: team seconds per
+    second of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's
+    last measurements can be asked for again; None: all. Who asks for older ones gets a new epoch
+    instead: a start at an unknown pose, and measurements that count from there. configurations:
+    what the others are to announce; the world does not begin while anyone has announced something
+    else. tells_map: the robots are told the landmarks, since they only localise themselves.
     batch_s: team time between two looks at what has come in, at the most.
     """
 
@@ -189,8 +191,8 @@ class WorldNode:
                     return f"of {message.robot}, not in this team"
                 if message.epoch > source.epoch:
                     return f"of incarnation {message.epoch} of {message.robot}, {source.epoch} is"
-                if message.readings > len(source.stream):
-                    return f"consumed {message.readings} of {len(source.stream)} readings"
+                if message.measurements > len(source.stream):
+                    return f"consumed {message.measurements} of {len(source.stream)} measurements"
             case m.FusedMap() if message.final and self._published and not self.ended:
                 return "a final map before the end of the streams"
             case _:
@@ -204,13 +206,13 @@ class WorldNode:
                 self._take_liveliness(message)
             case m.Progress() if message.node == "recorder":
                 stream = (message.robot, message.epoch)
-                self._recorded[stream] = max(self._recorded.get(stream, 0), message.readings)
+                self._recorded[stream] = max(self._recorded.get(stream, 0), message.measurements)
             case m.Progress():
-                if self._began_at is None and message.readings:
+                if self._began_at is None and message.measurements:
                     self._note_consumed(message)
                 source = self._sources.get(message.robot)
                 if source is not None and message.epoch == source.epoch:
-                    source.consumed = max(source.consumed, source.base + message.readings)
+                    source.consumed = max(source.consumed, source.base + message.measurements)
             case m.Configured():
                 self.configurations.take(message)
             case m.FusedMap() if message.final:
@@ -225,7 +227,7 @@ class WorldNode:
         """What robots say before this world has begun is of an earlier life of it."""
         stream = (progress.robot, progress.epoch)
         if progress.robot in self._sources:
-            self._consumed[stream] = max(self._consumed.get(stream, 0), progress.readings)
+            self._consumed[stream] = max(self._consumed.get(stream, 0), progress.measurements)
             self._passed_ns[progress.robot] = progress.stamp_ns
 
     def _take_liveliness(self, message: m.Liveliness) -> None:
@@ -282,20 +284,22 @@ class WorldNode:
 
     @property
     def _out_of_reach(self) -> int:
-        """Readings that nobody can ask for any more: a recorder that comes late never has them."""
+        """Measurements that nobody can ask for any more: a recorder that comes late never has
+        them.
+        """
         if self.cache is None:
             return 0
         return sum(max(0, x.published - self.cache) for x in self._sources.values())
 
     @property
     def unrecorded(self) -> int:
-        """Readings that a living recorder still lacks by its own word."""
+        """Measurements that a living recorder still lacks by its own word."""
         if not self._recorder:
             return 0
         return self._published - self._unrecorded - sum(self._recorded.values())
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """The next readings, at most BATCH and of batch_s: as many as pace and credit allow."""
+        """The next measurements, at most BATCH and of batch_s: as many as pace and credit allow."""
         if self.ended:  # a new epoch may begin after the end; it has its own last counters
             out, self._starts = self._starts, []
             return [*out, Outgoing(ch.END, "", self._end())] if out else []
@@ -347,8 +351,8 @@ class WorldNode:
         return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
     def _without_credit(self, source: _Source) -> str | None:
-        """Who has to get on before the next reading of this robot; None: nobody."""
-        if source.alive and source.published - source.consumed >= CREDIT_READINGS:
+        """Who has to get on before the next measurement of this robot; None: nobody."""
+        if source.alive and source.published - source.consumed >= CREDIT_MEASUREMENTS:
             return ch.robot_node(source.stream.robot)
         return "recorder" if self.unrecorded >= CREDIT_RECORDER else None
 
@@ -378,9 +382,11 @@ class WorldNode:
             notes += [f"{name}: {note}" for note in source.stream.notes]
         return m.End(self.now_ns, ends, tuple(notes))
 
-    def readings(self, request: bytes) -> Iterable[bytes]:
-        """The answer to `ReadingsWanted`: the published readings asked for, ANSWER at most."""
-        wanted = decoded(request, m.ReadingsWanted)
+    def measurements(self, request: bytes) -> Iterable[bytes]:
+        """The answer to `MeasurementsRequest`: the published measurements asked for, ANSWER at
+        most.
+        """
+        wanted = decoded(request, m.MeasurementsRequest)
         source = self._sources.get(wanted.robot)
         if source is None or wanted.epoch not in (0, source.epoch):
             return []
@@ -406,7 +412,7 @@ class WorldNode:
         """How far the world is, for people."""
         total = self._published + len(self._order)
         figures = {
-            "readings": float(self._published),
+            "measurements": float(self._published),
             "of": float(total),
             "team_time_s": (self.now_ns - self._first_ns) * 1e-9,
         }

@@ -1,4 +1,6 @@
-"""The same readings under other conditions: the recorded team's nodes, in memory, with changes."""
+"""The same measurements under other conditions: the recorded team's nodes, in memory, with
+changes.
+"""
 
 import msgspec
 
@@ -19,7 +21,8 @@ from team.wire.bus import Sample
 def changed_run(log: Log, changes: Changes) -> list[Sample]:
     """The samples of the changed run, as a recorder would have taken them.
 
-    Raises ScenarioError for a change that has no meaning, RerunError for a log that lacks readings.
+    Raises ScenarioError for a change that has no meaning, RerunError for a log that lacks
+    measurements.
     """
     world = RecordedWorld(log, changes.without)
     scenario = changed_scenario(world.scenario, changes)

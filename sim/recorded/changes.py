@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 Span = tuple[float, float]
-"""Begin and end in seconds since the log's first reading."""
+"""Begin and end in seconds since the log's first measurement."""
 
 
 @dataclass(frozen=True)
 class Changes:
-    """What is to be different; the readings are the log's whatever is asked.
+    """What is to be different; the measurements are the log's whatever is asked.
 
     without: robots that were not there. seed: of the estimators and of the losses. loss, delay_s:
     of submaps on their way to the centre. no_centre: when there is none. partitions: robots that

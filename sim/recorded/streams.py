@@ -26,13 +26,13 @@ def recorded_streams(
     clocks: the offset of each robot's odometry [s] that is to be put right; absent: none.
     """
     offsets = {} if clocks is None else clocks
-    readings: dict[str, dict[int, m.Reading]] = {}
+    measurements: dict[str, dict[int, m.Measurement]] = {}
     truth: dict[str, list[m.Truth]] = {}
     landmark_ids, landmarks = np.empty(0, np.uint32), None
     for message in messages:
         match message:
-            case m.Reading() if message.epoch == 1:
-                readings.setdefault(message.robot, {})[message.reading] = message
+            case m.Measurement() if message.epoch == 1:
+                measurements.setdefault(message.robot, {})[message.number] = message
             case m.Truth():
                 truth.setdefault(message.robot, []).append(message)
             case m.TruthLandmarks():
@@ -45,25 +45,25 @@ def recorded_streams(
             robot,
             [of[i] for i in sorted(of)],
             truth.get(robot, []),
-            tuple(sorted(readings)),
+            tuple(sorted(measurements)),
             offsets.get(robot, 0.0),
         )
-        for robot, of in sorted(readings.items())
+        for robot, of in sorted(measurements.items())
     ]
     return WorldStreams(tuple(streams), landmark_ids, landmarks, source)
 
 
 def _stream(
     robot: str,
-    readings: Sequence[m.Reading],
+    measurements: Sequence[m.Measurement],
     truth: Sequence[m.Truth],
     robots: tuple[str, ...],
     clock_offset_s: float,
 ) -> RobotStream:
-    starts = [each for each in readings if isinstance(each, m.Start)]
-    odometry = [each for each in readings if isinstance(each, m.Odometry)]
-    seen = [each for each in readings if isinstance(each, m.Observations)]
-    sighted = [each for each in readings if isinstance(each, m.Sightings)]
+    starts = [each for each in measurements if isinstance(each, m.Start)]
+    odometry = [each for each in measurements if isinstance(each, m.Odometry)]
+    seen = [each for each in measurements if isinstance(each, m.Observations)]
+    sighted = [each for each in measurements if isinstance(each, m.Sightings)]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
     intervals = Intervals(
         np.array(
@@ -78,7 +78,7 @@ def _stream(
     poses = [floats(each.poses, "poses").reshape(-1, 3) for each in truth]
     return robot_stream(
         robot,
-        readings[0].stamp_ns,
+        measurements[0].stamp_ns,
         None if pose is None else StartPose(pose, covariance),
         intervals,
         _detections(seen, [ids(each.ids, "ids") for each in seen]),

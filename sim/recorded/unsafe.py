@@ -17,7 +17,7 @@ from team.wire.bus import Outgoing
 class UnsafeRobot(RobotNode):
     """Its submaps begin with the team's map instead of with nothing.
 
-    The map holds the robot's earlier readings, and everyone's; each submap sends them again, so
+    The map holds the robot's earlier measurements, and everyone's; each submap sends them again, so
     they are counted again with every exchange. The mean hardly moves; the covariance loses its
     meaning. Kept for demonstration: no scenario can choose it.
     """

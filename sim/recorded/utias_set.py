@@ -19,21 +19,23 @@ def export_utias(log: Log, folder: Path) -> list[str]:
     """Write the data set into `folder`; the robots in the order of their numbers 1, 2, …
 
     The format has one stream per robot: the first epoch of each is written. Raises `LogError` for
-    a log that has no readings, or not those that the format needs.
+    a log that has no measurements, or not those that the format needs.
     """
     messages = list(_sound(log))
-    readings = [each for each in messages if isinstance(each, m.Reading)]
-    robots = {each.robot for each in readings if each.epoch == FIRST_EPOCH}
+    measurements = [each for each in messages if isinstance(each, m.Measurement)]
+    robots = {each.robot for each in measurements if each.epoch == FIRST_EPOCH}
     if not robots:
-        raise LogError(log.path, "no sensor readings in it", "`--format csv` writes what there is")
-    sighted = {n for each in readings if isinstance(each, m.Sightings) for n in each.teammates}
+        raise LogError(
+            log.path, "no sensor measurements in it", "`--format csv` writes what there is"
+        )
+    sighted = {n for each in measurements if isinstance(each, m.Sightings) for n in each.teammates}
     if sighted - robots:
-        what = f"it sights {', '.join(sorted(sighted - robots))}, of whom it has no readings"
+        what = f"it sights {', '.join(sorted(sighted - robots))}, of whom it has no measurements"
         raise LogError(log.path, what, "`teamslam log merge` puts the robots' logs together")
     try:
         world = recorded_streams(messages, log.path.name)
     except ValueError as error:
-        remedy = "the format needs readings without gaps: `teamslam log cut` to a part without"
+        remedy = "the format needs measurements without gaps: `teamslam log cut` to a part without"
         raise LogError(log.path, str(error), remedy) from None
     write_utias(world, folder)
     return [stream.robot for stream in world.streams]

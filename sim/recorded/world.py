@@ -1,4 +1,4 @@
-"""The world of a log: its readings and its truth once more, second by second of team time."""
+"""The world of a log: its measurements and its truth once more, second by second of team time."""
 
 from collections import deque
 from collections.abc import Collection
@@ -22,8 +22,8 @@ _SOURCE = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG, ch.END)
 class RecordedWorld:
     """What a log's world published, of some of its robots, in the order of team time.
 
-    Each robot's readings come in the order of their counters. Raises RerunError where one is not in
-    the log, since no robot could go on behind it.
+    Each robot's measurements come in the order of their counters. Raises RerunError where one is
+    not in the log, since no robot could go on behind it.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
@@ -40,10 +40,10 @@ class RecordedWorld:
             except WireError:
                 continue
             match message:
-                case m.Reading() | m.Truth() if name in without:
+                case m.Measurement() | m.Truth() if name in without:
                     pass
-                case m.Reading():
-                    place = (message.robot, message.epoch, message.reading)
+                case m.Measurement():
+                    place = (message.robot, message.epoch, message.number)
                     out = Outgoing(channel, name, message)
                     published.setdefault(place, (message.stamp_ns, out))
                 case m.Truth():
@@ -113,10 +113,10 @@ class RecordedWorld:
 def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...]:
     """The last epoch of every robot and its count; raises RerunError for a gap in any epoch."""
     counts: dict[tuple[str, int], int] = {}
-    for robot, epoch, reading in sorted(published):
-        if reading != counts.setdefault((robot, epoch), 0):
+    for robot, epoch, measurement in sorted(published):
+        if measurement != counts.setdefault((robot, epoch), 0):
             raise RerunError(
-                f"reading {counts[robot, epoch]} of {robot}, epoch {epoch} is not in the log: "
+                f"measurement {counts[robot, epoch]} of {robot}, epoch {epoch} is not in the log: "
                 "under other conditions the robot could not go on behind it"
             )
         counts[robot, epoch] += 1

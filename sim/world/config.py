@@ -28,13 +28,13 @@ class SimulatedWorld(
     steering: "together" turns and drives in one step; "turn-first" drives no step that turns.
     look_at_start: there is a message of what is seen before the first step, too.
     visible_from_m, visible_to_m: what lies at a *true* range between them is seen; absent: the
-    limits of the robot's sensor. They are the world's, since a robot that gates its noisy readings
-    at the same limits selects by the noise, and its map is biased.
+    limits of the robot's sensor. They are the world's, since a robot that gates its noisy
+    measurements at the same limits selects by the noise, and its map is biased.
     unknown_starts: the robots whose start pose is not told to the team; "*" is all of them, "!r1"
     after it all but that one.
-    garbage: the probability of each reading of a landmark to be spoilt. garbage_kind: "reading"
+    garbage: the probability of each measurement of a landmark to be spoilt. garbage_kind: "reading"
     gives it a uniform range and bearing of what can be seen, "identity" the identity of another of
-    the world's landmarks; "drop" leaves out the very readings that the others spoil, all else
+    the world's landmarks; "drop" leaves out the very measurements that the others spoil, all else
     being the same: what a run with garbage is compared with.
     """
 
@@ -73,7 +73,7 @@ class UtiasWorld(
     path: its folder or zip. odometry_delay_s: odometry logged at t acts at t + odometry_delay_s on
     the camera's clock. start_sigma_m, start_sigma_rad: how well the start poses are known; both 0:
     exactly. unknown_starts: as in a simulated world. duration_s: only this much from the team's
-    first reading. errata: repair known faults.
+    first measurement. errata: repair known faults.
     """
 
     path: str = ""

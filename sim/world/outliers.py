@@ -1,7 +1,9 @@
-"""Readings that have nothing to do with what is there: of the simulated world, if it is asked to.
+"""Measurements that have nothing to do with what is there: of the simulated world, if it is asked
+to.
 
-Which readings are spoilt is drawn for each of them, in the same way for every kind of garbage; so
-runs of different kinds, and the run in which the same readings are left out, can be compared.
+Which measurements are spoilt is drawn for each of them, in the same way for every kind of garbage;
+so runs of different kinds, and the run in which the same measurements are left out, can be
+compared.
 """
 
 import numpy as np
@@ -20,7 +22,7 @@ def spoilt(
     landmarks: int,
     uniforms: Float[np.ndarray, "R 3"],
 ) -> Detections:
-    """The detections with a share of the readings spoilt, from uniform numbers in [0, 1).
+    """The detections with a share of the measurements spoilt, from uniform numbers in [0, 1).
 
     The first number of a row chooses it. "reading": the other two are the range, uniform in `span`
     [m], and the bearing, uniform in the field of view. "identity": the second is which other of the

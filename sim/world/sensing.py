@@ -7,11 +7,13 @@ from jaxtyping import Float, Int64
 
 from team.config import Sensor
 
-SHORTEST_READING_M = 0.05
-"""A reading that the noise would make shorter is given as this: a sensor has no negative range."""
+SHORTEST_MEASUREMENT_M = 0.05
+"""A measurement that the noise would make shorter is given as this: a sensor has no negative
+range.
+"""
 
 SHORTEST_TIME_S = 1e-9
-"""A correlation time that is shorter is this: none from one reading to the next."""
+"""A correlation time that is shorter is this: none from one measurement to the next."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ def visible(
 def persistent(
     seen: Visible, sensor: Sensor, step_s: float, normals: Float[np.ndarray, "V 4"]
 ) -> Float[np.ndarray, "V 2"]:
-    """Errors of unit variance, of which a share stays with each point from reading to reading.
+    """Errors of unit variance, of which a share stays with each point from measurement to
+    measurement.
 
     n = √white w + √(1 − white) g with white w and, for each point, g of a first-order Gauss-Markov
     process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). All from standard
@@ -69,7 +72,7 @@ def persistent(
     return both
 
 
-def readings(
+def measurements(
     seen: Visible, sensor: Sensor, errors: Float[np.ndarray, "V 2"]
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
     """Ranges [m] and bearings [rad] as the sensor reads them, from errors n of unit variance.
@@ -80,7 +83,7 @@ def readings(
     sigma = np.hypot(sensor.range_sigma, sensor.range_sigma_per_m * seen.ranges)
     ranges = sensor.range_scale * (seen.ranges + sigma * errors[:, 0]) + sensor.range_offset
     bearings = seen.bearings + sensor.bearing_sigma * errors[:, 1] + sensor.bearing_offset
-    return np.maximum(ranges, SHORTEST_READING_M), on_circle(bearings)
+    return np.maximum(ranges, SHORTEST_MEASUREMENT_M), on_circle(bearings)
 
 
 def on_circle(angles: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:

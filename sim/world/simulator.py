@@ -1,4 +1,5 @@
-"""A simulated world: true paths, odometry with noise in it, readings of landmarks and teammates.
+"""A simulated world: true paths, odometry with noise in it, measurements of landmarks and
+teammates.
 
 Nothing here comes from the estimator: the motion and the sensor are written again in `paths`,
 `odometry` and `sensing` beside this, so that an error in either half shows. Every stream of random
@@ -17,7 +18,7 @@ from sim.world.config import SimulatedWorld, starts_unknown
 from sim.world.odometry import slip, told
 from sim.world.outliers import spoilt
 from sim.world.paths import Drive, Limits, Pose, Step, driven, followed
-from sim.world.sensing import Visible, persistent, readings, visible
+from sim.world.sensing import Visible, measurements, persistent, visible
 from sim.world.streams import (
     Detections,
     Intervals,
@@ -220,7 +221,7 @@ def _read(
     if sensor.range_white < 1.0 or sensor.bearing_white < 1.0:
         lasting = generator(seed, *names, "persistent").standard_normal((len(seen.steps), 2))
         errors = persistent(seen, sensor, world.step_s, np.column_stack((errors, lasting)))
-    return readings(seen, sensor, errors)
+    return measurements(seen, sensor, errors)
 
 
 def _sightings(
@@ -265,7 +266,7 @@ def _visible(
 
 
 def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
-    """The world's true ranges of sight; where it has none, those of the sensor's readings."""
+    """The world's true ranges of sight; where it has none, those of the sensor's measurements."""
     nearest = sensor.min_range if world.visible_from_m is None else world.visible_from_m
     farthest = sensor.max_range if world.visible_to_m is None else world.visible_to_m
     return nearest, farthest

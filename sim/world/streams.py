@@ -1,9 +1,9 @@
-"""What any world is, simulated or recorded: readings of each robot in order, and the truth.
+"""What any world is, simulated or recorded: measurements of each robot in order, and the truth.
 
-One counter spans all readings of a robot, in the order (stamp, kind); reading 0 is the start pose.
-An odometry reading is an interval that is stamped with its *end*, and the intervals of a robot are
-contiguous in time. So at equal stamps what was seen at the end of an interval comes before it.
-SI units, radians, bearings in (−π, π].
+One counter spans all measurements of a robot, in the order (stamp, kind); measurement 0 is the
+start pose. An odometry measurement is an interval that is stamped with its *end*, and the intervals
+of a robot are contiguous in time. So at equal stamps what was seen at the end of an interval comes
+before it. SI units, radians, bearings in (−π, π].
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ KIND_NAMES = ("start pose", "observations", "sightings", "odometry")
 
 @dataclass(frozen=True)
 class StartPose:
-    """The pose (x, y, θ) of reading 0 in the team's frame; covariance None: exactly known."""
+    """The pose (x, y, θ) of measurement 0 in the team's frame; covariance None: exactly known."""
 
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"] | None
@@ -44,7 +44,7 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Detections:
-    """M messages of range-bearing readings: message m has the rows offsets[m] … offsets[m + 1].
+    """M messages of range-bearing measurements: message m has the rows offsets[m] … offsets[m + 1].
 
     ids are landmark identities, or indices into a tuple of teammates.
     """
@@ -60,7 +60,7 @@ class Detections:
         return slice(int(self.offsets[message]), int(self.offsets[message + 1]))
 
 
-class OdometryReading(NamedTuple):
+class OdometryMeasurement(NamedTuple):
     """One interval that ends at stamp_ns."""
 
     stamp_ns: int
@@ -69,7 +69,7 @@ class OdometryReading(NamedTuple):
     yaw_rate: float
 
 
-class ObservationReading(NamedTuple):
+class ObservationMeasurement(NamedTuple):
     """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty."""
 
     stamp_ns: int
@@ -78,7 +78,7 @@ class ObservationReading(NamedTuple):
     bearings: Float[np.ndarray, " R"]
 
 
-class SightingReading(NamedTuple):
+class SightingMeasurement(NamedTuple):
     """Teammates seen at stamp_ns: names, ranges [m], bearings [rad]."""
 
     stamp_ns: int
@@ -89,12 +89,13 @@ class SightingReading(NamedTuple):
 
 @dataclass(frozen=True)
 class RobotStream:
-    """All readings of one robot; the index into kinds, stamps_ns and rows is the reading counter.
+    """All measurements of one robot; the index into kinds, stamps_ns and rows is the measurement
+    counter.
 
-    start: None when the start pose is not known. rows: the reading's row in the arrays of its kind.
-    truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was repaired or can not be
-    given, in a user's words. clock_offset_ns: all stamps here are team time, and the odometry's own
-    clock, whose stamps go out, reads so much less.
+    start: None when the start pose is not known. rows: the measurement's row in the arrays of its
+    kind. truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was repaired or can
+    not be given, in a user's words. clock_offset_ns: all stamps here are team time, and the
+    odometry's own clock, whose stamps go out, reads so much less.
     """
 
     robot: str
@@ -112,40 +113,41 @@ class RobotStream:
     clock_offset_ns: int = 0
 
     def __len__(self) -> int:
-        """The number of readings, the start pose included."""
+        """The number of measurements, the start pose included."""
         return len(self.kinds)
 
-    def odometry(self, counter: int) -> OdometryReading:
-        """The odometry interval with this reading counter."""
+    def odometry(self, counter: int) -> OdometryMeasurement:
+        """The odometry interval with this measurement counter."""
         row = self._row(counter, ODOMETRY)
         intervals = self.intervals
-        return OdometryReading(
+        return OdometryMeasurement(
             int(intervals.end_ns[row]),
             int(intervals.duration_ns[row]),
             float(intervals.forward[row]),
             float(intervals.yaw_rate[row]),
         )
 
-    def observations(self, counter: int) -> ObservationReading:
-        """The landmarks seen, of the message with this reading counter."""
+    def observations(self, counter: int) -> ObservationMeasurement:
+        """The landmarks seen, of the message with this measurement counter."""
         seen = self.landmark_detections
         at = seen.rows(self._row(counter, OBSERVATIONS))
         stamp_ns = int(self.stamps_ns[counter])
-        return ObservationReading(stamp_ns, seen.ids[at], seen.ranges[at], seen.bearings[at])
+        return ObservationMeasurement(stamp_ns, seen.ids[at], seen.ranges[at], seen.bearings[at])
 
-    def sightings(self, counter: int) -> SightingReading:
-        """The teammates seen, of the message with this reading counter."""
+    def sightings(self, counter: int) -> SightingMeasurement:
+        """The teammates seen, of the message with this measurement counter."""
         seen = self.teammate_detections
         at = seen.rows(self._row(counter, SIGHTINGS))
         names = tuple(self.teammates[i] for i in seen.ids[at])
         stamp_ns = int(self.stamps_ns[counter])
-        return SightingReading(stamp_ns, names, seen.ranges[at], seen.bearings[at])
+        return SightingMeasurement(stamp_ns, names, seen.ranges[at], seen.bearings[at])
 
     def _row(self, counter: int, kind: int) -> int:
         found = int(self.kinds[counter])
         if found != kind:
             raise LookupError(
-                f"reading {counter} of {self.robot}: {KIND_NAMES[found]}, not {KIND_NAMES[kind]}"
+                f"measurement {counter} of {self.robot}: {KIND_NAMES[found]}, not "
+                f"{KIND_NAMES[kind]}"
             )
         return int(self.rows[counter])
 
@@ -164,7 +166,8 @@ class WorldStreams:
     notes: tuple[str, ...] = ()
 
     def order(self) -> tuple[Int64[np.ndarray, " A"], Int64[np.ndarray, " A"]]:
-        """All readings of the team by (stamp, stream, counter): their stream indices and counters.
+        """All measurements of the team by (stamp, stream, counter): their stream indices and
+        counters.
 
         Restricted to one stream the counters ascend, since its stamps never decrease.
         """
@@ -189,16 +192,18 @@ def robot_stream(
     notes: Sequence[str] = (),
     clock_offset_ns: int = 0,
 ) -> RobotStream:
-    """Number the readings of one robot by (stamp, kind), the start pose first.
+    """Number the measurements of one robot by (stamp, kind), the start pose first.
 
-    Raises ValueError for a reading before the start, or odometry that is not contiguous.
+    Raises ValueError for a measurement before the start, or odometry that is not contiguous.
     """
     parts = (np.array([start_ns]), observations.stamps_ns, sightings.stamps_ns, intervals.end_ns)
     stamps = np.concatenate(parts)
     kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in parts])
     rows = np.concatenate([np.arange(len(part), dtype=np.int64) for part in parts])
     if stamps.min() < start_ns:
-        raise ValueError(f"{robot}: a reading at {stamps.min()} ns is before its start, {start_ns}")
+        raise ValueError(
+            f"{robot}: a measurement at {stamps.min()} ns is before its start, {start_ns}"
+        )
     begins = intervals.end_ns - intervals.duration_ns
     if np.any(begins[1:] != intervals.end_ns[:-1]):
         raise ValueError(f"{robot}: odometry intervals are not contiguous in time")
@@ -226,7 +231,7 @@ def grouped(
     ranges: Float[np.ndarray, " R"],
     bearings: Float[np.ndarray, " R"],
 ) -> Detections:
-    """Readings in order of time → one message per stamp."""
+    """Measurements in order of time → one message per stamp."""
     first = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[:1] - 1))
     offsets = np.append(first, len(stamps_ns)).astype(np.int64)
     return Detections(stamps_ns[first], offsets, ids, ranges, bearings)

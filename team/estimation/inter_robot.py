@@ -25,8 +25,8 @@ from team.estimation.models import NEAREST_M, Increment, noise
 class Sighting:
     """Submap `sequence` of (robot, epoch) has a pose node at stamp_ns, from where a teammate is.
 
-    reading: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
-    covariance: of the reading, [m², m·rad, rad²].
+    measurement: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
+    covariance: of the measurement, [m², m·rad, rad²].
     """
 
     robot: str
@@ -34,7 +34,7 @@ class Sighting:
     sequence: int
     stamp_ns: int
     teammate: str
-    reading: Float[np.ndarray, "2"]
+    measurement: Float[np.ndarray, "2"]
     covariance: Float[np.ndarray, "2 2"]
 
     @property

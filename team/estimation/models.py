@@ -266,9 +266,9 @@ def corrected(
 def acceptable(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which raw readings lie in [min_range, max_range] and in the field of view.
+    """Which raw measurements lie in [min_range, max_range] and in the field of view.
 
-    Readings that are not finite do not; neither does one whose corrected range is not positive.
+    Measurements that are not finite do not; neither does one whose corrected range is not positive.
     """
     distances, _ = corrected(sensor, ranges, bearings)
     inside: Bool[np.ndarray, " n"] = (

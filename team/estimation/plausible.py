@@ -33,7 +33,7 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
 
 def sighting_beyond(sighting: Sighting, bounds: Bounds) -> str | None:
     """Why an inter-robot measurement is refused; None if it is within the bounds."""
-    why = _far(sighting.reading[:1], bounds.extent_m, "of its observer")
+    why = _far(sighting.measurement[:1], bounds.extent_m, "of its observer")
     return why or _spread(sighting.covariance, np.array([False, True]), bounds)
 
 

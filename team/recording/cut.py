@@ -27,7 +27,7 @@ def cut(
 ) -> int:
     """Write the samples of [from_s, to_s) on these channels to a new log `out`; how many.
 
-    Seconds of team time since the first reading; None: no bound. So adjoining cuts part a log.
+    Seconds of team time since the first measurement; None: no bound. So adjoining cuts part a log.
     Of `STANDING` channels what was said before from_s is kept, too. The metadata is kept, with a
     note of the cut. Raises `LogError` when nothing is left or the log is damaged, before `out` is
     made, and `RecorderError` when `out` exists.
@@ -42,7 +42,9 @@ def cut(
     beyond = (begin is not None and begin > span[1]) or (end is not None and end <= span[0])
     if beyond or not any(True for _ in _within(log, begin, end, channels)):
         seconds = (span[1] - span[0]) * 1e-9
-        remedy = f"its readings are from 0 to {seconds:.3f} s; `teamslam log info` has its channels"
+        remedy = (
+            f"its measurements are from 0 to {seconds:.3f} s; `teamslam log info` has its channels"
+        )
         raise LogError(log.path, "nothing of it is in this cut", remedy)
     note = _note(log.path.name, span[0], from_s, to_s, channels)
     notes = "; ".join(filter(None, (log.metadata.get(CUT), note)))

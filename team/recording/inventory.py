@@ -133,11 +133,13 @@ class Inventory:
             return  # whoever opens it will say so
         match message:
             case m.Progress() | m.Done():
-                self._of("measurements", message.robot, message.epoch).know(message.readings - 1)
+                self._of("measurements", message.robot, message.epoch).know(
+                    message.measurements - 1
+                )
                 self._of("submaps", message.robot, message.epoch).know(message.submaps - 1)
             case m.End():
                 for end in message.streams:
-                    self._of("measurements", end.robot, end.epoch).know(end.readings - 1)
+                    self._of("measurements", end.robot, end.epoch).know(end.measurements - 1)
             case _:
                 pass
 

@@ -17,7 +17,7 @@ from team.wire.channels import (
     ALIVE,
     CHANNELS,
     FINAL_MAP,
-    READINGS,
+    MEASUREMENTS,
     RECORDER_PROGRESS,
     SENSORS,
     SENT,
@@ -28,9 +28,9 @@ from team.wire.channels import (
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
     Liveliness,
+    MeasurementsRequest,
     Message,
     Progress,
-    ReadingsWanted,
     Status,
     SubmapsWanted,
 )
@@ -38,7 +38,7 @@ from team.wire.patience import Patience
 
 NODE = "recorder"
 PROGRESS_EVERY = 256
-"""Readings of a robot between two reports of progress while the queue is busy."""
+"""Measurements of a robot between two reports of progress while the queue is busy."""
 _FAR_BEHIND = 20_000  # samples: the disk takes half a second for as many
 _WAIT_S = 0.05
 _QUIET_S = 0.5
@@ -168,8 +168,8 @@ class RecordLoop:
             first, last = self._inventory.span(stream)
             _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
             if kind == "measurements":
-                wanted = ReadingsWanted(self._newest_ns, robot, epoch, first, last, only=True)
-                self._bus.request(READINGS, robot, wanted)
+                wanted = MeasurementsRequest(self._newest_ns, robot, epoch, first, last, only=True)
+                self._bus.request(MEASUREMENTS, robot, wanted)
             else:
                 self._bus.request(SENT, robot, SubmapsWanted(self._newest_ns, robot, epoch, first))
 

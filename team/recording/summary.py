@@ -1,4 +1,6 @@
-"""What is in a log: messages, bytes, rates and times of each key, and the span of its readings."""
+"""What is in a log: messages, bytes, rates and times of each key, and the span of its
+measurements.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -45,9 +47,10 @@ class Summary(NamedTuple):
     damaged: tuple[str, ...]
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Team time of the first and the last reading; of any message where there is no reading.
+        """Team time of the first and the last measurement; of any message where there is no
+        measurement.
 
-        A configuration is announced at team time zero, long before the readings of a data set.
+        A configuration is announced at team time zero, long before the measurements of a data set.
         """
         sensors = {channel.name for channel in SENSORS}
         chosen = [each for each in self.keys if each.channel in sensors] or self.keys

@@ -16,7 +16,7 @@ from team.wire.bus import Bus, BusError, Sample
 from team.wire.codec import WireError, decoded
 
 GAP_PATIENCE_S = 0.5
-"""A reading that is missing for so long is asked for at its source."""
+"""A measurement that is missing for so long is asked for at its source."""
 ASK_TIMEOUT_S = 10.0
 SECOND_PATIENCE_S = 6.0
 """The token of a process that was cut off is there for the lease of its link: 5 s of silence."""
@@ -62,7 +62,7 @@ class RobotShell:
         if not self.node.finished and self._resume():
             self._catch_up()
         self._shell.run(self._mend)
-        _LOG.info("%d submaps from %d readings", self.node.submaps, self.node.next_reading)
+        _LOG.info("%d submaps from %d measurements", self.node.submaps, self.node.next_measurement)
         self._await_recorder()
         self._shell.end(self.node.final)
 
@@ -116,13 +116,15 @@ class RobotShell:
     def _catch_up(self) -> None:
         """Ask the source for everything since the last submap that it has published already."""
         while True:
-            first = self.node.next_reading
-            replies = self._ask(m.ReadingsWanted(0, self.node.robot, self.node.epoch, first, -1))
-            if not replies or self.node.next_reading == first:
+            first = self.node.next_measurement
+            replies = self._ask(
+                m.MeasurementsRequest(0, self.node.robot, self.node.epoch, first, -1)
+            )
+            if not replies or self.node.next_measurement == first:
                 return
 
     def _mend(self) -> None:
-        """Ask for readings that have been missing for GAP_PATIENCE_S."""
+        """Ask for measurements that have been missing for GAP_PATIENCE_S."""
         wanted = self.node.wanted()
         now = time.monotonic()
         if wanted is None:
@@ -131,14 +133,14 @@ class RobotShell:
             self._gap_since = now
         elif now - self._gap_since > GAP_PATIENCE_S:
             self._gap_since = now
-            _LOG.warning("readings %d to %d are missing: asked for", wanted.first, wanted.last)
+            _LOG.warning("measurements %d to %d are missing: asked for", wanted.first, wanted.last)
             self._ask(wanted)
 
-    def _ask(self, wanted: m.ReadingsWanted) -> int:
+    def _ask(self, wanted: m.MeasurementsRequest) -> int:
         try:
-            replies = self._bus.ask(ch.READINGS, wanted.robot, wanted, ASK_TIMEOUT_S)
+            replies = self._bus.ask(ch.MEASUREMENTS, wanted.robot, wanted, ASK_TIMEOUT_S)
         except BusError as error:
             _LOG.warning("%s", error)
             return 0
-        self._shell.take_replies(ch.READINGS, wanted.robot, replies, m.Reading)
+        self._shell.take_replies(ch.MEASUREMENTS, wanted.robot, replies, m.Measurement)
         return len(replies)

@@ -1,9 +1,10 @@
 """The robot's node: messages in, messages out; no I/O, no clock.
 
-Law 1 lives here: what is published for fusion (`submap`) depends on the robot's own readings alone.
-The fused map comes in as a prior and goes out as `team/pose`, and nowhere else. Only a rule with
-feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) absorbs the fused map into the map
-that the robot publishes; such a robot waits for the answer of each exchange before it goes on.
+Law 1 lives here: what is published for fusion (`submap`) depends on the robot's own measurements
+alone. The fused map comes in as a prior and goes out as `team/pose`, and nowhere else. Only a rule
+with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) absorbs the fused map into
+the map that the robot publishes; such a robot waits for the answer of each exchange before it goes
+on.
 """
 
 from collections import Counter
@@ -50,12 +51,12 @@ from team.wire.newer import is_newer_prior, later_end
 AHEAD = 64
 """Submaps of an earlier life that the centre may have taken since it was asked for them."""
 IN_SIGHTING = "in a sighting factor"
-"""The disposition of a reading of teammates that was used."""
+"""The disposition of a measurement of teammates that was used."""
 SET_ASIDE = "rejected: its handling raised"
 LATE = "rejected: counted in a window that ends before its stamp"
-"""The disposition of a reading that was set aside."""
+"""The disposition of a measurement that was set aside."""
 MOST_SET_ASIDE = 8
-"""Readings of one window after which the estimator is not put back behind them any more."""
+"""Measurements of one window after which the estimator is not put back behind them any more."""
 UNSOLVED = "its window has no solution"
 """Why a scan is rejected after all: of its window the odometry's motion alone is in the submap."""
 JOINT_LANDMARKS = 2000
@@ -112,8 +113,8 @@ class RobotNode:
         self._done = False
         self._start: m.Start | None = None
         self._closed: list[ClosedWindow] = []
-        self._window: list[m.Reading] = []
-        self._taking: m.Reading | None = None
+        self._window: list[m.Measurement] = []
+        self._taking: m.Measurement | None = None
         self._aside = 0
         self._pending: list[Outgoing] = []
         self._said_done = False
@@ -131,9 +132,9 @@ class RobotNode:
         return self._inbox.epoch
 
     @property
-    def next_reading(self) -> int:
-        """The counter of the reading that is consumed next."""
-        return self._inbox.next_reading
+    def next_measurement(self) -> int:
+        """The counter of the measurement that is consumed next."""
+        return self._inbox.next_measurement
 
     @property
     def submaps(self) -> int:
@@ -146,10 +147,12 @@ class RobotNode:
         orders = (ch.ORDER, ch.WITHDRAWAL)
         return (*orders, ch.RENDEZVOUS) if self._held.waits else orders
 
-    def wanted(self) -> m.ReadingsWanted | None:
-        """The readings that are missing and must be asked for at their source."""
+    def wanted(self) -> m.MeasurementsRequest | None:
+        """The measurements that are missing and must be asked for at their source."""
         missing = self._inbox.missing(self._end)
-        return None if missing is None else m.ReadingsWanted(self._now_ns, self.robot, *missing)
+        return (
+            None if missing is None else m.MeasurementsRequest(self._now_ns, self.robot, *missing)
+        )
 
     def begin(self) -> list[Outgoing]:
         """What the node says first: its configuration."""
@@ -185,8 +188,8 @@ class RobotNode:
             self._locals.append(local)
             closed = ClosedWindow(
                 sequence=submap.sequence,
-                first_reading=submap.first_reading,
-                last_reading=submap.last_reading,
+                first_measurement=submap.first_measurement,
+                last_measurement=submap.last_measurement,
                 start_ns=submap.start_ns,
                 end_ns=submap.stamp_ns,
                 local=local,
@@ -194,11 +197,11 @@ class RobotNode:
             self._closed.append(closed)
             self._submap_estimator.resume(closed)
         last = submaps[-1]
-        self._ledger["in a submap"] = self._consumed = last.last_reading + 1
+        self._ledger["in a submap"] = self._consumed = last.last_measurement + 1
         self._pace.acknowledged = len(submaps)
         self._now_ns = self._passed_ns = last.stamp_ns
         self._judge = StreamJudge(self.config.bounds, last.stamp_ns)
-        self._inbox.resume(last.epoch, last.last_reading + 1)
+        self._inbox.resume(last.epoch, last.last_measurement + 1)
 
     def refusal(self, message: m.Message) -> str | None:
         """Why a message can not be true of this robot: another's, an absurd count, an early end."""
@@ -206,9 +209,9 @@ class RobotNode:
         if refused is not None:
             return refused
         match message:
-            case m.Reading():
+            case m.Measurement():
                 own = message.robot == self.robot
-                return self._inbox.refusal(message) if own else f"a reading of {message.robot}"
+                return self._inbox.refusal(message) if own else f"a measurement of {message.robot}"
             case m.Progress() if message.epoch == self._epoch:
                 if message.submaps > self.submaps + AHEAD:
                     return f"acknowledges {message.submaps} submaps of {self.submaps}"
@@ -236,7 +239,7 @@ class RobotNode:
 
     def _handled(self, message: m.Message) -> list[Outgoing]:
         match message:
-            case m.Reading():
+            case m.Measurement():
                 self._inbox.put(message)
             case m.Prior():
                 self._take_prior(message)
@@ -265,7 +268,7 @@ class RobotNode:
         """What the robot is doing, for people."""
         figures = {
             "steps": float(self.steps),
-            "readings": float(self._inbox.next_reading),
+            "measurements": float(self._inbox.next_measurement),
             "submaps": float(self.submaps),
             "particles": float(self.config.front_end.particles),
             "landmarks": float(len(self._estimator.own_map().ids)),
@@ -281,19 +284,19 @@ class RobotNode:
             figures["landmarks_refused"] = float(self._team_map.refused)
         if self.config.front_end.garbage:
             figures["gated"] = float(self._gated)
-        state = "done" if self._done else "mapping" if self._inbox.next_reading else "waiting"
+        state = "done" if self._done else "mapping" if self._inbox.next_measurement else "waiting"
         node = ch.robot_node(self.robot)
-        waiting = ("no readings of this team yet",) if state == "waiting" else ()
+        waiting = ("no measurements of this team yet",) if state == "waiting" else ()
         doubt = (self._team_map.doubt,) if self._team_map.doubt else ()
         warnings = (*waiting, *doubt, *self.warnings[-3:])
         told = {name: value for name, value in figures.items() if abs(value) <= 1e300}
         return m.Status(self._now_ns, node, state, told, warnings)
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Go on behind a reading whose handling raised, as if it had never been there.
+        """Go on behind a measurement whose handling raised, as if it had never been there.
 
-        An estimator of submaps is put back: to its last submap, and the window's other readings.
-        One that raises as it closes its last window says `Done` without it.
+        An estimator of submaps is put back: to its last submap, and the window's other
+        measurements. One that raises as it closes its last window says `Done` without it.
         """
         if self._taking is not None:
             self._taking = None
@@ -313,15 +316,15 @@ class RobotNode:
         self._judge = StreamJudge(
             self.config.bounds, self._closed[-1].end_ns if self._closed else None
         )
-        for reading in self._window:
-            self._goes_in(reading)
-            match reading:
+        for measurement in self._window:
+            self._goes_in(measurement)
+            match measurement:
                 case m.Odometry():
-                    self._go(reading)
+                    self._go(measurement)
                 case m.Observations():
-                    self._look(reading)
+                    self._look(measurement)
                 case m.Sightings():
-                    self._see(reading)
+                    self._see(measurement)
                 case _:
                     pass
 
@@ -331,13 +334,15 @@ class RobotNode:
     _gated = 0
 
     def _go_on(self) -> list[Outgoing]:
-        """Take the readings whose turn has come; what there is to say is kept until it is said."""
-        readings = self._inbox.taken()
+        """Take the measurements whose turn has come; what there is to say is kept until it is
+        said.
+        """
+        measurements = self._inbox.taken()
         while not self._blocked:
-            reading = next(readings, None)
-            if reading is None:
+            measurement = next(measurements, None)
+            if measurement is None:
                 break
-            self._pending += self._take(reading)
+            self._pending += self._take(measurement)
         if not self._done and not self._blocked and self._complete:
             self._pending += self._finish()
         self._pending += self._credit()
@@ -360,44 +365,44 @@ class RobotNode:
     def _complete(self) -> bool:
         return self._end is not None and self._inbox.complete(self._end)
 
-    def _take(self, reading: m.Reading) -> list[Outgoing]:
+    def _take(self, measurement: m.Measurement) -> list[Outgoing]:
         out: list[Outgoing] = []
-        if isinstance(reading, m.Start):
+        if isinstance(measurement, m.Start):
             out += self._leave_epoch()
-            self._begin_epoch(reading)
-        self._taking = reading
-        self._consumed = reading.reading + 1
-        stamp_ns = self._team_time(reading)
+            self._begin_epoch(measurement)
+        self._taking = measurement
+        self._consumed = measurement.number + 1
+        stamp_ns = self._team_time(measurement)
         self._now_ns = max(self._now_ns, stamp_ns)
         # What was seen at a stamp comes before the odometry that ends there, and may end a window.
-        ahead = 0 if isinstance(reading, m.Odometry) else 1
+        ahead = 0 if isinstance(measurement, m.Odometry) else 1
         self._passed_ns = max(self._passed_ns, stamp_ns - ahead)
-        match reading:
+        match measurement:
             case m.Start():
                 self._ledger["start pose"] += 1
             case m.Odometry():
-                out += self._drive(reading)
+                out += self._drive(measurement)
             case m.Observations():
-                self._observe(reading)
+                self._observe(measurement)
             case m.Sightings():
-                out += self._sight(reading)
+                out += self._sight(measurement)
         if self._taking is not None:
-            self._taken(reading)
+            self._taken(measurement)
         if self._pace.counted():
             out.append(self._progress())
         return out
 
-    def _taken(self, reading: m.Reading) -> None:
-        """The open window has the reading."""
+    def _taken(self, measurement: m.Measurement) -> None:
+        """The open window has the measurement."""
         self._taking = None
         if self._consumer == "submap":
-            self._window.append(reading)
+            self._window.append(measurement)
 
-    def _team_time(self, reading: m.Reading) -> int:
-        """The reading's stamp; the odometry's put right."""
-        if isinstance(reading, m.Odometry):
-            return translate.motion_of(reading, self.config.clock_offset_s)[0]
-        return reading.stamp_ns
+    def _team_time(self, measurement: m.Measurement) -> int:
+        """The measurement's stamp; the odometry's put right."""
+        if isinstance(measurement, m.Odometry):
+            return translate.motion_of(measurement, self.config.clock_offset_s)[0]
+        return measurement.stamp_ns
 
     def _begin_epoch(self, start: m.Start) -> None:
         initial = self._believed(start)
@@ -429,10 +434,10 @@ class RobotNode:
             raise ValueError(f"the estimator {self.config.estimator} has no submaps to resume from")
         return self._windows
 
-    def _goes_in(self, reading: m.Reading) -> None:
-        """The open window, if there is one, names the reading among its inputs."""
+    def _goes_in(self, measurement: m.Measurement) -> None:
+        """The open window, if there is one, names the measurement among its inputs."""
         if self._windows is not None:
-            self._windows.consumed(reading.reading)
+            self._windows.consumed(measurement.number)
 
     def _believed(self, start: m.Start) -> InitialPose:
         """The initial pose and its covariance; one beyond the bounds is taken as unknown."""
@@ -450,46 +455,46 @@ class RobotNode:
             self.warnings.append(f"{np.count_nonzero(~inside)} known landmarks beyond the bounds")
         return KnownMap(known.ids[inside], known.landmarks[inside])
 
-    def _observe(self, reading: m.Observations) -> None:
-        self._goes_in(reading)
-        reason = self._look(reading)
+    def _observe(self, measurement: m.Observations) -> None:
+        self._goes_in(measurement)
+        reason = self._look(measurement)
         self._ledger[self._estimator.used if reason is None else f"rejected: {reason}"] += 1
 
-    def _sight(self, reading: m.Sightings) -> list[Outgoing]:
-        self._goes_in(reading)
-        reason = self._see(reading)
+    def _sight(self, measurement: m.Sightings) -> list[Outgoing]:
+        self._goes_in(measurement)
+        reason = self._see(measurement)
         if reason is None:
-            self._sighted.add(reading.reading)
+            self._sighted.add(measurement.number)
         self._ledger[IN_SIGHTING if reason is None else f"rejected: {reason}"] += 1
-        return self._release(reading.teammates)
+        return self._release(measurement.teammates)
 
-    def _drive(self, reading: m.Odometry) -> list[Outgoing]:
+    def _drive(self, measurement: m.Odometry) -> list[Outgoing]:
         self._steps += 1
         self.steps += 1
-        self._goes_in(reading)
-        driven = self._go(reading)
+        self._goes_in(measurement)
+        driven = self._go(measurement)
         if driven.closed is None:
-            self._used(reading)
+            self._used(measurement)
         return self._told(driven)
 
     # A measurement within the bounds goes to the estimator; of one beyond them the reason is said.
 
-    def _look(self, reading: m.Observations) -> str | None:
-        scan = translate.scan_of(reading)
+    def _look(self, measurement: m.Observations) -> str | None:
+        scan = translate.scan_of(measurement)
         near = self._judge.near(scan[1])
-        reason = self._judge.time(reading.stamp_ns)
+        reason = self._judge.time(measurement.stamp_ns)
         if reason is None and len(near) and not near.any():
             reason = RANGE
         if reason is None:
             ids, ranges, bearings = (each[near] for each in scan)
-            reason = self._estimator.observe(reading.stamp_ns, (ids, ranges, bearings))
+            reason = self._estimator.observe(measurement.stamp_ns, (ids, ranges, bearings))
         return reason
 
-    def _see(self, reading: m.Sightings) -> str | None:
-        teammates, ranges, bearings = translate.looks_of(reading)
+    def _see(self, measurement: m.Sightings) -> str | None:
+        teammates, ranges, bearings = translate.looks_of(measurement)
         others = np.array([name != self.robot for name in teammates], dtype=np.bool_)
         near = self._judge.near(ranges) & others
-        reason = self._judge.time(reading.stamp_ns)
+        reason = self._judge.time(measurement.stamp_ns)
         if reason is None and len(near) and not near.any():
             reason = RANGE if others.any() else "a robot does not see itself"
         if reason is None:
@@ -499,12 +504,12 @@ class RobotNode:
             reason = (
                 NOT_USED
                 if windows is None
-                else windows.sight(reading.stamp_ns, reading.reading, looks)
+                else windows.sight(measurement.stamp_ns, measurement.number, looks)
             )
         return reason
 
-    def _go(self, reading: m.Odometry) -> Estimates:
-        motion = translate.motion_of(reading, self.config.clock_offset_s)
+    def _go(self, measurement: m.Odometry) -> Estimates:
+        motion = translate.motion_of(measurement, self.config.clock_offset_s)
         self._unused = self._judge.odometry(*motion)
         if self._unused not in {None, SPEED}:
             return NOTHING_NEW
@@ -516,11 +521,11 @@ class RobotNode:
     def _speaker(self) -> Speaker:
         return Speaker(self.robot, self._epoch, self._announcement.digest)
 
-    def _used(self, reading: m.Reading) -> None:
+    def _used(self, measurement: m.Measurement) -> None:
         """The ledger has an interval of odometry; it is used, or rejected with its reason."""
         unused = self._unused
         self._ledger[self._estimator.used if unused is None else f"rejected: {unused}"] += 1
-        self._taken(reading)
+        self._taken(measurement)
 
     def _told(self, driven: Estimates) -> list[Outgoing]:
         """What there is to say of what the estimator has given."""
@@ -553,8 +558,8 @@ class RobotNode:
             self._ledger[f"rejected: {UNSOLVED}"] += closed.unsolved
         plain = ClosedWindow(
             sequence=closed.sequence,
-            first_reading=closed.first_reading,
-            last_reading=closed.last_reading,
+            first_measurement=closed.first_measurement,
+            last_measurement=closed.last_measurement,
             start_ns=closed.start_ns,
             end_ns=closed.end_ns,
             local=closed.local,
@@ -598,7 +603,7 @@ class RobotNode:
         """What becomes of the sightings of a window that ends and that reached no node."""
         used = set[int]()
         if closed is not None:
-            used = used.union(*(each.readings for each in closed.sightings))
+            used = used.union(*(each.measurements for each in closed.sightings))
         lost = len(self._sighted - used)
         if lost:
             self._ledger[IN_SIGHTING] -= lost
@@ -637,7 +642,7 @@ class RobotNode:
         )
 
     def _poses(self, stamp_ns: int | None) -> list[Outgoing]:
-        """The running poses: from own readings, and given the fused map."""
+        """The running poses: from own measurements, and given the fused map."""
         if stamp_ns is None or (
             self._pose_ns is not None and stamp_ns - self._pose_ns < self.config.pose_s * 1e9
         ):

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 CREDIT_SUBMAPS = 4
 """A robot is at most this many submaps ahead of a living centre."""
-PROGRESS_READINGS = 64
-"""A robot reports its progress at least once per this many readings."""
+PROGRESS_MEASUREMENTS = 64
+"""A robot reports its progress at least once per this many measurements."""
 
 
 @dataclass
@@ -15,7 +15,8 @@ class Pace:
     lockstep: each map that is exchanged is answered before the robot goes on (rules with feedback).
     credit: the submaps that are sent are acknowledged. exchange: the last round that was answered;
     awaited: the round of the last map that was sent. acknowledged: submaps of this epoch that the
-    centre has dealt with; credited: readings of this epoch that were reported ahead of their use.
+    centre has dealt with; credited: measurements of this epoch that were reported ahead of their
+    use.
     """
 
     lockstep: bool
@@ -28,7 +29,7 @@ class Pace:
     unreported: int = 0
 
     def begin_epoch(self) -> None:
-        """Submaps and readings are counted anew; rounds are the team's and go on."""
+        """Submaps and measurements are counted anew; rounds are the team's and go on."""
         self.acknowledged = self.credited = 0
 
     def holds(self, submaps: int) -> bool:
@@ -59,14 +60,14 @@ class Pace:
         """Whether a robot in lockstep must report what it has received, not what it has used.
 
         Else the world would wait for it, and with the world whoever it waits for: a teammate that
-        needs more readings for its map, or the end.
+        needs more measurements for its map, or the end.
         """
-        if received - max(self.credited, consumed) < PROGRESS_READINGS:
+        if received - max(self.credited, consumed) < PROGRESS_MEASUREMENTS:
             return False
         self.credited = received
         return True
 
     def counted(self) -> bool:
-        """One more reading was used; whether it is time to report."""
+        """One more measurement was used; whether it is time to report."""
         self.unreported += 1
-        return self.unreported >= PROGRESS_READINGS
+        return self.unreported >= PROGRESS_MEASUREMENTS

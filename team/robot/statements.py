@@ -33,7 +33,7 @@ class Speaker:
             self.robot,
             self.epoch,
             closed.sequence,
-            (closed.first_reading, closed.last_reading),
+            (closed.first_measurement, closed.last_measurement),
             (closed.start_ns, closed.end_ns),
             self.config,
             closed.local,
@@ -50,10 +50,10 @@ class Speaker:
             closed.sequence,
             each.stamp_ns,
             each.teammate,
-            each.reading,
+            each.measurement,
             each.covariance,
         )
-        message = translate.sighting_message(sighting, self.config, each.readings)
+        message = translate.sighting_message(sighting, self.config, each.measurements)
         return Outgoing(ch.SIGHTING_FACTOR, self.robot, message)
 
     def cloud(self, stamp_ns: int, cloud: Cloud | None) -> list[Outgoing]:
@@ -65,7 +65,7 @@ class Speaker:
         return [Outgoing(ch.PARTICLES, self.robot, message)]
 
     def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
-        """How well the readings of a window, or since the last of these, were predicted."""
+        """How well the measurements of a window, or since the last of these, were predicted."""
         message = m.Innovation(stamp_ns, self.robot, self.epoch, sequence, *found)
         return Outgoing(ch.INNOVATION, self.robot, message)
 

@@ -1,105 +1,114 @@
-"""The readings of one robot, put in the order of its reading counter."""
+"""The measurements of one robot, put in the order of its measurement counter."""
 
 from collections.abc import Iterator
 
 from team.door import another_time
-from team.wire.messages import End, Reading, Start, StreamEnd
+from team.wire.messages import End, Measurement, Start, StreamEnd
 
 NEAR_LIVES = 16
 """A stream begins a new life when it is asked for what it has lost: seldom, one by one."""
 
 
 class Inbox:
-    """Holds readings until their turn: Zenoh promises no order across keys.
+    """Holds measurements until their turn: Zenoh promises no order across keys.
 
-    A reading is yielded once; duplicates and readings of earlier epochs are dropped. A later epoch
-    begins when its reading 0 arrives.
+    A measurement is yielded once; duplicates and measurements of earlier epochs are dropped. A
+    later epoch begins when its measurement 0 arrives.
     """
 
     def __init__(self) -> None:
         self.epoch = 0
-        self.next_reading = 0
-        self._waiting: dict[int, Reading] = {}
-        self._later: dict[int, dict[int, Reading]] = {}
+        self.next_measurement = 0
+        self._waiting: dict[int, Measurement] = {}
+        self._later: dict[int, dict[int, Measurement]] = {}
         self._received = 0
         self._began_ns: int | None = None
 
-    def resume(self, epoch: int, next_reading: int) -> None:
-        """Everything before `next_reading` of `epoch` has been consumed in an earlier life."""
+    def resume(self, epoch: int, next_measurement: int) -> None:
+        """Everything before `next_measurement` of `epoch` has been consumed in an earlier life."""
         self.epoch = epoch
-        self.next_reading = next_reading
+        self.next_measurement = next_measurement
         waiting = self._later.pop(epoch, {}) | self._waiting
-        self._waiting = {n: r for n, r in waiting.items() if r.epoch == epoch and n >= next_reading}
+        self._waiting = {
+            n: r for n, r in waiting.items() if r.epoch == epoch and n >= next_measurement
+        }
         self._forget(epoch)
 
-    def put(self, reading: Reading) -> None:
-        """Take a reading, in any order."""
-        if reading.epoch > self.epoch:
-            self._later.setdefault(reading.epoch, {})[reading.reading] = reading
-        elif reading.epoch == self.epoch and reading.reading >= self.next_reading:
-            self._waiting[reading.reading] = reading
+    def put(self, measurement: Measurement) -> None:
+        """Take a measurement, in any order."""
+        if measurement.epoch > self.epoch:
+            self._later.setdefault(measurement.epoch, {})[measurement.number] = measurement
+        elif measurement.epoch == self.epoch and measurement.number >= self.next_measurement:
+            self._waiting[measurement.number] = measurement
 
-    def refusal(self, reading: Reading) -> str | None:
-        """Why a reading can not be of this stream, in words; None: it can.
+    def refusal(self, measurement: Measurement) -> str | None:
+        """Why a measurement can not be of this stream, in words; None: it can.
 
         A stream's incarnations follow one another, and its stamps its initial pose's.
         """
-        if self.next_reading and reading.epoch > self.epoch + NEAR_LIVES:
-            return f"of incarnation {reading.epoch}, while {self.epoch} is in progress"
-        if reading.epoch == self.epoch and self._began_ns is not None:
-            return another_time(reading.stamp_ns, self._began_ns)
+        if self.next_measurement and measurement.epoch > self.epoch + NEAR_LIVES:
+            return f"of incarnation {measurement.epoch}, while {self.epoch} is in progress"
+        if measurement.epoch == self.epoch and self._began_ns is not None:
+            return another_time(measurement.stamp_ns, self._began_ns)
         return None
 
     def contradicts(self, end: End, robot: str) -> str | None:
         """Why this can not be the end of the robot's stream, in words."""
-        ends = {stream.epoch: stream.readings for stream in end.streams if stream.robot == robot}
-        if not ends and self.next_reading:
+        ends = {
+            stream.epoch: stream.measurements for stream in end.streams if stream.robot == robot
+        }
+        if not ends and self.next_measurement:
             return f"an end that does not know of {robot}"
         last = ends.get(self.epoch)
-        if last is not None and last < self.next_reading:
-            return f"ends with reading {last} of {robot}, which has consumed {self.next_reading}"
+        if last is not None and last < self.next_measurement:
+            return (
+                f"ends with measurement {last} of {robot}, which has consumed "
+                f"{self.next_measurement}"
+            )
         return None
 
-    def taken(self) -> Iterator[Reading]:
-        """The readings whose turn has come, one by one."""
+    def taken(self) -> Iterator[Measurement]:
+        """The measurements whose turn has come, one by one."""
         while True:
-            reading = self._waiting.pop(self.next_reading, None)
-            if reading is not None:
-                self.next_reading += 1
-                if isinstance(reading, Start):
-                    self._began_ns = reading.stamp_ns
-                yield reading
+            measurement = self._waiting.pop(self.next_measurement, None)
+            if measurement is not None:
+                self.next_measurement += 1
+                if isinstance(measurement, Start):
+                    self._began_ns = measurement.stamp_ns
+                yield measurement
                 continue
             following = min((e for e, r in self._later.items() if 0 in r), default=None)
             if following is None:
                 return
-            self.epoch, self.next_reading = following, 0
+            self.epoch, self.next_measurement = following, 0
             self._waiting = self._later.pop(following)
             self._forget(following)
 
     def _forget(self, epoch: int) -> None:
         """Nothing of this epoch or an earlier one can become its turn any more."""
         self._received = 0
-        self._later = {e: readings for e, readings in self._later.items() if e > epoch}
+        self._later = {e: measurements for e, measurements in self._later.items() if e > epoch}
 
     @property
     def received(self) -> int:
-        """The count of readings of this epoch that are here without a gap, consumed or not."""
-        self._received = max(self._received, self.next_reading)
+        """The count of measurements of this epoch that are here without a gap, consumed or not."""
+        self._received = max(self._received, self.next_measurement)
         while self._received in self._waiting:
             self._received += 1
         return self._received
 
     @property
     def gap(self) -> tuple[int, int, int] | None:
-        """Epoch, first and last reading that are missing before the earliest one that waits.
+        """Epoch, first and last measurement that are missing before the earliest one that waits.
 
         Of a later epoch that is its beginning, when nothing else of this one is here.
         """
         if self._waiting:
             first = min(self._waiting)
             return (
-                None if first <= self.next_reading else (self.epoch, self.next_reading, first - 1)
+                None
+                if first <= self.next_measurement
+                else (self.epoch, self.next_measurement, first - 1)
             )
         if not self._later:
             return None
@@ -108,20 +117,22 @@ class Inbox:
         return (following, 0, first - 1) if first else None
 
     def complete(self, end: StreamEnd) -> bool:
-        """Whether every reading up to the stream's last one has had its turn."""
-        return end.readings == 0 or (self.epoch == end.epoch and self.next_reading >= end.readings)
+        """Whether every measurement up to the stream's last one has had its turn."""
+        return end.measurements == 0 or (
+            self.epoch == end.epoch and self.next_measurement >= end.measurements
+        )
 
     def missing(self, end: StreamEnd | None) -> tuple[int, int, int] | None:
-        """Epoch, first and last reading to ask the source for: a gap, or all up to the end."""
+        """Epoch, first and last measurement to ask the source for: a gap, or all up to the end."""
         gap = self.gap
         if gap is not None:
             return gap
         if end is None or self.complete(end) or self.waiting or end.epoch < self.epoch:
             return None
-        first = self.next_reading if end.epoch == self.epoch else 0
-        return end.epoch, first, end.readings - 1
+        first = self.next_measurement if end.epoch == self.epoch else 0
+        return end.epoch, first, end.measurements - 1
 
     @property
     def waiting(self) -> int:
-        """How many readings wait for their turn."""
+        """How many measurements wait for their turn."""
         return len(self._waiting) + sum(len(r) for r in self._later.values())

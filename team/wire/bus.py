@@ -162,7 +162,7 @@ NO_COUNTER = 2**32 - 1
 
 
 LATEST_KEPT = 8_192
-"""Publications of a `latest` key that a publisher keeps: a robot may be 4096 readings ahead."""
+"""Publications of a `latest` key that a publisher keeps: a robot may be 4096 measurements ahead."""
 CLOUDS_KEPT = 1_024
 """… of particles: kilobytes each."""
 MAPS_KEPT = 256

@@ -6,8 +6,8 @@ the key's prefix: a robot's process `robot/{robot}/…`, its driver `source/{rob
 world is the source of every robot, and the truth is its own too.
 
 `{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer` or
-`robot/<name>`, `{view}` for a view (`team.wire.views`). In the rates a life is one incarnation of a robot's stream (the messages'
-`epoch`), a keyframe one epoch of observation.
+`robot/<name>`, `{view}` for a view (`team.wire.views`). In the rates a life is one incarnation of a
+robot's stream (the messages' `epoch`), a keyframe one epoch of observation.
 """
 
 import re
@@ -20,7 +20,7 @@ from team.wire import messages as m
 Delivery = Literal["stream", "latest", "all"]
 """How a message must arrive. Nothing is ever dropped by congestion; beyond that:
 
-stream: what a receiver misses it asks its source for, by the reading counter.
+stream: what a receiver misses it asks its source for, by the measurement counter.
 latest: a late joiner gets the newest one, a cut link recovers what it missed.
 all:    a late joiner and a cut link get every one.
 """
@@ -66,7 +66,7 @@ class Channel:
 
 
 START = Channel("start", "source/{robot}/start", m.Start, "once per life of the stream", "all", True, False,
-                "reading 0: the start pose, if known")  # fmt: skip
+                "measurement 0: the start pose, if known")  # fmt: skip
 ODOMETRY = Channel("odometry", "source/{robot}/odometry", m.Odometry, "8-100 Hz", "stream", True,
                    False, "one odometry interval")  # fmt: skip
 OBSERVATIONS = Channel("observations", "source/{robot}/observations", m.Observations, "1-30 Hz",
@@ -94,17 +94,17 @@ OWN_MAP = Channel("own_map", "robot/{robot}/own/map", m.MapEstimate, "one per wi
                   "latest", True, True,
                   "running landmark means and covariances; consumed by rules with feedback")  # fmt: skip
 OWN_POSE = Channel("own_pose", "robot/{robot}/own/pose", m.PoseEstimate, "one per keyframe", "latest",
-                   True, True, "running pose from own readings alone")  # fmt: skip
+                   True, True, "running pose from own measurements alone")  # fmt: skip
 TEAM_POSE = Channel("team_pose", "robot/{robot}/team/pose", m.PoseEstimate, "one per keyframe",
                     "latest", True, True, "pose given the fused map; never an input of fusion")  # fmt: skip
 PARTICLES = Channel("particles", "robot/{robot}/particles", m.ParticleCloud, "one per window",
                     "latest", True, True, "thinned cloud, for viewers")  # fmt: skip
 INNOVATION = Channel("innovation", "robot/{robot}/innovation", m.Innovation, "one per window", "latest",
-                     True, True, "how well a window's readings were predicted (NIS)")  # fmt: skip
-ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 readings",
+                     True, True, "how well a window's measurements were predicted (NIS)")  # fmt: skip
+ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 measurements",
                          "latest", True, False, "credit for the world")  # fmt: skip
 ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per life of the stream", "latest", True,
-                     True, "all readings consumed, last submap sent")  # fmt: skip
+                     True, "all measurements consumed, last submap sent")  # fmt: skip
 
 CENTRAL_CONFIG = Channel("central_config", "central/config", m.Configured, "once", "latest", True,
                          False, "the centre's configuration")  # fmt: skip
@@ -126,7 +126,7 @@ FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", 
 TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per life of the stream",
                      "all", True, True, "smoothed end poses of the submaps, or of all keyframes")  # fmt: skip
 CENTRAL_POSE = Channel("central_pose", "central/pose/{robot}", m.PoseEstimate, "one per keyframe or broadcast",
-                       "latest", True, True, "running pose by a rule on raw readings")  # fmt: skip
+                       "latest", True, True, "running pose by a rule on raw measurements")  # fmt: skip
 CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress,
                            "one per submap", "latest", True, False, "credit for the robots")  # fmt: skip
 
@@ -137,7 +137,7 @@ KNOWN_MAP = Channel("known_map", "world/known_map", m.KnownMap, "once", "latest"
 END = Channel("end", "world/end", m.End, "once", "latest", True, False,
               "everything is published; the last counters")  # fmt: skip
 RECORDER_PROGRESS = Channel("recorder_progress", "recorder/progress/{robot}", m.Progress,
-                            "every 256 readings", "latest", False, False,
+                            "every 256 measurements", "latest", False, False,
                             "credit for the world")  # fmt: skip
 STATUS = Channel("status", "{node}/status", m.Status, "1 Hz", "latest", True, False,
                  "what a node is doing, for people")  # fmt: skip
@@ -149,8 +149,8 @@ ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", Tr
 TALLY = Channel("tally", "{node}/tally", m.Tally, "once, at its end", "latest", True, False,
                 "how many messages the node's process has published on each key")  # fmt: skip
 
-READINGS = Channel("readings", "source/{robot}/readings", m.ReadingsWanted, "query", "stream", False,
-                   False, "a query; the replies are the readings")  # fmt: skip
+MEASUREMENTS = Channel("readings", "source/{robot}/readings", m.MeasurementsRequest, "query", "stream", False,
+                   False, "a query; the replies are the measurements")  # fmt: skip
 SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "stream", False, False,
                   "a query; the replies are the starts, submaps and sightings in the centre's set")  # fmt: skip
 SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsWanted, "query", "stream", False, False,
@@ -166,9 +166,9 @@ VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "lat
                "what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
-QUERIES = (READINGS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT)
+QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT)
 REPLIES = {
-    READINGS: SENSORS,
+    MEASUREMENTS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
     SENT: (START, SUBMAP, SIGHTING_FACTOR),
     ORDERS_KEPT: (GIVEN_UP,),

@@ -6,7 +6,7 @@ version; readers ignore what follows the fields that they know. A new meaning, u
 new version. Arrays travel as `bin`: little-endian, C order, of the type that the field's name in
 `Floats`, `Ids` or `Stamps` says. SI units, radians, bearings in (−π, π].
 
-Every message has `stamp_ns`, its team time: the time of the reading that it is about.
+Every message has `stamp_ns`, its team time: the time of the measurement that it is about.
 `check` raises `ValueError` with the reason when the numbers can not be what the message says.
 """
 
@@ -50,16 +50,18 @@ class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
         """Raise ValueError where the arrays do not fit together; nothing to check here."""
 
 
-class Reading(Message, frozen=True, array_like=True, gc=False):
-    """What every reading of a sensor stream has: robot, epoch and the robot's reading counter."""
+class Measurement(Message, frozen=True, array_like=True, gc=False):
+    """What every measurement of a sensor stream has: robot, epoch and the robot's measurement
+    counter.
+    """
 
     robot: Name
     epoch: Count
-    reading: Count
+    number: Count
 
 
-class Start(Reading, frozen=True, array_like=True, gc=False, tag="start/1"):
-    """Reading 0 of an epoch: the start pose in the team's frame, if it is known.
+class Start(Measurement, frozen=True, array_like=True, gc=False, tag="start/1"):
+    """Measurement 0 of an epoch: the start pose in the team's frame, if it is known.
 
     pose: 3 floats (x, y, theta), or empty when unknown. covariance: 3 × 3 floats, row by row; empty
     for a pose that is exactly known.
@@ -76,7 +78,7 @@ class Start(Reading, frozen=True, array_like=True, gc=False, tag="start/1"):
             check_covariance(self.covariance, 3, "covariance")
 
 
-class Odometry(Reading, frozen=True, array_like=True, gc=False, tag="odometry/1"):
+class Odometry(Measurement, frozen=True, array_like=True, gc=False, tag="odometry/1"):
     """One odometry interval that ends at stamp_ns: mean forward speed and yaw rate over it."""
 
     duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
@@ -84,7 +86,7 @@ class Odometry(Reading, frozen=True, array_like=True, gc=False, tag="odometry/1"
     yaw_rate: Real
 
 
-class Observations(Reading, frozen=True, array_like=True, gc=False, tag="observations/1"):
+class Observations(Measurement, frozen=True, array_like=True, gc=False, tag="observations/1"):
     """Range [m] and bearing [rad] of landmarks with known identities, seen at stamp_ns."""
 
     ids: Ids
@@ -99,7 +101,7 @@ class Observations(Reading, frozen=True, array_like=True, gc=False, tag="observa
         check_angles(self.bearings, "bearings", n)
 
 
-class Sightings(Reading, frozen=True, array_like=True, gc=False, tag="sightings/1"):
+class Sightings(Measurement, frozen=True, array_like=True, gc=False, tag="sightings/1"):
     """Range [m] and bearing [rad] of teammates, seen at stamp_ns."""
 
     teammates: tuple[Name, ...]
@@ -158,21 +160,22 @@ class Configured(Message, frozen=True, array_like=True, gc=False, tag="configure
 class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     """One window's Gaussian, the only input of the rule `join`; stamp_ns is its end pose's stamp.
 
-    It names its inputs: the readings first_reading … last_reading of (robot, epoch), and the
-    configuration by digest (the seed is in it). ids: L, ascending. mean: 3 + 3K + 2L floats (end
-    pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed upper triangle,
-    row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings: how many
+    It names its inputs: the measurements first_measurement … last_measurement of (robot, epoch),
+    and the configuration by digest (the seed is in it). ids: L, ascending. mean: 3 + 3K + 2L floats
+    (end pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed upper
+    triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings: how many
     SightingFactor messages belong to it. biases: errors that the robot's submaps share, B of them,
     ascending; sensitivity: B × n floats, the mean's derivative by each: given the error b of the
     bearings [rad], of the scale of the ranges or of the speed, the mean is mean + b · sensitivity.
-    gated: so many of its landmark readings no others of the window confirmed; they are not in it.
+    gated: so many of its landmark measurements no others of the window confirmed; they are not in
+    it.
     """
 
     robot: Name
     epoch: Count
     sequence: Count
-    first_reading: Count
-    last_reading: Count
+    first_measurement: Count
+    last_measurement: Count
     start_ns: StampNs
     config: Digest
     ids: Ids
@@ -197,16 +200,16 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
             raise ValueError("not ascending: nodes")
         if len(times) and not self.start_ns < times[0] <= times[-1] <= self.stamp_ns:
             raise ValueError("out of bounds: a node is not in the submap's time")
-        if self.last_reading < self.first_reading or self.stamp_ns < self.start_ns:
-            raise ValueError("out of bounds: the interval of readings or of time is empty")
+        if self.last_measurement < self.first_measurement or self.stamp_ns < self.start_ns:
+            raise ValueError("out of bounds: the interval of measurements or of time is empty")
 
 
 class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sighting_factor/1"):
     """A teammate seen from a pose node of submap (robot, epoch, sequence); stamp_ns is the node's.
 
     range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed
-    2 × 2 (range, bearing). readings: the counters of the sightings that went into it, ascending;
-    with the submap's odometry and configuration they are its inputs.
+    2 × 2 (range, bearing). measurements: the counters of the sightings that went into it,
+    ascending; with the submap's odometry and configuration they are its inputs.
     """
 
     robot: Name
@@ -217,14 +220,14 @@ class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sight
     range: Real
     bearing: Real
     covariance: Floats
-    readings: tuple[Count, ...]
+    measurements: tuple[Count, ...]
 
     def check(self) -> None:  # noqa: D102
         check_packed_covariance(self.covariance, 2, "covariance")
         if self.range <= 0.0 or abs(self.bearing) > np.pi:
             raise ValueError("out of bounds: the range is not positive or the bearing not an angle")
-        if not self.readings or any(a >= b for a, b in pairwise(self.readings)):
-            raise ValueError("not ascending: readings, or none")
+        if not self.measurements or any(a >= b for a, b in pairwise(self.measurements)):
+            raise ValueError("not ascending: measurements, or none")
         if self.teammate == self.robot:
             raise ValueError("out of bounds: a robot sees itself")
 
@@ -319,11 +322,13 @@ class ParticleCloud(Message, frozen=True, array_like=True, gc=False, tag="partic
 
 
 class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovation/1"):
-    """Σ νᵀ S⁻¹ ν of a window's readings against their prediction; χ² where the models are right.
+    """Σ νᵀ S⁻¹ ν of a window's measurements against their prediction; χ² where the models are
+    right.
 
-    dof: its degrees of freedom, two for each reading of a landmark that the window knew already.
-    (robot, epoch, sequence) and stamp_ns are those of the window's submap; an estimator over the
-    whole stream says it of the readings since the last of these, named by its epochs so far.
+    dof: its degrees of freedom, two for each measurement of a landmark that the window knew
+    already. (robot, epoch, sequence) and stamp_ns are those of the window's submap; an estimator
+    over the whole stream says it of the measurements since the last of these, named by its epochs
+    so far.
     """
 
     robot: Name
@@ -336,8 +341,8 @@ class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovatio
 class Member(msgspec.Struct, frozen=True, array_like=True):
     """One entry of a version vector: all submaps of (robot, epoch) up to `sequence` are in.
 
-    Of a rule on whole maps it is the robot's map of that sequence, of one on raw readings the
-    robot's readings up to that counter.
+    Of a rule on whole maps it is the robot's map of that sequence, of one on raw measurements the
+    robot's measurements up to that counter.
     """
 
     robot: Name
@@ -453,17 +458,18 @@ class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajector
 
 
 class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"):
-    """How far a node is: per (robot, epoch) the count of readings it is done with, and of submaps.
+    """How far a node is: per (robot, epoch) the count of measurements it is done with, and of
+    submaps.
 
-    A robot reports itself: readings consumed (while it waits for an exchange of maps: received),
-    and stamp_ns is the team time before which it sends no submap any more. The centre reports
-    submaps that are in its set; the recorder reports readings that it has taken.
+    A robot reports itself: measurements consumed (while it waits for an exchange of maps:
+    received), and stamp_ns is the team time before which it sends no submap any more. The centre
+    reports submaps that are in its set; the recorder reports measurements that it has taken.
     """
 
     node: Text
     robot: Name
     epoch: Count
-    readings: Count
+    measurements: Count
     submaps: Count
 
 
@@ -481,21 +487,23 @@ class Rendezvous(Message, frozen=True, array_like=True, gc=False, tag="rendezvou
 
 
 class Disposed(msgspec.Struct, frozen=True, array_like=True):
-    """How many readings of a robot ended in one way: in a submap, rejected for a reason, lost…"""
+    """How many measurements of a robot ended in one way: in a submap, rejected for a reason,
+    lost…
+    """
 
     disposition: Text
-    readings: Count
+    measurements: Count
 
 
 class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
-    """A robot has consumed every reading of its stream and sent its last submap.
+    """A robot has consumed every measurement of its stream and sent its last submap.
 
     last_map: the sequence of its last own map, where the rule consumes own maps; −1: none.
     """
 
     robot: Name
     epoch: Count
-    readings: Count
+    measurements: Count
     steps: Count
     submaps: Count
     ledger: tuple[Disposed, ...]
@@ -503,11 +511,13 @@ class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
 
 
 class StreamEnd(msgspec.Struct, frozen=True, array_like=True):
-    """The last counters of one robot's stream: its readings are numbered 0 … readings − 1."""
+    """The last counters of one robot's stream: its measurements are numbered 0 … measurements −
+    1.
+    """
 
     robot: Name
     epoch: Count
-    readings: Count
+    measurements: Count
 
 
 class End(Message, frozen=True, array_like=True, gc=False, tag="end/1"):
@@ -568,8 +578,8 @@ class Tally(Message, frozen=True, array_like=True, gc=False, tag="tally/1"):
             raise ValueError(f"{len(self.counts)} counts of {len(self.keys)} keys")
 
 
-class ReadingsWanted(Message, frozen=True, array_like=True, gc=False, tag="readings_wanted/1"):
-    """A query to a source: readings first … last of (robot, epoch); last −1: all there are.
+class MeasurementsRequest(Message, frozen=True, array_like=True, gc=False, tag="readings_wanted/1"):
+    """A query to a source: measurements first … last of (robot, epoch); last −1: all there are.
 
     only: the source gives what it has, and does not begin the stream anew for what it has not.
     """

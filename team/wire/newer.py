@@ -46,7 +46,7 @@ def further(new: m.Progress, held: m.Progress | None) -> m.Progress:
     """How far a robot has come by both: it goes over what it has said before, never behind it.
 
     Started again it says less than in its earlier life, whose words are true still: the same
-    readings give the same submaps.
+    measurements give the same submaps.
     """
     if held is None or new.epoch > held.epoch:
         return new
@@ -57,7 +57,7 @@ def further(new: m.Progress, held: m.Progress | None) -> m.Progress:
         new.node,
         new.robot,
         new.epoch,
-        max(new.readings, held.readings),
+        max(new.measurements, held.measurements),
         max(new.submaps, held.submaps),
     )
 
@@ -69,7 +69,7 @@ def later_end(new: m.End, held: m.End | None) -> m.End:
     streams = {each.robot: each for each in held.streams}
     for each in new.streams:
         before = streams.get(each.robot)
-        if before is None or (each.epoch, each.readings) > (before.epoch, before.readings):
+        if before is None or (each.epoch, each.measurements) > (before.epoch, before.measurements):
             streams[each.robot] = each
     ordered = tuple(streams[robot] for robot in sorted(streams))
     return m.End(max(new.stamp_ns, held.stamp_ns), ordered, new.notes)

@@ -179,7 +179,7 @@ def sequences(found, robot):
 def test_nobody_need_wait_for_what_was_refused_and_what_follows_it():
     found = rule()
     found.take_submap(SUBMAPS["r1"][0])
-    torn = msgspec.structs.replace(SUBMAPS["r1"][1], first_reading=0)
+    torn = msgspec.structs.replace(SUBMAPS["r1"][1], first_measurement=0)
     assert found.take_submap(torn) == 2
     assert found.take_submap(SUBMAPS["r1"][2]) == 3
     assert found.count(("r1", 1)) == 3

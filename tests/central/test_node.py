@@ -208,7 +208,7 @@ def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_is_waited_for_
 
 def test_a_refused_submap_does_not_hold_up_the_team():
     centre = joined()
-    torn = msgspec.structs.replace(SUBMAPS["r2"][1], first_reading=0)
+    torn = msgspec.structs.replace(SUBMAPS["r2"][1], first_measurement=0)
     out = centre.hears(SUBMAPS["r2"][0], torn, *SUBMAPS["r2"][2:])
     acknowledged = [o.message.submaps for o in out if o.channel is ch.CENTRAL_PROGRESS]
     assert acknowledged == [1, 2, 3, 4], "the robot has its credit"

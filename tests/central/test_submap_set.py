@@ -52,12 +52,12 @@ def changed(i, **fields):
     ("there", "new", "reason"),
     [
         ([0, 1], changed(1, mean=CHAIN[0].covariance[: 8 * 7]), "differs from the one in the set"),
-        ([0], changed(1, first_reading=9), "overlap submap 0's 0-9"),
-        ([1], changed(0, last_reading=10), "overlap submap 1's 10-19"),
-        ([0], changed(1, first_reading=11), "does not continue submap 0"),
+        ([0], changed(1, first_measurement=9), "overlap submap 0's 0-9"),
+        ([1], changed(0, last_measurement=10), "overlap submap 1's 10-19"),
+        ([0], changed(1, first_measurement=11), "does not continue submap 0"),
         ([0], changed(1, start_ns=999_999), "does not continue submap 0"),
-        ([0], changed(3, first_reading=5), "overlap submap 0's 0-9"),
-        ([4], changed(1, last_reading=45), "overlap submap 4's 40-49"),
+        ([0], changed(3, first_measurement=5), "overlap submap 0's 0-9"),
+        ([4], changed(1, last_measurement=45), "overlap submap 4's 40-49"),
         ([4], changed(1, stamp_ns=4_500_000), "does not continue submap 4"),
     ],
 )
@@ -80,15 +80,15 @@ def test_another_epoch_is_another_stream():
 # --- sightings: what completes a submap ---
 
 
-def sighting(i, stamp=1, teammate="bravo", readings=(3,)):
+def sighting(i, stamp=1, teammate="bravo", measurements=(3,)):
     stamp_ns = i * 1_000_000 + stamp
     return m.SightingFactor(
-        stamp_ns, "alpha", 0, i, b"configur", teammate, 2.0, 0.5, packed(spd(2)), readings
+        stamp_ns, "alpha", 0, i, b"configur", teammate, 2.0, 0.5, packed(spd(2)), measurements
     )
 
 
 SEEN = [
-    sighting(1, 1, readings=(11,)),
+    sighting(1, 1, measurements=(11,)),
     sighting(1, 1, "carol", (11,)),
     sighting(1, 2, "bravo", (12,)),
 ]
@@ -122,8 +122,8 @@ def test_an_incomplete_submap_is_what_its_stream_waits_for():
 @pytest.mark.parametrize(
     ("new", "reason"),
     [
-        (sighting(1, 1, readings=(13,)), "differs from the one in the set"),
-        (sighting(3, 1, readings=(12, 13)), "uses reading 12, which another one has used"),
+        (sighting(1, 1, measurements=(13,)), "differs from the one in the set"),
+        (sighting(3, 1, measurements=(12, 13)), "uses measurement 12, which another one has used"),
         (sighting(1, 3, "bravo", (14,)), "is one more than submap 1 has"),
     ],
 )

@@ -157,15 +157,15 @@ def test_a_standing_robot_that_is_seen_by_another_one_stays_apart_and_it_is_said
                 submap(robot, k, ids=(), mean=still, P=np.diag([1e-6, 1e-6, 1e-8] * 5),
                        nodes=nodes, sightings=4 * sees)
             )  # fmt: skip
-    final = concluded([_with_readings(each, k) for k, each in enumerate(messages)])
+    final = concluded([_with_measurements(each, k) for k, each in enumerate(messages)])
     assert any("r2 (epoch 1) not joined" in reason for reason in final.reasons), final.reasons
 
 
-def _with_readings(message, k):
+def _with_measurements(message, k):
     if not isinstance(message, m.SightingFactor):
         return message
     fields = {name: getattr(message, name) for name in message.__struct_fields__}
-    return m.SightingFactor(**{**fields, "readings": (k + 1,)})
+    return m.SightingFactor(**{**fields, "measurements": (k + 1,)})
 
 
 def test_a_million_metres_from_the_origin_the_map_is_the_same():

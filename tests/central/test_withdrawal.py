@@ -259,7 +259,7 @@ def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong() -> None:
 
 
 def in_garbage(kind: GarbageKind, seed: int) -> Scenario:
-    """The small world with three in ten readings spoilt, which windows and centre expect."""
+    """The small world with three in ten measurements spoilt, which windows and centre expect."""
     of = scenario(robust_c=2.0, landmark_submaps=2)
     replaced = msgspec.structs.replace
     team = tuple(
@@ -274,7 +274,7 @@ def in_garbage(kind: GarbageKind, seed: int) -> Scenario:
 def test_no_good_robot_is_withdrawn_for_the_garbage_that_it_reads(
     kind: GarbageKind, seed: int
 ) -> None:
-    """Nor is anybody a suspect; by windows that take every reading all are (2000 and more)."""
+    """Nor is anybody a suspect; by windows that take every measurement all are (2000 and more)."""
     of = in_garbage(kind, seed)
     samples = tuple(run(of))
     assert final_map(list(samples)).withdrawn == ()

@@ -35,15 +35,15 @@ def epochs_of(config, stream):
         step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
         increment = increment_of(config.motion, *map(float, step))
         rows = seen.rows(k)
-        readings = corrected(config.sensor, seen.ranges[rows], seen.bearings[rows])
-        epochs.append(Epoch(increment, seen.ids[rows], *readings))
+        measurements = corrected(config.sensor, seen.ranges[rows], seen.bearings[rows])
+        epochs.append(Epoch(increment, seen.ids[rows], *measurements))
     return epochs
 
 
 def run(state, step, epochs, config, *generator):
     """The state after the epochs, by an estimator's `stepped`."""
-    for increment, *readings in epochs:
-        state = step(state, increment, config.sensor, *readings, *generator)
+    for increment, *measurements in epochs:
+        state = step(state, increment, config.sensor, *measurements, *generator)
     return state
 
 

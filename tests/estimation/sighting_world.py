@@ -68,10 +68,10 @@ def meeting(seed, robots=2, submaps=6, landmarks=5, reach=12.0, sigmas=(0.1, 0.0
         for other in (f"r{r}" for r in range(robots) if f"r{r}" != robot):
             to = seen_from(pose, poses[other, k][0] + 1j * poses[other, k][1])
             noise = np.array(sigmas) * rng.normal(size=2)
-            reading = np.array([abs(to) + noise[0], wrap(np.angle(to) + noise[1])])
+            measurement = np.array([abs(to) + noise[0], wrap(np.angle(to) + noise[1])])
             covariance = np.diag(np.square(sigmas))
             stamp = 1000 * k + 500
-            sightings.append(Sighting(robot, 0, k, stamp, other, reading, covariance))
+            sightings.append(Sighting(robot, 0, k, stamp, other, measurement, covariance))
     canonical = sorted(made, key=lambda each: each.key)
     return Met(points, starts, canonical, sorted(sightings, key=lambda each: each.key))
 
@@ -111,9 +111,9 @@ def mirrored(bearing_sigma, options):
     for stamp, observer, seen in zip(stamps.tolist(), nodes["r0"], nodes["r1"], strict=True):
         to = seen_from(observer, seen[0] + 1j * seen[1])
         bearing = np.angle(to) if bearing_sigma < 1.0 else 0.0
-        reading = np.array([abs(to), bearing])
+        measurement = np.array([abs(to), bearing])
         covariance = np.diag([0.01, bearing_sigma]) ** 2
-        ranges_seen.append(Sighting("r0", 0, 0, stamp, "r1", reading, covariance))
+        ranges_seen.append(Sighting("r0", 0, 0, stamp, "r1", measurement, covariance))
     starts = [Start("r0", 0, np.zeros(3)), Start("r1", 0, paths["r1"], np.diag([100.0, 100, 9]))]
     island = joined_with(submaps, starts, ranges_seen, options).main
     across = island.state.copy()

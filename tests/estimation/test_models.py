@@ -265,14 +265,14 @@ def test_calibration_takes_back_what_the_sensor_does():
     np.testing.assert_allclose(corrected, bearings)
 
 
-def test_readings_outside_the_sensors_reach_and_broken_ones_are_not_acceptable():
+def test_measurements_outside_the_sensors_reach_and_broken_ones_are_not_acceptable():
     sensor = Sensor(min_range=0.5, max_range=10.0, field_of_view=np.pi, range_offset=0.6)
     ranges = np.array([1.0, 0.55, 0.2, 11.0, 1.0, 1.0, np.nan, 1.0])
     bearings = np.array([1.5, 0.0, 0.0, 0.0, 1.7, -2.0, 0.0, np.nan])
     np.testing.assert_array_equal(models.acceptable(sensor, ranges, bearings), [True] + [False] * 7)
 
 
-def test_an_axis_reading_of_a_whole_turn_is_in_the_narrowest_view():
+def test_an_axis_measurement_of_a_whole_turn_is_in_the_narrowest_view():
     sensor = Sensor(field_of_view=0.1)
     seen = models.acceptable(sensor, np.ones(3), np.array([2.0 * np.pi, -2.0 * np.pi, np.pi]))
     np.testing.assert_array_equal(seen, [True, True, False])

@@ -120,10 +120,10 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
     keys: Folders, *, locked: bool
 ) -> None:
     forged = [encoded(odometry(5, "r1"))]
-    wanted = m.ReadingsWanted(0, "r1", 1, 0, -1)
+    wanted = m.MeasurementsRequest(0, "r1", 1, 0, -1)
     with door(keys if locked else None) as enter:
         robot, attacker = enter("robot-r1"), enter("robot-r2")
-        attacker.answer(ch.READINGS, "r1", lambda _: forged)
+        attacker.answer(ch.MEASUREMENTS, "r1", lambda _: forged)
         attacker.answer(ch.SUBMAPS, "", lambda _: forged)
         attacker.declare_alive("robot/r1")
         attacker.declare_alive("robot/r2")
@@ -135,7 +135,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
         )
         serving.start()
         try:
-            found = answers(robot, ch.READINGS, "r1", wanted)
+            found = answers(robot, ch.MEASUREMENTS, "r1", wanted)
             found += answers(robot, ch.SUBMAPS, "", m.SubmapsWanted(0, "r1"))
         finally:
             over.set()

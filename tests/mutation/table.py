@@ -24,12 +24,12 @@ WINDOW = ("estimation/hybrid_slam/test_window.py", "estimation/hybrid_slam/test_
 MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "team/estimation/hybrid_slam/window.py": (
         12,
-        (*WINDOW, "estimation/hybrid_slam/test_correlated_readings.py"),
+        (*WINDOW, "estimation/hybrid_slam/test_correlated_measurements.py"),
     ),
     "team/estimation/hybrid_slam/moments.py": (6, WINDOW),
     "team/estimation/hybrid_slam/landmarks_along_paths.py": (
         8,
-        (*WINDOW, "estimation/hybrid_slam/test_correlated_readings.py"),
+        (*WINDOW, "estimation/hybrid_slam/test_correlated_measurements.py"),
     ),
     "team/estimation/hybrid_slam/fastslam.py": (
         8,

@@ -35,7 +35,7 @@ def sample(channel: c.Channel, name: str, message: m.Message, counter: int = 0) 
 
 
 def stream(count: int) -> list[Sample]:
-    """Interleaved readings and submaps of two robots."""
+    """Interleaved measurements and submaps of two robots."""
     return [
         sample(c.SUBMAP, robot, submap(i, robot), i)
         if i % 10 == 9
@@ -392,7 +392,7 @@ def _small_log(factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-def test_reading_is_lazy(path: Path, noise: list[Sample]) -> None:
+def test_measurement_is_lazy(path: Path, noise: list[Sample]) -> None:
     recorded(path, noise)
     last = chunks_of(path)[-1]
     data = bytearray(path.read_bytes())

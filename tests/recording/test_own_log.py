@@ -25,8 +25,8 @@ def test_what_a_bus_sends_and_receives_is_in_its_own_log_and_merged_there_once(
             robot.publish(Outgoing(c.SUBMAP, "alpha", submap(i)))
             robot.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
         received(centre, 5)
-    submaps, readings = c.SUBMAP.key("alpha"), c.ODOMETRY.key("alpha")
+    submaps, measurements = c.SUBMAP.key("alpha"), c.ODOMETRY.key("alpha")
     found = [{k: n for k, (n, _) in open_log(path).counts().items()} for path in paths]
-    assert found == [{submaps: 5, readings: 5}, {submaps: 5}]
+    assert found == [{submaps: 5, measurements: 5}, {submaps: 5}]
     merged = merge([open_log(path) for path in paths], tmp_path / "whole.mcap")
     assert merged == (10, 5)

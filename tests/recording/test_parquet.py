@@ -71,7 +71,7 @@ def test_a_long_table_is_written_in_groups(tmp_path: Path, monkeypatch: pytest.M
     }
     file = pq.ParquetFile(tmp_path / "out" / "odometry.parquet")
     assert file.num_row_groups == 4
-    assert file.read().column("reading").to_pylist() == list(range(35))
+    assert file.read().column("number").to_pylist() == list(range(35))
     monkeypatch.setattr(parquet_tables, "GROUP_BYTES", 1)
     export_parquet(log, tmp_path / "fine")
     assert pq.ParquetFile(tmp_path / "fine" / "odometry.parquet").num_row_groups == 35

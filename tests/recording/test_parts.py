@@ -68,8 +68,8 @@ def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path: Pat
     assert join(path) == [path]
     log = open_log(path)
     assert log.complete
-    readings = [decoded(s.payload, m.Odometry) for s in log.samples([c.ODOMETRY])]
-    assert sorted(readings, key=lambda x: x.reading) == team.published
+    measurements = [decoded(s.payload, m.Odometry) for s in log.samples([c.ODOMETRY])]
+    assert sorted(measurements, key=lambda x: x.number) == team.published
     assert sorted(s.counter for s in log.samples([c.OWN_POSE])) == list(range(17))
     assert holes(log) == []
 
@@ -132,10 +132,10 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
     bus, world = MemoryBus(network), MemoryBus(network)
 
     def answer(request: bytes) -> list[bytes]:
-        wanted = decoded(request, m.ReadingsWanted)
+        wanted = decoded(request, m.MeasurementsRequest)
         return [encoded(odometry(i)) for i in range(wanted.first, wanted.last + 1)]
 
-    world.answer(c.READINGS, "alpha", answer)
+    world.answer(c.MEASUREMENTS, "alpha", answer)
     recorder, inventory = next_part(path, "t", {})
     room = False
 

@@ -41,20 +41,22 @@ def messages_of(samples: list[Sample], channel: c.Channel) -> list[m.Message]:
     return [message for of, _, message in found if of is channel]
 
 
-def test_progress_is_told_every_256_readings_and_when_it_is_quiet(path: Path) -> None:
+def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path) -> None:
     network = MemoryNetwork()
     world, bus = MemoryBus(network), MemoryBus(network)
     world.subscribe(c.RECORDER_PROGRESS)
     told = []
     with Recorder(path, "t", {}) as recorder:
         loop = RecordLoop(bus, recorder, ())
-        reading = count_from(0)
+        measurement = count_from(0)
         for count in (PROGRESS_EVERY - 1, 1, 10, 0, 0):
             for _ in range(count):
-                world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(next(reading))))
+                world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(next(measurement))))
             loop.take(bus.receive())
             got = messages_of(world.receive(), c.RECORDER_PROGRESS)
-            told.append([message.readings for message in got if isinstance(message, m.Progress)])
+            told.append(
+                [message.measurements for message in got if isinstance(message, m.Progress)]
+            )
     assert told == [[], [PROGRESS_EVERY], [], [PROGRESS_EVERY + 10], []]
 
 
@@ -64,8 +66,8 @@ def test_a_new_epoch_counts_from_zero(path: Path) -> None:
     world.subscribe(c.RECORDER_PROGRESS)
     with Recorder(path, "t", {}) as recorder:
         loop = RecordLoop(bus, recorder, ())
-        for epoch, reading in ((0, 0), (0, 1), (3, 0)):
-            message = m.Odometry(7, "alpha", epoch, reading, 0, 0.0, 0.0)
+        for epoch, measurement in ((0, 0), (0, 1), (3, 0)):
+            message = m.Odometry(7, "alpha", epoch, measurement, 0, 0.0, 0.0)
             world.publish(Outgoing(c.ODOMETRY, "alpha", message))
         loop.take(bus.receive())
         loop.take([])
@@ -86,7 +88,7 @@ def test_a_submap_is_told_at_once_so_that_its_robot_does_not_leave_before(path: 
             loop.take(bus.receive())
             (told,) = messages_of(robot.receive(), c.RECORDER_PROGRESS)
             assert isinstance(told, m.Progress)
-            assert (told.readings, told.submaps) == (0, sequence + 1)
+            assert (told.measurements, told.submaps) == (0, sequence + 1)
 
 
 def test_unsound_payloads_are_recorded_as_they_came(path: Path) -> None:
@@ -161,13 +163,13 @@ class Team:
 
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
-        self.published: list[m.Reading] = []
+        self.published: list[m.Measurement] = []
         self.submaps: list[m.Submap] = []
-        bus.answer(c.READINGS, "alpha", self.readings)
+        bus.answer(c.MEASUREMENTS, "alpha", self.measurements)
         bus.answer(c.SENT, "alpha", lambda _: [encoded(each) for each in self.submaps])
 
-    def readings(self, request: bytes) -> list[bytes]:
-        wanted = decoded(request, m.ReadingsWanted)
+    def measurements(self, request: bytes) -> list[bytes]:
+        wanted = decoded(request, m.MeasurementsRequest)
         assert wanted.only
         return [encoded(each) for each in self.published[wanted.first : wanted.last + 1]]
 
@@ -314,11 +316,11 @@ def plain_subscriber(endpoint: str, arrived: list[tuple[str, bytes, bytes]]) -> 
 
 
 def test_a_replay_is_the_log_byte_by_byte_in_its_order(path: Path, endpoint: str) -> None:
-    readings, submaps = [encoded(odometry(i)) for i in range(50)], [encoded(submap(0))]
+    measurements, submaps = [encoded(odometry(i)) for i in range(50)], [encoded(submap(0))]
     keys = [c.ODOMETRY, c.SUBMAP, c.ROBOT_PROGRESS, c.TRUTH, c.STATUS]
     with Recorder(path, "t", {}) as recorder:
         recorder.write(
-            Sample(channel.key("alpha"), (submaps + readings)[i % 51], i, 2 * i, i)
+            Sample(channel.key("alpha"), (submaps + measurements)[i % 51], i, 2 * i, i)
             for i in range(4_000)
             for channel in keys
         )

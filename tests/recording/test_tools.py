@@ -42,12 +42,12 @@ def sampled(channel: c.Channel, name: str, message: m.Message, counter: int) -> 
 
 
 def drive(robot: str, seconds: int) -> list[Sample]:
-    """A configuration at zero, ten odometry readings a second and a submap each second."""
+    """A configuration at zero, ten odometry measurements a second and a submap each second."""
     out = [sampled(c.ROBOT_CONFIG, robot, m.Configured(0, f"robot/{robot}", 1, bytes(8), "{}"), 0)]
     for i in range(10 * seconds):
         stamp = 100 * SECOND + i * SECOND // 10
-        reading = m.Odometry(stamp, robot, 1, i, SECOND // 10, 0.5, 0.1)
-        out.append(sampled(c.ODOMETRY, robot, reading, i))
+        measurement = m.Odometry(stamp, robot, 1, i, SECOND // 10, 0.5, 0.1)
+        out.append(sampled(c.ODOMETRY, robot, measurement, i))
         if i % 10 == 9:
             times = {"stamp_ns": stamp, "start_ns": stamp - SECOND}
             said = msgspec.structs.replace(submap(i // 10, robot), **times)
@@ -317,7 +317,7 @@ def test_a_schema_is_held_against_its_channel(
 # Summary.
 
 
-def test_a_summary_counts_and_its_span_is_that_of_the_readings(whole: Log) -> None:
+def test_a_summary_counts_and_its_span_is_that_of_the_measurements(whole: Log) -> None:
     summary = summarised(whole)
     of = {each.key: each for each in summary.keys}
     assert {key: each.messages for key, each in of.items()} == {
@@ -383,7 +383,9 @@ def test_a_cut_with_nothing_in_it_is_refused(
     tmp_path: Path, bounds: tuple[float | None, float | None]
 ) -> None:
     log = recorded(tmp_path / "log.mcap", [s for s in drive("alpha", 6) if "config" not in s.key])
-    with pytest.raises(LogError, match=r"nothing of it is in this cut; its readings are .* 5\.900"):
+    with pytest.raises(
+        LogError, match=r"nothing of it is in this cut; its measurements are .* 5\.900"
+    ):
         cut(log, tmp_path / "a.mcap", *bounds)
     assert not (tmp_path / "a.mcap").exists()
 
@@ -469,7 +471,7 @@ def test_numbers_read_back_from_csv_are_the_same(
     log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
     export_csv(log, folder / "out")
     (row,) = rows_of(folder / "out" / "observations.csv")
-    assert (row["key"], row["counter"], row["reading"]) == ("source/alpha/observations", "3", "9")
+    assert (row["key"], row["counter"], row["number"]) == ("source/alpha/observations", "3", "9")
     assert from_ids([int(word) for word in row["ids"].split()]) == message.ids
     for name in ("ranges", "bearings"):
         back = np.array([float(word) for word in row[name].split()])

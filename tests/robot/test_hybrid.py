@@ -1,4 +1,6 @@
-"""The member: windows that depend on their own readings alone, and the thesis' running state."""
+"""The member: windows that depend on their own measurements alone, and the thesis' running
+state.
+"""
 
 from itertools import pairwise
 
@@ -18,19 +20,22 @@ from team.robot.hybrid import HybridEstimator
 from team.wire import messages as m
 from tests.teams import config, published, stream
 
-READINGS = published(stream("r1", 12, off_ns=300_000_000))
+MEASUREMENTS = published(stream("r1", 12, off_ns=300_000_000))
 
 
-def fed(member, readings):
+def fed(member, measurements):
     closed = []
-    for reading in readings:
+    for measurement in measurements:
         if isinstance(member, HybridEstimator):
-            member.consumed(reading.reading)
-        if isinstance(reading, m.Observations):
-            member.observe(reading.stamp_ns, translate.scan_of(reading))
-        if isinstance(reading, m.Odometry):
+            member.consumed(measurement.number)
+        if isinstance(measurement, m.Observations):
+            member.observe(measurement.stamp_ns, translate.scan_of(measurement))
+        if isinstance(measurement, m.Odometry):
             window = member.drive(
-                reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
+                measurement.stamp_ns,
+                measurement.duration_ns,
+                measurement.forward,
+                measurement.yaw_rate,
             ).closed
             closed += [] if window is None else [window]
     return closed
@@ -42,97 +47,99 @@ def begun():
 
 def same(a, b):
     return (
-        (a.sequence, a.first_reading, a.last_reading, a.start_ns, a.end_ns)
-        == (b.sequence, b.first_reading, b.last_reading, b.start_ns, b.end_ns)
+        (a.sequence, a.first_measurement, a.last_measurement, a.start_ns, a.end_ns)
+        == (b.sequence, b.first_measurement, b.last_measurement, b.start_ns, b.end_ns)
         and a.local.ids.tobytes() == b.local.ids.tobytes()
         and a.local.mean.tobytes() == b.local.mean.tobytes()
         and a.local.covariance.tobytes() == b.local.covariance.tobytes()
     )
 
 
-def test_windows_are_contiguous_in_readings_and_time():
+def test_windows_are_contiguous_in_measurements_and_time():
     member = begun()
-    closed = fed(member, READINGS)
+    closed = fed(member, MEASUREMENTS)
     ended, uncovered = member.finish()
     assert uncovered == 0
     assert ended.closed is None, "the last window ended with the last odometry"
     assert [w.sequence for w in closed] == [0, 1, 2, 3]
-    assert closed[0].first_reading == 0
-    assert closed[-1].last_reading == len(READINGS) - 1
+    assert closed[0].first_measurement == 0
+    assert closed[-1].last_measurement == len(MEASUREMENTS) - 1
     for before, after in pairwise(closed):
-        assert after.first_reading == before.last_reading + 1
+        assert after.first_measurement == before.last_measurement + 1
         assert after.start_ns == before.end_ns
 
 
 @settings(deadline=None, max_examples=12)
 @given(st.integers(0, 3), st.integers(1, 3))
 def test_a_member_that_takes_over_earlier_windows_goes_on_byte_for_byte(taken, looks):
-    whole = fed(begun(), READINGS)
+    whole = fed(begun(), MEASUREMENTS)
     member = begun()
     for closed in whole[:taken]:
         member.resume(closed)
     for _ in range(looks):
         member.open_window()
-    first = whole[taken - 1].last_reading + 1 if taken else 0
-    again = fed(member, READINGS[first:])
+    first = whole[taken - 1].last_measurement + 1 if taken else 0
+    again = fed(member, MEASUREMENTS[first:])
     assert len(again) == len(whole) - taken
     assert all(same(a, b) for a, b in zip(again, whole[taken:], strict=True))
-    assert member.whole.mean.tobytes() == _whole_of(READINGS).mean.tobytes()
+    assert member.whole.mean.tobytes() == _whole_of(MEASUREMENTS).mean.tobytes()
 
 
-def _whole_of(readings):
+def _whole_of(measurements):
     member = begun()
-    fed(member, readings)
+    fed(member, measurements)
     return member.whole
 
 
 def test_a_window_does_not_depend_on_what_was_read_before_it():
     other = [
-        m.Odometry(r.stamp_ns, r.robot, r.epoch, r.reading, r.duration_ns, 2 * r.forward, 0.5)
+        m.Odometry(r.stamp_ns, r.robot, r.epoch, r.number, r.duration_ns, 2 * r.forward, 0.5)
         if isinstance(r, m.Odometry) and r.stamp_ns <= 3_000_000_000
         else r
-        for r in READINGS
+        for r in MEASUREMENTS
     ]
-    one, two = fed(begun(), READINGS), fed(begun(), other)
+    one, two = fed(begun(), MEASUREMENTS), fed(begun(), other)
     assert not same(one[0], two[0])
     assert all(same(a, b) for a, b in zip(one[1:], two[1:], strict=True))
 
 
 @pytest.mark.parametrize("other", [config(seed=2), config("r2")])
 def test_a_window_depends_on_its_seed_and_its_robot(other):
-    assert not same(fed(HybridEstimator(other, 1), READINGS)[0], fed(begun(), READINGS)[0])
+    assert not same(fed(HybridEstimator(other, 1), MEASUREMENTS)[0], fed(begun(), MEASUREMENTS)[0])
 
 
 def test_a_window_depends_on_its_epoch():
-    assert not same(fed(HybridEstimator(config(), 2), READINGS)[0], fed(begun(), READINGS)[0])
+    assert not same(
+        fed(HybridEstimator(config(), 2), MEASUREMENTS)[0], fed(begun(), MEASUREMENTS)[0]
+    )
 
 
 def test_what_no_odometry_covers_is_counted_at_the_end():
-    readings = published(stream("r1", 4, beyond=3))
+    measurements = published(stream("r1", 4, beyond=3))
     member = begun()
-    closed = fed(member, readings)
+    closed = fed(member, measurements)
     ended, uncovered = member.finish()
     assert uncovered == 3
-    assert ended.closed.last_reading == readings[-1].reading
-    assert ended.closed.first_reading == closed[-1].last_reading + 1
+    assert ended.closed.last_measurement == measurements[-1].number
+    assert ended.closed.first_measurement == closed[-1].last_measurement + 1
     assert ended.closed.end_ns == 4_000_000_000
 
 
 def test_a_member_without_odometry_has_no_window_and_covers_nothing():
-    readings = published(stream("r1", 4, drives=False))
+    measurements = published(stream("r1", 4, drives=False))
     member = begun()
-    assert fed(member, readings) == []
+    assert fed(member, measurements) == []
     ended, uncovered = member.finish()
     assert ended.closed is None
-    assert uncovered == sum(isinstance(r, m.Observations) for r in readings)
+    assert uncovered == sum(isinstance(r, m.Observations) for r in measurements)
 
 
 def test_the_thesis_member_starts_where_it_is_told_and_replaces_what_it_absorbs():
     robot = config(estimator="hybrid-thesis", fusion="kalman-per-axis")
     member = estimator_of(robot, 1, InitialPose(np.array([1.0, 2.0, 0.5]), None))
     np.testing.assert_array_equal(member.own_pose().mean, [1.0, 2.0, 0.5])
-    fed(member, READINGS[1:])
-    assert member.sequence == sum(isinstance(r, m.Observations) for r in READINGS)
+    fed(member, MEASUREMENTS[1:])
+    assert member.sequence == sum(isinstance(r, m.Observations) for r in MEASUREMENTS)
     before = member.own_map()
     assert len(before.ids) > 0
     told = LandmarkGaussian(before.ids[:1], np.array([[50.0, 60.0]]), 4.0 * np.eye(2))

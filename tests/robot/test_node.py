@@ -1,4 +1,4 @@
-"""The robot's node: what it sends for fusion hangs on its own readings alone."""
+"""The robot's node: what it sends for fusion hangs on its own measurements alone."""
 
 from itertools import pairwise
 
@@ -21,8 +21,8 @@ from tests.support import packed, spd
 from tests.teams import config, driven, of, published, stream
 
 STREAM = stream("r1", 12, off_ns=300_000_000)
-READINGS = published(STREAM)
-END = m.End(12_000_000_000, (m.StreamEnd("r1", 1, len(READINGS)),))
+MEASUREMENTS = published(STREAM)
+END = m.End(12_000_000_000, (m.StreamEnd("r1", 1, len(MEASUREMENTS)),))
 CENTRE = m.Liveliness(0, "central", True)
 
 
@@ -30,7 +30,7 @@ def payloads(out, channel=ch.SUBMAP):
     return [encoded(message) for message in of(out, channel)]
 
 
-LONELY = payloads(driven(RobotNode(config()), READINGS))
+LONELY = payloads(driven(RobotNode(config()), MEASUREMENTS))
 
 
 def prior(sequence=0, epoch=1, scale=1.0, at=0.0, ids=(1, 2)):
@@ -65,11 +65,11 @@ garbage = st.one_of(
 
 
 @settings(deadline=None, max_examples=25)
-@given(st.lists(st.tuples(st.integers(0, len(READINGS) - 1), garbage), max_size=8))
+@given(st.lists(st.tuples(st.integers(0, len(MEASUREMENTS) - 1), garbage), max_size=8))
 def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections):
     node, out = RobotNode(config()), []
-    for i, reading in enumerate(READINGS):
-        out += node.handle(reading, 0)
+    for i, measurement in enumerate(MEASUREMENTS):
+        out += node.handle(measurement, 0)
         for at, message in interjections:
             out += node.handle(message, 0) if at == i else []
     out += node.handle(END, 0)
@@ -83,9 +83,9 @@ def test_the_prior_does_change_the_team_pose():
     poses = []
     for at in (0.0, 3.0):
         node = RobotNode(config())
-        out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
+        out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
         out += node.handle(prior(at=at), 0)
-        out += [o for r in READINGS[10:] for o in node.handle(r, 0)]
+        out += [o for r in MEASUREMENTS[10:] for o in node.handle(r, 0)]
         poses.append(payloads(out, ch.TEAM_POSE))
     assert len(poses[0]) == len(poses[1]) > 0
     assert poses[0] != poses[1]
@@ -98,10 +98,10 @@ def test_an_older_prior_does_not_replace_the_one_that_is_held():
     older = msgspec.structs.replace(prior(1), members=(m.Member("r1", 1, 1),))
     for after in ((), (older,), (newer,), (older, newer, older)):
         node = RobotNode(config())
-        out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
+        out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
         for message in (newer, *after):
             out += node.handle(message, 0)
-        out += [o for r in READINGS[10:] for o in node.handle(r, 0)]
+        out += [o for r in MEASUREMENTS[10:] for o in node.handle(r, 0)]
         poses.append(payloads(out, ch.TEAM_POSE))
     assert poses[0] == poses[1] == poses[2] == poses[3]
 
@@ -109,25 +109,25 @@ def test_an_older_prior_does_not_replace_the_one_that_is_held():
 def test_a_prior_that_can_not_be_solved_is_a_warning_and_the_robot_goes_on():
     node = RobotNode(config())
     flat = msgspec.structs.replace(prior(), covariance=packed(-100.0 * np.eye(7)))
-    out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
+    out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
     out += node.handle(flat, 0)
-    out += driven(node, READINGS[10:])
+    out += driven(node, MEASUREMENTS[10:])
     assert payloads(out) == LONELY
     assert not of(out, ch.TEAM_POSE)
     assert "no team pose" in node.warnings[0]
 
 
 @settings(deadline=None, max_examples=15)
-@given(st.permutations(range(len(READINGS))), st.lists(st.integers(0, len(READINGS) - 1)))
+@given(st.permutations(range(len(MEASUREMENTS))), st.lists(st.integers(0, len(MEASUREMENTS) - 1)))
 def test_any_order_of_arrival_and_duplicates_give_the_same_submaps(order, again):
     node = RobotNode(config())
-    out = [o for i in [*order, *again] for o in node.handle(READINGS[i], 0)]
+    out = [o for i in [*order, *again] for o in node.handle(MEASUREMENTS[i], 0)]
     assert payloads(out + node.handle(END, 0)) == LONELY
 
 
 def test_run_twice_everything_it_says_is_equal():
     one, two = (
-        [encoded(o.message) for o in [*node.begin(), *driven(node, READINGS)]]
+        [encoded(o.message) for o in [*node.begin(), *driven(node, MEASUREMENTS)]]
         for node in (RobotNode(config()), RobotNode(config()))
     )
     assert one == two
@@ -147,82 +147,84 @@ STREAMS = {
 @pytest.mark.parametrize("name", STREAMS)
 @pytest.mark.parametrize("keyframe_s", [0.0, 0.7])
 @pytest.mark.parametrize("estimator", sorted({estimator for estimator, _ in PAIRS}))
-def test_every_reading_has_one_disposition(name, keyframe_s, estimator):
-    readings = published(STREAMS[name])
+def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
+    measurements = published(STREAMS[name])
     front_end = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
     fusion = {"hybrid": "join", "hybrid-thesis": "kalman-per-axis"}.get(estimator, "alone")
     node = RobotNode(config(front_end=front_end, estimator=estimator, fusion=fusion))
     node.handle(m.Liveliness(0, "central", False), 0)
     node.handle(m.KnownMap(0, from_ids([1, 2]), from_floats([5.0, 3.0, 9.0, -2.0])), 0)
-    out = driven(node, readings)
+    out = driven(node, measurements)
     (done,) = of(out, ch.ROBOT_DONE)
-    assert done.readings == len(readings)
-    assert sum(entry.readings for entry in done.ledger) == len(readings)
-    assert all(entry.readings > 0 for entry in done.ledger)
-    assert done.steps == sum(isinstance(r, m.Odometry) for r in readings)
-    used = [e.readings for e in done.ledger if e.disposition.startswith("in ")]
-    uncovered = [e.readings for e in done.ledger if "no odometry" in e.disposition]
+    assert done.measurements == len(measurements)
+    assert sum(entry.measurements for entry in done.ledger) == len(measurements)
+    assert all(entry.measurements > 0 for entry in done.ledger)
+    assert done.steps == sum(isinstance(r, m.Odometry) for r in measurements)
+    used = [e.measurements for e in done.ledger if e.disposition.startswith("in ")]
+    uncovered = [e.measurements for e in done.ledger if "no odometry" in e.disposition]
     beyond = name in ("observations beyond the odometry", "nothing but observations")
     assert bool(uncovered) == (beyond and estimator != "dead-reckoning")
     submaps = of(out, ch.SUBMAP)
     assert done.submaps == len(submaps)
     if estimator == "hybrid" and submaps:
-        assert submaps[0].first_reading == 0
+        assert submaps[0].first_measurement == 0
         for before, after in pairwise(submaps):
-            assert after.first_reading == before.last_reading + 1
+            assert after.first_measurement == before.last_measurement + 1
             assert after.start_ns == before.stamp_ns
-        inside = sum(s.last_reading - s.first_reading + 1 for s in submaps)
-        rejected = sum(e.readings for e in done.ledger if e.disposition.startswith("rejected"))
+        inside = sum(s.last_measurement - s.first_measurement + 1 for s in submaps)
+        rejected = sum(e.measurements for e in done.ledger if e.disposition.startswith("rejected"))
         assert sum(used) + 1 <= inside <= sum(used) + 1 + rejected
 
 
-def out_of_order(readings):
+def out_of_order(measurements):
     """What is counted right before an odometry interval is stamped half a second behind its end."""
     late = []
-    for reading, following in pairwise([*readings, None]):
+    for measurement, following in pairwise([*measurements, None]):
         ends = following is not None and isinstance(following, m.Odometry)
-        if ends and isinstance(reading, m.Observations | m.Sightings):
-            reading = msgspec.structs.replace(reading, stamp_ns=following.stamp_ns + 500_000_000)
-        late.append(reading)
+        if ends and isinstance(measurement, m.Observations | m.Sightings):
+            measurement = msgspec.structs.replace(
+                measurement, stamp_ns=following.stamp_ns + 500_000_000
+            )
+        late.append(measurement)
     return late
 
 
 @pytest.mark.parametrize("options", [{}, {"keyframe_s": 0.3}, {"node_s": 1.0}])
 def test_what_is_stamped_behind_its_window_is_in_no_submap_also_after_a_restart(options):
     """Before, the next window used it too: a robot that was started again sent another submap."""
-    readings = out_of_order(published(stream("r1", 12)))
+    measurements = out_of_order(published(stream("r1", 12)))
     front_end = msgspec.structs.replace(config().front_end, **options)
-    out = driven(RobotNode(config(front_end=front_end)), readings)
+    out = driven(RobotNode(config(front_end=front_end)), measurements)
     whole = of(out, ch.SUBMAP)
     (done,) = of(out, ch.ROBOT_DONE)
-    assert sum(entry.readings for entry in done.ledger) == len(readings)
-    assert {e.disposition: e.readings for e in done.ledger}[LATE] == len(whole) - 1
+    assert sum(entry.measurements for entry in done.ledger) == len(measurements)
+    assert {e.disposition: e.measurements for e in done.ledger}[LATE] == len(whole) - 1
     for taken in range(1, len(whole)):
         node = RobotNode(config(front_end=front_end))
-        node.resume(readings[0], whole[:taken])
-        assert payloads(driven(node, readings)) == [encoded(each) for each in whole[taken:]]
+        node.resume(measurements[0], whole[:taken])
+        assert payloads(driven(node, measurements)) == [encoded(each) for each in whole[taken:]]
 
 
 @pytest.mark.parametrize("taken", [1, 2, 3])
 @pytest.mark.parametrize("name", ["observations between odometry stamps", "quick odometry"])
 def test_a_robot_that_was_started_again_sends_the_same_following_submaps(name, taken):
-    readings = published(STREAMS[name])
+    measurements = published(STREAMS[name])
     front_end = msgspec.structs.replace(config().front_end, keyframe_s=0.3, window_s=0.6)
-    whole = of(driven(RobotNode(config(front_end=front_end)), readings), ch.SUBMAP)
+    whole = of(driven(RobotNode(config(front_end=front_end)), measurements), ch.SUBMAP)
     node = RobotNode(config(front_end=front_end))
-    node.resume(readings[0], whole[:taken])
-    assert node.next_reading == whole[taken - 1].last_reading + 1
-    out = driven(node, readings)
+    node.resume(measurements[0], whole[:taken])
+    assert node.next_measurement == whole[taken - 1].last_measurement + 1
+    out = driven(node, measurements)
     assert payloads(out) == [encoded(each) for each in whole[taken:]]
     (done,) = of(out, ch.ROBOT_DONE)
-    assert sum(e.readings for e in done.ledger) == done.readings == len(readings)
+    assert sum(e.measurements for e in done.ledger) == done.measurements == len(measurements)
 
 
 def test_submaps_and_maps_name_the_configuration_that_was_announced():
     node = RobotNode(config())
     (announced,) = of(node.begin(), ch.ROBOT_CONFIG)
     assert announced.digest == translate.digest_of(announced.configuration.encode())
-    submaps = of(driven(node, READINGS), ch.SUBMAP)
+    submaps = of(driven(node, MEASUREMENTS), ch.SUBMAP)
     assert {each.config for each in submaps} == {announced.digest}
     (other,) = of(RobotNode(config(seed=2)).begin(), ch.ROBOT_CONFIG)
     assert other.digest != announced.digest
@@ -231,8 +233,8 @@ def test_submaps_and_maps_name_the_configuration_that_was_announced():
 def test_everything_it_sends_passes_the_door():
     node = RobotNode(config())
     out = [*node.begin(), *node.handle(CENTRE, 0)]
-    for reading in READINGS:
-        out += node.handle(reading, 0)
+    for measurement in MEASUREMENTS:
+        out += node.handle(measurement, 0)
         out += node.handle(prior(), 0)
     out += node.handle(END, 0)
     for o in out:
@@ -242,10 +244,10 @@ def test_everything_it_sends_passes_the_door():
 
 def test_progress_never_passes_a_window_that_may_still_end(monkeypatch):
     """At a progress's stamp every submap that ends there or before has been sent."""
-    monkeypatch.setattr(pace, "PROGRESS_READINGS", 1)
+    monkeypatch.setattr(pace, "PROGRESS_MEASUREMENTS", 1)
     node, passed = RobotNode(config()), -1
-    for reading in published(stream("r1", 12)):
-        for o in node.handle(reading, 0):
+    for measurement in published(stream("r1", 12)):
+        for o in node.handle(measurement, 0):
             if o.channel is ch.ROBOT_PROGRESS:
                 passed = max(passed, o.message.stamp_ns)
             if o.channel is ch.SUBMAP:
@@ -257,7 +259,7 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
     monkeypatch.setattr(pace, "CREDIT_SUBMAPS", 1)
     node = RobotNode(config())
     node.handle(CENTRE, 0)
-    out = [o for r in READINGS for o in node.handle(r, 0)] + node.handle(END, 0)
+    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
     assert len(of(out, ch.SUBMAP)) == 2
     out += node.handle(m.Progress(0, "central", "r1", 7, 0, 9), 0)
     assert len(of(out, ch.SUBMAP)) == 2, "credit of another epoch is none"
@@ -270,24 +272,24 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
 
-def test_missing_readings_are_asked_for():
+def test_missing_measurements_are_asked_for():
     node = RobotNode(config())
     assert node.wanted() is None
-    node.handle(READINGS[3], 0)
-    assert node.wanted() == m.ReadingsWanted(0, "r1", 1, 0, 2), "the very first ones too"
-    for reading in READINGS[:3]:
-        node.handle(reading, 0)
+    node.handle(MEASUREMENTS[3], 0)
+    assert node.wanted() == m.MeasurementsRequest(0, "r1", 1, 0, 2), "the very first ones too"
+    for measurement in MEASUREMENTS[:3]:
+        node.handle(measurement, 0)
     assert node.wanted() is None
-    node.handle(READINGS[8], 0)
+    node.handle(MEASUREMENTS[8], 0)
     wanted = node.wanted()
     assert (wanted.epoch, wanted.first, wanted.last) == (1, 4, 7)
-    for reading in READINGS[4:8]:
-        node.handle(reading, 0)
+    for measurement in MEASUREMENTS[4:8]:
+        node.handle(measurement, 0)
     node.handle(END, 0)
     wanted = node.wanted()
-    assert (wanted.epoch, wanted.first, wanted.last) == (1, 9, len(READINGS) - 1)
-    for reading in READINGS[9:]:
-        node.handle(reading, 0)
+    assert (wanted.epoch, wanted.first, wanted.last) == (1, 9, len(MEASUREMENTS) - 1)
+    for measurement in MEASUREMENTS[9:]:
+        node.handle(measurement, 0)
     assert node.wanted() is None
 
 
@@ -295,13 +297,13 @@ def test_a_stream_that_was_missed_entirely_is_asked_for_at_its_end():
     node = RobotNode(config())
     node.handle(END, 0)
     wanted = node.wanted()
-    assert (wanted.epoch, wanted.first, wanted.last) == (1, 0, len(READINGS) - 1)
+    assert (wanted.epoch, wanted.first, wanted.last) == (1, 0, len(MEASUREMENTS) - 1)
 
 
 def test_a_new_epoch_closes_the_old_one_under_its_own_name():
     node = RobotNode(config())
-    out = [o for r in READINGS[:10] for o in node.handle(r, 0)]
-    second = [msgspec.structs.replace(r, epoch=2, reading=r.reading - 15) for r in READINGS[15:]]
+    out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
+    second = [msgspec.structs.replace(r, epoch=2, number=r.number - 15) for r in MEASUREMENTS[15:]]
     second[0] = m.Start(second[0].stamp_ns, "r1", 2, 0, b"", b"")
     out += [o for r in second for o in node.handle(r, 0)]
     ends = (m.StreamEnd("r1", 2, len(second)),)
@@ -310,13 +312,13 @@ def test_a_new_epoch_closes_the_old_one_under_its_own_name():
     names = [(s.epoch, s.sequence) for s in submaps]
     assert names == [(1, 0), (1, 1), *((2, k) for k in range(len(names) - 2))]
     assert len(names) > 2
-    assert submaps[1].last_reading == 9
-    assert next(s for s in submaps if s.epoch == 2).first_reading == 0
+    assert submaps[1].last_measurement == 9
+    assert next(s for s in submaps if s.epoch == 2).first_measurement == 0
     last, first = of(out, ch.ROBOT_DONE)
     assert (last.epoch, first.epoch) == (2, 1)
-    assert (first.readings, last.readings) == (10, len(second))
+    assert (first.measurements, last.measurements) == (10, len(second))
     for done in (first, last):
-        assert sum(e.readings for e in done.ledger) == done.readings
+        assert sum(e.measurements for e in done.ledger) == done.measurements
     for progress in of(out, ch.ROBOT_PROGRESS):
         assert progress.submaps <= sum(s.epoch == progress.epoch for s in submaps)
 
@@ -327,11 +329,11 @@ def feedback(**options):
 
 def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
     node = feedback()
-    out = [o for r in READINGS for o in node.handle(r, 0)] + node.handle(END, 0)
+    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
     assert [x.exchange for x in of(out, ch.OWN_MAP)] == [1]
-    before = node.next_reading
+    before = node.next_measurement
     assert node.handle(fused(exchange=0), 0) == []
-    assert node.next_reading == before, "an old answer is none"
+    assert node.next_measurement == before, "an old answer is none"
     for number in range(1, 5):
         out += node.handle(fused(ids=(1, 2), at=2.0, exchange=number), 0)
     assert [x.exchange for x in of(out, ch.OWN_MAP)] == [1, 2, 3, 4]
@@ -340,26 +342,26 @@ def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
 
 def test_waiting_for_an_exchange_a_robot_reports_what_it_has_received(monkeypatch):
     """Else the world waits for it, and it for a teammate that waits for the world."""
-    monkeypatch.setattr(pace, "PROGRESS_READINGS", 4)
+    monkeypatch.setattr(pace, "PROGRESS_MEASUREMENTS", 4)
     node = feedback()
-    out = [o for r in READINGS for o in node.handle(r, 0)]
-    assert node.next_reading < len(READINGS) - 10
-    reported = max(p.readings for p in of(out, ch.ROBOT_PROGRESS))
-    assert len(READINGS) - 4 < reported <= len(READINGS)
+    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)]
+    assert node.next_measurement < len(MEASUREMENTS) - 10
+    reported = max(p.measurements for p in of(out, ch.ROBOT_PROGRESS))
+    assert len(MEASUREMENTS) - 4 < reported <= len(MEASUREMENTS)
 
 
 def test_under_feedback_the_last_map_is_sent_whether_or_not_an_exchange_is_due():
     for estimator, fusion in (("hybrid", "kalman"), ("hybrid-thesis", "kalman-per-axis")):
         node = RobotNode(config(estimator=estimator, fusion=fusion, exchange_s=1e6))
         node.handle(m.Liveliness(0, "central", False), 0)
-        maps = of(driven(node, READINGS), ch.OWN_MAP)
+        maps = of(driven(node, MEASUREMENTS), ch.OWN_MAP)
         assert len(maps) == 2
         assert maps[-1].stamp_ns > maps[0].stamp_ns
 
 
 def test_under_feedback_a_lost_centre_is_not_waited_for():
     node = feedback()
-    out = [o for r in READINGS for o in node.handle(r, 0)] + node.handle(END, 0)
+    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
     assert not of(out, ch.ROBOT_DONE)
     out += node.handle(m.Liveliness(0, "central", False), 0)
     assert len(of(out, ch.ROBOT_DONE)) == 1
@@ -367,7 +369,7 @@ def test_under_feedback_a_lost_centre_is_not_waited_for():
 
 def test_the_final_map_ends_it():
     node = RobotNode(config())
-    driven(node, READINGS)
+    driven(node, MEASUREMENTS)
     assert not node.finished
     node.handle(fused(final=True), 0)
     assert node.finished
@@ -376,26 +378,26 @@ def test_the_final_map_ends_it():
 def test_its_status_says_what_it_is_doing():
     node = RobotNode(config())
     assert node.status().state == "waiting"
-    for reading in READINGS[:9]:
-        node.handle(reading, 0)
+    for measurement in MEASUREMENTS[:9]:
+        node.handle(measurement, 0)
     status = node.status()
     assert status.state == "mapping"
-    assert status.figures["readings"] == 9.0
-    assert status.figures["steps"] == sum(isinstance(r, m.Odometry) for r in READINGS[:9])
-    driven(node, READINGS[9:])
+    assert status.figures["measurements"] == 9.0
+    assert status.figures["steps"] == sum(isinstance(r, m.Odometry) for r in MEASUREMENTS[:9])
+    driven(node, MEASUREMENTS[9:])
     assert node.status().state == "done"
 
 
 def test_out_of_its_messages_none_is_on_another_robots_key():
-    out: list[Outgoing] = driven(RobotNode(config()), READINGS)
+    out: list[Outgoing] = driven(RobotNode(config()), MEASUREMENTS)
     assert {o.name for o in out} == {"r1"}
 
 
 def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
     node = RobotNode(config())
     assert "nis_per_dof" not in node.status().figures
-    windows = of(driven(node, READINGS[:-8], end=False), ch.INNOVATION)
-    submaps = of(driven(RobotNode(config()), READINGS[:-8], end=False), ch.SUBMAP)
+    windows = of(driven(node, MEASUREMENTS[:-8], end=False), ch.INNOVATION)
+    submaps = of(driven(RobotNode(config()), MEASUREMENTS[:-8], end=False), ch.SUBMAP)
     assert [(w.sequence, w.stamp_ns) for w in windows] == [
         (s.sequence, s.stamp_ns) for s in submaps
     ]
@@ -404,7 +406,7 @@ def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
     assert figures["nis_dof"] > closed > 0
     total = figures["nis_per_dof"] * figures["nis_dof"]
     assert total > sum(window.squared for window in windows) > 0.0
-    rest = of(driven(node, READINGS[-8:]), ch.INNOVATION)
+    rest = of(driven(node, MEASUREMENTS[-8:]), ch.INNOVATION)
     figures = node.status().figures
     assert figures["nis_dof"] == closed + sum(window.dof for window in rest)
 
@@ -423,26 +425,26 @@ def test_an_order_to_withdraw_a_robot_is_repeated_once_for_a_centre_that_comes_l
 
 def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
     first, sent = RobotNode(config()), []
-    for reading in READINGS[: len(READINGS) // 2]:
-        sent += first.handle(reading, 0)
-    kept = [READINGS[0], *of(sent, ch.SUBMAP)]
+    for measurement in MEASUREMENTS[: len(MEASUREMENTS) // 2]:
+        sent += first.handle(measurement, 0)
+    kept = [MEASUREMENTS[0], *of(sent, ch.SUBMAP)]
     node = RobotNode(config())
     node.take_over(kept)
-    for reading in READINGS[node.next_reading :]:
-        sent += node.handle(reading, 0)
+    for measurement in MEASUREMENTS[node.next_measurement :]:
+        sent += node.handle(measurement, 0)
 
     def answer(**wanted):
         request = encoded(m.SubmapsWanted(0, "r1", **wanted))
         return [decoded(reply) for reply in node.answer_submaps(request)]
 
-    assert answer() == [READINGS[0], *of(sent, ch.SUBMAP)]
-    assert answer(epoch=1, first=2) == [READINGS[0], *of(sent, ch.SUBMAP)[2:]]
+    assert answer() == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)]
+    assert answer(epoch=1, first=2) == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)[2:]]
     assert answer(epoch=2) == []
     assert node.answer_submaps(encoded(m.SubmapsWanted(0, "r2"))) == []
 
 
 def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
     node = RobotNode(config(), "rendezvous")
-    for reading in READINGS:
-        node.handle(reading, 0)
-    assert node.answer_submaps(encoded(m.SubmapsWanted(0, "r1"))) == [encoded(READINGS[0])]
+    for measurement in MEASUREMENTS:
+        node.handle(measurement, 0)
+    assert node.answer_submaps(encoded(m.SubmapsWanted(0, "r1"))) == [encoded(MEASUREMENTS[0])]

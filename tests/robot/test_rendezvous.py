@@ -18,7 +18,7 @@ from tests.teams import Team, driven, of, published
 from tests.test_sighted_team import CENTRE, SCENARIO, STREAMS
 
 CONFIG = SCENARIO.robots[0]
-READINGS = published(STREAMS.streams[0])
+MEASUREMENTS = published(STREAMS.streams[0])
 
 
 def at_rendezvous(scenario: Scenario) -> Scenario:
@@ -49,30 +49,30 @@ def test_a_robot_that_keeps_what_it_holds_is_found_out(continuous, monkeypatch) 
     assert encoded(met(1).final) != encoded(continuous.final)
 
 
-def sent_by(readings: list[m.Message], exchange: str = "rendezvous", end: bool = True) -> list:
-    return driven(RobotNode(CONFIG, exchange), readings, end=end)
+def sent_by(measurements: list[m.Message], exchange: str = "rendezvous", end: bool = True) -> list:
+    return driven(RobotNode(CONFIG, exchange), measurements, end=end)
 
 
 def test_nothing_is_sent_until_a_teammate_is_seen_and_then_all_of_it() -> None:
-    first = next(k for k, r in enumerate(READINGS) if isinstance(r, m.Sightings))
-    before = sent_by(READINGS[:first], end=False)
-    there = sent_by(READINGS[: first + 1], end=False)
-    held = of(sent_by(READINGS[:first], "continuous", end=False), ch.SUBMAP)
+    first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
+    before = sent_by(MEASUREMENTS[:first], end=False)
+    there = sent_by(MEASUREMENTS[: first + 1], end=False)
+    held = of(sent_by(MEASUREMENTS[:first], "continuous", end=False), ch.SUBMAP)
     assert held
     assert of(before, ch.SUBMAP) == of(before, ch.RENDEZVOUS) == []
     assert of(there, ch.SUBMAP) == held
     (told,) = of(there, ch.RENDEZVOUS)
-    assert told.teammates == READINGS[first].teammates
+    assert told.teammates == MEASUREMENTS[first].teammates
     assert told.submaps == len(held)
-    assert told.waited_s == pytest.approx(1e-9 * (READINGS[first].stamp_ns - held[0].stamp_ns))
+    assert told.waited_s == pytest.approx(1e-9 * (MEASUREMENTS[first].stamp_ns - held[0].stamp_ns))
 
 
 def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else() -> None:
-    first = next(k for k, r in enumerate(READINGS) if isinstance(r, m.Sightings))
+    first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
     for teammates, count in (((CONFIG.id,), 1), (("r9",), 0)):
         node = RobotNode(CONFIG, "rendezvous")
-        driven(node, READINGS[:first], end=False)
-        seen = m.Rendezvous(READINGS[first].stamp_ns, "r2", 1, teammates, 0, 0.0)
+        driven(node, MEASUREMENTS[:first], end=False)
+        seen = m.Rendezvous(MEASUREMENTS[first].stamp_ns, "r2", 1, teammates, 0, 0.0)
         out = node.handle(seen, 0)
         assert (len(of(out, ch.SUBMAP)) > 0) == (len(of(out, ch.RENDEZVOUS)) == 1) == bool(count)
         if count:
@@ -80,15 +80,15 @@ def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else() -> None:
 
 
 def test_a_held_submap_holds_back_the_team_time_that_its_robot_has_passed() -> None:
-    first = next(k for k, r in enumerate(READINGS) if isinstance(r, m.Sightings))
-    reports = of(sent_by(READINGS[:first], end=False), ch.ROBOT_PROGRESS)
+    first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
+    reports = of(sent_by(MEASUREMENTS[:first], end=False), ch.ROBOT_PROGRESS)
     assert {report.submaps for report in reports} == {0}
-    assert max(report.stamp_ns for report in reports) <= READINGS[0].stamp_ns
+    assert max(report.stamp_ns for report in reports) <= MEASUREMENTS[0].stamp_ns
 
 
 def test_at_the_end_of_the_stream_everything_is_sent() -> None:
-    alone = [r for r in READINGS if not isinstance(r, m.Sightings)]
-    alone = [msgspec.structs.replace(r, reading=k) for k, r in enumerate(alone)]
+    alone = [r for r in MEASUREMENTS if not isinstance(r, m.Sightings)]
+    alone = [msgspec.structs.replace(r, number=k) for k, r in enumerate(alone)]
     out, usual = sent_by(alone), sent_by(alone, "continuous")
     assert of(out, ch.SUBMAP) == of(usual, ch.SUBMAP)
     assert len(of(out, ch.RENDEZVOUS)) == 1

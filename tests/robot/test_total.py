@@ -73,8 +73,8 @@ def lived(messages, **fields) -> tuple[RobotNode, list[m.Submap], Counter[str]]:
     node, out = robot_session(iter(messages), config(**fields))
     (done,) = [each.message for each in out if isinstance(each.message, m.Done)]
     submaps = [each.message for each in out if isinstance(each.message, m.Submap)]
-    ledger = Counter({each.disposition: each.readings for each in done.ledger})
-    assert sum(ledger.values()) == done.readings, "each measurement has one disposition"
+    ledger = Counter({each.disposition: each.measurements for each in done.ledger})
+    assert sum(ledger.values()) == done.measurements, "each measurement has one disposition"
     return node, submaps, ledger
 
 
@@ -112,7 +112,7 @@ def test_a_clock_that_has_truly_leapt_is_followed_from_the_second_interval_on():
 
 def test_a_range_beyond_the_bounds_is_not_taken():
     far = m.Observations(5 * S, "r1", 1, 9, from_ids([1]), from_floats([9e5]), from_floats([0.0]))
-    messages = [far if getattr(x, "reading", None) == 9 else x for x in drive(20)]
+    messages = [far if getattr(x, "number", None) == 9 else x for x in drive(20)]
     _, _, ledger = lived(messages, bounds=Bounds(extent_m=1e4))
     assert ledger[f"rejected: {RANGE}"] == 1
 
@@ -121,7 +121,7 @@ def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bo
     messages = []
     for each in drive(20):
         if isinstance(each, m.Observations):
-            k = each.reading
+            k = each.number
             n = 2000 if k == 21 else 60
             seen = np.arange(1, n + 1) + 60 * k
             ranges = np.linspace(1.0, 50.0, n)

@@ -108,14 +108,14 @@ def joined_log(of: Scenario, deviation: float) -> list[Sample]:
 
 
 def counted_twice(log: Sequence[Sample]) -> list[Sample]:
-    """The log with every observation in it twice, as two readings."""
+    """The log with every observation in it twice, as two measurements."""
     doubled = []
     for sample in log:
         _, _, message = opened(sample)
-        if isinstance(message, m.Reading):
+        if isinstance(message, m.Measurement):
             copies = 2 if isinstance(message, m.Observations) else 1
             for k in range(copies):
-                again = msgspec.structs.replace(message, reading=2 * message.reading + k)
+                again = msgspec.structs.replace(message, number=2 * message.number + k)
                 doubled.append(replace(sample, payload=encoded(again)))
         else:
             doubled.append(sample)

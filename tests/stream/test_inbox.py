@@ -1,4 +1,4 @@
-"""The inbox: readings in their order, each once, whatever order they come in."""
+"""The inbox: measurements in their order, each once, whatever order they come in."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -7,12 +7,12 @@ from team.stream.inbox import Inbox
 from team.wire import messages as m
 
 
-def reading(number, epoch=0):
+def measurement(number, epoch=0):
     return m.Odometry(number * 1_000, "r1", epoch, number, 1_000, 1.0, 0.0)
 
 
 def names(taken):
-    return [(each.epoch, each.reading) for each in taken]
+    return [(each.epoch, each.number) for each in taken]
 
 
 @settings(deadline=None)
@@ -20,7 +20,7 @@ def names(taken):
 def test_any_order_with_duplicates_comes_out_in_order_and_once(order, at_once):
     inbox, out = Inbox(), []
     for i, number in enumerate(order):
-        inbox.put(reading(number))
+        inbox.put(measurement(number))
         if i % at_once == 0:
             out += names(inbox.taken())
     out += names(inbox.taken())
@@ -33,26 +33,26 @@ def test_any_order_with_duplicates_comes_out_in_order_and_once(order, at_once):
 def test_of_two_epochs_the_earlier_is_taken_as_far_as_it_is_there(order):
     inbox, out = Inbox(), []
     for epoch, number in order:
-        inbox.put(reading(number, epoch))
+        inbox.put(measurement(number, epoch))
         out += names(inbox.taken())
     assert out == sorted(out)
     assert [name for name in out if name[0] == 3] == [(3, number) for number in range(4)]
     assert inbox.waiting == 0, "nothing of a past epoch is kept"
 
 
-def test_a_reading_waits_until_those_before_it_are_here():
+def test_a_measurement_waits_until_those_before_it_are_here():
     inbox = Inbox()
-    inbox.put(reading(1))
+    inbox.put(measurement(1))
     assert names(inbox.taken()) == []
-    inbox.put(reading(0))
+    inbox.put(measurement(0))
     assert names(inbox.taken()) == [(0, 0), (0, 1)]
 
 
-def test_who_stops_taking_finds_the_next_reading_later():
+def test_who_stops_taking_finds_the_next_measurement_later():
     inbox = Inbox()
     for number in range(3):
-        inbox.put(reading(number))
-    assert next(inbox.taken()).reading == 0
+        inbox.put(measurement(number))
+    assert next(inbox.taken()).number == 0
     assert names(inbox.taken()) == [(0, 1), (0, 2)]
 
 
@@ -60,11 +60,11 @@ def test_the_gap_is_what_is_missing_before_the_earliest_that_waits():
     inbox = Inbox()
     assert inbox.gap is None
     for number in (0, 4, 7):
-        inbox.put(reading(number))
+        inbox.put(measurement(number))
     assert names(inbox.taken()) == [(0, 0)]
     assert inbox.gap == (0, 1, 3)
     for number in (1, 2, 3):
-        inbox.put(reading(number))
+        inbox.put(measurement(number))
     assert inbox.gap is None
     assert names(inbox.taken()) == [(0, 1), (0, 2), (0, 3), (0, 4)]
     assert inbox.gap == (0, 5, 6)
@@ -72,41 +72,41 @@ def test_the_gap_is_what_is_missing_before_the_earliest_that_waits():
 
 def test_a_later_epoch_whose_beginning_is_missing_is_a_gap():
     inbox = Inbox()
-    inbox.put(reading(3, epoch=1))
+    inbox.put(measurement(3, epoch=1))
     assert names(inbox.taken()) == []
     assert inbox.gap == (1, 0, 2)
 
 
-def test_a_later_epoch_begins_with_its_reading_0_and_the_earlier_one_is_over():
+def test_a_later_epoch_begins_with_its_measurement_0_and_the_earlier_one_is_over():
     inbox = Inbox()
     for number in (0, 2):
-        inbox.put(reading(number))
-    inbox.put(reading(0, epoch=5))
+        inbox.put(measurement(number))
+    inbox.put(measurement(0, epoch=5))
     assert names(inbox.taken()) == [(0, 0), (5, 0)]
-    inbox.put(reading(1))
+    inbox.put(measurement(1))
     assert names(inbox.taken()) == []
-    assert (inbox.epoch, inbox.next_reading, inbox.waiting) == (5, 1, 0)
+    assert (inbox.epoch, inbox.next_measurement, inbox.waiting) == (5, 1, 0)
 
 
 def test_what_an_earlier_life_consumed_is_not_taken_again():
     inbox = Inbox()
     for number in range(6):
-        inbox.put(reading(number, epoch=2))
-    inbox.put(reading(0))
+        inbox.put(measurement(number, epoch=2))
+    inbox.put(measurement(0))
     inbox.resume(2, 4)
-    inbox.put(reading(3, epoch=2))
+    inbox.put(measurement(3, epoch=2))
     assert names(inbox.taken()) == [(2, 4), (2, 5)]
 
 
 def test_received_counts_what_is_here_without_a_gap_consumed_or_not():
     inbox = Inbox()
     for number in (0, 1, 2, 4):
-        inbox.put(reading(number))
+        inbox.put(measurement(number))
     assert inbox.received == 3
-    assert next(inbox.taken()).reading == 0
+    assert next(inbox.taken()).number == 0
     assert inbox.received == 3
-    inbox.put(reading(3))
+    inbox.put(measurement(3))
     assert inbox.received == 5
-    inbox.put(reading(0, epoch=1))
+    inbox.put(measurement(0, epoch=1))
     list(inbox.taken())
     assert inbox.received == 1

@@ -153,7 +153,7 @@ async def test_a_data_set_without_ground_truth_works_and_says_what_can_not_be_co
     assert isinstance(result["robots"], dict)
     for robot in result["robots"].values():
         assert robot["position_rmse_m"] is None
-        assert robot["readings_consumed"] == robot["readings_published"] > 0
+        assert robot["measurements_consumed"] == robot["measurements_published"] > 0
 
 
 async def test_a_robot_without_odometry_is_told_and_the_others_run(
@@ -167,7 +167,7 @@ async def test_a_robot_without_odometry_is_told_and_the_others_run(
     assert steps["r2"] == 0
     assert min(steps["r1"], steps["r3"]) > 0
     for robot in result["robots"].values():
-        assert robot["readings_consumed"] == robot["readings_published"] > 0
+        assert robot["measurements_consumed"] == robot["measurements_published"] > 0
 
 
 async def test_a_port_that_is_taken_is_told(team: Processes) -> None:

@@ -23,8 +23,8 @@ FIGURES = (
     "landmarks", "final_map_digest", "log", "wall_s",
 )  # fmt: skip
 ROBOT_FIGURES = (
-    "steps", "readings_published", "readings_consumed", "position_rmse_m", "heading_rmse_rad",
-    "pose_nees_per_dof", "uplink_bytes", "submaps",
+    "steps", "measurements_published", "measurements_consumed", "position_rmse_m",
+    "heading_rmse_rad", "pose_nees_per_dof", "uplink_bytes", "submaps",
 )  # fmt: skip
 
 
@@ -50,15 +50,15 @@ def test_the_json_of_a_launch_has_every_figure(launched: Launched) -> None:
         assert result["channels"][key]["messages"] > 0
 
 
-def test_every_published_reading_is_consumed_once(launched: Launched) -> None:
+def test_every_published_measurement_is_consumed_once(launched: Launched) -> None:
     for name, robot in launched.result["robots"].items():
-        assert robot["readings_published"] == robot["readings_consumed"] > 2 * STEPS
-        assert robot["readings_used_once"]
+        assert robot["measurements_published"] == robot["measurements_consumed"] > 2 * STEPS
+        assert robot["measurements_used_once"]
         sent = sum(
             launched.result["channels"].get(channel.key(name), {"messages": 0})["messages"]
             for channel in ch.SENSORS
         )
-        assert sent == robot["readings_published"], "the log has each reading once"
+        assert sent == robot["measurements_published"], "the log has each measurement once"
 
 
 def test_the_log_of_a_launch_is_complete_and_says_what_ran(launched: Launched) -> None:

@@ -80,8 +80,8 @@ async def test_a_robot_that_dies_and_is_started_again_changes_no_bit_of_the_map(
     assert found.final_map() == map_in_memory(found.scenario)
 
 
-@pytest.mark.parametrize("cut_for", ["some readings", "the rest of the run"])
-async def test_readings_that_a_cut_link_loses_are_asked_for_at_their_source(
+@pytest.mark.parametrize("cut_for", ["some measurements", "the rest of the run"])
+async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(
     cut_for: str, team: Processes
 ) -> None:
     found = await assembled(team, "12")
@@ -93,7 +93,7 @@ async def test_readings_that_a_cut_link_loses_are_asked_for_at_their_source(
         await seen.sees(1, ch.SUBMAP, "r1")
         link.cut()
         passed = seen.count(ch.ODOMETRY, "r1")
-        if cut_for == "some readings":
+        if cut_for == "some measurements":
             await seen.sees(passed + 10, ch.ODOMETRY, "r1")
         else:
             await seen.sees(1, ch.END)

@@ -176,9 +176,9 @@ def test_a_question_gets_all_its_answers_in_order(joined: Joined) -> None:
 
 def test_one_answer_can_serve_every_name(joined: Joined) -> None:
     world, robot = joined(), joined()
-    world.answer(c.READINGS, "*", lambda request: [request])
-    wanted = m.ReadingsWanted(0, "bravo", 0, 1, 2)
-    assert asked(robot, world, c.READINGS, "bravo", wanted) == [encoded(wanted)]
+    world.answer(c.MEASUREMENTS, "*", lambda request: [request])
+    wanted = m.MeasurementsRequest(0, "bravo", 0, 1, 2)
+    assert asked(robot, world, c.MEASUREMENTS, "bravo", wanted) == [encoded(wanted)]
 
 
 def test_a_question_that_nobody_answers_has_no_answers(joined: Joined) -> None:

@@ -72,7 +72,7 @@ def test_a_submap_from_before_the_sensitivities_has_none() -> None:
     assert (submap(0).biases, submap(0).sensitivity) == ((), b"")
 
 
-def test_a_submap_from_before_the_gate_has_all_its_readings() -> None:
+def test_a_submap_from_before_the_gate_has_all_its_measurements() -> None:
     shorter = msgpack.packb(fields_of(submap(0))[:-1])
     assert decoded(shorter) == submap(0)
     assert submap(0).gated == 0
@@ -98,9 +98,9 @@ def test_a_submap_whose_sensitivities_do_not_fit_is_refused(
 @settings(deadline=None)
 @given(stamps, names, counts, counts, st.integers(0, 2**62 - 1), finite, finite)
 def test_odometry_comes_back_as_it_went(
-    stamp: int, robot: str, epoch: int, reading: int, duration: int, forward: float, rate: float
+    stamp: int, robot: str, epoch: int, measurement: int, duration: int, forward: float, rate: float
 ) -> None:
-    message = m.Odometry(stamp, robot, epoch, reading, duration, forward, rate)
+    message = m.Odometry(stamp, robot, epoch, measurement, duration, forward, rate)
     assert decoded(encoded(message), m.Odometry) == message
 
 
@@ -220,8 +220,8 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("out of bounds", with_fields(MET, range=0.0), None),
         ("out of bounds", with_fields(MET, bearing=3.2), None),
         ("out of bounds", with_fields(MET, teammate="alpha"), None),
-        ("not ascending", with_fields(MET, readings=[]), None),
-        ("not ascending", with_fields(MET, readings=[5, 5]), None),
+        ("not ascending", with_fields(MET, measurements=[]), None),
+        ("not ascending", with_fields(MET, measurements=[5, 5]), None),
         ("not positive definite", with_fields(MET, covariance=indefinite(2)), None),
         ("too large", b"\xdd\x7f\xff\xff\xff" + b"\x00" * 100, None),
         ("too large", with_fields(SUBMAP, ids=from_ids(range(4096)), mean=bytes(8 * 8198)), None),

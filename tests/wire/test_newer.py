@@ -56,8 +56,8 @@ def test_a_later_life_of_the_stream_and_a_settled_map_of_the_same_set_are_newer(
     assert not is_newer_map(less, MAP)
 
 
-def progress(stamp_ns: int, epoch: int, readings: int, submaps: int) -> m.Progress:
-    return m.Progress(stamp_ns, "robot/r1", "r1", epoch, readings, submaps)
+def progress(stamp_ns: int, epoch: int, measurements: int, submaps: int) -> m.Progress:
+    return m.Progress(stamp_ns, "robot/r1", "r1", epoch, measurements, submaps)
 
 
 counters = st.builds(progress, st.integers(0, 3), st.integers(1, 2), st.integers(0, 3),
@@ -71,14 +71,14 @@ def test_progress_never_goes_back(said: list[m.Progress]) -> None:
         before, held = held, further(each, held)
         assert before is None or held.epoch >= before.epoch
         if before is not None and held.epoch == before.epoch:
-            assert held.readings >= before.readings
+            assert held.measurements >= before.measurements
             assert held.submaps >= before.submaps
             assert held.stamp_ns >= before.stamp_ns
     assert held is not None
     assert held.submaps == max(p.submaps for p in said if p.epoch == held.epoch)
 
 
-def test_an_older_end_does_not_take_readings_back() -> None:
+def test_an_older_end_does_not_take_measurements_back() -> None:
     first = m.End(1, (m.StreamEnd("r1", 1, 90), m.StreamEnd("r2", 1, 40)))
     later = m.End(2, (m.StreamEnd("r1", 2, 10), m.StreamEnd("r2", 1, 50)))
     assert later_end(first, later).streams == later.streams

@@ -38,7 +38,7 @@ from team.wire.bus import Sample
 UPLINK = {
     "submap": (ch.SUBMAP, ch.SIGHTING_FACTOR),
     "own/map": (ch.OWN_MAP,),
-    "readings": ch.SENSORS,
+    "measurements": ch.SENSORS,
 }
 """The channels of each name in `PAIRS`."""
 
@@ -77,10 +77,11 @@ class RobotResult:
     """One robot: its stream, what became of it, and its poses against the truth.
 
     smoothed: the final map's poses at the ends of the submaps. online: what the robot said when it
-    was there, given the team's map (`online_channel`: "team/pose"), or from its own readings alone
-    where it never had that. aligned_rmse_m: of the smoothed positions after the rigid motion that
-    aligns the map (`alignment`: "map"), or else their own ("trajectory"); online_aligned_rmse_m: of
-    the online ones after the map's. own_map: of the robot's last own map, as it lies.
+    was there, given the team's map (`online_channel`: "team/pose"), or from its own measurements
+    alone where it never had that. aligned_rmse_m: of the smoothed positions after the rigid motion
+    that aligns the map (`alignment`: "map"), or else their own ("trajectory");
+    online_aligned_rmse_m: of the online ones after the map's. own_map: of the robot's last own map,
+    as it lies.
     """
 
     consumption: Consumption
@@ -243,9 +244,9 @@ def _robot_json(robot: RobotResult) -> dict[str, Any]:
     own = robot.own_map
     return {
         "steps": used.steps,
-        "readings_published": used.published,
-        "readings_consumed": used.consumed,
-        "readings_used_once": used.each_once,
+        "measurements_published": used.published,
+        "measurements_consumed": used.consumed,
+        "measurements_used_once": used.each_once,
         "ledger": dict(used.ledger),
         "submaps": used.submaps,
         "position_rmse_m": None if smoothed is None else smoothed.position_rmse_m,

@@ -15,7 +15,7 @@ MOST = 2000
 FIRST = 1
 """The incarnation with which every stream begins."""
 _NUMBER = re.compile(r"\d+\.\d+")
-_AWAITED = ("waiting for ", "has not appeared yet", "no readings of this team yet")
+_AWAITED = ("waiting for ", "has not appeared yet", "no measurements of this team yet")
 """Nobody is there at once: that is no event."""
 
 
@@ -61,7 +61,7 @@ class EventTeller:
                 node = robot_node(message.robot)
                 self._done.add(node)
                 text = (
-                    f"{message.robot} used all its {message.readings:,} readings, "
+                    f"{message.robot} used all its {message.measurements:,} measurements, "
                     f"{message.submaps} submaps"
                 )
                 return [Event(now_ns, "done", node, text)]

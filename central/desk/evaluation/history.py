@@ -54,10 +54,10 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Latencies:
-    """Of one robot's submaps that some map used: wall time [s] from a reading to the first map.
+    """Of one robot's submaps that some map used: wall time [s] from a measurement to the first map.
 
-    stamps_ns: team time of the submap's end. first, last: from its first and its last reading's
-    publication to the map's. A reading waits for its window to close, so `first` is the longer.
+    stamps_ns: team time of the submap's end. first, last: from its first and its last measurement's
+    publication to the map's. A measurement waits for its window to close, so `first` is the longer.
     """
 
     stamps_ns: Int64[np.ndarray, " n"]
@@ -77,7 +77,7 @@ class Traffic:
 class History:
     """What happened in a run, by team time.
 
-    start_ns, end_ns: the span of the readings, of everything where there are none. map_nees: of
+    start_ns, end_ns: the span of the measurements, of everything where there are none. map_nees: of
     every fused map, NEES per dof of its landmarks in their own blocks; empty without truth.
     map_cost: of every fused map; robot_cost: as the centre's status gave it.
     """
@@ -93,7 +93,7 @@ class History:
     events: tuple[Event, ...]
 
     def seconds(self, stamps_ns: Int64[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Team time since the first reading [s]; what was before is at its beginning."""
+        """Team time since the first measurement [s]; what was before is at its beginning."""
         elapsed: Float[np.ndarray, " n"] = np.maximum(stamps_ns - self.start_ns, 0) * 1e-9
         return elapsed
 
@@ -117,22 +117,26 @@ class _Column:
 
 
 class _Clocks:
-    """The wall clocks [ns] of a stream's readings, 16 bytes each; one out of order is left out."""
+    """The wall clocks [ns] of a stream's measurements, 16 bytes each; one out of order is left
+    out.
+    """
 
     def __init__(self) -> None:
-        self._readings = array("q")
+        self._measurements = array("q")
         self._clocks = array("q")
 
-    def take(self, reading: int, wall_ns: int) -> None:
-        """Of one reading."""
-        if abs(reading) < 2**63 and (not self._readings or reading > self._readings[-1]):
-            self._readings.append(reading)
+    def take(self, measurement: int, wall_ns: int) -> None:
+        """Of one measurement."""
+        if abs(measurement) < 2**63 and (
+            not self._measurements or measurement > self._measurements[-1]
+        ):
+            self._measurements.append(measurement)
             self._clocks.append(min(wall_ns, 2**63 - 1))
 
-    def of(self, reading: int) -> int | None:
+    def of(self, measurement: int) -> int | None:
         """None where it is not known."""
-        k = bisect_left(self._readings, reading)
-        known = k < len(self._readings) and self._readings[k] == reading
+        k = bisect_left(self._measurements, measurement)
+        known = k < len(self._measurements) and self._measurements[k] == measurement
         return self._clocks[k] if known else None
 
 
@@ -141,8 +145,8 @@ class _Submap:
     """A submap that no map has used yet: who waits for it."""
 
     end_ns: int
-    first_reading: int
-    last_reading: int
+    first_measurement: int
+    last_measurement: int
 
 
 @dataclass
@@ -169,7 +173,7 @@ class _Gathering:
     def take(self, sample: Sample, channel: ch.Channel | None) -> None:
         self.traffic[sample.key].take(sample.stamp_ns, float(len(sample.payload)))
         if channel in ch.SENSORS:
-            self._take_reading(sample)
+            self._take_measurement(sample)
         if channel not in _LOOKED_AT:
             return
         try:
@@ -180,7 +184,9 @@ class _Gathering:
         del self.events[MOST:]
         match message:
             case m.Submap():
-                interval = _Submap(message.stamp_ns, message.first_reading, message.last_reading)
+                interval = _Submap(
+                    message.stamp_ns, message.first_measurement, message.last_measurement
+                )
                 self.unused[message.robot, message.epoch][message.sequence] = interval
             case m.FusedMap():
                 self._take_map(message, sample.wall_ns)
@@ -196,11 +202,13 @@ class _Gathering:
             case _:
                 pass
 
-    def _take_reading(self, sample: Sample) -> None:
-        reading = head_of(sample)
-        if reading is None:
+    def _take_measurement(self, sample: Sample) -> None:
+        measurement = head_of(sample)
+        if measurement is None:
             return
-        self.published[reading.robot, reading.epoch].take(reading.reading, sample.wall_ns)
+        self.published[measurement.robot, measurement.epoch].take(
+            measurement.number, sample.wall_ns
+        )
         self.span = (min(self.span[0], sample.stamp_ns), max(self.span[1], sample.stamp_ns))
 
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
@@ -216,9 +224,9 @@ class _Gathering:
 
     def _arrived(self, robot: str, epoch: int, submap: _Submap, wall_ns: int) -> None:
         clocks = self.published[robot, epoch]
-        first_ns, last_ns = clocks.of(submap.first_reading), clocks.of(submap.last_reading)
+        first_ns, last_ns = clocks.of(submap.first_measurement), clocks.of(submap.last_measurement)
         if first_ns is None or last_ns is None:
-            return  # a part of a log: the reading was published before it
+            return  # a part of a log: the measurement was published before it
         first, last = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
         self.latencies[robot].append((submap.end_ns, first, last))
 

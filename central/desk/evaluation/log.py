@@ -1,7 +1,7 @@
 """One pass over a log's samples: what an evaluation needs of them, and no more.
 
-Most of a log is sensor readings; of those only the head (robot, epoch, reading) is decoded, to be
-counted. Everything else that matters goes through the one door, `opened`.
+Most of a log is sensor measurements; of those only the head (robot, epoch, measurement) is decoded,
+to be counted. Everything else that matters goes through the one door, `opened`.
 """
 
 from collections import defaultdict
@@ -38,20 +38,20 @@ _OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, 
 
 
 class Head(msgspec.Struct, array_like=True, gc=False):
-    """The first fields of every reading; what follows is skipped."""
+    """The first fields of every measurement; what follows is skipped."""
 
     tag: str
     stamp_ns: int
     robot: str
     epoch: int
-    reading: int
+    number: int
 
 
 _HEAD = msgspec.msgpack.Decoder(Head)
 
 
 def head_of(sample: Sample) -> Head | None:
-    """The head of a reading; None of what is none."""
+    """The head of a measurement; None of what is none."""
     try:
         return _HEAD.decode(sample.payload)
     except (msgspec.DecodeError, UnicodeDecodeError):
@@ -67,8 +67,8 @@ class Traffic:
 
 
 @dataclass
-class Readings:
-    """The readings of one robot on its sensor channels, each (epoch, reading) once."""
+class Measurements:
+    """The measurements of one robot on its sensor channels, each (epoch, measurement) once."""
 
     all: set[tuple[int, int]] = field(default_factory=set)
     odometry: set[tuple[int, int]] = field(default_factory=set)
@@ -82,15 +82,15 @@ class Collected:
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
-    readings: dict[str, Readings] = field(default_factory=lambda: defaultdict(Readings))
+    measurements: dict[str, Measurements] = field(default_factory=lambda: defaultdict(Measurements))
     latest: dict[str, Sample] = field(default_factory=dict)
     kept: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
     unsound: int = 0
 
     @property
     def robots(self) -> list[str]:
-        """The robots that any reading or truth is of, by name."""
-        names = set(self.readings)
+        """The robots that any measurement or truth is of, by name."""
+        names = set(self.measurements)
         for key in self.traffic:
             found = channel_of(key)
             if found is not None and found[0].name in _OF_A_ROBOT:
@@ -143,10 +143,10 @@ class Collected:
         if head is None:
             self.unsound += 1
             return
-        of_robot = self.readings[robot]
-        of_robot.all.add((head.epoch, head.reading))
+        of_robot = self.measurements[robot]
+        of_robot.all.add((head.epoch, head.number))
         if odometry:
-            of_robot.odometry.add((head.epoch, head.reading))
+            of_robot.odometry.add((head.epoch, head.number))
 
 
 def collected(samples: Iterable[Sample]) -> Collected:

@@ -1,4 +1,4 @@
-"""One robot in a log: its poses and its truth, and what became of its readings."""
+"""One robot in a log: its poses and its truth, and what became of its measurements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ class RobotLog:
 
 @dataclass(frozen=True)
 class Consumption:
-    """Readings on the robot's sensor channels, and what the robot says became of them.
+    """Measurements on the robot's sensor channels, and what the robot says became of them.
 
-    steps: odometry intervals. published: distinct readings. consumed, ledger: the robot's last
-    word, None and empty where it never said that it was done. each_once: no reading lies in two
+    steps: odometry intervals. published: distinct measurements. consumed, ledger: the robot's last
+    word, None and empty where it never said that it was done. each_once: no measurement lies in two
     submaps, and the ledger adds up to what was consumed.
     """
 
@@ -76,7 +76,7 @@ def robot_log(log: Collected, robot: str) -> RobotLog:
 
 
 def consumption(log: Collected, robot: str) -> Consumption:
-    """What became of one robot's readings."""
+    """What became of one robot's measurements."""
     dones = {d.epoch: d for d in log.messages(ch.ROBOT_DONE, robot) if isinstance(d, m.Done)}
     submaps = {
         (s.epoch, s.sequence): s for s in log.messages(ch.SUBMAP, robot) if isinstance(s, m.Submap)
@@ -84,12 +84,12 @@ def consumption(log: Collected, robot: str) -> Consumption:
     ledger: dict[str, int] = {}
     for epoch in sorted(dones):
         for entry in dones[epoch].ledger:
-            ledger[entry.disposition] = ledger.get(entry.disposition, 0) + entry.readings
-    readings = log.readings.get(robot)
-    consumed = sum(d.readings for d in dones.values()) if dones else None
+            ledger[entry.disposition] = ledger.get(entry.disposition, 0) + entry.measurements
+    measurements = log.measurements.get(robot)
+    consumed = sum(d.measurements for d in dones.values()) if dones else None
     return Consumption(
-        0 if readings is None else len(readings.odometry),
-        0 if readings is None else len(readings.all),
+        0 if measurements is None else len(measurements.odometry),
+        0 if measurements is None else len(measurements.all),
         consumed,
         len(submaps),
         ledger,
@@ -101,8 +101,10 @@ def consumption(log: Collected, robot: str) -> Consumption:
 
 
 def _disjoint(submaps: Sequence[m.Submap]) -> bool:
-    """Whether no reading lies in two of the submaps, which are in order."""
-    return all(a.epoch != b.epoch or a.last_reading < b.first_reading for a, b in pairwise(submaps))
+    """Whether no measurement lies in two of the submaps, which are in order."""
+    return all(
+        a.epoch != b.epoch or a.last_measurement < b.first_measurement for a, b in pairwise(submaps)
+    )
 
 
 def _short(channel: ch.Channel) -> str:

@@ -52,7 +52,7 @@ def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePat
 def export_tum(log: Log, folder: FilePath) -> list[FilePath]:
     """Write every robot's paths in the TUM format; what was written.
 
-    Raises `LogError` for a log that has no path, as one of sensor readings alone.
+    Raises `LogError` for a log that has no path, as one of sensor measurements alone.
     """
     written = write_trajectories(evaluate(log.samples()), folder)
     if not written:

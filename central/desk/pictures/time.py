@@ -142,7 +142,7 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     axis.axhline(1.0, color="#888888", linewidth=0.8)
     _scale(axis, max(largest, *highs, 1.5))
     axis.set_ylabel("NIS per dof")
-    axis.set_title("Readings against what the particles expected: needs no truth", fontsize=10)
+    axis.set_title("Measurements against what the particles expected: needs no truth", fontsize=10)
 
 
 def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
@@ -193,7 +193,11 @@ def traffic_picture(history: History, path: FilePath) -> bool:
         shown[f"{len(largest) - SHOWN_KEYS} more"] = rest
     for axis, groups, title in (
         (axes[0][0], shown, "by channel"),
-        (axes[1][0], by_robot, "what each robot's node says (its sensors' readings are not in it)"),
+        (
+            axes[1][0],
+            by_robot,
+            "what each robot's node says (its sensors' measurements are not in it)",
+        ),
     ):
         _draw_rates(axis, history, groups)
         axis.set_title(title, fontsize=10)
@@ -231,7 +235,7 @@ def _log_scale(axis: "Axes") -> None:
 
 
 def latency_picture(history: History, path: FilePath) -> bool:
-    """Wall time from a submap's first and last reading to the first map that used it."""
+    """Wall time from a submap's first and last measurement to the first map that used it."""
     if not history.latencies:
         return False
     figure, axes = new_figure(9.0, 3.6, 1, 1)
@@ -245,8 +249,8 @@ def latency_picture(history: History, path: FilePath) -> bool:
             label=name,
         )  # fmt: skip
         axis.plot(seconds, of.first_s[kept], color=colours[name], linewidth=0.8, linestyle=":")
-    axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last reading")
-    axis.plot([], [], color="#555555", linestyle=":", label="from its first reading")
+    axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last measurement")
+    axis.plot([], [], color="#555555", linestyle=":", label="from its first measurement")
     if all((of.last_s > 0.0).all() for of in history.latencies.values()):
         _log_scale(axis)  # clocks of two machines may disagree
     axis.set_xlabel("end of the submap, team time [s]")

@@ -107,7 +107,7 @@ def _page(run: Run, pictures: Mapping[str, Path]) -> str:
         ("Robots", _robots(run, pictures)),
         ("Honesty", _honesty(run, pictures)),
         ("Paths", _paths(run)),
-        ("Readings", _readings(run)),
+        ("Measurements", _measurements(run)),
         ("Events", _events(run, pictures)),
         ("Latency", _latency(run, pictures)),
         ("Traffic", _traffic(run, pictures)),
@@ -207,7 +207,7 @@ def _paths(run: Run) -> list[str]:
     return [_table(PATH_HEADINGS, rows), _note(PATH_NOTE), _table(headings, absolute), _note(note)]
 
 
-def _readings(run: Run) -> list[str]:
+def _measurements(run: Run) -> list[str]:
     ledger = run.ledger
     if ledger is None:
         told = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
@@ -264,8 +264,8 @@ def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "first\n95 %", "first\nmax",
     )  # fmt: skip
     note = (
-        "Wall time [s] from the publication of a submap's last and first reading to that of the "
-        "first map that used it, by the publishers' clocks."
+        "Wall time [s] from the publication of a submap's last and first measurement to that of "
+        "the first map that used it, by the publishers' clocks."
     )
     return [_table(headings, rows), _note(note), _image(pictures, "latency")]
 

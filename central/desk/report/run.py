@@ -53,7 +53,10 @@ def run_figures(run: Run) -> dict[str, Any]:
         "nis_per_dof": {robot: of.per_dof for robot, of in history.innovations.items()},
         "nis_dof": {robot: int(of.dof.sum()) for robot, of in history.innovations.items()},
         "latency_s": {
-            robot: {"last_reading": _spread(of.last_s), "first_reading": _spread(of.first_s)}
+            robot: {
+                "last_measurement": _spread(of.last_s),
+                "first_measurement": _spread(of.first_s),
+            }
             for robot, of in history.latencies.items()
         },
         "bytes_per_s": {
@@ -72,7 +75,7 @@ def run_figures(run: Run) -> dict[str, Any]:
         "ledger": None
         if ledger is None
         else {
-            "readings": ledger.readings,
+            "measurements": ledger.measurements,
             "dispositions": ledger.totals(),
             "offenders": list(ledger.offenders),
         },

@@ -96,7 +96,7 @@ def _absurd(evaluation: Evaluation) -> str:
     """The digits of a NEES of 1e18 say nothing to people; why it is so large does."""
     scenario = evaluation.scenario
     again = scenario is not None and scenario.fusion in _COUNT_AGAIN
-    why = " (rule counts readings again)" if again else ""
+    why = " (rule counts measurements again)" if again else ""
     return f"> {ABSURD_NEES}: over-confident{why}"
 
 
@@ -108,7 +108,7 @@ def robot_note(evaluation: Evaluation) -> str:
 
 
 ROBOT_HEADINGS = (
-    "robot", "steps", "readings\naccounted\nfor/sent", "sub-\nmaps", "position\nRMSE [m]",
+    "robot", "steps", "measurements\naccounted\nfor/sent", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
 )  # fmt: skip
 
@@ -117,13 +117,13 @@ def robot_row(name: str, robot: RobotResult) -> tuple[str, ...]:
     """The cells under ROBOT_HEADINGS."""
     used = robot.consumption
     errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
-    readings = f"all {used.published}"
+    measurements = f"all {used.published}"
     if used.consumed != used.published:
-        readings = f"{'–' if used.consumed is None else used.consumed}/{used.published}"
+        measurements = f"{'–' if used.consumed is None else used.consumed}/{used.published}"
     return (
         name,
         str(used.steps),
-        readings,
+        measurements,
         str(used.submaps),
         shown(None if errors is None else errors.position_rmse_m, ".3f", mark),
         shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),

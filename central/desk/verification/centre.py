@@ -55,7 +55,7 @@ class _LogInputs:
     def __init__(self, log: Recorded, consumed: Channel) -> None:
         self._log, self._consumed = log, consumed
         self._submaps, self._sightings = log.submaps(), log.sightings()
-        starts = {stream: readings.get(0) for stream, readings in log.readings.items()}
+        starts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
         self._starts = {s: start for s, start in starts.items() if isinstance(start, m.Start)}
         own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
         self._maps = {(x.robot, x.epoch, x.sequence, x.exchange): x for x in own}
@@ -63,7 +63,7 @@ class _LogInputs:
     def of(self, fused: m.FusedMap) -> Inputs | None:
         """None where the log lacks a submap of the map's version vector."""
         vector = {(x.robot, x.epoch): x.sequence for x in fused.members}
-        if self._consumed == "readings":
+        if self._consumed == "measurements":
             return Inputs(starts=self._starts, heard=tuple(self._heard()))
         if self._consumed == "own/map":
             named = ((*stream, k, fused.exchange) for stream, k in vector.items())
@@ -90,9 +90,9 @@ class _LogInputs:
         for node in sorted(log.configured):
             if node.startswith("robot/"):
                 yield log.configured[node]
-        for stream in sorted(log.readings):
-            readings = log.readings[stream]
-            yield from (readings[counter] for counter in sorted(readings))
+        for stream in sorted(log.measurements):
+            measurements = log.measurements[stream]
+            yield from (measurements[counter] for counter in sorted(measurements))
         ends = tuple(m.StreamEnd(*stream, count) for stream, count in log.published.items())
         if ends:
             yield m.End(0, ends)

@@ -36,20 +36,20 @@ class Said:
 
 @dataclass
 class Recorded:
-    """Everything in a log that is an input or an output of a node; each reading once.
+    """Everything in a log that is an input or an output of a node; each measurement once.
 
-    readings: by (robot, epoch) and counter. configured: the last announcement of each node.
-    contradicted: readings that the log has twice with different content. reported: how many
-    readings a robot had consumed by its own word. published: how many the world says there are.
+    measurements: by (robot, epoch) and counter. configured: the last announcement of each node.
+    contradicted: measurements that the log has twice with different content. reported: how many
+    measurements a robot had consumed by its own word. published: how many the world says there are.
     known_map: what the robots were told of the landmarks, if they were.
     withdrawals: of robots that the team went on without, the first word on each.
     unsound: samples that no node would have let in.
     """
 
-    readings: dict[Stream, dict[int, m.Reading]] = field(default_factory=dict)
+    measurements: dict[Stream, dict[int, m.Measurement]] = field(default_factory=dict)
     configured: dict[str, m.Configured] = field(default_factory=dict)
     said: list[Said] = field(default_factory=list)
-    contradicted: list[m.Reading] = field(default_factory=list)
+    contradicted: list[m.Measurement] = field(default_factory=list)
     reported: dict[Stream, int] = field(default_factory=dict)
     published: dict[Stream, int] = field(default_factory=dict)
     known_map: m.KnownMap | None = None
@@ -66,21 +66,21 @@ class Recorded:
             self.unsound += 1
             return
         match message:
-            case m.Reading():
-                stream = self.readings.setdefault((message.robot, message.epoch), {})
-                if stream.setdefault(message.reading, message) != message:
+            case m.Measurement():
+                stream = self.measurements.setdefault((message.robot, message.epoch), {})
+                if stream.setdefault(message.number, message) != message:
                     self.contradicted.append(message)
             case m.Configured():
                 self.configured[message.node] = message
             case m.Progress():
                 consumed = self.reported.get((message.robot, message.epoch), 0)
-                self.reported[message.robot, message.epoch] = max(consumed, message.readings)
+                self.reported[message.robot, message.epoch] = max(consumed, message.measurements)
             case m.KnownMap():
                 self.known_map = message
             case m.Withdrawal():
                 self.withdrawals.setdefault(message.robot, message)
             case m.End():
-                self.published |= {(s.robot, s.epoch): s.readings for s in message.streams}
+                self.published |= {(s.robot, s.epoch): s.measurements for s in message.streams}
             case _ if channel.recomputable:
                 self.said.append(Said(sample, channel, message))
             case _:
@@ -92,14 +92,14 @@ class Recorded:
 
     @property
     def robots(self) -> list[str]:
-        """Every robot that the log has readings or messages of, by name."""
-        names = {robot for robot, _ in self.readings}
+        """Every robot that the log has measurements or messages of, by name."""
+        names = {robot for robot, _ in self.measurements}
         names |= {s.message.robot for s in self.said if isinstance(s.message, m.Submap | m.Done)}
         return sorted(names)
 
     def epochs(self, robot: str) -> list[int]:
-        """The epochs of a robot that there are readings of, in order."""
-        return sorted(epoch for name, epoch in self.readings if name == robot)
+        """The epochs of a robot that there are measurements of, in order."""
+        return sorted(epoch for name, epoch in self.measurements if name == robot)
 
     def submaps(self) -> Mapping[Stream, dict[int, m.Submap]]:
         """The recorded submaps by stream and sequence."""
@@ -166,8 +166,8 @@ def identity(key: str, message: m.Message) -> Identity:
             names: Identity = (
                 message.epoch,
                 message.sequence,
-                message.first_reading,
-                message.last_reading,
+                message.first_measurement,
+                message.last_measurement,
             )
         case m.SightingFactor():
             names = (message.epoch, message.sequence, message.stamp_ns, message.teammate)
@@ -176,7 +176,7 @@ def identity(key: str, message: m.Message) -> Identity:
         case m.PoseEstimate():
             names = (message.epoch, message.stamp_ns, message.sequence, message.map_digest)
         case m.Done():
-            names = (message.epoch, message.readings, message.steps)
+            names = (message.epoch, message.measurements, message.steps)
         case m.Prior() | m.Trajectory():
             names = (message.epoch, message.digest)
         case m.FusedMap():

@@ -1,4 +1,4 @@
-"""One robot's messages again: its node over its recorded readings."""
+"""One robot's messages again: its node over its recorded measurements."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -48,7 +48,7 @@ class RetoldRobot(RobotNode):
         return self._boundary.give(self, message)
 
     def took(self, message: m.Message) -> Counter[str]:
-        """Take a reading or the end; the dispositions that it gave, how many of each."""
+        """Take a measurement or the end; the dispositions that it gave, how many of each."""
         before = Counter[str]() if isinstance(message, m.Start) else Counter(self._ledger)
         self.given(message)
         return self._ledger - before
@@ -58,7 +58,7 @@ Born = Callable[[], RetoldRobot]
 
 
 def retold_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """Every message that the robot's readings give, under the names of its inputs."""
+    """Every message that the robot's measurements give, under the names of its inputs."""
     config, digest = log.robot_config(robot)
     said = _poses_said(log, robot)
 
@@ -92,19 +92,19 @@ def _poses_said(log: Recorded, robot: str) -> PosesSaid:
 def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
     """Without feedback nothing from outside matters: each epoch by itself, each life that ended.
 
-    A `Done` names the life that it closes: up to which reading, over how many steps. A life that
-    began after a submap is computed from there, as a resumed robot does. Where a reading is not in
-    the log, the computation goes on behind the next recorded submap.
+    A `Done` names the life that it closes: up to which measurement, over how many steps. A life
+    that began after a submap is computed from there, as a resumed robot does. Where a measurement
+    is not in the log, the computation goes on behind the next recorded submap.
     """
     for epoch in log.epochs(robot):
-        readings = log.readings[(robot, epoch)]
+        measurements = log.measurements[(robot, epoch)]
         chain = _chain(log, robot, epoch)
         dones = _dones(log, robot, epoch)
-        lives = [(_first_of(done, chain, readings), done.readings) for done in dones]
+        lives = [(_first_of(done, chain, measurements), done.measurements) for done in dones]
         if not any(first == 0 for first, _ in lives):
-            yield from _life(born, readings, chain, 0, None)
+            yield from _life(born, measurements, chain, 0, None)
         for first, until in lives:
-            yield from _life(born, readings, chain, first, until)
+            yield from _life(born, measurements, chain, first, until)
 
 
 def _dones(log: Recorded, robot: str, epoch: int) -> list[m.Done]:
@@ -117,12 +117,14 @@ def _chain(log: Recorded, robot: str, epoch: int) -> list[m.Submap]:
     return [found[k] for k in takewhile(found.__contains__, range(len(found)))]
 
 
-def _first_of(done: m.Done, chain: Sequence[m.Submap], readings: Mapping[int, m.Reading]) -> int:
-    """The first reading of the life that ended so, by its steps."""
+def _first_of(
+    done: m.Done, chain: Sequence[m.Submap], measurements: Mapping[int, m.Measurement]
+) -> int:
+    """The first measurement of the life that ended so, by its steps."""
     steps = 0
-    begins = {0, *(submap.last_reading + 1 for submap in chain)}
-    for counter in range(min(done.readings, max(readings) + 1), -1, -1):
-        steps += counter < done.readings and isinstance(readings.get(counter), m.Odometry)
+    begins = {0, *(submap.last_measurement + 1 for submap in chain)}
+    for counter in range(min(done.measurements, max(measurements) + 1), -1, -1):
+        steps += counter < done.measurements and isinstance(measurements.get(counter), m.Odometry)
         if counter in begins and steps == done.steps:
             return counter
     return 0
@@ -130,29 +132,31 @@ def _first_of(done: m.Done, chain: Sequence[m.Submap], readings: Mapping[int, m.
 
 def _life(
     born: Born,
-    readings: Mapping[int, m.Reading],
+    measurements: Mapping[int, m.Measurement],
     chain: Sequence[m.Submap],
     first: int,
     until: int | None,
 ) -> Iterator[Outgoing]:
-    """The messages of a life from reading `first` on; it ends before reading `until`, if it did."""
-    start = readings.get(0)
+    """The messages of a life from measurement `first` on; it ends before measurement `until`, if it
+    did.
+    """
+    start = measurements.get(0)
     if not isinstance(start, m.Start):
         return
-    last = max(readings) + 1 if until is None else until
+    last = max(measurements) + 1 if until is None else until
     while True:
         node = born()
         if first:
-            node.resume(start, [s for s in chain if s.last_reading < first])
+            node.resume(start, [s for s in chain if s.last_measurement < first])
         counter = first
-        while counter < last and counter in readings:
-            yield from node.given(readings[counter])
+        while counter < last and counter in measurements:
+            yield from node.given(measurements[counter])
             counter += 1
         if counter == last and until is not None:
             end = m.StreamEnd(start.robot, start.epoch, until)
             yield from node.given(m.End(0, (end,)))
-        behind = (s.last_reading + 1 for s in chain if counter <= s.last_reading < last)
-        following = next((b for b in behind if b in readings), None)
+        behind = (s.last_measurement + 1 for s in chain if counter <= s.last_measurement < last)
+        following = next((b for b in behind if b in measurements), None)
         if counter >= last or following is None:
             return
         first = following
@@ -167,12 +171,12 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
     node = born()
     epochs = log.epochs(robot)
     inputs: list[m.Message] = [
-        log.readings[(robot, epoch)][counter]
+        log.measurements[(robot, epoch)][counter]
         for epoch in epochs
-        for counter in sorted(log.readings[(robot, epoch)])
+        for counter in sorted(log.measurements[(robot, epoch)])
     ]
     if any(isinstance(d, m.Done) and d.robot == robot for d in log.of(ch.ROBOT_DONE)):
-        end = m.StreamEnd(robot, epochs[-1], len(log.readings[(robot, epochs[-1])]))
+        end = m.StreamEnd(robot, epochs[-1], len(log.measurements[(robot, epochs[-1])]))
         inputs.append(m.End(0, (end,)))
     inputs.reverse()
     while inputs:
@@ -185,7 +189,8 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
 
 
 def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
-    """What the robot's node does with each reading of an epoch that it consumed, in its own words.
+    """What the robot's node does with each measurement of an epoch that it consumed, in its own
+    words.
 
     Without a centre nothing holds it up. Scans that no odometry covers and sightings whose pose
     node did not come are known at the end only.
@@ -195,13 +200,15 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     if log.known_map is not None:
         node.given(log.known_map)
     node.given(m.Liveliness(0, "central", False))
-    readings = log.readings.get((robot, epoch), {})
-    done = max((d.readings for d in _dones(log, robot, epoch)), default=None)
+    measurements = log.measurements.get((robot, epoch), {})
+    done = max((d.measurements for d in _dones(log, robot, epoch)), default=None)
     said: dict[int, str] = {}
-    for counter in takewhile(readings.__contains__, range(len(readings) if done is None else done)):
-        took = node.took(readings[counter])
+    for counter in takewhile(
+        measurements.__contains__, range(len(measurements) if done is None else done)
+    ):
+        took = node.took(measurements[counter])
         if LATE in took:  # an odometry interval that ends a window, and scans that it leaves behind
-            scans = [n for n in said if isinstance(readings[n], m.Observations)]
+            scans = [n for n in said if isinstance(measurements[n], m.Observations)]
             scans = [n for n in scans if not said[n].startswith("rejected")]
             said |= dict.fromkeys(scans[-took.pop(LATE) :], LATE)
             said[counter] = HybridEstimator.used
@@ -211,7 +218,7 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
         end = m.StreamEnd(robot, epoch, len(said))
         for reason, count in node.took(m.End(0, (end,))).items():
             kind = m.Sightings if reason == f"rejected: {NO_NODE}" else m.Observations
-            taken = [n for n in said if isinstance(readings[n], kind)]
+            taken = [n for n in said if isinstance(measurements[n], kind)]
             taken = [n for n in taken if not said[n].startswith("rejected")]
             said |= dict.fromkeys(taken[-count:], reason)
     return said

@@ -1,7 +1,7 @@
 """Verification: every recomputable message of a log, computed again and compared.
 
 A log's order is the recorder's, not a node's, so no run is played again: each message is computed
-from the inputs that it names. Submaps, own maps and own poses come from the readings and the
+from the inputs that it names. Submaps, own maps and own poses come from the measurements and the
 configuration alone; a team pose from the prior whose digest it names; a fused map, its priors,
 the trajectories and the final map from the recorded submaps of the map's version vector; what a
 rule with feedback exchanged from the recorded maps of the round. So one wrong message shows by
@@ -77,12 +77,12 @@ class Verification:
     """A log that was computed again.
 
     other_platform: the metadata in which this platform is not the log's; with any, numbers are
-    compared within a tolerance. span_s: team time from the first reading to the last.
+    compared within a tolerance. span_s: team time from the first measurement to the last.
     """
 
     channels: tuple[ChannelResult, ...]
     other_platform: tuple[str, ...]
-    readings: int
+    measurements: int
     span_s: float
     unsound: int
 
@@ -111,7 +111,7 @@ def verify(log: Log) -> Verification:
         said = [each for each in found.said if each.channel is channel]
         if said:
             results.append(_compared(channel.name, said, retold, found, exact=not other))
-    stamps = [r.stamp_ns for stream in found.readings.values() for r in stream.values()]
+    stamps = [r.stamp_ns for stream in found.measurements.values() for r in stream.values()]
     span_s = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
     return Verification(tuple(results), other, len(stamps), span_s, found.unsound)
 
@@ -171,10 +171,12 @@ def _lacking(message: m.Message, log: Recorded) -> str:
     """Why nothing came out for a message: an input that is not in the log, if that is it."""
     match message:
         case m.Submap():
-            readings = log.readings.get((message.robot, message.epoch), {})
-            wanted = range(message.first_reading, message.last_reading + 1)
-            gone = next((str(n) for n in wanted if n not in readings), None)
-            return "no such window" if gone is None else f"reading {gone} is not in the log: none"
+            measurements = log.measurements.get((message.robot, message.epoch), {})
+            wanted = range(message.first_measurement, message.last_measurement + 1)
+            gone = next((str(n) for n in wanted if n not in measurements), None)
+            return (
+                "no such window" if gone is None else f"measurement {gone} is not in the log: none"
+            )
         case m.PoseEstimate() if any(message.map_digest):
             priors = {p.digest for p in log.of(ch.PRIOR) if isinstance(p, m.Prior)}
             known = message.map_digest in priors

@@ -1,7 +1,7 @@
 """What the page is told: one frame per piece of news, as JSON, in the order of the log.
 
-t: seconds of team time since the first reading. Poses and errors come as rows of numbers, maps and
-particles as base64 of little-endian float32 and uint32. Frames, by `k`:
+t: seconds of team time since the first measurement. Poses and errors come as rows of numbers, maps
+and particles as base64 of little-endian float32 and uint32. Frames, by `k`:
 
 hello: team, title, colours, live. now: how far all robots at work are. pose: rows x, y, heading,
 xx, xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of
@@ -120,7 +120,7 @@ class PageFrames:
         self._out.append(json.dumps({"k": kind, **fields}, separators=(",", ":")))
 
     def _t(self, stamp_ns: int) -> float:
-        """Seconds since the first reading; 0 for what was said before it."""
+        """Seconds since the first measurement; 0 for what was said before it."""
         if self._origin_ns is None:
             return 0.0
         return round(max(stamp_ns - self._origin_ns, 0) * 1e-9, 3)

@@ -73,7 +73,7 @@ class Audience(Protocol):
 class Feed:
     """Reads a log as it grows, and keeps the frames that it makes.
 
-    audience: is given every view, once, in order. error: why the reading ended early.
+    audience: is given every view, once, in order. error: why the measurement ended early.
     """
 
     tail: Tail

@@ -1,6 +1,6 @@
-"""The batch MAP's readings under the profile's own noise: errors that persist are states.
+"""The batch MAP's measurements under the profile's own noise: errors that persist are states.
 
-A reading (range r, bearing b) of a landmark at distance d from robot k at time t is
+A measurement (range r, bearing b) of a landmark at distance d from robot k at time t is
 
     b = β(x, l) + bias_b + σ_b √(1 − w_b) e_b(t) + σ_b √w_b ε,
     r = (1 + bias_r) d(x, l) + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,    ε ~ N(0, 1) and white,
@@ -10,7 +10,7 @@ variance for each robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = ex
 sensor's correlation times; so it is in the simulator, and the robots' windows take it as constant.
 The biases are one pair per robot with the centre's priors. A teammate's sighting is a factor
 between two poses of the same time, as the robots reduce them. GTSAM has no factor for such a
-reading: it is a Python function of (pose, landmark, e, biases) with its own derivatives.
+measurement: it is a Python function of (pose, landmark, e, biases) with its own derivatives.
 """
 
 import math
@@ -34,9 +34,9 @@ _BIASES = 2**57
 
 
 class Look(NamedTuple):
-    """A landmark seen from a pose of a chain, and the error state of this reading.
+    """A landmark seen from a pose of a chain, and the error state of this measurement.
 
-    before: the error state of the reading of the same landmark that is gap_s older.
+    before: the error state of the measurement of the same landmark that is gap_s older.
     """
 
     key: int
@@ -55,7 +55,7 @@ def bias_key(chain: int) -> int:
 
 
 def looks_of(chains: Sequence[Chain]) -> list[Look]:
-    """All readings of landmarks in the order of chain, pose and landmark."""
+    """All measurements of landmarks in the order of chain, pose and landmark."""
     looks: list[Look] = []
     for c, chain in enumerate(chains):
         last: dict[int, tuple[int, int]] = {}
@@ -80,7 +80,7 @@ def profile_graph(
 ) -> Any:
     """All factors. The range noise is the sensor's at the range that the joined solution predicts.
 
-    The Cauchy loss of scale c is on √(χ²/2) of each reading and sighting, as the centre's is on
+    The Cauchy loss of scale c is on √(χ²/2) of each measurement and sighting, as the centre's is on
     √(χ²/dim) of each submap.
     """
     graph = path_graph(gtsam, chains, poses)
@@ -102,8 +102,8 @@ def profile_graph(
         keys = [pose_key(look.chain, look.pose), look.landmark, look.key]
         if has_biases(chains[look.chain]):
             keys.append(bias_key(look.chain))
-        reading = _reading(look, keys, np.sqrt(variances * (1.0 - white)))
-        graph.push_back(gtsam.CustomFactor(under_loss(gtsam, model, loss), keys, reading))
+        measurement = _measurement(look, keys, np.sqrt(variances * (1.0 - white)))
+        graph.push_back(gtsam.CustomFactor(under_loss(gtsam, model, loss), keys, measurement))
     for factor in _sighting_factors(gtsam, chains, loss):
         graph.push_back(factor)
     return graph
@@ -124,10 +124,10 @@ def add_errors(values: Any, chains: Sequence[Chain]) -> Any:
     return values
 
 
-def _reading(
+def _measurement(
     look: Look, keys: Sequence[int], scales: Float[np.ndarray, "2"]
 ) -> Callable[[Any, Any, Any], np.ndarray]:
-    """The residual (bearing [rad], range [m]) of a reading, and its derivatives by `keys`."""
+    """The residual (bearing [rad], range [m]) of a measurement, and its derivatives by `keys`."""
     across, along = scales.tolist()
 
     def residual(_: Any, values: Any, derivatives: Any) -> np.ndarray:
@@ -188,7 +188,7 @@ def _sighting_factors(gtsam: Any, chains: Sequence[Chain], loss: float | None) -
             there = keys.get((sighting.teammate, sighting.stamp_ns))
             if here is not None and there is not None:
                 model = gtsam.noiseModel.Gaussian.Covariance(sighting.covariance[::-1, ::-1])
-                distance, bearing = sighting.reading
+                distance, bearing = sighting.measurement
                 factors.append(
                     gtsam.BearingRangeFactorPose2(
                         here,

@@ -1,4 +1,4 @@
-"""From a log's raw readings to chains of poses: what the batch optimiser takes."""
+"""From a log's raw measurements to chains of poses: what the batch optimiser takes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Chain:
     """One epoch of a robot's stream: N + 1 poses, the first at the start.
 
     increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1.
-    start: the pose that reading 0 gives (None: unknown), with its covariance (None: exact).
+    start: the pose that measurement 0 gives (None: unknown), with its covariance (None: exact).
     sightings: of teammates, from the poses at the team's grid times, if they were asked for.
     """
 
@@ -67,36 +67,36 @@ class Chain:
 def chains_of(
     samples: Iterable[Sample], scenario: TeamConfig, *, sightings: bool = False
 ) -> list[Chain]:
-    """The chains of all robots by (robot, epoch); readings in the order of their counter, once.
+    """The chains of all robots by (robot, epoch); measurements in the order of their counter, once.
 
     With sightings there is a pose at each time of the team's grid (`front_end.node_s`) too.
-    Raises WireError for a reading that is not sound.
+    Raises WireError for a measurement that is not sound.
     """
-    streams: dict[tuple[str, int], dict[int, m.Reading]] = {}
+    streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:
         found = channel_of(sample.key)
         if found is not None and found[0].name in _TAKEN:
             message = opened(sample)[2]
-            if isinstance(message, m.Reading):
+            if isinstance(message, m.Measurement):
                 stream = streams.setdefault((message.robot, message.epoch), {})
-                stream[message.reading] = message
+                stream[message.number] = message
     configs = {robot.id: robot for robot in scenario.robots}
     chains = [
-        _chain(configs[robot], epoch, [readings[i] for i in sorted(readings)], sightings)
-        for (robot, epoch), readings in sorted(streams.items())
+        _chain(configs[robot], epoch, [measurements[i] for i in sorted(measurements)], sightings)
+        for (robot, epoch), measurements in sorted(streams.items())
         if robot in configs
     ]
     return [chain for chain in chains if chain is not None]
 
 
 def _chain(
-    config: RobotConfig, epoch: int, readings: Sequence[m.Reading], sightings: bool
+    config: RobotConfig, epoch: int, measurements: Sequence[m.Measurement], sightings: bool
 ) -> Chain | None:
     """None for a stream without odometry: it has no motion that links its poses."""
     odometry = [
-        translate.motion_of(reading, config.clock_offset_s)
-        for reading in readings
-        if isinstance(reading, m.Odometry)
+        translate.motion_of(measurement, config.clock_offset_s)
+        for measurement in measurements
+        if isinstance(measurement, m.Odometry)
     ]
     if not odometry:
         return None
@@ -106,16 +106,18 @@ def _chain(
     segmenter.begin(first_ns)
     start: tuple[Pose | None, Matrix | None] = (None, None)
     epochs: list[Keyframe] = []
-    for reading in readings:
-        match reading:
+    for measurement in measurements:
+        match measurement:
             case m.Start():
-                start = translate.pose_of(reading)
+                start = translate.pose_of(measurement)
             case m.Observations():
-                segmenter.observe(reading.stamp_ns, *translate.scan_of(reading))
+                segmenter.observe(measurement.stamp_ns, *translate.scan_of(measurement))
             case m.Sightings() if grid is not None:
-                grid.observe(reading.stamp_ns, reading.reading, translate.looks_of(reading))
+                grid.observe(
+                    measurement.stamp_ns, measurement.number, translate.looks_of(measurement)
+                )
             case m.Odometry():
-                epochs += segmenter.drive(*translate.motion_of(reading, config.clock_offset_s))
+                epochs += segmenter.drive(*translate.motion_of(measurement, config.clock_offset_s))
     last, rest = segmenter.cut(last_ns)
     epochs += last
     if rest.mean.any() or rest.covariance.any():

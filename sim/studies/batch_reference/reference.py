@@ -1,4 +1,4 @@
-"""The limit: the batch MAP over all raw readings of a log, by GTSAM (the extra `limit`).
+"""The limit: the batch MAP over all raw measurements of a log, by GTSAM (the extra `limit`).
 
 One pose per observation epoch of each robot. Factors: the start poses; between consecutive poses
 the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of `increment_of`, which is GTSAM's
@@ -6,10 +6,10 @@ the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of `increment
 sensor's noise (under a Cauchy loss where the centre's `robust_c` asks for a robust join).
 Levenberg-Marquardt starts from the joined solution, so what it finds is never worse than that: from
 three ways to fill the paths between its poses (under the noise `profile` from the best of them).
-Under the noise `white` every reading's error is its own and sightings of teammates are not used;
-under `profile` the sensor's errors persist as the scenario says, biases are estimated and sightings
-are factors (`errors`). Not modelled: an error of the odometry's scale at speeds that the profile
-has not seen.
+Under the noise `white` every measurement's error is its own and sightings of teammates are not
+used; under `profile` the sensor's errors persist as the scenario says, biases are estimated and
+sightings are factors (`errors`). Not modelled: an error of the odometry's scale at speeds that the
+profile has not seen.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,8 +1,8 @@
-"""Three readings in ten are garbage: how much worse is the map than without them.
+"""Three measurements in ten are garbage: how much worse is the map than without them.
 
-The clean run of the same seed leaves out the very readings that the others spoil, so it has as many
-good ones. A reading is spoilt to a uniform range and bearing, or to the identity of another
-landmark.
+The clean run of the same seed leaves out the very measurements that the others spoil, so it has as
+many good ones. A measurement is spoilt to a uniform range and bearing, or to the identity of
+another landmark.
 """
 
 import msgspec
@@ -20,7 +20,7 @@ LANDMARK_SUBMAPS = 2
 ROBUST_C = 2.0
 """Of the centre, in the clean runs too: garbage that agrees by chance is left to it."""
 KINDS: tuple[GarbageKind, ...] = ("drop", "reading", "identity")
-NAMES = {"drop": "clean", "reading": "random readings", "identity": "random identities"}
+NAMES = {"drop": "clean", "reading": "random measurements", "identity": "random identities"}
 MOST_SEEDS = 30
 MOST_RATIO = 1.2
 SHOWN: Shown = (
@@ -83,9 +83,9 @@ def _tasks(world: str, kind: GarbageKind, options: Options) -> list[Task]:
 
 
 def _spoilt(scenario: Scenario, kind: GarbageKind) -> Scenario:
-    """The scenario with garbage among its readings, which its windows and its centre expect.
+    """The scenario with garbage among its measurements, which its windows and its centre expect.
 
-    The clean run has the same centre, and windows that take every reading.
+    The clean run has the same centre, and windows that take every measurement.
     """
     replace = msgspec.structs.replace
     assert isinstance(scenario.world, SimulatedWorld)

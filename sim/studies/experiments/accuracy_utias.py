@@ -2,7 +2,7 @@
 
 The raw map lies where the start poses say; `shape` is what no rigid motion explains, and its NEES
 is per landmark: 2 where the covariance is right. Beside each set stands the batch optimiser over
-all its raw readings under the same noise: the price of the submaps.
+all its raw measurements under the same noise: the price of the submaps.
 """
 
 from collections.abc import Mapping

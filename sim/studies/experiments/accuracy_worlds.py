@@ -1,4 +1,5 @@
-"""Simulated worlds under every pair of estimator and rule, and the batch MAP of the same readings.
+"""Simulated worlds under every pair of estimator and rule, and the batch MAP of the same
+measurements.
 
 NEES is per degree of freedom: 1 where the covariance is right.
 """

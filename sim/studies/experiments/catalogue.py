@@ -37,7 +37,9 @@ ENTRIES = (
     Entry("ma-5", "ma_maps:FIGURE_5", "Ma & Ma: paths of three and of five robots.", 1, 1),
     Entry("ma-6a", "ma_errors:FIGURE_6A", "Ma & Ma: path, one robot against many.", 10, 1, 5),
     Entry("ma-6b", "ma_errors:FIGURE_6B", "Ma & Ma: landmarks, one robot against many.", 10, 1, 5),
-    Entry("survey", "survey", "All estimators and rules on the same readings; tables 2.1, 2.2."),
+    Entry(
+        "survey", "survey", "All estimators and rules on the same measurements; tables 2.1, 2.2."
+    ),
     Entry("xu-3.5", "xu_localisation", "Thesis: particle-filter localisation on a known map."),
     Entry("xu-4.1", "xu_maps:FIGURE_4_1", "Thesis: the map of EKF-SLAM."),
     Entry("xu-4.2", "xu_maps:FIGURE_4_2", "Thesis: the map of FastSLAM."),

@@ -43,7 +43,7 @@ def curves_task(
 ) -> Task:
     """The curves of a run. told: the scenario that the team is told, where the world's differs.
 
-    late: each step's readings are those of the step before. shots: the steps at which maps and
+    late: each step's measurements are those of the step before. shots: the steps at which maps and
     paths are kept to be drawn.
     """
     return Task(
@@ -140,7 +140,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
     """Where a robot's online pose is said: by the centre if it is the one that estimates it; else
     by the robot, with the team's map once it has one.
     """
-    if PAIRS[scenario.estimator, scenario.fusion] == "readings":
+    if PAIRS[scenario.estimator, scenario.fusion] == "measurements":
         return (ch.CENTRAL_POSE.key(robot),)
     return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
 

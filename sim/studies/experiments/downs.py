@@ -358,7 +358,7 @@ TABLE_5_1 = PrintedTable(
     ),
     (
         _DIFFERS,
-        "Ours is the same filter with readings sampled to half a second. The text explains his "
+        "Ours is the same filter with measurements sampled to half a second. The text explains his "
         "errors by linearisation; most of them is a turn of the whole map, which alignment takes "
         "away: the start heading and the odometry's first metres decide it.",
     ),

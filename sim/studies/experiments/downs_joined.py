@@ -1,9 +1,9 @@
 """Runs after J. Downs' thesis as tasks: whole-run maps of each robot, and submaps joined his way.
 
-His protocol: readings sampled to a second, a submap for every step, of which only the mean is kept:
-each robot's submaps are joined by least squares with the identity as covariance, and the robots'
-maps are tied by singular values (`svd-join-spherical`). A submap of ours is a window of the hybrid
-estimator of one step, his is a step of an EKF without landmarks before it.
+His protocol: measurements sampled to a second, a submap for every step, of which only the mean is
+kept: each robot's submaps are joined by least squares with the identity as covariance, and the
+robots' maps are tied by singular values (`svd-join-spherical`). A submap of ours is a window of the
+hybrid estimator of one step, his is a step of an EKF without landmarks before it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +51,7 @@ DRAWN_POINTS = 1000
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
-    """Readings and submaps of a second, exact starts, no loss, no factor, no error states."""
+    """Measurements and submaps of a second, exact starts, no loss, no factor, no error states."""
     change = msgspec.structs.replace
     robots = tuple(
         change(

@@ -86,7 +86,7 @@ def _scenario(method: Method, seed: int) -> Scenario:
 
 
 def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
-    """Its models; every reading by itself, resampled at each step; a map said each second."""
+    """Its models; every measurement by itself, resampled at each step; a map said each second."""
     replace = msgspec.structs.replace
     front_end = replace(
         robot.front_end, resample_below=1.0, keyframe_s=0.0, window_s=1.0, window_m=0.0, biases=()

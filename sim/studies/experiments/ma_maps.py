@@ -136,13 +136,13 @@ FIGURE_3 = PathFigure(
     "Ma & Ma, figure 3",
     (DEAD_RECKONING, SINGLE),
     "The report prints the paths without figures. Its dead reckoning is the particle filter "
-    "without readings; ours is the Gaussian of the same motion, so (a) has an ellipse at the end "
-    "and (b) the cloud. The odometry is as logged; with the calibrated models of the scenario "
+    "without measurements; ours is the Gaussian of the same motion, so (a) has an ellipse at the "
+    "end and (b) the cloud. The odometry is as logged; with the calibrated models of the scenario "
     "`utias` dead reckoning drifts less.",
 )
 FIGURE_5 = PathFigure(
     "Ma & Ma, figure 5",
     (MULTI_3, MULTI_5),
     "The report shows three robots and names a video of five. The poses are the centre's, said at "
-    "readings of landmarks; its particles are not sent, so the picture has none.",
+    "measurements of landmarks; its particles are not sent, so the picture has none.",
 )

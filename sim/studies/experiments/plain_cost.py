@@ -124,7 +124,7 @@ class PlainCost:
             self._of_sighting, self._graph.sightings, strict=True
         ):
             h, at, J = _sighting(state, int(offset[observer]), int(offset[teammate]))
-            r = h - sighting.reading
+            r = h - sighting.measurement
             r[1:] = _around(r[1:])
             yield W, r, at, J
         for W, (node, mean, _) in zip(self._of_prior, self._graph.priors, strict=True):

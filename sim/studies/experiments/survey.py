@@ -1,4 +1,4 @@
-"""All estimators and rules on the same readings, and the thesis' tables 2.1 and 2.2 in numbers.
+"""All estimators and rules on the same measurements, and the thesis' tables 2.1 and 2.2 in numbers.
 
 The thesis praises and blames the methods in words; here is what was measured for those that are
 implemented, on its own world and on the one with an accurate sensor. The methods that are not
@@ -104,7 +104,7 @@ def outcome(options: Options, results: Results) -> Outcome:
     tables += [_table_2_1(figures["thesis"]), _table_2_2(figures["thesis"], particles)]
     absent = ", ".join(s.method for s in SAID if s.pair is None and s.method != BATCH)
     return Outcome(
-        "all estimators and rules on the same readings",
+        "all estimators and rules on the same measurements",
         {"survey": figures, "fastslam_particles": particles},
         tuple(tables),
         remarks=(

@@ -45,7 +45,7 @@ def team_task(
     note: str = "",
     noise: NoiseKind = "white",
 ) -> Task:
-    """A run of this scenario. batch: with the batch MAP of the same readings beside it.
+    """A run of this scenario. batch: with the batch MAP of the same measurements beside it.
 
     minimum: with how the map's minimum lies to the truth. note: what the scenario's name does not
     say. noise: the batch's.
@@ -126,9 +126,9 @@ class TimedRun:
 
     def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
         """Run the team; its log. streams: what the world says; None: as the scenario has it."""
-        readings = streams_of(scenario) if streams is None else streams
+        measurements = streams_of(scenario) if streams is None else streams
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
-        for sample in run_team(scenario, readings, *self._nodes()):
+        for sample in run_team(scenario, measurements, *self._nodes()):
             self._steps += sample.key in odometry
             self._fusions += sample.key == ch.FUSED_MAP.key()
             yield sample

@@ -80,8 +80,8 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
         log.take(sample)
     ticks = TickFold(log.central_config()[0])
     sightings = log.sightings()
-    for stream, readings in log.readings.items():
-        start = readings.get(0)
+    for stream, measurements in log.measurements.items():
+        start = measurements.get(0)
         value = translate.start_of(start) if isinstance(start, m.Start) else None
         if value is not None:
             ticks.know_start(value)

@@ -3,7 +3,7 @@
 Its figures 3.2 to 3.5 are those of Fox et al. 2000, without figures. Here the same is shown on the
 thesis' own world: the three steps of the filter one by one at the end of a blind stretch, and a
 start anywhere. The states are those of `team.estimation.baselines.localisation`; the motions and
-readings are what the robot of such a run hears, cut into epochs as at every node.
+measurements are what the robot of such a run hears, cut into epochs as at every node.
 """
 
 from collections.abc import Mapping
@@ -121,7 +121,7 @@ def outcome(options: Options, results: Results) -> Outcome:
         "The thesis takes its figures 3.2 to 3.5 from Fox et al. 2000, made with a laser or sonar "
         "in a building; here they are made on its own world of 18 landmarks with its own noise. "
         f"It names no number of particles for them: {PARTICLES} here, {ANYWHERE_PARTICLES} for a "
-        "start anywhere, since enough of them must fit the first readings.",
+        "start anywhere, since enough of them must fit the first measurements.",
         "Resampling changes no information: mean and spread stay, but many particles become copies "
         "of few; the next motion spreads them again.",
     )
@@ -284,8 +284,8 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     for k, each in enumerate(run.epochs, 1):
         epoch = each.epoch
         far = np.argsort(epoch.ranges)[-1:]  # with all of them the first step would do
-        readings = epoch.ids[far], epoch.ranges[far], epoch.bearings[far]
-        state = localisation.stepped(state, epoch.increment, config.sensor, *readings, random)
+        measurements = epoch.ids[far], epoch.ranges[far], epoch.bearings[far]
+        state = localisation.stepped(state, epoch.increment, config.sensor, *measurements, random)
         if k in ANYWHERE_STEPS:
             true = run.truth[each.stamp_ns]
             found[str(k)] = _summary(state, true)

@@ -1,11 +1,12 @@
-"""The batch MAP over all raw readings: every pose of every robot, and one map.
+"""The batch MAP over all raw measurements: every pose of every robot, and one map.
 
-Minimises Σ rᵀP⁻¹r of the start poses and of the odometry + Σ ρ(rᵀR⁻¹r) of the readings (their
+Minimises Σ rᵀP⁻¹r of the start poses and of the odometry + Σ ρ(rᵀR⁻¹r) of the measurements (their
 residuals: `batch_factors`) over one pose per robot and epoch and all landmarks: full smoothing
 (Dellaert & Kaess 2006, Square root SAM), with the information matrix instead of its root. ρ is the
-identity, or Cauchy's c² log(1 + χ²/c²) by iterated re-weighting. A reading's noise is the sensor's
-at the range that the estimate predicts, and is not differentiated. Nothing is ever linearised for
-good: the estimate grows with the readings and every iteration is over all of them.
+identity, or Cauchy's c² log(1 + χ²/c²) by iterated re-weighting. A measurement's noise is the
+sensor's at the range that the estimate predicts, and is not differentiated. Nothing is ever
+linearised for good: the estimate grows with the measurements and every iteration is over all of
+them.
 """
 
 import math
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.estimation.baselines import batch_factors as factors_of
-from team.estimation.baselines.batch_factors import Factors, Linear, Motions, Readings, Starts
+from team.estimation.baselines.batch_factors import Factors, Linear, Measurements, Motions, Starts
 from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian, information
 from team.estimation.geometry import Pose, compose, tangent
@@ -30,7 +31,7 @@ can not slip is singular, and that of no motion at all is zero."""
 EXACT_SIGMA = 1e-5
 """Of a start pose that is exactly known [m, rad]."""
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
-"""A reading's robust scale begins at 8 c and narrows with each iteration that it lives through,
+"""A measurement's robust scale begins at 8 c and narrows with each iteration that it lives through,
 until it is c: what is far off since a pose was dead-reckoned is not taken for an outlier."""
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Of an undamped step, tried before damping: the odometry makes long curved valleys, in which a
@@ -49,8 +50,8 @@ class Batch:
     poses:     (x [m], y [m], θ [rad]), in the order in which they came.
     pose_robot: place in `robots` of each pose's robot.
     landmarks: [m], in the order in which they were first seen; ids are theirs.
-    age:       iterations that each reading has lived through; its robust scale follows from it.
-    robust_c:  Cauchy's scale on √χ² of a reading (2 numbers); None for least squares.
+    age:       iterations that each measurement has lived through; its robust scale follows from it.
+    robust_c:  Cauchy's scale on √χ² of a measurement (2 numbers); None for least squares.
     """
 
     robots: tuple[str, ...]
@@ -64,19 +65,21 @@ class Batch:
 
     @cached_property
     def _seen(self) -> Linear:
-        return factors_of.reading_residuals(self.factors.readings, self.poses, self.landmarks)
+        return factors_of.measurement_residuals(
+            self.factors.measurements, self.poses, self.landmarks
+        )
 
     @cached_property
     def _precision(self) -> Float[np.ndarray, "n 2"]:
-        """1/σ² of (range, bearing) of each reading at the range that the estimate predicts."""
-        readings = self.factors.readings
-        distance = self._seen.residual[:, 0] + readings.ranges
-        at_zero, per_m, bearing = readings.variances.T
+        """1/σ² of (range, bearing) of each measurement at the range that the estimate predicts."""
+        measurements = self.factors.measurements
+        distance = self._seen.residual[:, 0] + measurements.ranges
+        at_zero, per_m, bearing = measurements.variances.T
         return 1.0 / np.column_stack([at_zero + per_m * distance**2, bearing])
 
     @property
     def narrow(self) -> bool:
-        """Whether every reading's robust scale has come to its end."""
+        """Whether every measurement's robust scale has come to its end."""
         return self.robust_c is None or bool((self._widening <= 1.0).all())
 
     @property
@@ -86,7 +89,7 @@ class Batch:
 
     @cached_property
     def _weight(self) -> Values:
-        """Robust weight of each reading, 1/(1 + χ²/c²); 1 without a robust loss."""
+        """Robust weight of each measurement, 1/(1 + χ²/c²); 1 without a robust loss."""
         if self.robust_c is None:
             return np.ones(len(self.age))
         scale = self.robust_c * np.maximum(self._widening, 1.0)
@@ -184,7 +187,7 @@ class Batch:
 
     @property
     def renewed(self) -> "Batch":
-        """Every reading's robust scale begins anew."""
+        """Every measurement's robust scale begins anew."""
         return replace(self, age=np.zeros_like(self.age))
 
 
@@ -199,7 +202,7 @@ def begun(starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | No
         0,
         Starts(order, mean, told),
         Motions(none, none, np.empty((0, 3)), np.empty((0, 3, 3))),
-        Readings(none, none, nothing, nothing, np.empty((0, 3))),
+        Measurements(none, none, nothing, nothing, np.empty((0, 3))),
     )
     ids = np.empty(0, np.uint32)
     return Batch(tuple(starts), factors, mean, order, np.empty((0, 2)), ids, none, robust_c)
@@ -217,7 +220,7 @@ def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
     """The batch with more turns, in the given order.
 
     A new pose is dead-reckoned from the robot's newest one, a new landmark is where its first
-    reading puts it. Raises ValueError for a robot that has no start.
+    measurement puts it. Raises ValueError for a robot that has no start.
     """
     newest = {
         robot: int(np.flatnonzero(batch.pose_robot == k)[-1])
@@ -241,7 +244,7 @@ def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
             seen.append(place[id_])
     factors = batch.factors
     after = np.arange(len(batch.poses), len(poses))
-    motions, readings = factors.motions, factors.readings
+    motions, measurements = factors.motions, factors.measurements
     counts = [len(turn.ids) for turn in turns]
     floor = np.diag(FLOOR_SIGMAS) ** 2
     added = Motions(
@@ -252,7 +255,7 @@ def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
             [information(turn.increment.covariance + floor, "a motion") for turn in turns]
         ).reshape(-1, 3, 3),
     )
-    looks = Readings(
+    looks = Measurements(
         np.repeat(after, counts),
         np.array(seen, np.int64),
         np.concatenate([np.empty(0), *(turn.ranges for turn in turns)]),
@@ -268,7 +271,7 @@ def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
             len(landmarks),
             factors.starts,
             Motions(*(np.concatenate(each) for each in zip(motions, added, strict=True))),
-            Readings(*(np.concatenate(each) for each in zip(readings, looks, strict=True))),
+            Measurements(*(np.concatenate(each) for each in zip(measurements, looks, strict=True))),
         ),
         poses=np.array(poses),
         pose_robot=np.concatenate(

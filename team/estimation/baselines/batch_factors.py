@@ -5,7 +5,7 @@ by addition [m]. With P⁻¹ a factor's information and its residual r zero in t
 
 start     r = Log(mean⁻¹ ∘ x),                      ∂r/∂ξ = Jr⁻¹(r)
 odometry  r = Log(mean⁻¹ ∘ h), h = a⁻¹ ∘ b,         ∂r/∂ξ_b = Jr⁻¹(r), ∂r/∂ξ_a = −Jr⁻¹(r) Ad(h⁻¹)
-reading   r = (predicted − read) of range and bearing, the bearing's on the circle.
+measurement   r = (predicted − read) of range and bearing, the bearing's on the circle.
 
 Log and Jr⁻¹ are those of SE(2): Solà et al., A micro Lie theory, eq. 158 and 163. Each
 row is what `geometry` and `models` say of one, and every sum runs in the order of the factors.
@@ -60,8 +60,8 @@ class Motions(NamedTuple):
     information: Blocks
 
 
-class Readings(NamedTuple):
-    """Landmarks seen from poses, and the sensor's variances of each reading.
+class Measurements(NamedTuple):
+    """Landmarks seen from poses, and the sensor's variances of each measurement.
 
     landmark: its place among the landmarks. variances: (σ_range² [m²], σ_range_per_m²,
     σ_bearing² [rad²]), as `models.variances`.
@@ -172,23 +172,23 @@ def motion_residuals(motions: Motions, poses: Poses) -> Linear:
     return Linear(residual, -after @ _adjoints_of_inverse(moved), after)
 
 
-def reading_residuals(readings: Readings, poses: Poses, landmarks: Points) -> Linear:
+def measurement_residuals(measurements: Measurements, poses: Poses, landmarks: Points) -> Linear:
     """R of (range, bearing), ∂r/∂ξ of the pose and ∂r/∂ of the landmark, as in `models`."""
-    z = np.column_stack([readings.ranges, readings.bearings])
-    return Linear(*_linearised(poses[readings.pose], landmarks[readings.landmark], z))
+    z = np.column_stack([measurements.ranges, measurements.bearings])
+    return Linear(*_linearised(poses[measurements.pose], landmarks[measurements.landmark], z))
 
 
 @compiled
 def _linearised(
-    poses: Rows, landmarks: Float[np.ndarray, "n 2"], readings: Float[np.ndarray, "n 2"]
+    poses: Rows, landmarks: Float[np.ndarray, "n 2"], measurements: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 2"]]:
-    count = len(readings)
+    count = len(measurements)
     residual = np.empty((count, 2))
     of_pose, of_landmark = np.empty((count, 2, 3)), np.empty((count, 2, 2))
     for k in range(count):
         distance, bearing = predicted(poses[k], landmarks[k])
-        residual[k, 0] = distance - readings[k, 0]
-        residual[k, 1] = wrapped(bearing - readings[k, 1])
+        residual[k, 0] = distance - measurements[k, 0]
+        residual[k, 1] = wrapped(bearing - measurements[k, 1])
         of_pose[k] = pose_jacobian(distance, bearing)
         of_landmark[k] = landmark_jacobian(distance, poses[k, 2] + bearing)
     return residual, of_pose, of_landmark
@@ -202,16 +202,16 @@ class Factors:
     landmarks: int
     starts: Starts
     motions: Motions
-    readings: Readings
+    measurements: Measurements
 
     @cached_property
     def _pattern_and_entries(self) -> tuple[Pattern, tuple[Indices, ...]]:
         """The pattern, and the entry of each factor's blocks in the order of `places`."""
-        starts, motions, readings = self.starts, self.motions, self.readings
+        starts, motions, measurements = self.starts, self.motions, self.measurements
         pairs = np.concatenate(
             [
                 np.column_stack([motions.before, motions.after]),
-                np.column_stack([readings.pose, self.poses + readings.landmark]),
+                np.column_stack([measurements.pose, self.poses + measurements.landmark]),
             ]
         )
         fixed: Bool[np.ndarray, " n"] = np.zeros(self.poses + self.landmarks, dtype=np.bool_)
@@ -222,11 +222,11 @@ class Factors:
         )
         sizes = np.repeat(np.array([3, 2]), [self.poses, self.landmarks])
         table = entry[len(starts.pose) :].reshape(-1, 4)
-        of_motions, of_readings = table[: len(motions.before)], table[len(motions.before) :]
+        of_motions, of_measurements = table[: len(motions.before)], table[len(motions.before) :]
         entries = (
             entry[: len(starts.pose)],
             *(of_motions[:, k] for k in (0, 2, 3)),
-            *(of_readings[:, k] for k in (0, 2, 3)),
+            *(of_measurements[:, k] for k in (0, 2, 3)),
         )
         return Pattern(sizes, column_start, rows), entries
 
@@ -256,7 +256,7 @@ class Factors:
         """The sum of blocks in the layout of the pattern.
 
         blocks: of the starts; of the motions (before, before), (after, before), (after, after); of
-        the readings (pose, pose), (landmark, pose), (landmark, landmark).
+        the measurements (pose, pose), (landmark, pose), (landmark, landmark).
         """
         numbers = np.concatenate([block.ravel() for block in blocks])
         length = int(self.pattern.value_start[-1])
@@ -266,17 +266,19 @@ class Factors:
     @cached_property
     def _gradient_places(self) -> Indices:
         of_pose, of_point = np.arange(3), np.arange(2)
-        starts, motions, readings = self.starts, self.motions, self.readings
-        poses = (starts.pose, motions.before, motions.after, readings.pose)
+        starts, motions, measurements = self.starts, self.motions, self.measurements
+        poses = (starts.pose, motions.before, motions.after, measurements.pose)
         return np.concatenate(
             [
                 *((3 * pose[:, None] + of_pose).ravel() for pose in poses),
-                (3 * self.poses + 2 * readings.landmark[:, None] + of_point).ravel(),
+                (3 * self.poses + 2 * measurements.landmark[:, None] + of_point).ravel(),
             ]
         )
 
     def gathered(self, slopes: tuple[Float[np.ndarray, "..."], ...]) -> Values:
-        """The sum of slopes of the starts, motions (before, after), readings (pose, landmark)."""
+        """The sum of slopes of the starts, motions (before, after), measurements (pose,
+        landmark).
+        """
         numbers = np.concatenate([slope.ravel() for slope in slopes])
         total: Values = np.bincount(
             self._gradient_places, numbers, 3 * self.poses + 2 * self.landmarks

@@ -1,7 +1,8 @@
 """Dead reckoning: the odometry alone, composed on SE(2).
 
-pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound and no reading takes any of
-it back. Thrun et al. 2005, chapter 5; Ma & Ma, section VI-A, take it as what SLAM is held against.
+pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound and no measurement takes any
+of it back. Thrun et al. 2005, chapter 5; Ma & Ma, section VI-A, take it as what SLAM is held
+against.
 """
 
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ def stepped(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> DeadReckoning:
-    """The pose composed with the increment; the readings are not used."""
+    """The pose composed with the increment; the measurements are not used."""
     return DeadReckoning(state.pose.then(increment))
 
 

@@ -1,4 +1,4 @@
-"""The EKF-SLAM step in one compiled pass: motion, readings of known landmarks, new landmarks.
+"""The EKF-SLAM step in one compiled pass: motion, measurements of known landmarks, new landmarks.
 
 The state is (x, y, theta, x₁, y₁, …); `mean` and `P` are arrays that the caller just made, with
 room for the new landmarks, and are written in place. A sensor is (σ_range², σ_range_per_m²,
@@ -24,27 +24,28 @@ def step(
     Q: Float[np.ndarray, "3 3"],
     slots: Int64[np.ndarray, " k"],
     first: Bool[np.ndarray, " k"],
-    readings: Float[np.ndarray, "k 2"],
+    measurements: Float[np.ndarray, "k 2"],
     sensor: Triple,
 ) -> bool:
     """One step; before it only the pose and the first `known` landmarks are in mean and P.
 
-    slots: the landmark of each reading in the state; first: whether it is a first sight. A further
-    reading of a landmark that is new in this step updates it after it was placed. False where the
-    covariance of what is predicted is not positive definite; mean and P are then worth nothing.
+    slots: the landmark of each measurement in the state; first: whether it is a first sight. A
+    further measurement of a landmark that is new in this step updates it after it was placed. False
+    where the covariance of what is predicted is not positive definite; mean and P are then worth
+    nothing.
     """
     size = 3 + 2 * known
     before, P_before = mean[:size], P[:size, :size]
     _move(before, P_before, motion, Q)
     places = 3 + 2 * slots
     old = slots < known
-    if not _condition(before, P_before, places[old], readings[old], sensor):
+    if not _condition(before, P_before, places[old], measurements[old], sensor):
         return False
     for k in range(len(slots)):
         if first[k]:
-            _place(mean, P, places[k], readings[k], sensor)
+            _place(mean, P, places[k], measurements[k], sensor)
     again = ~old & ~first
-    return _condition(mean, P, places[again], readings[again], sensor)
+    return _condition(mean, P, places[again], measurements[again], sensor)
 
 
 @compiled
@@ -84,7 +85,7 @@ def _place(
     mean: Float[np.ndarray, " n"],
     P: Float[np.ndarray, "n n"],
     at: int,
-    reading: Float[np.ndarray, "2"],
+    measurement: Float[np.ndarray, "2"],
     sensor: Triple,
 ) -> None:
     """A landmark at first sight becomes the numbers `at` and at + 1 of the state.
@@ -93,7 +94,7 @@ def _place(
     P_ll = G_p P_pp G_pᵀ + G_z R G_zᵀ, so its error is that of the pose too.
     """
     own = np.empty(3)
-    place(mean[at : at + 2], own, (mean[0], mean[1], mean[2]), reading, sensor)
+    place(mean[at : at + 2], own, (mean[0], mean[1], mean[2]), measurement, sensor)
     of_x, of_y = mean[1] - mean[at + 1], mean[at] - mean[0]
     for j in range(at):
         P[at, j] = P[0, j] + of_x * P[2, j]
@@ -107,7 +108,7 @@ def _place(
 
 @compiled
 def _applied(seen_at: Triple, at: int, vector: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """H v of one reading: the rows (range, bearing) of a landmark that lies `at` in the state.
+    """H v of one measurement: the rows (range, bearing) of a landmark that lies `at` in the state.
 
     seen_at is (d, ex, ey): distance and unit vector to the landmark. With e⊥ = (−ey, ex) and δ the
     landmark's entries of v less the position's: (e·δ, e⊥·δ/d − v_theta).
@@ -124,7 +125,7 @@ def _all_applied(
     vector: Float[np.ndarray, " n"],
     out: Float[np.ndarray, " m"],
 ) -> None:
-    """H v of all readings into `out`."""
+    """H v of all measurements into `out`."""
     for i in range(len(places)):
         seen_at = (sights[i, 0], sights[i, 1], sights[i, 2])
         out[2 * i], out[2 * i + 1] = _applied(seen_at, places[i], vector)
@@ -135,10 +136,10 @@ def _condition(
     mean: Float[np.ndarray, " n"],
     P: Float[np.ndarray, "n n"],
     places: Int64[np.ndarray, " t"],
-    readings: Float[np.ndarray, "t 2"],
+    measurements: Float[np.ndarray, "t 2"],
     sensor: Triple,
 ) -> bool:
-    """Readings of the landmarks at `places`, all linearised at the state before them.
+    """Measurements of the landmarks at `places`, all linearised at the state before them.
 
     S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), and P by `_joseph`.
     False where S is not positive definite.
@@ -151,8 +152,8 @@ def _condition(
     for i in range(len(places)):
         distance, ex, ey = seen(pose, mean[places[i] : places[i] + 2])
         sights[i, 0], sights[i, 1], sights[i, 2] = distance, ex, ey
-        innovation[2 * i] = readings[i, 0] - distance
-        innovation[2 * i + 1] = wrapped(readings[i, 1] + pose[2] - math.atan2(ey, ex))
+        innovation[2 * i] = measurements[i, 0] - distance
+        innovation[2 * i + 1] = wrapped(measurements[i, 1] + pose[2] - math.atan2(ey, ex))
         R[2 * i], R[2 * i + 1] = sensor[0] + sensor[1] * distance * distance, sensor[2]
     HP, S, column = np.empty((m, n)), np.empty((m, m)), np.empty(m)
     for j in range(n):

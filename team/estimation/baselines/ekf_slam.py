@@ -1,8 +1,8 @@
 """EKF-SLAM with known data association: one Gaussian over the pose and all landmarks.
 
 The filter of Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1; Downs' thesis, section
-2.6 and experiment 1. Every reading is linearised once, at the estimate of its time, so over a long
-run the covariance becomes too small (Julier and Uhlmann 2001).
+2.6 and experiment 1. Every measurement is linearised once, at the estimate of its time, so over a
+long run the covariance becomes too small (Julier and Uhlmann 2001).
 """
 
 from dataclasses import dataclass
@@ -46,11 +46,11 @@ def stepped(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> EkfSlam:
-    """Move, take all readings of known landmarks at once, then place the new ones.
+    """Move, take all measurements of known landmarks at once, then place the new ones.
 
-    ranges [m] and bearings [rad] are corrected by the calibration. A further reading of a landmark
-    that is new in this epoch updates it after it was placed. Raises NotACovarianceError where the
-    state's covariance is none any more, so that the readings can not be predicted.
+    ranges [m] and bearings [rad] are corrected by the calibration. A further measurement of a
+    landmark that is new in this epoch updates it after it was placed. Raises NotACovarianceError
+    where the state's covariance is none any more, so that the measurements can not be predicted.
     """
     ids_after, slots, first = slots_of(state.ids, ids)
     n = 3 + 2 * len(ids_after)
@@ -70,7 +70,7 @@ def stepped(
         variances(sensor),
     )
     if not sound:
-        raise NotACovarianceError("the prediction of readings", "not positive definite")
+        raise NotACovarianceError("the prediction of measurements", "not positive definite")
     return EkfSlam(ids_after, mean, P)
 
 
@@ -82,7 +82,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Of the readings that `stepped` would take; of landmarks that are known already."""
+    """Of the measurements that `stepped` would take; of landmarks that are known already."""
     return joint_innovation(
         state.ids, state.mean, state.covariance, increment, sensor, ids, ranges, bearings
     )

@@ -3,7 +3,7 @@
 W. Xu, sections 4.2 and 4.3. The reset forgets how the pose and the landmarks depend on each other
 and all of the pose's uncertainty but that of the last step, so the covariances come out far too
 small; `window` is the estimator that does not. Two things are set right: the initial covariance of
-a landmark follows from the reading (the thesis sets 30 m), and the weights start anew with each
+a landmark follows from the measurement (the thesis sets 30 m), and the weights start anew with each
 step, as its text says, not as its program does.
 """
 
@@ -105,7 +105,7 @@ def absorbed(
     """These landmarks replace the state's own of the same id; unknown ones are added.
 
     This is the feedback of the thesis' fused map (section 5.2): what is fused from this state again
-    counts its readings again.
+    counts its measurements again.
     """
     kept = ~np.isin(state.ids, ids)
     merged = np.concatenate((state.ids[kept], ids))

@@ -24,7 +24,7 @@ from team.estimation.models import Increment
 
 FIRST_RANGE_VAR = 15.0**2
 FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2
-"""`r = [(15)^2 0; 0 10*pi/18^2]`: variances of a first reading [m², rad²]."""
+"""`r = [(15)^2 0; 0 10*pi/18^2]`: variances of a first measurement [m², rad²]."""
 
 
 @dataclass(frozen=True)

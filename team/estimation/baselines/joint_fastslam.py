@@ -63,8 +63,8 @@ def stepped(
     """One step of the team: resample if the particles are thin, then the robots' turns in order.
 
     Each turn multiplies the weights by its own p(zʳ | …); with the 2.0 proposal a robot's pose is
-    drawn given its readings and the map that the turns before it left. A step may be the turn of
-    one robot, so robots need not be synchronous. Draws one uniform number if it resamples and
+    drawn given its measurements and the map that the turns before it left. A step may be the turn
+    of one robot, so robots need not be synchronous. Draws one uniform number if it resamples and
     M × 3 normal ones per turn. Raises ValueError for a robot that the state does not know.
     """
     thin = state.resample_below * len(state.log_weights)

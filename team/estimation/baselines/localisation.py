@@ -60,7 +60,7 @@ def begun_anywhere(
 ) -> Localisation:
     """Uniform over a rectangle [m] and all headings: nothing is known (Xu, figure 3.5a).
 
-    The particles must be dense enough that some of them fit the first readings.
+    The particles must be dense enough that some of them fit the first measurements.
     """
     low, high = np.append(lowest, -np.pi), np.append(highest, np.pi)
     poses = high - (high - low) * generator.random((particles, 3))
@@ -78,8 +78,8 @@ def stepped(
 ) -> Localisation:
     """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
 
-    ranges [m] and bearings [rad] are corrected by the calibration; a reading of a landmark that is
-    not on the map is left out. Draws one uniform number if it resamples and M × 3 normal ones.
+    ranges [m] and bearings [rad] are corrected by the calibration; a measurement of a landmark that
+    is not on the map is left out. Draws one uniform number if it resamples and M × 3 normal ones.
     """
     cloud = state.cloud
     thin = state.resample_below * len(cloud.poses)
@@ -107,7 +107,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Of the readings that `stepped` would take, where the map is exact.
+    """Of the measurements that `stepped` would take, where the map is exact.
 
     A cloud of several modes predicts a broad mixture, so it says little, as its Gaussian does.
     """
@@ -139,10 +139,10 @@ def _weighed(
     poses: Float[np.ndarray, "M 3"],
     landmarks: Float[np.ndarray, "L 2"],
     slots: Int64[np.ndarray, " n"],
-    readings: Float[np.ndarray, "n 2"],
+    measurements: Float[np.ndarray, "n 2"],
     sensor: Triple,
 ) -> Float[np.ndarray, " M"]:
-    """The weights after the readings: log w + Σ log N(z; h(pose, landmark), R).
+    """The weights after the measurements: log w + Σ log N(z; h(pose, landmark), R).
 
     R is that of the predicted range.
     """
@@ -153,8 +153,8 @@ def _weighed(
         for k in range(len(slots)):
             distance, ex, ey = seen(pose, landmarks[slots[k]])
             range_sigma = math.sqrt(sensor[0] + sensor[1] * distance * distance)
-            of_range = (readings[k, 0] - distance) / range_sigma
-            turn = wrapped(readings[k, 1] + pose[2] - math.atan2(ey, ex))
+            of_range = (measurements[k, 0] - distance) / range_sigma
+            turn = wrapped(measurements[k, 1] + pose[2] - math.atan2(ey, ex))
             of_bearing = turn / bearing_sigma
             weighed[i] -= 0.5 * (of_range * of_range + of_bearing * of_bearing)
             weighed[i] -= math.log(2.0 * math.pi * range_sigma * bearing_sigma)

@@ -48,7 +48,9 @@ def stepped(
     bearings: Float[np.ndarray, " n"],
     generator: np.random.Generator,
 ) -> PlainFastSlam:
-    """Resample if the particles are thin, move, take the readings (`propagated_and_updated`)."""
+    """Resample if the particles are thin, move, take the measurements
+    (`propagated_and_updated`).
+    """
     particles, _ = fastslam.propagated_and_updated(
         state.particles,
         increment,

@@ -1,4 +1,4 @@
-"""What one robot adds to an estimate over all robots' raw readings."""
+"""What one robot adds to an estimate over all robots' raw measurements."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from team.estimation.models import Increment
 
 
 class RobotStep(NamedTuple):
-    """A robot's motion since its last turn, then its readings at the end of it.
+    """A robot's motion since its last turn, then its measurements at the end of it.
 
     ranges [m] and bearings [rad] are corrected by the calibration of its sensor.
     """

@@ -19,8 +19,8 @@ class ClosedWindow:
     """
 
     sequence: int
-    first_reading: int
-    last_reading: int
+    first_measurement: int
+    last_measurement: int
     start_ns: int
     end_ns: int
     local: LocalMap

@@ -1,11 +1,12 @@
-"""Which readings of one window agree: a landmark is taken when others confirm it, garbage is not.
+"""Which measurements of one window agree: a landmark is taken when others confirm it, garbage is
+not.
 
-A reading is good with probability 1 − ε and has the sensor's noise, or garbage and uniform over
+A measurement is good with probability 1 − ε and has the sensor's noise, or garbage and uniform over
 what the sensor can read, density u. It is taken if (1 − ε) p(z | the other taken ones, odometry) is
-above ε u; and a landmark is, if all its taken readings together speak for it with odds of EVIDENCE,
-against garbage and against being another landmark of the window under a wrong name. Only readings
-of the window itself are asked: a map or an earlier window could lock the robot out of what is true,
-and would use readings twice.
+above ε u; and a landmark is, if all its taken measurements together speak for it with odds of
+EVIDENCE, against garbage and against being another landmark of the window under a wrong name. Only
+measurements of the window itself are asked: a map or an earlier window could lock the robot out of
+what is true, and would use measurements twice.
 """
 
 import math
@@ -21,7 +22,9 @@ from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.models import Increment, located, variances
 
 EVIDENCE = math.log(100.0)
-"""Log odds that a landmark's taken readings must reach: they agree by chance once in a hundred."""
+"""Log odds that a landmark's taken measurements must reach: they agree by chance once in a
+hundred.
+"""
 MOTION_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each motion's variances [m², m², rad²]: noise of rank 2 has no information."""
 ROUNDS = 5
@@ -30,47 +33,47 @@ ROUNDS = 5
 Taken = Bool[np.ndarray, " N"]
 
 
-class _Readings:
-    """The readings of the epochs that have some, by landmark slots, and the motions between."""
+class _Measurements:
+    """The measurements of the epochs that have some, by landmark slots, and the motions between."""
 
     def __init__(
         self,
         motions: Sequence[Increment],
         epochs: Int64[np.ndarray, " N"],
         ids: UInt32[np.ndarray, " N"],
-        readings: Float[np.ndarray, "N 2"],
+        measurements: Float[np.ndarray, "N 2"],
         sensor: Sensor,
         garbage: float,
     ) -> None:
         seen, self.epochs = np.unique(epochs, return_inverse=True)
         _, self.slots = np.unique(ids, return_inverse=True)
         self.landmarks = int(self.slots.max()) + 1
-        self.readings = readings
+        self.measurements = measurements
         self.sensor = variances(sensor)
         self.means, self.covariances = _between(motions, seen.tolist())
-        reach = min(sensor.max_range, float(readings[:, 0].max()))
+        reach = min(sensor.max_range, float(measurements[:, 0].max()))
         uniform = 1.0 / (reach * sensor.field_of_view)
         self.prior = math.log((1.0 - garbage) / garbage)
         self.odds = self.prior - math.log(uniform)
-        """Added to log p(z): the log odds that the reading is good."""
+        """Added to log p(z): the log odds that the measurement is good."""
 
 
 def agreeing(
     motions: Sequence[Increment],
     epochs: Int64[np.ndarray, " N"],
     ids: UInt32[np.ndarray, " N"],
-    readings: Float[np.ndarray, "N 2"],
+    measurements: Float[np.ndarray, "N 2"],
     sensor: Sensor,
     garbage: float,
 ) -> Taken:
-    """Readings that agree with others of their landmark under the odometry alone.
+    """Measurements that agree with others of their landmark under the odometry alone.
 
-    Of a landmark's readings the one that the others support best places it, and they are taken with
-    it. motions[k] leads to epoch k; readings are calibrated; 0 < garbage < 1 is ε.
+    Of a landmark's measurements the one that the others support best places it, and they are taken
+    with it. motions[k] leads to epoch k; measurements are calibrated; 0 < garbage < 1 is ε.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Readings(motions, epochs, ids, readings, sensor, garbage)
+    window = _Measurements(motions, epochs, ids, measurements, sensor, garbage)
     return _agreeing(window)[0]
 
 
@@ -78,26 +81,27 @@ def confirmed(
     motions: Sequence[Increment],
     epochs: Int64[np.ndarray, " N"],
     ids: UInt32[np.ndarray, " N"],
-    readings: Float[np.ndarray, "N 2"],
+    measurements: Float[np.ndarray, "N 2"],
     sensor: Sensor,
     garbage: float,
 ) -> Taken:
-    """As `agreeing`, then by a smoother over the whole window until no reading changes sides.
+    """As `agreeing`, then by a smoother over the whole window until no measurement changes sides.
 
-    The poses and landmarks of least squares over the odometry and the taken readings are found, and
-    every reading is judged by what the others predict of it. Where the smoother's equations have no
-    solution in these numbers (odometry and readings of scales too far apart) it judges nothing.
+    The poses and landmarks of least squares over the odometry and the taken measurements are found,
+    and every measurement is judged by what the others predict of it. Where the smoother's equations
+    have no solution in these numbers (odometry and measurements of scales too far apart) it judges
+    nothing.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Readings(motions, epochs, ids, readings, sensor, garbage)
+    window = _Measurements(motions, epochs, ids, measurements, sensor, garbage)
     agreed, placed_by = _agreeing(window)
     taken = agreed
     path = np.zeros((len(window.means), 3))
     for k in range(1, len(path)):
         path[k] = compose(path[k - 1], window.means[k])
     landmarks = np.array(
-        [located(path[window.epochs[i]], *readings[i].tolist()) for i in placed_by]
+        [located(path[window.epochs[i]], *measurements[i].tolist()) for i in placed_by]
     ).reshape(-1, 2)
     metrics = np.linalg.inv(window.covariances + np.diag(MOTION_JITTER))
     for _ in range(ROUNDS):
@@ -106,7 +110,14 @@ def confirmed(
             return agreed
         path, landmarks, covariance = smoothed
         logs = kernel.left_out(
-            path, landmarks, covariance, window.epochs, window.slots, readings, taken, window.sensor
+            path,
+            landmarks,
+            covariance,
+            window.epochs,
+            window.slots,
+            measurements,
+            taken,
+            window.sensor,
         )
         before, taken = taken, _judged(window, logs + window.odds, taken)
         if np.array_equal(before, taken):
@@ -128,13 +139,13 @@ def _between(
     return means, covariances
 
 
-def _agreeing(window: _Readings) -> tuple[Taken, Int64[np.ndarray, " L"]]:
-    """The readings that agree, and for each landmark the reading that places it best."""
+def _agreeing(window: _Measurements) -> tuple[Taken, Int64[np.ndarray, " L"]]:
+    """The measurements that agree, and for each landmark the measurement that places it best."""
     return kernel.agreement(
         *kernel.relative_motions(window.means, window.covariances),
         window.epochs,
         window.slots,
-        window.readings,
+        window.measurements,
         window.sensor,
         window.landmarks,
         window.odds,
@@ -143,24 +154,25 @@ def _agreeing(window: _Readings) -> tuple[Taken, Int64[np.ndarray, " L"]]:
 
 
 def _smoothed(
-    window: _Readings,
+    window: _Measurements,
     path: Float[np.ndarray, "K 3"],
     landmarks: Float[np.ndarray, "L 2"],
     metrics: Float[np.ndarray, "K 3 3"],
     taken: Taken,
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "L 2"], Float[np.ndarray, "n n"]] | None:
-    """Two Gauss-Newton steps and the covariance; a landmark without a taken reading stays, unknown.
+    """Two Gauss-Newton steps and the covariance; a landmark without a taken measurement stays,
+    unknown.
 
     Such a landmark has a variance of the reach squared, about what is known of it. None where the
     normal equations are not positive definite.
     """
     unknown = np.bincount(window.slots[taken], minlength=window.landmarks) == 0
     free = 3 * (len(path) - 1) + np.flatnonzero(np.repeat(unknown, 2))
-    far = float(window.readings[:, 0].max()) ** 2
+    far = float(window.measurements[:, 0].max()) ** 2
     for _ in range(2):
         H, g = kernel.normal_equations(
-            path, landmarks, window.means, metrics, window.epochs, window.slots, window.readings,
-            taken, window.sensor,
+            path, landmarks, window.means, metrics, window.epochs, window.slots,
+            window.measurements, taken, window.sensor,
         )  # fmt: skip
         H[free, free] = 1.0 / far
         factor, indefinite = dpotrf(H, lower=1)
@@ -174,11 +186,11 @@ def _smoothed(
     return path, landmarks, covariance
 
 
-def _judged(window: _Readings, odds: Float[np.ndarray, " N"], before: Taken) -> Taken:
-    """The readings with odds above even, of landmarks whose readings have enough evidence.
+def _judged(window: _Measurements, odds: Float[np.ndarray, " N"], before: Taken) -> Taken:
+    """The measurements with odds above even, of landmarks whose measurements have enough evidence.
 
-    Each of k readings is predicted by the k − 1 others, so their odds count (k − 1)/k times. A
-    landmark that had lost all its readings stays out.
+    Each of k measurements is predicted by the k − 1 others, so their odds count (k − 1)/k times. A
+    landmark that had lost all its measurements stays out.
     """
     held = np.bincount(window.slots[before], minlength=window.landmarks)
     taken = (odds > 0.0) & (held[window.slots] > 0)
@@ -189,16 +201,17 @@ def _judged(window: _Readings, odds: Float[np.ndarray, " N"], before: Taken) -> 
 
 
 def _misread(
-    window: _Readings,
+    window: _Measurements,
     path: Float[np.ndarray, "K 3"],
     landmarks: Float[np.ndarray, "L 2"],
     covariance: Float[np.ndarray, "n n"],
     logs: Float[np.ndarray, " N"],
     taken: Taken,
 ) -> Taken:
-    """Readings of landmarks that may well be another one of the window, with as many readings.
+    """Measurements of landmarks that may well be another one of the window, with as many
+    measurements.
 
-    k readings that agree may all be of landmark m, misread k times as l: probability of each
+    k measurements that agree may all be of landmark m, misread k times as l: probability of each
     ε/(L − 1) p(z | m) for the L names in the window, against (1 − ε) p(z | l) of its own, the first
     of which is uniform. Taken are odds of EVIDENCE for l.
     """
@@ -210,7 +223,7 @@ def _misread(
     for other in np.flatnonzero(count >= 2):
         as_other = kernel.left_out(
             path, landmarks, covariance, window.epochs, np.full_like(window.slots, other),
-            window.readings, np.zeros_like(taken), window.sensor,
+            window.measurements, np.zeros_like(taken), window.sensor,
         )  # fmt: skip
         predicted = np.bincount(window.slots[taken], as_other[taken], minlength=window.landmarks)
         own = total * (count - 1) / np.maximum(count, 1) - (window.odds - window.prior)

@@ -1,7 +1,7 @@
-"""The arithmetic of `consensus`: readings of one window held against each other.
+"""The arithmetic of `consensus`: measurements of one window held against each other.
 
-Poses are K epochs, the first at zero; a reading is (range [m], bearing [rad]); all variances of a
-reading are its whole ones, since what persists of its error is much the same in a window.
+Poses are K epochs, the first at zero; a measurement is (range [m], bearing [rad]); all variances of
+a measurement are its whole ones, since what persists of its error is much the same in a window.
 """
 
 import math
@@ -76,13 +76,14 @@ def _prediction(
     pose: Float[np.ndarray, "3"],
     spread: Float[np.ndarray, "3 3"],
     seen: Float[np.ndarray, "2"],
-    reading: Float[np.ndarray, "2"],
+    measurement: Float[np.ndarray, "2"],
     sensor: Sensor3,
 ) -> float:
-    """The log p(reading | another one of the landmark, `seen` from where `pose` is relative to).
+    """The log p(measurement | another one of the landmark, `seen` from where `pose` is relative
+    to).
 
     The landmark is where `seen` places it, with its noise, and is looked at after the odometry,
-    with its noise and the reading's: S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ.
+    with its noise and the measurement's: S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ.
     """
     distance, bearing = max(seen[0], NEAREST_M), seen[1]
     c, s = math.cos(bearing), math.sin(bearing)
@@ -100,7 +101,7 @@ def _prediction(
             S[p, q] += H[p, 1] * (xy * H[q, 0] + yy * H[q, 1])
     S[0, 0] += sensor[0] + sensor[1] * r * r
     S[1, 1] += sensor[2]
-    e0, e1 = reading[0] - r, wrapped(reading[1] - b)
+    e0, e1 = measurement[0] - r, wrapped(measurement[1] - b)
     return _log_density(e0, e1, S[0, 0], S[0, 1], S[1, 1])
 
 
@@ -110,16 +111,17 @@ def agreement(
     spread: Float[np.ndarray, "K K 3 3"],
     epochs: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
-    readings: Float[np.ndarray, "N 2"],
+    measurements: Float[np.ndarray, "N 2"],
     sensor: Sensor3,
     landmarks: int,
     odds: float,
     enough: float,
 ) -> tuple[Bool[np.ndarray, " N"], Int64[np.ndarray, " L"]]:
-    """The readings that agree, and for each landmark the reading that the others support best.
+    """The measurements that agree, and for each landmark the measurement that the others support
+    best.
 
-    Reading j supports i with max(0, log p(j | i, odometry) + odds); a landmark whose best reading
-    has support above `enough` takes it and those that support it.
+    Measurement j supports i with max(0, log p(j | i, odometry) + odds); a landmark whose best
+    measurement has support above `enough` takes it and those that support it.
     """
     placed_by = np.full(landmarks, -1)
     support = np.full(landmarks, -1.0)
@@ -128,7 +130,7 @@ def agreement(
         for j in range(len(slots)):
             if j != i and slots[j] == slots[i]:
                 motion, noise = poses[epochs[i], epochs[j]], spread[epochs[i], epochs[j]]
-                log = _prediction(motion, noise, readings[i], readings[j], sensor)
+                log = _prediction(motion, noise, measurements[i], measurements[j], sensor)
                 total += max(0.0, log + odds)
         if total > support[slots[i]]:
             support[slots[i]] = total
@@ -138,7 +140,7 @@ def agreement(
         i = placed_by[slots[j]]
         if support[slots[j]] > enough:
             motion, noise = poses[epochs[i], epochs[j]], spread[epochs[i], epochs[j]]
-            log = _prediction(motion, noise, readings[i], readings[j], sensor)
+            log = _prediction(motion, noise, measurements[i], measurements[j], sensor)
             taken[j] = j == i or log + odds > 0.0
     return taken, placed_by
 
@@ -151,13 +153,13 @@ def normal_equations(
     metrics: Float[np.ndarray, "K 3 3"],
     epochs: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
-    readings: Float[np.ndarray, "N 2"],
+    measurements: Float[np.ndarray, "N 2"],
     used: Bool[np.ndarray, " N"],
     sensor: Sensor3,
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
     """(H, g) of the smoother over poses 1 … K − 1 (tangent at their ends) and landmarks.
 
-    Odometry residual log(mean⁻¹ ∘ x_{k−1}⁻¹ ∘ x_k) in the metric C⁻¹, readings z − h in R⁻¹.
+    Odometry residual log(mean⁻¹ ∘ x_{k−1}⁻¹ ∘ x_k) in the metric C⁻¹, measurements z − h in R⁻¹.
     The first three rows and columns are those of the first pose, which is fixed: they stand apart.
     """
     size = 3 * len(path) + 2 * len(landmarks)
@@ -174,7 +176,7 @@ def normal_equations(
     for n in range(len(epochs)):
         if used[n]:
             J2, at2, innovation, variances = _row(
-                path, landmarks, epochs[n], slots[n], readings[n], sensor
+                path, landmarks, epochs[n], slots[n], measurements[n], sensor
             )
             metric[0, 0], metric[1, 1] = 1.0 / variances[0], 1.0 / variances[1]
             _added(H, g, at2, J2, metric, innovation)
@@ -207,12 +209,12 @@ def _row(
     landmarks: Float[np.ndarray, "L 2"],
     epoch: int,
     slot: int,
-    reading: Float[np.ndarray, "2"],
+    measurement: Float[np.ndarray, "2"],
     sensor: Sensor3,
 ) -> tuple[
     Float[np.ndarray, "2 5"], Int64[np.ndarray, "5"], Float[np.ndarray, "2"], tuple[float, float]
 ]:
-    """∂h/∂(pose, landmark), its columns' place in the state, z − h and R of one reading."""
+    """∂h/∂(pose, landmark), its columns' place in the state, z − h and R of one measurement."""
     r, b = predicted(path[epoch], landmarks[slot])
     J, at = np.empty((2, 5)), np.empty(5, np.int64)
     J[:, :3] = pose_jacobian(r, b)
@@ -221,7 +223,7 @@ def _row(
         at[i] = 3 * epoch + i
     at[3] = 3 * len(path) + 2 * slot
     at[4] = at[3] + 1
-    innovation = np.array([reading[0] - r, wrapped(reading[1] - b)])
+    innovation = np.array([measurement[0] - r, wrapped(measurement[1] - b)])
     return J, at, innovation, (sensor[0] + sensor[1] * r * r, sensor[2])
 
 
@@ -232,18 +234,18 @@ def left_out(
     covariance: Float[np.ndarray, "n n"],
     epochs: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
-    readings: Float[np.ndarray, "N 2"],
+    measurements: Float[np.ndarray, "N 2"],
     used: Bool[np.ndarray, " N"],
     sensor: Sensor3,
 ) -> Float[np.ndarray, " N"]:
-    """The log p(reading | all other used readings, odometry), linearised at the optimum.
+    """The log p(measurement | all other used measurements, odometry), linearised at the optimum.
 
-    With M = J P Jᵀ a reading that was not used has S = R + M; of one that was, D = R − M is the
+    With M = J P Jᵀ a measurement that was not used has S = R + M; of one that was, D = R − M is the
     covariance of its residual e, and without it the residual is R D⁻¹ e with S = R D⁻¹ R.
     """
     logs = np.empty(len(epochs))
     for n in range(len(epochs)):
-        J, at, e, variances = _row(path, landmarks, epochs[n], slots[n], readings[n], sensor)
+        J, at, e, variances = _row(path, landmarks, epochs[n], slots[n], measurements[n], sensor)
         M = np.zeros((2, 2))
         for p in range(3 if epochs[n] == 0 else 0, 5):
             for q in range(3 if epochs[n] == 0 else 0, 5):

@@ -134,7 +134,7 @@ def propagated_and_updated(
     resample_below: float,
     generator: np.random.Generator,
 ) -> tuple[Particles, StepInfo]:
-    """One step: resample if the particles are thin, move, then take the readings (`step`).
+    """One step: resample if the particles are thin, move, then take the measurements (`step`).
 
     Resampling comes first, when the effective sample size that the last step left is below
     `resample_below`·M: so the particles of a window's last step keep their weights. ranges [m] and
@@ -196,7 +196,7 @@ def stepped(
 def propagated(
     particles: Particles, increment: Increment, generator: np.random.Generator
 ) -> Particles:
-    """Motion without readings: pose ∘ mean ∘ Exp(xi), weights and landmarks as they were."""
+    """Motion without measurements: pose ∘ mean ∘ Exp(xi), weights and landmarks as they were."""
     nothing = np.empty(0)
     ids = np.empty(0, np.uint32)
     moved, _ = stepped(

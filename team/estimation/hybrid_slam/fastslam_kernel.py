@@ -11,7 +11,12 @@ from jaxtyping import Bool, Float, Int64, UInt32
 
 from team.estimation.compiled import compiled
 from team.estimation.geometry import swept, wrapped
-from team.estimation.hybrid_slam.landmark_kernel import Triple, condition_on_reading, place, seen
+from team.estimation.hybrid_slam.landmark_kernel import (
+    Triple,
+    condition_on_measurement,
+    place,
+    seen,
+)
 
 Ids = UInt32[np.ndarray, " L"]
 
@@ -20,7 +25,9 @@ Ids = UInt32[np.ndarray, " L"]
 def slots_of(
     known: Ids, observed: UInt32[np.ndarray, " n"]
 ) -> tuple[Ids, Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """The ids after the readings, each reading's slot in them, and whether it is a first sight."""
+    """The ids after the measurements, each measurement's slot in them, and whether it is a first
+    sight.
+    """
     ids = np.empty(len(known) + len(observed), np.uint32)
     ids[: len(known)] = known
     count = len(known)
@@ -115,12 +122,12 @@ def _condition_noise(
 
 
 @compiled
-def _condition_noise_on_reading(
+def _condition_noise_on_measurement(
     noise_mean: Float[np.ndarray, "3"],
     root: Float[np.ndarray, "3 3"],
     L: Float[np.ndarray, "3 3"],
     pose: Triple,
-    reading: Float[np.ndarray, "2"],
+    measurement: Float[np.ndarray, "2"],
     sensor: Triple,
     mean: Float[np.ndarray, "2"],
     covariance: Float[np.ndarray, "3"],
@@ -145,8 +152,8 @@ def _condition_noise_on_reading(
     b1 = -u * L[1, 1] / distance - L[2, 1] - slope * r1
     b2 = -L[2, 2]
     m0, m1, m2 = noise_mean[0], noise_mean[1], noise_mean[2]
-    of_range = reading[0] - distance
-    of_bearing = wrapped(reading[1] - math.atan2(v, u)) - slope * of_range
+    of_range = measurement[0] - distance
+    of_bearing = wrapped(measurement[1] - math.atan2(v, u)) - slope * of_range
     change = _condition_noise(noise_mean, root, (r0, r1, 0.0), of_range, S_rr)
     of_bearing -= b0 * (noise_mean[0] - m0) + b1 * (noise_mean[1] - m1) + b2 * (noise_mean[2] - m2)
     return change + _condition_noise(
@@ -163,7 +170,7 @@ def step(
     known: int,
     slots: Int64[np.ndarray, " n"],
     first: Bool[np.ndarray, " n"],
-    readings: Float[np.ndarray, "n 2"],
+    measurements: Float[np.ndarray, "n 2"],
     sensor: Triple,
     improved: bool,
     poses: Float[np.ndarray, "M 3"],
@@ -171,18 +178,18 @@ def step(
     means: Float[np.ndarray, "M L 2"],
     covariances: Float[np.ndarray, "M L 3"],
 ) -> None:
-    """Poses start ∘ motion ∘ Exp(L ε), then every landmark of the readings given them.
+    """Poses start ∘ motion ∘ Exp(L ε), then every landmark of the measurements given them.
 
     ε is drawn from the prior N(0, I) (FastSLAM 1.0) or, `improved`, from N(m, A Aᵀ): the prior
-    conditioned on the readings of known landmarks, one after another, each linearised where the
+    conditioned on the measurements of known landmarks, one after another, each linearised where the
     ones before it have brought m (FastSLAM 2.0 in the space of the motion's noise: no covariance
     of motion is inverted, so it may be singular). Added to `log_weights`, at the sampled pose:
 
         log p(z | pose, landmarks marginalised) + log N(ε; 0, I) − log N(ε; m, A Aᵀ).
 
     Slots below `known` hold landmarks of earlier steps. A first sight has a flat prior and adds
-    nothing; a second reading of it in the same step updates it, but has no part in the proposal.
-    The last four arrays are written in place.
+    nothing; a second measurement of it in the same step updates it, but has no part in the
+    proposal. The last four arrays are written in place.
     Thrun et al. 2005, section 13.5-13.8; Montemerlo 2003, chapter 4.
     """
     noise_mean, root = np.empty(3), np.empty((3, 3))
@@ -195,12 +202,12 @@ def step(
         for k in range(len(slots) if improved else 0):
             if slots[k] < known:
                 pose = _moved_by_noise(origin, L, (noise_mean[0], noise_mean[1], noise_mean[2]))
-                log_weight += _condition_noise_on_reading(
+                log_weight += _condition_noise_on_measurement(
                     noise_mean,
                     root,
                     L,
                     pose,
-                    readings[k],
+                    measurements[k],
                     sensor,
                     means[i, slots[k]],
                     covariances[i, slots[k]],
@@ -215,7 +222,9 @@ def step(
         for k in range(len(slots)):
             mean, covariance = means[i, slots[k]], covariances[i, slots[k]]
             if first[k]:
-                place(mean, covariance, pose, readings[k], sensor)
+                place(mean, covariance, pose, measurements[k], sensor)
             else:
-                log_weight += condition_on_reading(mean, covariance, pose, readings[k], sensor)
+                log_weight += condition_on_measurement(
+                    mean, covariance, pose, measurements[k], sensor
+                )
         log_weights[i] += log_weight

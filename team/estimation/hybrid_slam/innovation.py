@@ -1,4 +1,4 @@
-"""Were the readings as the particles expected them? The normalised innovation squared (NIS).
+"""Were the measurements as the particles expected them? The normalised innovation squared (NIS).
 
 What a filter predicts can be held against what it then reads, so this check needs no truth.
 Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
@@ -29,7 +29,8 @@ from team.estimation.models import (
 
 
 class Innovation(NamedTuple):
-    """squared: Σ νᵀ S⁻¹ ν, χ² of `dof` degrees of freedom, two for each reading that was predicted.
+    """squared: Σ νᵀ S⁻¹ ν, χ² of `dof` degrees of freedom, two for each measurement that was
+    predicted.
 
     Innovations of different epochs are independent where the models are right, so both add up.
     """
@@ -58,17 +59,17 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """ν = z − ẑ of one epoch's readings in the metric of their joint predictive covariance S.
+    """ν = z − ẑ of one epoch's measurements in the metric of their joint predictive covariance S.
 
-    The particles of the epoch before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of all readings of
+    The particles of the epoch before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of all measurements of
     landmarks that they know; ẑ and S are its moments, bearings on the circle:
 
         ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,
         S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ.
 
-    It is the prediction before the readings: FastSLAM 2.0 draws its particles from a proposal that
-    has seen them, so after that step there is no innovation left to judge. A first sight has a flat
-    prior and is left out. ranges [m] and bearings [rad] are accepted and corrected by the
+    It is the prediction before the measurements: FastSLAM 2.0 draws its particles from a proposal
+    that has seen them, so after that step there is no innovation left to judge. A first sight has a
+    flat prior and is left out. ranges [m] and bearings [rad] are accepted and corrected by the
     calibration. R is white, as in the particles' weights.
     Raises NotACovarianceError if S is not positive definite.
     """
@@ -121,11 +122,11 @@ def joint_innovation(
     m = 2 * len(slots)
     error, A, H = np.empty(m), np.zeros((m, len(columns))), np.empty((m, 3))
     R = np.empty(m)
-    readings = np.column_stack((ranges, bearings))[known]
+    measurements = np.column_stack((ranges, bearings))[known]
     for k, slot in enumerate(slots):
         rows = slice(2 * k, 2 * k + 2)
         distance, bearing = predicted(pose, places[slot])
-        error[rows] = readings[k, 0] - distance, wrapped(readings[k, 1] - bearing)
+        error[rows] = measurements[k, 0] - distance, wrapped(measurements[k, 1] - bearing)
         R[rows] = noise(sensor, distance)
         H[rows] = pose_jacobian(distance, bearing)
         A[rows, :3] = H[rows] @ to_own
@@ -135,7 +136,7 @@ def joint_innovation(
 
 
 def _squared(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> Innovation:
-    L = cholesky_factor(S, "the prediction of readings")
+    L = cholesky_factor(S, "the prediction of measurements")
     whitened = solve_triangular(L, error, lower=True)
     return Innovation(float(whitened @ whitened), len(error))
 
@@ -149,10 +150,10 @@ def _predictive(
     motion: Float[np.ndarray, "3"],
     L: Float[np.ndarray, "3 3"],
     slots: Int64[np.ndarray, " n"],
-    readings: Float[np.ndarray, "n 2"],
+    measurements: Float[np.ndarray, "n 2"],
     sensor: Triple,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
-    """(z − ẑ, S) of n readings as (range, bearing, range, …), m = 2n; L Lᵀ is the motion's Q.
+    """(z − ẑ, S) of n measurements as (range, bearing, range, …), m = 2n; L Lᵀ is the motion's Q.
 
     S = A Aᵀ + blocks: row j of A is √wᵢ (Hₓ L, dᵢ) of all particles, one behind the other.
     """
@@ -164,12 +165,12 @@ def _predictive(
     for i in range(count):
         root = math.sqrt(weights[i])
         _predict(
-            compose(poses[i], motion), means[i], L, slots, readings, errors[:, i],
+            compose(poses[i], motion), means[i], L, slots, measurements, errors[:, i],
             A[:, 4 * i : 4 * i + 3], of_landmark[:, :, i],
         )  # fmt: skip
         A[:, 4 * i : 4 * i + 3] *= root
         for k in range(len(slots)):
-            distance = readings[k, 0] - errors[2 * k, i]
+            distance = measurements[k, 0] - errors[2 * k, i]
             S[2 * k, 2 * k] += weights[i] * (sensor[0] + sensor[1] * distance * distance)
             S[2 * k + 1, 2 * k + 1] += weights[i] * sensor[2]
     mean = np.empty(m)
@@ -198,7 +199,7 @@ def _predict(
     means: Float[np.ndarray, "L 2"],
     L: Float[np.ndarray, "3 3"],
     slots: Int64[np.ndarray, " n"],
-    readings: Float[np.ndarray, "n 2"],
+    measurements: Float[np.ndarray, "n 2"],
     errors: Float[np.ndarray, " m"],
     of_motion: Float[np.ndarray, "m 3"],
     of_landmark: Float[np.ndarray, "m 2"],
@@ -209,8 +210,8 @@ def _predict(
         r, b = 2 * k, 2 * k + 1
         distance, ex, ey = seen((pose[0], pose[1], pose[2]), means[slots[k]])
         u, v = c * ex + s * ey, c * ey - s * ex
-        errors[r] = readings[k, 0] - distance
-        errors[b] = wrapped(readings[k, 1] - math.atan2(v, u))
+        errors[r] = measurements[k, 0] - distance
+        errors[b] = wrapped(measurements[k, 1] - math.atan2(v, u))
         of_motion[r, 0] = -u * L[0, 0] - v * L[1, 0]
         of_motion[r, 1] = -v * L[1, 1]
         of_motion[r, 2] = 0.0

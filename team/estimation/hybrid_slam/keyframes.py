@@ -50,7 +50,7 @@ class Segmenter:
     With keyframe_s = 0 every observation message is an epoch. Otherwise the scans within keyframe_s
     are reduced to one range and bearing per landmark (the median, each scan first moved by the
     odometry to the end of the interval that closes the keyframe). With a grid each of its times is
-    an epoch without readings.
+    an epoch without measurements.
     """
 
     def __init__(
@@ -155,8 +155,8 @@ class Segmenter:
     def leave(self) -> int:
         """A window ends: drop the scans that are stamped behind it, and say how many there were.
 
-        The window's interval of readings holds them, so no later window may use them: one that is
-        computed again, by a robot that was started again, would not have them.
+        The window's interval of measurements holds them, so no later window may use them: one that
+        is computed again, by a robot that was started again, would not have them.
         """
         left, self._waiting = len(self._waiting), []
         return left

@@ -35,7 +35,8 @@ def _condition_on_scalar(
     innovation: float,
     variance: float,
 ) -> float:
-    """A landmark given one scalar reading of row h = (hx, hy), in place; log N(innovation; 0, s).
+    """A landmark given one scalar measurement of row h = (hx, hy), in place; log N(innovation; 0,
+    s).
 
     For 2 × 2, Σ − Σhhᵀ Σ/s = (R Σ + |Σ| h⊥h⊥ᵀ)/s with s = hᵀΣh + R: a sum of positive terms, so
     the covariance stays positive definite.
@@ -53,11 +54,11 @@ def _condition_on_scalar(
 
 
 @compiled
-def condition_on_reading(
+def condition_on_measurement(
     mean: Float[np.ndarray, "2"],
     covariance: Float[np.ndarray, "3"],
     pose: Triple,
-    reading: Float[np.ndarray, "2"],
+    measurement: Float[np.ndarray, "2"],
     sensor: Triple,
 ) -> float:
     """The EKF update of one landmark at a known pose, in place; log p(z | pose, landmark).
@@ -66,8 +67,8 @@ def condition_on_reading(
     """
     distance, ex, ey = seen(pose, mean)
     before_x, before_y = mean[0], mean[1]
-    of_range = reading[0] - distance
-    of_bearing = wrapped(reading[1] + pose[2] - math.atan2(ey, ex))
+    of_range = measurement[0] - distance
+    of_bearing = wrapped(measurement[1] + pose[2] - math.atan2(ey, ex))
     log_likelihood = _condition_on_scalar(
         mean, covariance, ex, ey, of_range, sensor[0] + sensor[1] * distance * distance
     )
@@ -81,11 +82,11 @@ def place(
     mean: Float[np.ndarray, "2"],
     covariance: Float[np.ndarray, "3"],
     pose: Triple,
-    reading: Float[np.ndarray, "2"],
+    measurement: Float[np.ndarray, "2"],
     sensor: Triple,
 ) -> None:
     """A landmark at first sight, in place: the inverse model g and Σ = G R Gᵀ, G = ∂g/∂z."""
-    distance, direction = max(reading[0], NEAREST_M), pose[2] + reading[1]
+    distance, direction = max(measurement[0], NEAREST_M), pose[2] + measurement[1]
     ex, ey = math.cos(direction), math.sin(direction)
     along = sensor[0] + sensor[1] * distance * distance
     across = sensor[2] * distance * distance

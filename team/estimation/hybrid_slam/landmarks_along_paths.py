@@ -21,21 +21,22 @@ def landmarks_along_paths(
     paths: Float[np.ndarray, "K M 3"],
     bounds: Int64[np.ndarray, " L+1"],
     epochs: Int64[np.ndarray, " N"],
-    readings: Float[np.ndarray, "N 2"],
+    measurements: Float[np.ndarray, "N 2"],
     noise: Noise,
 ) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
-    """Each landmark of each particle by Gauss-Newton over its readings, given the particle's path.
+    """Each landmark of each particle by Gauss-Newton over its measurements, given the particle's
+    path.
 
     Minimises Σ ‖z − h(path, landmark) − b‖² in R⁻¹ plus ‖b‖² in B⁻¹ from the EKF's mean with at
     most three steps, each kept only if the cost falls. R is the white part of the noise, of the
     range predicted at the start; b ~ N(0, B) is the landmark's constant error, B the rest of the
-    variances (of the last reading's range), eliminated by Schur's complement: with D = Σ R⁻¹ + B⁻¹
-    and C = Σ Hᵀ R⁻¹ the covariance is (Σ Hᵀ R⁻¹ H − C D⁻¹ Cᵀ)⁻¹ at the result, (xx, xy, yy).
-    Readings bounds[l] to bounds[l + 1] belong to landmark l. Where no evaluation is finite the
+    variances (of the last measurement's range), eliminated by Schur's complement: with D = Σ R⁻¹ +
+    B⁻¹ and C = Σ Hᵀ R⁻¹ the covariance is (Σ Hᵀ R⁻¹ H − C D⁻¹ Cᵀ)⁻¹ at the result, (xx, xy, yy).
+    Measurements bounds[l] to bounds[l + 1] belong to landmark l. Where no evaluation is finite the
     EKF's mean and covariance stay.
     """
     means, covariances = starts.copy(), start_covariances.copy()
-    range_information = np.empty(len(readings))
+    range_information = np.empty(len(measurements))
     for i in range(means.shape[0]):
         for landmark in range(means.shape[1]):
             x, y = starts[i, landmark]
@@ -53,8 +54,8 @@ def landmarks_along_paths(
                     if iteration == 0:
                         range_information[k] = 1.0 / (noise.range_white * total)
                     ex, ey = dx / distance, dy / distance
-                    of_range = readings[k, 0] - distance
-                    of_bearing = wrapped(readings[k, 1] + pose[2] - math.atan2(dy, dx))
+                    of_range = measurements[k, 0] - distance
+                    of_bearing = wrapped(measurements[k, 1] + pose[2] - math.atan2(dy, dx))
                     wr = range_information[k]
                     wb = 1.0 / (noise.bearing_white * noise.bearing_variance)
                     cost += wr * of_range * of_range + wb * of_bearing * of_bearing

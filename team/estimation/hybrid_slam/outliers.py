@@ -1,4 +1,4 @@
-"""The open window's readings, and which of them the others confirm."""
+"""The open window's measurements, and which of them the others confirm."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,11 +13,11 @@ from team.estimation.models import Increment
 
 
 class OutlierGate:
-    """Lets readings pass that agree with others of the same window; it forgets at its end.
+    """Lets measurements pass that agree with others of the same window; it forgets at its end.
 
-    While the window is open a reading passes if earlier ones (or some beside it) agree with it; for
-    the submap all are judged again with all others, since the first reading of a landmark is only
-    confirmed by a later one.
+    While the window is open a measurement passes if earlier ones (or some beside it) agree with it;
+    for the submap all are judged again with all others, since the first measurement of a landmark
+    is only confirmed by a later one.
     """
 
     def __init__(self, sensor: Sensor, garbage: float) -> None:
@@ -37,7 +37,7 @@ class OutlierGate:
         self.gated = 0
 
     def admitted(self, epoch: Keyframe) -> Keyframe:
-        """The epoch with those of its readings that agree with what was read up to it."""
+        """The epoch with those of its measurements that agree with what was read up to it."""
         if not self.judges:
             return epoch
         self._epochs.append(epoch)
@@ -47,7 +47,7 @@ class OutlierGate:
         return _with(epoch, taken[-len(epoch.ids) :])
 
     def settled(self) -> Sequence[Keyframe]:
-        """All epochs of the window with the readings that are confirmed; counts the others."""
+        """All epochs of the window with the measurements that are confirmed; counts the others."""
         taken = confirmed(*self._all(), self._sensor, self._garbage)
         self.gated = int(np.count_nonzero(~taken))
         bounds = np.cumsum([0, *(len(epoch.ids) for epoch in self._epochs)])
@@ -66,12 +66,12 @@ class OutlierGate:
     ]:
         epochs = self._epochs
         counts = [len(epoch.ids) for epoch in epochs]
-        readings = [np.column_stack((epoch.ranges, epoch.bearings)) for epoch in epochs]
+        measurements = [np.column_stack((epoch.ranges, epoch.bearings)) for epoch in epochs]
         return (
             [epoch.increment for epoch in epochs],
             np.repeat(np.arange(len(epochs)), counts),
             np.concatenate([np.empty(0, np.uint32), *(epoch.ids for epoch in epochs)]),
-            np.concatenate([np.empty((0, 2)), *readings]),
+            np.concatenate([np.empty((0, 2)), *measurements]),
         )
 
 

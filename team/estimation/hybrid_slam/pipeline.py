@@ -61,13 +61,13 @@ class HybridSlam:
 
     def resume(self, closed: ClosedWindow) -> None:
         """Go on behind a submap of an earlier life: the next window begins where it ended."""
-        self._open(closed.sequence + 1, closed.last_reading + 1, closed.end_ns)
+        self._open(closed.sequence + 1, closed.last_measurement + 1, closed.end_ns)
 
     # A measurement comes in.
 
     def consumed(self, measurement: int) -> None:
         """The measurement belongs to the open window (or was rejected while it was open)."""
-        self._last_reading = measurement
+        self._last_measurement = measurement
 
     def observe(self, stamp_ns: int, scan: Scan) -> str | None:
         """Take a scan of landmarks; the reason if it is rejected."""
@@ -174,8 +174,8 @@ class HybridSlam:
         assert self._start_ns is not None
         closed = ClosedWindow(
             sequence=self.sequence,
-            first_reading=self._first_reading,
-            last_reading=self._last_reading,
+            first_measurement=self._first_measurement,
+            last_measurement=self._last_measurement,
             start_ns=self._start_ns,
             end_ns=stamp_ns,
             local=windows.motion_alone(self._motion) if submap is None else submap,
@@ -191,7 +191,7 @@ class HybridSlam:
                 innovation=self.window.innovation,
             )
         self._innovation = self._innovation.plus(closed.innovation)
-        self._open(self.sequence + 1, self._last_reading + 1, stamp_ns)
+        self._open(self.sequence + 1, self._last_measurement + 1, stamp_ns)
         return closed
 
     def _settle(self) -> None:
@@ -232,9 +232,9 @@ class HybridSlam:
 
     # The next window opens.
 
-    def _open(self, sequence: int, first_reading: int, stamp_ns: int | None) -> None:
+    def _open(self, sequence: int, first_measurement: int, stamp_ns: int | None) -> None:
         self.sequence = sequence
-        self._first_reading, self._last_reading = first_reading, first_reading - 1
+        self._first_measurement, self._last_measurement = first_measurement, first_measurement - 1
         self._start_ns = stamp_ns
         self._way_m, self._motion, self._solvable = 0.0, Increment.identity(), True
         self.last_keyframe_ns = None

@@ -3,7 +3,7 @@
 A robot does not know when it is seen, so all robots put nodes at the same times: the multiples of
 node_s. A sighting belongs to the grid time nearest to it, if that lies in the open window and not
 too far away. The observer's odometry carries it there; the sightings of one teammate at one node
-become one reading.
+become one measurement.
 """
 
 from dataclasses import dataclass, replace
@@ -25,14 +25,14 @@ Looks = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 class NodeSighting:
     """One teammate seen from one pose node: range [m], bearing [rad], their covariance.
 
-    readings: the counters of the sensor's messages that went into it, ascending.
+    measurements: the counters of the sensor's messages that went into it, ascending.
     """
 
     stamp_ns: int
     teammate: str
-    reading: Float[np.ndarray, "2"]
+    measurement: Float[np.ndarray, "2"]
     covariance: Float[np.ndarray, "2 2"]
-    readings: tuple[int, ...]
+    measurements: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)

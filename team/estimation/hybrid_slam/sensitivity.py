@@ -3,9 +3,9 @@
 A calibration that is a little wrong, b, shifts every submap of a robot alike. With S = ∂mean/∂b a
 submap says r = h(x) − (mean + S b) ~ N(0, P), and the centre estimates b with the map. The
 mean of the particles has no derivative in closed form; S is that of the window's smoother,
-linearised about the particles' mean path: with J, W over the motions and the readings and g the
+linearised about the particles' mean path: with J, W over the motions and the measurements and g the
 derivative of their residuals, S = −(JᵀWJ)⁻¹ Jᵀ W g. As in the window itself the path takes the
-readings as independent, and the landmarks are solved for given the path.
+measurements as independent, and the landmarks are solved for given the path.
 """
 
 import math
@@ -29,7 +29,7 @@ MOTION_JITTER = (1e-7, 1e-7, 1e-9)
 
 
 class Noise(NamedTuple):
-    """Variances of a reading, and the share of each that is white: the rest is constant."""
+    """Variances of a measurement, and the share of each that is white: the rest is constant."""
 
     range_variance: float
     range_per_m2: float
@@ -85,12 +85,12 @@ def columns(
     path: Float[np.ndarray, "P 3"],
     motions: Sequence[Motion],
     landmarks: Float[np.ndarray, "L 2"],
-    readings: tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " N"]],
+    measurements: tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " N"]],
     noise: Noise,
 ) -> tuple[Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"]]:
     """∂/∂b of the path's poses (x, y, theta) and of the landmarks, in the window's frame.
 
-    path: the pose at the end of each motion; the first motion begins at zero. readings: of each
+    path: the pose at the end of each motion; the first motion begins at zero. measurements: of each
     the pose (an index into path) and the landmark. The bias b is the error: a bearing reads b too
     much, a range (1 + b) times itself, and the way driven is (1 + b) times the odometry's.
     """
@@ -99,12 +99,12 @@ def columns(
     covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 3, 3)
     metrics = np.linalg.inv(covariances + np.diag(MOTION_JITTER)) if len(path) else covariances
     shifts = np.array([motion.forward for motion in motions]).reshape(-1, 3)
-    rows = _reading_rows(path, landmarks, *readings, noise)
+    rows = _measurement_rows(path, landmarks, *measurements, noise)
     _add_motions(A, right, path, metrics, shifts)
-    _add_readings(A, right, rows, *readings, 3 * len(path))
+    _add_measurements(A, right, rows, *measurements, 3 * len(path))
     moved = cho_solve((cholesky_factor(A, "the smoother of a window"), True), right).T
     twists = np.ascontiguousarray(moved[:, : 3 * len(path)]).reshape(len(BIASES), len(path), 3)
-    points = _landmarks_given(twists, rows, *readings, len(landmarks), noise)
+    points = _landmarks_given(twists, rows, *measurements, len(landmarks), noise)
     c, s = np.cos(path[:, 2]), np.sin(path[:, 2])
     x, y = c * twists[..., 0] - s * twists[..., 1], s * twists[..., 0] + c * twists[..., 1]
     chosen = [BIASES.index(bias) for bias in biases]
@@ -143,14 +143,16 @@ def _add_motions(
 
 
 @compiled
-def _reading_rows(
+def _measurement_rows(
     path: Float[np.ndarray, "P 3"],
     landmarks: Float[np.ndarray, "L 2"],
     poses: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     noise: Noise,
 ) -> Float[np.ndarray, "N 2 7"]:
-    """Of each reading, for range and bearing: ∂h by the pose and the landmark, g, the variance."""
+    """Of each measurement, for range and bearing: ∂h by the pose and the landmark, g, the
+    variance.
+    """
     rows = np.zeros((len(poses), 2, 7))
     for n in range(len(poses)):
         pose = path[poses[n]]
@@ -173,7 +175,7 @@ def _reading_rows(
 
 
 @compiled
-def _add_readings(
+def _add_measurements(
     A: Float[np.ndarray, "n n"],
     right: Float[np.ndarray, "n B"],
     rows: Float[np.ndarray, "N 2 7"],
@@ -181,7 +183,8 @@ def _add_readings(
     slots: Int64[np.ndarray, " N"],
     first: int,
 ) -> None:
-    """Residual h(pose, landmark) + g b of readings that are independent, as particles weigh them.
+    """Residual h(pose, landmark) + g b of measurements that are independent, as particles weigh
+    them.
 
     first: where the landmarks' unknowns begin.
     """

@@ -2,8 +2,8 @@
 
 The front end runs FastSLAM in the frame of the window's start. Its particles at any time are one
 submap by moment matching, after each landmark of each particle is solved again over the window's
-readings along that particle's path: an EKF is linearised at the first, noisiest reading, and that
-bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
+measurements along that particle's path: an EKF is linearised at the first, noisiest measurement,
+and that bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
 from contextlib import suppress
@@ -32,14 +32,14 @@ POSE_JITTER = (1e-6, 1e-6, 1e-8)
 
 @dataclass(frozen=True)
 class Window:
-    """Particles since the window's start, their paths, and the readings that they have used.
+    """Particles since the window's start, their paths, and the measurements that they have used.
 
     paths:    the pose of each particle's line of descent at each of the K observation epochs.
-    epochs:   the epoch of each of the N readings, in [0, K).
-    ids:      the landmark of each reading.
-    readings: (range [m], bearing [rad]) with the sensor's calibration applied.
+    epochs:   the epoch of each of the N measurements, in [0, K).
+    ids:      the landmark of each measurement.
+    measurements: (range [m], bearing [rad]) with the sensor's calibration applied.
     node_stamps, node_epochs: team time [ns] of the pose nodes, and the epoch that each is.
-    innovation: of all readings so far that were predicted.
+    innovation: of all measurements so far that were predicted.
     motions:  up to each epoch, and after the last one; kept where biases are asked for.
     """
 
@@ -49,7 +49,7 @@ class Window:
     paths: Float[np.ndarray, "K M 3"]
     epochs: Int64[np.ndarray, " N"]
     ids: UInt32[np.ndarray, " N"]
-    readings: Float[np.ndarray, "N 2"]
+    measurements: Float[np.ndarray, "N 2"]
     node_stamps: Int64[np.ndarray, " nodes"]
     node_epochs: Int64[np.ndarray, " nodes"]
     innovation: Innovation = NOTHING
@@ -76,7 +76,7 @@ def noise_of(sensor: Sensor) -> Noise:
 
 
 def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
-    """A window at its start: every particle exactly at zero, no landmark, no reading."""
+    """A window at its start: every particle exactly at zero, no landmark, no measurement."""
     return Window(
         front_end,
         sensor,
@@ -99,9 +99,10 @@ def advanced(
     generator: np.random.Generator,
     forward: Float[np.ndarray, "3"] = STILL,
 ) -> Window:
-    """One observation epoch: the motion since the last one, then its readings (there may be none).
+    """One observation epoch: the motion since the last one, then its measurements (there may be
+    none).
 
-    The readings are accepted and corrected already (`models.acceptable`, `models.corrected`).
+    The measurements are accepted and corrected already (`models.acceptable`, `models.corrected`).
     forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
     """
     expected = NOTHING
@@ -126,7 +127,7 @@ def advanced(
         paths=np.concatenate((paths, particles.poses[None])),
         epochs=np.concatenate((window.epochs, epoch)),
         ids=np.concatenate((window.ids, ids)),
-        readings=np.concatenate((window.readings, np.column_stack((ranges, bearings)))),
+        measurements=np.concatenate((window.measurements, np.column_stack((ranges, bearings)))),
         innovation=window.innovation.plus(expected),
         motions=_with_motion(window, increment, forward),
     )
@@ -157,7 +158,7 @@ def moved(
 ) -> Window:
     """Motion without an observation epoch, as from the last one to the window's end.
 
-    It never resamples: the weights of the last readings stay as they are.
+    It never resamples: the weights of the last measurements stay as they are.
     """
     particles = fastslam.propagated(window.particles, increment, generator)
     return replace(window, particles=particles, motions=_with_motion(window, increment, forward))
@@ -196,7 +197,7 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
         window.paths,
         bounds,
         window.epochs[by_slot],
-        window.readings[by_slot],
+        window.measurements[by_slot],
         noise_of(window.sensor),
     )
     return ParticleLandmarks(ids, means, covariances)

@@ -31,21 +31,21 @@ class Sightings(NamedTuple):
     """
 
     nodes: Int64[np.ndarray, "S 2"]
-    readings: Float[np.ndarray, "S 2"]
+    measurements: Float[np.ndarray, "S 2"]
     information: Float[np.ndarray, "S 2 2"]
     first_pair: int
 
 
 @compiled
 def sighting_residual(
-    observer: Values, teammate: Values, reading: Values
+    observer: Values, teammate: Values, measurement: Values
 ) -> tuple[Values, Float[np.ndarray, "2 6"]]:
     """Residual r and its Jacobian over (observer's pose, teammate's pose)."""
     vx, vy = teammate[0] - observer[0], teammate[1] - observer[1]
     distance = max(math.sqrt(vx * vx + vy * vy), NEAREST_M)
     residual = np.empty(2)
-    residual[0] = reading[0] - distance
-    residual[1] = wrapped(reading[1] - (math.atan2(vy, vx) - observer[2]))
+    residual[0] = measurement[0] - distance
+    residual[1] = wrapped(measurement[1] - (math.atan2(vy, vx) - observer[2]))
     jacobian = np.zeros((2, 6))
     jacobian[0, 0], jacobian[0, 1] = vx / distance, vy / distance
     square = distance * distance
@@ -62,7 +62,7 @@ def sighting_costs(state: Values, offset: Indices, sightings: Sightings) -> Valu
     result = np.empty(len(sightings.nodes))
     for f in range(len(result)):
         a, b = offset[sightings.nodes[f, 0]], offset[sightings.nodes[f, 1]]
-        r, _ = sighting_residual(state[a : a + 3], state[b : b + 3], sightings.readings[f])
+        r, _ = sighting_residual(state[a : a + 3], state[b : b + 3], sightings.measurements[f])
         metric = sightings.information[f]
         result[f] = (
             metric[0, 0] * r[0] * r[0] + 2.0 * metric[0, 1] * r[0] * r[1] + metric[1, 1] * r[1] ** 2
@@ -101,7 +101,9 @@ def add_sightings(
     for f in range(len(sightings.nodes)):
         nodes = sightings.nodes[f]
         a, b = offset[nodes[0]], offset[nodes[1]]
-        r, jacobian = sighting_residual(state[a : a + 3], state[b : b + 3], sightings.readings[f])
+        r, jacobian = sighting_residual(
+            state[a : a + 3], state[b : b + 3], sightings.measurements[f]
+        )
         metric = sightings.information[f]
         slope = np.empty(2)
         for i in range(2):
@@ -137,7 +139,9 @@ def explained_by_sightings(
     pair = sightings.first_pair
     for f in range(len(result)):
         a, b = offset[sightings.nodes[f, 0]], offset[sightings.nodes[f, 1]]
-        _, jacobian = sighting_residual(state[a : a + 3], state[b : b + 3], sightings.readings[f])
+        _, jacobian = sighting_residual(
+            state[a : a + 3], state[b : b + 3], sightings.measurements[f]
+        )
         hessian = _hessian(jacobian, sightings.information[f])
         for i in range(2):
             for j in range(2):

@@ -74,7 +74,7 @@ def _points(island: Island, at: Sequence[tuple[int, Sighting | None]]) -> Points
         J[rows, begin : begin + 2] = np.eye(2)
         points[k] = value[:2]
         if seen is not None:
-            distance, bearing = float(seen.reading[0]), float(seen.reading[1])
+            distance, bearing = float(seen.measurement[0]), float(seen.measurement[1])
             points[k] = located(value[:3], distance, bearing)
             x, y = points[k] - value[:2]
             J[rows, begin + 2] = -y, x

@@ -97,7 +97,7 @@ def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
         )
         yield _turns(start, at[nodes[1 : count + 1]], poses[:, 2], 1.0 / np.sqrt(spreads[:, 2]))
     for sighting, observer, teammate in graph.sightings:
-        distance, bearing = sighting.reading.tolist()
+        distance, bearing = sighting.measurement.tolist()
         spread = 0.5 * (sighting.covariance[0, 0] + sighting.covariance[1, 1] * distance**2)
         point = distance * np.array([[math.cos(bearing), math.sin(bearing)]])
         weight = np.array([1.0 / math.sqrt(spread)])

@@ -118,7 +118,7 @@ class Graph:
         """The sightings in flat arrays, for the kernels; their entries follow the submaps'."""
         return Sightings(
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
-            np.array([met.sighting.reading for met in self.sightings]).reshape(-1, 2),
+            np.array([met.sighting.measurement for met in self.sightings]).reshape(-1, 2),
             np.array([met.sighting.information for met in self.sightings]).reshape(-1, 2, 2),
             int((np.diff(self.factors.member_start) ** 2).sum()),
         )

@@ -154,7 +154,8 @@ def absorbed(
     """The fused map replaces the landmarks' marginal; pose and other landmarks follow it.
 
     They follow by regression (see `carried_along`). Landmarks that were unknown are added. What the
-    fused map holds of this robot's own readings is counted again if the result is sent for fusion.
+    fused map holds of this robot's own measurements is counted again if the result is sent for
+    fusion.
     """
     _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)
     mean, joint = carried_along(

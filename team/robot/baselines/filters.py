@@ -28,7 +28,7 @@ from team.robot.estimator import InitialPose, KnownMap
 
 IN_MAP = "in the running map"
 IN_POSE = "in the running pose"
-"""The dispositions of a reading that such an estimator takes."""
+"""The dispositions of a measurement that such an estimator takes."""
 
 
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray]
@@ -43,7 +43,7 @@ class Filter(NamedTuple):
 
     looks: it takes landmarks; maps: it has a map of its own. joint: with the covariance between
     landmarks. absorbed: the state with these landmarks in place of its own. particles: those of a
-    state, for viewers. innovation: of a step's readings, as the state before it predicts them.
+    state, for viewers. innovation: of a step's measurements, as the state before it predicts them.
     """
 
     begun: Begun
@@ -106,7 +106,7 @@ def _thesis_stepped(
 
 def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
     """The innovation against the particles of a state."""
-    return lambda state, *readings: innovation(particles(state), *readings)
+    return lambda state, *measurements: innovation(particles(state), *measurements)
 
 
 def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
@@ -212,7 +212,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         *_exact(dead_reckoning.begun, dead_reckoning.stepped),
         dead_reckoning.pose_gaussian,
         dead_reckoning.landmark_gaussian,
-        lambda *readings: NOTHING,
+        lambda *measurements: NOTHING,
         used=IN_POSE,
         looks=False,
         maps=False,

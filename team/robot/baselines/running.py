@@ -50,7 +50,7 @@ class RunningEstimator:
 
     @property
     def used(self) -> str:
-        """The disposition of a reading that it takes."""
+        """The disposition of a measurement that it takes."""
         return self._filter.used
 
     @property
@@ -134,7 +134,8 @@ class RunningEstimator:
         self.last_epoch_ns = stamp_ns
 
     def _stepped(self, step: Step) -> tuple[Any, Innovation] | None:
-        """The state after a step, and how well its readings were predicted; None: there is none.
+        """The state after a step, and how well its measurements were predicted; None: there is
+        none.
 
         A state without a finite pose is none.
         """

@@ -1,4 +1,6 @@
-"""The rule `batch`: what GTSAM finds on the same readings, and what it does not know is said."""
+"""The rule `batch`: what GTSAM finds on the same measurements, and what it does not know is
+said.
+"""
 
 import msgspec
 import numpy as np
@@ -20,7 +22,7 @@ from tests.teams import config, of, published, stream
 
 
 def team_run(world, fusion, estimator, steps):
-    """A run in memory; few particles, which the readings do not know of."""
+    """A run in memory; few particles, which the measurements do not know of."""
     scenario = with_options(load(world), fusion=fusion, estimator=estimator)
     robots = tuple(
         msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, particles=50))
@@ -31,7 +33,7 @@ def team_run(world, fusion, estimator, steps):
 
 
 @pytest.mark.parametrize(("world", "steps"), [("thesis", 150), ("thesis-b", 150)])
-def test_it_is_the_batch_map_of_gtsam_on_the_same_readings(world, steps):
+def test_it_is_the_batch_map_of_gtsam_on_the_same_measurements(world, steps):
     pytest.importorskip("gtsam", reason="pip install '.[limit]'")
     limit = batch_map(team_run(world, "join", "hybrid", steps))
     samples = team_run(world, "batch", "dead-reckoning", steps)
@@ -54,19 +56,19 @@ def robots(**options):
     return {name: config(name, **options) for name in ("r1", "r2")}
 
 
-READINGS = {"r1": published(stream("r1", 9)), "r2": published(stream("r2", 7, y=1.0))}
+MEASUREMENTS = {"r1": published(stream("r1", 9)), "r2": published(stream("r2", 7, y=1.0))}
 
 
 def heard(configs, **options):
-    """A team's readings at the centre, one after the other."""
+    """A team's measurements at the centre, one after the other."""
     node = CentralNode(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
     out = []
     for name, told in configs.items():
         out += node.handle(translate.configured(ch.robot_node(name), 0, 0, told), 0)
-        for reading in READINGS[name]:
-            out += node.handle(reading, 0)
-        out += node.handle(m.Done(0, name, 1, len(READINGS[name]), 0, 0, ()), 0)
-    ends = tuple(m.StreamEnd(name, 1, len(each)) for name, each in READINGS.items())
+        for measurement in MEASUREMENTS[name]:
+            out += node.handle(measurement, 0)
+        out += node.handle(m.Done(0, name, 1, len(MEASUREMENTS[name]), 0, 0, ()), 0)
+    ends = tuple(m.StreamEnd(name, 1, len(each)) for name, each in MEASUREMENTS.items())
     return node, out + node.handle(m.End(0, ends), 0)
 
 
@@ -76,7 +78,7 @@ def pose_times(out, name):
 
 def test_each_map_comes_with_the_newest_pose_of_every_robot_that_has_moved():
     _, out = heard(robots())
-    assert {name: pose_times(out, name) for name in READINGS} == {"r1": [4, 8, 9], "r2": [4, 7]}
+    assert {name: pose_times(out, name) for name in MEASUREMENTS} == {"r1": [4, 8, 9], "r2": [4, 7]}
     _, out = heard(robots(pose_s=5.0))
     assert pose_times(out, "r1") == [4, 9]
 
@@ -84,9 +86,9 @@ def test_each_map_comes_with_the_newest_pose_of_every_robot_that_has_moved():
 def test_the_final_map_comes_with_whole_paths():
     node, out = heard(robots())
     paths = {path.robot: path for path in of(out, ch.TRAJECTORY)}
-    for name, readings in READINGS.items():
+    for name, measurements in MEASUREMENTS.items():
         stamps, poses = translate.trajectory_of(paths[name])
-        assert (len(stamps), stamps[-1]) == (9 if name == "r1" else 7, readings[-1].stamp_ns)
+        assert (len(stamps), stamps[-1]) == (9 if name == "r1" else 7, measurements[-1].stamp_ns)
         assert paths[name].digest == node.final.digest
     *_, last = (o.message for o in out if o.key == ch.CENTRAL_POSE.key("r1"))
     _, poses = translate.trajectory_of(paths["r1"])
@@ -95,7 +97,7 @@ def test_the_final_map_comes_with_whole_paths():
 
 def test_the_map_has_the_joint_cost():
     node, _ = heard(robots())
-    every = [reading for readings in READINGS.values() for reading in readings]
+    every = [measurement for measurements in MEASUREMENTS.values() for measurement in measurements]
     read = sum(len(x.ids) // 4 for x in every if isinstance(x, m.Observations))
     assert node.final.dof == 2 * read - 2 * len(translate.landmarks_of(node.final)[0])
     assert 0.5 < node.final.chi2 / node.final.dof < 1.5

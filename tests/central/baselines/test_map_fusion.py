@@ -32,7 +32,7 @@ def random_map(ids, seed, sigma=1.0):
 
 
 @pytest.mark.parametrize("rule", [kalman, kalman_per_axis])
-def test_two_readings_of_one_coordinate_are_weighted_by_their_precision(rule):
+def test_two_measurements_of_one_coordinate_are_weighted_by_their_precision(rule):
     fused = rule([one(2.0, 4.0), one(7.0, 1.0)])
     assert fused.means[0, 0] == pytest.approx(2.0 + 4.0 / 5.0 * 5.0)
     assert fused.covariance[0, 0] == pytest.approx(4.0 / 5.0)

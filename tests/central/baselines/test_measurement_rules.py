@@ -1,4 +1,4 @@
-"""Rules on raw readings: a function of the streams alone, whatever comes when."""
+"""Rules on raw measurements: a function of the streams alone, whatever comes when."""
 
 import msgspec
 import numpy as np
@@ -25,16 +25,16 @@ PARTICLES = 20
 RULES = ["joint-fastslam", "batch"]
 STREAMS = {"r1": stream("r1", 9), "r2": stream("r2", 7, y=1.0)}
 CONFIGS = {name: config(name) for name in STREAMS}
-READINGS = {name: published(each) for name, each in STREAMS.items()}
-LAST_WORDS = [m.Done(0, name, 1, len(each), 0, 0, ()) for name, each in READINGS.items()]
+MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
+LAST_WORDS = [m.Done(0, name, 1, len(each), 0, 0, ()) for name, each in MEASUREMENTS.items()]
 
 
 def announced(name):
     return translate.configured(ch.robot_node(name), 0, 0, CONFIGS[name])
 
 
-def end(readings=READINGS):
-    return m.End(0, tuple(m.StreamEnd(n, r[-1].epoch, len(r)) for n, r in readings.items()))
+def end(measurements=MEASUREMENTS):
+    return m.End(0, tuple(m.StreamEnd(n, r[-1].epoch, len(r)) for n, r in measurements.items()))
 
 
 def heard(fusion, messages, robots=("r1", "r2")):
@@ -45,9 +45,9 @@ def heard(fusion, messages, robots=("r1", "r2")):
     return node, out
 
 
-def everything(readings=READINGS):
-    every = [x for name in readings for x in (announced(name), *readings[name])]
-    return [*every, *LAST_WORDS, end(readings)]
+def everything(measurements=MEASUREMENTS):
+    every = [x for name in measurements for x in (announced(name), *measurements[name])]
+    return [*every, *LAST_WORDS, end(measurements)]
 
 
 def said(out):
@@ -104,18 +104,24 @@ def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_epochs():
 
 
 @pytest.mark.parametrize("fusion", RULES)
-def test_maps_name_the_last_reading_of_each_robot_in_them(fusion):
+def test_maps_name_the_last_measurement_of_each_robot_in_them(fusion):
     node, out = heard(fusion, everything())
     assert len(of(out, ch.FUSED_MAP)) == 2
-    assert [x.sequence for x in node.final.members] == [len(r) - 1 for r in READINGS.values()]
+    assert [x.sequence for x in node.final.members] == [len(r) - 1 for r in MEASUREMENTS.values()]
     digests = {x.digest for x in (*of(out, ch.FUSED_MAP), node.final)}
     assert len(digests) == 3
 
 
 @pytest.mark.parametrize("fusion", RULES)
-def test_it_waits_for_every_robots_models_start_and_last_reading(fusion):
+def test_it_waits_for_every_robots_models_start_and_last_measurement(fusion):
     messages = everything()
-    for last in (announced("r2"), READINGS["r2"][0], READINGS["r1"][5], LAST_WORDS[0], end()):
+    for last in (
+        announced("r2"),
+        MEASUREMENTS["r2"][0],
+        MEASUREMENTS["r1"][5],
+        LAST_WORDS[0],
+        end(),
+    ):
         node, out = heard(fusion, (x for x in messages if x != last))
         assert not node.finished
         out += node.handle(last, 0)
@@ -124,18 +130,18 @@ def test_it_waits_for_every_robots_models_start_and_last_reading(fusion):
 
 
 @pytest.mark.parametrize("fusion", RULES)
-def test_missing_readings_are_asked_for(fusion):
-    node, _ = heard(fusion, (x for x in everything() if x not in READINGS["r1"][4:6]))
-    assert node.wanted() == [m.ReadingsWanted(node.status().stamp_ns, "r1", 1, 4, 5)]
-    for reading in READINGS["r1"][4:6]:
-        node.handle(reading, 0)
+def test_missing_measurements_are_asked_for(fusion):
+    node, _ = heard(fusion, (x for x in everything() if x not in MEASUREMENTS["r1"][4:6]))
+    assert node.wanted() == [m.MeasurementsRequest(node.status().stamp_ns, "r1", 1, 4, 5)]
+    for measurement in MEASUREMENTS["r1"][4:6]:
+        node.handle(measurement, 0)
     assert node.finished
     assert node.wanted() == []
 
 
 @pytest.mark.parametrize("fusion", RULES)
 def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
-    free = {"r1": READINGS["r1"], "r2": published(stream("r2", 7, y=1.0, known=False))}
+    free = {"r1": MEASUREMENTS["r1"], "r2": published(stream("r2", 7, y=1.0, known=False))}
     node, out = heard(fusion, everything(free))
     assert node.final.reasons == ("r2: its start pose is not known",)
     assert [x.robot for x in node.final.members] == ["r1"]
@@ -148,10 +154,12 @@ def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
 
 @pytest.mark.parametrize("fusion", RULES)
 def test_a_stream_that_begins_anew_ends_there(fusion):
-    later = [msgspec.structs.replace(x, epoch=2) for x in READINGS["r2"]]
+    later = [msgspec.structs.replace(x, epoch=2) for x in MEASUREMENTS["r2"]]
     later[0] = m.Start(later[0].stamp_ns, "r2", 2, 0, b"", b"")
-    whole = {"r1": READINGS["r1"], "r2": [*READINGS["r2"][:8], *later]}
-    ends = m.End(0, (m.StreamEnd("r1", 1, len(READINGS["r1"])), m.StreamEnd("r2", 2, len(later))))
+    whole = {"r1": MEASUREMENTS["r1"], "r2": [*MEASUREMENTS["r2"][:8], *later]}
+    ends = m.End(
+        0, (m.StreamEnd("r1", 1, len(MEASUREMENTS["r1"])), m.StreamEnd("r2", 2, len(later)))
+    )
     messages = [x for x in everything(whole) if not isinstance(x, m.End | m.Done)]
     dones = [LAST_WORDS[0], m.Done(0, "r2", 2, len(later), 0, 0, ())]
     node, _ = heard(fusion, [*messages, *dones, ends])

@@ -41,9 +41,9 @@ def stamps(*seconds: float) -> np.ndarray:
     return np.rint(np.array(seconds) * SECOND).astype(np.int64)
 
 
-def done(readings: int, ledger: tuple[tuple[str, int], ...]) -> Outgoing:
+def done(measurements: int, ledger: tuple[tuple[str, int], ...]) -> Outgoing:
     entries = tuple(m.Disposed(name, count) for name, count in ledger)
-    return Outgoing(ch.ROBOT_DONE, "r1", m.Done(9, "r1", 1, readings, 20, 2, entries))
+    return Outgoing(ch.ROBOT_DONE, "r1", m.Done(9, "r1", 1, measurements, 20, 2, entries))
 
 
 def submap(sequence: int, first: int, last: int) -> Outgoing:
@@ -228,7 +228,7 @@ def test_a_robots_last_own_map_is_held_against_the_truth() -> None:
     assert figures["r2"]["own_map_nees_per_dof"] is None
 
 
-def test_a_reading_that_is_in_the_log_twice_is_counted_once() -> None:
+def test_a_measurement_that_is_in_the_log_twice_is_counted_once() -> None:
     log = world_log(scenario())
     again = [s for s in log if s.key == ch.ODOMETRY.key("r1")]
     once, twice = evaluate(log).robots["r1"], evaluate(log + again).robots["r1"]
@@ -247,9 +247,9 @@ def test_steps_are_odometry_intervals_and_the_uplink_is_what_the_rule_consumes()
 @pytest.mark.parametrize(
     ("first", "counted", "once"),
     [(21, 41, True), (20, 41, False), (21, 42, False)],
-    ids=["disjoint", "a reading in two submaps", "a ledger that counts one twice"],
+    ids=["disjoint", "a measurement in two submaps", "a ledger that counts one twice"],
 )
-def test_a_reading_that_is_used_twice_is_found(first: int, counted: int, once: bool) -> None:
+def test_a_measurement_that_is_used_twice_is_found(first: int, counted: int, once: bool) -> None:
     said = [submap(0, 0, 20), submap(1, first, 40), done(41, (("in a submap", counted),))]
     robot = evaluate(world_log(scenario()) + samples(said)).robots["r1"]
     assert robot.consumption.consumed == 41
@@ -273,7 +273,7 @@ def test_a_log_that_was_cut_before_the_final_map_is_evaluated() -> None:
     figures = to_json(evaluate(world_log(scenario())[:30]))
     assert figures["final_map_digest"] is None
     assert figures["landmark_rmse_m"] is None
-    assert figures["robots"]["r1"]["readings_consumed"] is None
+    assert figures["robots"]["r1"]["measurements_consumed"] is None
 
 
 def test_an_empty_log_is_evaluated() -> None:
@@ -363,8 +363,8 @@ def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds() -> 
         "landmarks", "final_map_digest", "robots", "channels", "processes", "log", "wall_s",
     )  # fmt: skip
     of_a_robot = (
-        "steps", "readings_published", "readings_consumed", "position_rmse_m", "heading_rmse_rad",
-        "pose_nees_per_dof", "pose_coverage_95", "uplink_bytes", "submaps",
+        "steps", "measurements_published", "measurements_consumed", "position_rmse_m",
+        "heading_rmse_rad", "pose_nees_per_dof", "pose_coverage_95", "uplink_bytes", "submaps",
         "position_rmse_aligned_m", "online_position_rmse_m", "online_position_rmse_aligned_m",
         "online_pose_nees_per_dof", "online_pose_coverage_95",
     )  # fmt: skip

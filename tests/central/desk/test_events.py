@@ -28,7 +28,7 @@ def test_a_robot_joins_is_lost_and_comes_back() -> None:
 def test_a_robot_that_is_done_leaves() -> None:
     done = m.Done(0, "r1", 1, 1200, 5, 4, ())
     assert told(alive(True), done, done, alive(False))[1:] == [
-        ("done", "r1 used all its 1,200 readings, 4 submaps"),
+        ("done", "r1 used all its 1,200 measurements, 4 submaps"),
         ("left", "r1 left"),
     ]
 

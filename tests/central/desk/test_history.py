@@ -61,7 +61,7 @@ def test_the_cost_and_the_nees_are_those_of_each_map(run: History, log: list[Sam
     assert (np.diff(run.map_nees.stamps_ns) >= 0).all()
 
 
-def reading(k: int, wall_ms: int) -> Sample:
+def measurement(k: int, wall_ms: int) -> Sample:
     (sample,) = samples([Outgoing(ch.ODOMETRY, "r1", m.Odometry(k * MS, "r1", 0, k, MS, 0.5, 0.1))])
     return dataclasses.replace(sample, wall_ns=wall_ms * MS)
 
@@ -80,9 +80,9 @@ def fused(stamp_ns: int, last: int, **fields: object) -> Outgoing:
     return Outgoing(ch.FUSED_MAP, "", message)
 
 
-def test_latency_runs_from_a_readings_publication_to_the_first_map_that_used_it() -> None:
-    windows = [submap(k, "r1") for k in range(2)]  # of readings 0-9 and 10-19
-    log = [reading(k, 100 + 10 * k) for k in range(20)]
+def test_latency_runs_from_a_measurements_publication_to_the_first_map_that_used_it() -> None:
+    windows = [submap(k, "r1") for k in range(2)]  # of measurements 0-9 and 10-19
+    log = [measurement(k, 100 + 10 * k) for k in range(20)]
     log += [at(Outgoing(ch.SUBMAP, "r1", w), 400) for w in windows]
     log += [at(fused(9, 0), 450), at(fused(10, 0), 700), at(fused(11, 1), 900)]
     found = history(log).latencies["r1"]
@@ -91,7 +91,7 @@ def test_latency_runs_from_a_readings_publication_to_the_first_map_that_used_it(
 
 
 def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
-    log = [reading(k, 10 * k) for k in range(12, 20)]
+    log = [measurement(k, 10 * k) for k in range(12, 20)]
     log += [at(Outgoing(ch.SUBMAP, "r1", submap(k, "r1")), 400) for k in range(2)]
     assert "r1" not in history([*log, at(fused(9, 1), 450)]).latencies
     absurd = samples([Outgoing(ch.ODOMETRY, "r1", m.Odometry(5, "r1", 0, 2**60, MS, 0.5, 0.1))])

@@ -1,4 +1,4 @@
-"""Each reading of a log has exactly one disposition, or the offender is named."""
+"""Each measurement of a log has exactly one disposition, or the offender is named."""
 
 from pathlib import Path
 
@@ -35,16 +35,21 @@ def submap_changed(samples: list[Sample], sequence: int, **fields: int) -> list[
     return changed(samples, ch.SUBMAP, change)
 
 
-def test_a_good_log_disposes_of_each_reading_once(samples: list[Sample], tmp_path: Path) -> None:
+def test_a_good_log_disposes_of_each_measurement_once(
+    samples: list[Sample], tmp_path: Path
+) -> None:
     found = ledger_of(samples, tmp_path)
     assert found.offenders == ()
     (end,) = messages(samples, ch.END)
-    assert found.readings == sum(s.readings for s in end.streams)
-    assert sum(found.totals().values()) == found.readings
+    assert found.measurements == sum(s.measurements for s in end.streams)
+    assert sum(found.totals().values()) == found.measurements
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)
-        assert found.totals(robot) == {d.disposition: d.readings for d in done.ledger}
-    assert f"each of {found.readings} readings has exactly one disposition" in found.statement()
+        assert found.totals(robot) == {d.disposition: d.measurements for d in done.ledger}
+    assert (
+        f"each of {found.measurements} measurements has exactly one disposition"
+        in found.statement()
+    )
 
 
 def test_every_submap_names_the_maps_that_used_it(samples: list[Sample], tmp_path: Path) -> None:
@@ -55,30 +60,30 @@ def test_every_submap_names_the_maps_that_used_it(samples: list[Sample], tmp_pat
     assert len(found.maps["r1", 1, 0]) > len(found.maps["r1", 1, 5])
 
 
-def test_a_reading_in_two_submaps_is_named(samples: list[Sample], tmp_path: Path) -> None:
+def test_a_measurement_in_two_submaps_is_named(samples: list[Sample], tmp_path: Path) -> None:
     second = messages(samples, ch.SUBMAP, "r1")[1]
-    twice = submap_changed(samples, 1, first_reading=second.first_reading - 1)
+    twice = submap_changed(samples, 1, first_measurement=second.first_measurement - 1)
     (offender,) = ledger_of(twice, tmp_path).offenders
-    counter = second.first_reading - 1
-    assert offender == f"reading {counter} of r1, epoch 1 is in two submaps: 0 and 1"
+    counter = second.first_measurement - 1
+    assert offender == f"measurement {counter} of r1, epoch 1 is in two submaps: 0 and 1"
 
 
-def test_a_reading_that_no_submap_took_is_named(samples: list[Sample], tmp_path: Path) -> None:
+def test_a_measurement_that_no_submap_took_is_named(samples: list[Sample], tmp_path: Path) -> None:
     second = messages(samples, ch.SUBMAP, "r1")[1]
-    skipped = submap_changed(samples, 1, first_reading=second.first_reading + 1)
+    skipped = submap_changed(samples, 1, first_measurement=second.first_measurement + 1)
     offenders = ledger_of(skipped, tmp_path).offenders
-    name = f"reading {second.first_reading} of r1, epoch 1"
+    name = f"measurement {second.first_measurement} of r1, epoch 1"
     assert offenders[0] == f"{name} is behind its submaps and in none of them"
     assert "r1, epoch 1 says" in offenders[1]
 
 
-def test_a_submap_of_readings_that_are_not_there_is_named(
+def test_a_submap_of_measurements_that_are_not_there_is_named(
     samples: list[Sample], tmp_path: Path
 ) -> None:
     last = messages(samples, ch.SUBMAP, "r1")[-1]
-    beyond = submap_changed(samples, last.sequence, last_reading=last.last_reading + 2**40)
+    beyond = submap_changed(samples, last.sequence, last_measurement=last.last_measurement + 2**40)
     (offender,) = ledger_of(beyond, tmp_path).offenders
-    assert offender.startswith(f"submap {last.sequence} of r1, epoch 1 uses reading")
+    assert offender.startswith(f"submap {last.sequence} of r1, epoch 1 uses measurement")
 
 
 def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(
@@ -93,19 +98,19 @@ def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(
     )
 
 
-def test_a_reading_that_was_changed_and_sent_again_is_named(
+def test_a_measurement_that_was_changed_and_sent_again_is_named(
     samples: list[Sample], tmp_path: Path
 ) -> None:
     copy = next(s for s in samples if s.key == ch.ODOMETRY.key("r1"))
-    counter = messages([copy], ch.ODOMETRY, "r1")[0].reading
+    counter = messages([copy], ch.ODOMETRY, "r1")[0].number
     (again,) = changed([copy], ch.ODOMETRY, lambda x: msgspec.structs.replace(x, forward=9.0))
     (offender,) = ledger_of([*samples, again], tmp_path).offenders
-    assert offender == f"reading {counter} of r1, epoch 1 is in the log twice, and not the same"
+    assert offender == f"measurement {counter} of r1, epoch 1 is in the log twice, and not the same"
 
 
 def test_a_robots_false_word_is_named(samples: list[Sample], tmp_path: Path) -> None:
     def lie(done: m.Message) -> m.Message:
-        ledger = tuple(m.Disposed(d.disposition, d.readings + 1) for d in done.ledger)
+        ledger = tuple(m.Disposed(d.disposition, d.measurements + 1) for d in done.ledger)
         return msgspec.structs.replace(done, ledger=ledger) if done.robot == "r2" else done
 
     offenders = ledger_of(changed(samples, ch.ROBOT_DONE, lie), tmp_path).offenders
@@ -113,7 +118,7 @@ def test_a_robots_false_word_is_named(samples: list[Sample], tmp_path: Path) -> 
     assert all(offender.startswith("r2, epoch 1") for offender in offenders)
 
 
-def test_a_dead_robots_last_readings_are_open_or_lost(tmp_path: Path) -> None:
+def test_a_dead_robots_last_measurements_are_open_or_lost(tmp_path: Path) -> None:
     found = ledger_of(said(restless(2, dies=True)), tmp_path)
     assert found.offenders == ()
     lost = found.totals("r1")
@@ -122,7 +127,9 @@ def test_a_dead_robots_last_readings_are_open_or_lost(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cache", [None, 0])
-def test_restarts_and_new_epochs_use_no_reading_twice(cache: int | None, tmp_path: Path) -> None:
+def test_restarts_and_new_epochs_use_no_measurement_twice(
+    cache: int | None, tmp_path: Path
+) -> None:
     assert ledger_of(said(restless(1, cache=cache)), tmp_path).offenders == ()
 
 
@@ -135,7 +142,7 @@ def test_the_command_ends_with_1_and_names_the_offender(
     assert proof.exit_code == 0, proof.output
     assert "exactly one disposition" in proof.output
     second = messages(samples, ch.SUBMAP, "r1")[1]
-    bad = submap_changed(samples, 1, first_reading=second.first_reading - 1)
+    bad = submap_changed(samples, 1, first_measurement=second.first_measurement - 1)
     path = written(tmp_path / "bad.mcap", bad).path
     result = runner.invoke(app, ["verify-ledger", str(path)])
     assert result.exit_code == 1

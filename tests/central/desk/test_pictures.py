@@ -88,7 +88,7 @@ def test_the_tables_fit_a_terminal_of_80_columns_and_name_their_units(run: Evalu
     text = console.export_text()
     for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2", "2 is right", "0% within 95 %"):
         assert words in text
-    assert "…" not in text.partition("readings")[2]
+    assert "…" not in text.partition("measurements")[2]
 
 
 def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
@@ -113,7 +113,7 @@ def test_a_star_is_explained_only_where_there_is_one(run: Evaluation) -> None:
     ("fusion", "said"),
     [
         ("join", "> 1000: over-confident"),
-        ("kalman", "> 1000: over-confident (rule counts readings again)"),
+        ("kalman", "> 1000: over-confident (rule counts measurements again)"),
     ],
 )
 def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(

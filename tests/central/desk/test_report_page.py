@@ -114,18 +114,18 @@ def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: 
     assert "has exactly one disposition" in done.output
     assert re.search(r"^NIS per dof: r1 [\d.]+, r2 [\d.]+$", done.output, re.MULTILINE)
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
-    assert re.search(r'class="good">Ledger: each of \d+ readings has exactly one', page)
+    assert re.search(r'class="good">Ledger: each of \d+ measurements has exactly one', page)
     figures = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
     assert figures["ledger"]["offenders"] == []
     assert figures["provenance"] == {"seed": "1"}
 
 
-def test_a_reading_used_twice_is_named_on_the_page(log: list[Sample], tmp_path: Path) -> None:
+def test_a_measurement_used_twice_is_named_on_the_page(log: list[Sample], tmp_path: Path) -> None:
     run = run_of(log)
-    name = "reading 7 of r1, epoch 1 is in two submaps: 0 and 1"
+    name = "measurement 7 of r1, epoch 1 is in two submaps: 0 and 1"
     offending = Ledger({("r1", 1): 3 * (Entry("in a submap", 0),)}, {}, (name,))
     page = page_of(replace(run, ledger=offending), tmp_path)
-    assert 'class="bad">Ledger: 1 offenders: reading 7 of r1' in page
+    assert 'class="bad">Ledger: 1 offenders: measurement 7 of r1' in page
 
 
 def test_a_log_that_lacks_what_the_ledger_needs_says_what(tmp_path: Path) -> None:

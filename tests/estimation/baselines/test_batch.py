@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from team.config import Sensor
 from team.estimation.baselines import batch, batch_factors
-from team.estimation.baselines.batch_factors import Motions, Readings, Starts
+from team.estimation.baselines.batch_factors import Measurements, Motions, Starts
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.geometry import (
     adjoint,
@@ -100,18 +100,18 @@ def test_the_derivatives_of_starts_and_odometry_are_those_of_their_residuals(a, 
 
 @settings(deadline=None, max_examples=50)
 @given(poses, st.floats(0.5, 9.0), st.floats(-3.1, 3.1), st.floats(-0.5, 0.5))
-def test_the_derivatives_of_readings_are_those_of_their_residuals(pose, distance, bearing, off):
+def test_the_derivatives_of_measurements_are_those_of_their_residuals(pose, distance, bearing, off):
     direction = pose[2] + bearing
     point = pose[:2] + distance * np.array([np.cos(direction), np.sin(direction)])
-    read = Readings(
+    read = Measurements(
         ONE, ONE, np.array([distance - off]), np.array([wrap(bearing - off)]), np.ones((1, 3))
     )
 
     def seen(delta):
         at, landmark = moved(pose, delta[:3])[None], (point + delta[3:])[None]
-        return batch_factors.reading_residuals(read, at, landmark).residual[0]
+        return batch_factors.measurement_residuals(read, at, landmark).residual[0]
 
-    linear = batch_factors.reading_residuals(read, pose[None], point[None])
+    linear = batch_factors.measurement_residuals(read, pose[None], point[None])
     np.testing.assert_allclose(linear.residual[0], [off, off], atol=1e-9)
     of_both = np.column_stack([linear.first[0], linear.second[0]])
     np.testing.assert_allclose(of_both, along(seen, 5), atol=1e-6)
@@ -292,8 +292,8 @@ def told_twice(turn):
     )
 
 
-@pytest.mark.parametrize("twice", [False, True], ids=["each reading once", "mutant: twice"])
-def test_it_is_consistent_and_a_reading_used_twice_is_found(twice):
+@pytest.mark.parametrize("twice", [False, True], ids=["each measurement once", "mutant: twice"])
+def test_it_is_consistent_and_a_measurement_used_twice_is_found(twice):
     runs, total, dof = 200, 0.0, 0
     for seed in range(runs):
         rounds, truth = team_run(seed, steps=6)
@@ -308,7 +308,7 @@ def test_it_is_consistent_and_a_reading_used_twice_is_found(twice):
     assert (low <= total / dof <= high) == (not twice), total / dof
 
 
-def test_the_same_readings_give_the_same_bits():
+def test_the_same_measurements_give_the_same_bits():
     rounds, _ = team_run(4)
     one, two = (
         batch.landmark_gaussian(converged(batch.begun(KNOWN, 1.0), turns_of(rounds)))

@@ -25,10 +25,10 @@ increments = st.builds(
 )
 
 
-def reckoned(steps, start=START, readings=NOTHING):
+def reckoned(steps, start=START, measurements=NOTHING):
     state = dead_reckoning.begun(start)
     for step in steps:
-        state = dead_reckoning.stepped(state, step, SENSOR, *readings)
+        state = dead_reckoning.stepped(state, step, SENSOR, *measurements)
     return state
 
 
@@ -102,10 +102,10 @@ def test_an_uncertain_start_is_a_first_step_that_stands_still():
     np.testing.assert_allclose(state.pose.covariance, spread)
 
 
-def test_readings_change_nothing_and_no_landmark_is_known():
+def test_measurements_change_nothing_and_no_landmark_is_known():
     told, _ = drive(0)
     seen = (np.array([4], np.uint32), np.array([5.0]), np.array([0.1]))
-    blind, seeing = reckoned(told), reckoned(told, readings=seen)
+    blind, seeing = reckoned(told), reckoned(told, measurements=seen)
     assert blind.pose.mean.tobytes() == seeing.pose.mean.tobytes()
     assert blind.pose.covariance.tobytes() == seeing.pose.covariance.tobytes()
     ids, means, covariance = dead_reckoning.landmark_gaussian(seeing)

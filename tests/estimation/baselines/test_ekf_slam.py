@@ -61,7 +61,7 @@ def some_motion(rng):
     return Increment(rng.uniform([0.0, -0.3, -0.4], [1.0, 0.3, 0.4]), root @ root.T)
 
 
-def textbook(state, motion, slots, readings):
+def textbook(state, motion, slots, measurements):
     """Thrun et al. 2005, table 3.3, with dense matrices and numerical Jacobians."""
 
     def moved(x, xi):
@@ -78,7 +78,7 @@ def textbook(state, motion, slots, readings):
     H = np.concatenate([jacobian(lambda x, k=k: observed(x, k), mean) for k in slots])
     sigmas = [(np.hypot(0.2, 0.01 * observed(mean, slot)[0]), 0.03) for slot in slots]
     R = np.diag(np.concatenate(sigmas) ** 2)
-    innovation = np.concatenate(readings) - predicted
+    innovation = np.concatenate(measurements) - predicted
     innovation[1::2] = wrap(innovation[1::2])
     K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
     A = np.eye(len(mean)) - K @ H
@@ -90,15 +90,15 @@ def textbook(state, motion, slots, readings):
 
 @quick
 @given(seeds)
-def test_a_step_is_the_textbooks_with_all_readings_of_the_epoch_at_once(seed):
+def test_a_step_is_the_textbooks_with_all_measurements_of_the_epoch_at_once(seed):
     rng = np.random.default_rng(seed)
     state, motion = some_state(rng), some_motion(rng)
     slots = rng.integers(0, 4, rng.integers(1, 6))
     there = np.concatenate((compose(state.mean[:3], motion.mean), state.mean[3:]))
-    readings = [observed(there, k) + rng.normal(scale=[0.2, 0.03]) for k in slots]
-    z = np.array(readings)
+    measurements = [observed(there, k) + rng.normal(scale=[0.2, 0.03]) for k in slots]
+    z = np.array(measurements)
     after = ekf_slam.stepped(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
-    mean, P, squared = textbook(state, motion, slots, readings)
+    mean, P, squared = textbook(state, motion, slots, measurements)
     judged = ekf_slam.innovation(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
     assert judged.dof == 2 * len(slots)
     assert judged.squared == pytest.approx(squared, rel=1e-5)
@@ -140,12 +140,12 @@ def test_turning_and_moving_the_frame_moves_the_answer_with_it(seed):
     rng = np.random.default_rng(seed)
     shift = rng.uniform(-3.0, 3.0, 3)
     motions = [some_motion(rng) for _ in range(4)]
-    readings = [
+    measurements = [
         (np.arange(3, dtype=np.uint32), rng.uniform(4.0, 9.0, 3), np.array([-1.0, 0.5, 2.0]))
         for _ in motions
     ]
     here, there = ekf_slam.begun(np.zeros(3)), ekf_slam.begun(shift)
-    for motion, epoch in zip(motions, readings, strict=True):
+    for motion, epoch in zip(motions, measurements, strict=True):
         here = ekf_slam.stepped(here, motion, SENSOR, *epoch)
         there = ekf_slam.stepped(there, motion, SENSOR, *epoch)
     c, s = np.cos(shift[2]), np.sin(shift[2])
@@ -159,7 +159,7 @@ def test_turning_and_moving_the_frame_moves_the_answer_with_it(seed):
     np.testing.assert_allclose(there.covariance, turn @ here.covariance @ turn.T, atol=1e-9)
 
 
-def test_further_readings_of_a_new_landmark_update_it_as_in_an_epoch_of_their_own():
+def test_further_measurements_of_a_new_landmark_update_it_as_in_an_epoch_of_their_own():
     first = (np.array([5], np.uint32), np.array([8.0]), np.array([0.4]))
     again = (np.array([5], np.uint32), np.array([8.3]), np.array([0.38]))
     start = ekf_slam.begun(np.array([1.0, 2.0, 0.3]))
@@ -171,7 +171,7 @@ def test_further_readings_of_a_new_landmark_update_it_as_in_an_epoch_of_their_ow
     np.testing.assert_array_equal(one.covariance, two.covariance)
 
 
-def test_the_order_of_an_epochs_readings_does_not_matter():
+def test_the_order_of_an_epochs_measurements_does_not_matter():
     rng = np.random.default_rng(3)
     state = some_state(rng)
     ids = np.append(state.ids, np.array([40, 41], np.uint32))
@@ -218,7 +218,9 @@ def test_the_map_grows_to_a_thousand_landmarks():
 
 @functools.cache
 def short_run(seed, repeat):
-    """NEES, NIS and their dofs of ten steps among six landmarks, each reading `repeat` times."""
+    """NEES, NIS and their dofs of ten steps among six landmarks, each measurement `repeat`
+    times.
+    """
     rng = np.random.default_rng(seed)
     landmarks = rng.uniform(-12.0, 12.0, (6, 2))
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.005)
@@ -243,7 +245,7 @@ def short_run(seed, repeat):
 
 
 @pytest.mark.parametrize("column", [0, 2], ids=["NEES", "NIS"])
-def test_a_short_window_is_consistent_and_one_that_counts_readings_twice_is_not(column):
+def test_a_short_window_is_consistent_and_one_that_counts_measurements_twice_is_not(column):
     honest, twice = (np.array([short_run(seed, k) for seed in range(200)]) for k in (1, 2))
     for runs, is_right in ((honest, True), (twice, False)):
         dof = runs[:, column + 1].sum()
@@ -292,6 +294,6 @@ def test_a_state_whose_covariance_is_none_any_more_is_named_not_carried_on():
     rng = np.random.default_rng(0)
     state = some_state(rng)
     broken = dataclasses.replace(state, covariance=state.covariance - np.eye(11))
-    readings = (state.ids[:1], np.array([9.0]), np.array([0.1]))
-    with pytest.raises(NotACovarianceError, match="prediction of readings"):
-        ekf_slam.stepped(broken, STANDING, SENSOR, *readings)
+    measurements = (state.ids[:1], np.array([9.0]), np.array([0.1]))
+    with pytest.raises(NotACovarianceError, match="prediction of measurements"):
+        ekf_slam.stepped(broken, STANDING, SENSOR, *measurements)

@@ -53,7 +53,7 @@ def test_a_landmark_that_is_not_read_keeps_its_exact_values():
     assert not np.array_equal(after.landmarks[1], KNOWN.landmarks[1])
 
 
-def test_standing_still_a_reading_updates_its_landmark_as_the_kalman_filter_does():
+def test_standing_still_a_measurement_updates_its_landmark_as_the_kalman_filter_does():
     offset = KNOWN.landmarks[1] - KNOWN.pose[:2]
     r = np.hypot(*offset)
     z = np.array([r + 0.3, np.arctan2(offset[1], offset[0]) - KNOWN.pose[2] + 0.02])
@@ -67,7 +67,7 @@ def test_standing_still_a_reading_updates_its_landmark_as_the_kalman_filter_does
     np.testing.assert_allclose(after.pose, KNOWN.pose, atol=1e-12)
 
 
-def test_a_new_landmark_has_the_covariance_of_its_reading_and_of_the_steps_spread():
+def test_a_new_landmark_has_the_covariance_of_its_measurement_and_of_the_steps_spread():
     state = hybrid_thesis.started(np.array([1.0, 2.0, 0.5]))
     after = stepped(state, STANDING, [4], [10.0], [0.2], particles=10)
     c, s = np.cos(0.7), np.sin(0.7)
@@ -81,7 +81,7 @@ def test_a_new_landmark_has_the_covariance_of_its_reading_and_of_the_steps_sprea
     assert abs(across @ spread.covariances[0] @ across / expected - 1.0) < 0.1
 
 
-def test_readings_pull_the_mean_pose_by_the_weights():
+def test_measurements_pull_the_mean_pose_by_the_weights():
     tight = dataclasses.replace(KNOWN, covariances=1e-4 * KNOWN.covariances)
     true_pose = np.array([1.0 + 1.05 * np.cos(3.0), 2.0 + 1.05 * np.sin(3.0), 3.15])
     offset = tight.landmarks - true_pose[:2]
@@ -135,9 +135,9 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least):
         (config, *_), streams = world(name, seed)
         stream = streams.streams[0]
         state = hybrid_thesis.started(stream.start.pose)
-        for increment, *readings in epochs_of(config, stream):
+        for increment, *measurements in epochs_of(config, stream):
             state = hybrid_thesis.stepped(
-                state, increment, config.sensor, *readings, 100, generator(seed, "r1", 1, 0)
+                state, increment, config.sensor, *measurements, 100, generator(seed, "r1", 1, 0)
             )
         landmarks = LandmarkGaussian(state.ids, state.landmarks, block_diag(*state.covariances))
         error = map_errors(landmarks, streams)

@@ -15,14 +15,14 @@ ID = np.array([7], np.uint32)
 
 
 def run(steps: int, particles: int = 50, seed: int = 1) -> list[CodedState]:
-    """Straight on, past a landmark at (10, 5) whose readings have no error."""
+    """Straight on, past a landmark at (10, 5) whose measurements have no error."""
     generator = np.random.default_rng(seed)
     state = hybrid_thesis_coded.started(np.zeros(3), particles)
     states = [state]
     for k in range(1, steps + 1):
         offset = np.array([10.0 - k, 5.0])
-        reading = np.array([np.hypot(*offset)]), np.array([np.arctan2(offset[1], offset[0])])
-        state = hybrid_thesis_coded.stepped(state, MOTION, SENSOR, ID, *reading, generator)
+        measurement = np.array([np.hypot(*offset)]), np.array([np.arctan2(offset[1], offset[0])])
+        state = hybrid_thesis_coded.stepped(state, MOTION, SENSOR, ID, *measurement, generator)
         states.append(state)
     return states
 

@@ -113,7 +113,7 @@ def test_the_order_of_the_robots_does_not_matter_beyond_the_random_numbers(propo
         assert (np.abs(one.mean - other.mean) < close * np.sqrt(np.diag(one.covariance))).all()
 
 
-def test_standing_robots_readings_of_one_landmark_are_fused_as_gaussians():
+def test_standing_robots_measurements_of_one_landmark_are_fused_as_gaussians():
     sees = np.array([0], np.uint32)
     turns, informations, weighted = [], [], []
     for (robot, pose), sensor, error in zip(
@@ -136,7 +136,7 @@ def test_standing_robots_readings_of_one_landmark_are_fused_as_gaussians():
 
 
 def short_run(seed, repeat):
-    """NEES and dof of the team's map after a short drive, each reading told `repeat` times."""
+    """NEES and dof of the team's map after a short drive, each measurement told `repeat` times."""
     rounds, _ = team_run(seed, steps=5)
     rounds = [
         [
@@ -155,7 +155,7 @@ def short_run(seed, repeat):
     return nees(error, landmarks.covariance), len(error)
 
 
-def test_a_short_run_is_consistent_and_one_that_counts_readings_twice_is_not():
+def test_a_short_run_is_consistent_and_one_that_counts_measurements_twice_is_not():
     honest, twice = (np.array([short_run(seed, k) for seed in range(200)]) for k in (1, 2))
     low, high = chi2_interval(int(honest[:, 1].sum()), 0.999, 1)
     assert low < honest[:, 0].sum() / honest[:, 1].sum() < high

@@ -162,7 +162,7 @@ def test_turning_and_moving_the_frame_moves_the_cloud_with_it(start):
     np.testing.assert_allclose(wrap(there.poses[:, 2] - expected[:, 2]), 0.0, atol=1e-9)
 
 
-def test_a_reading_of_a_landmark_that_is_not_on_the_map_is_left_out():
+def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
     state = localisation.begun(np.zeros(3), 50, IDS, LANDMARKS)
     ranges, bearings = sights(np.array([1.0, 0.0, 0.2]))
     known = (IDS, ranges, bearings)
@@ -179,7 +179,7 @@ def test_a_reading_of_a_landmark_that_is_not_on_the_map_is_left_out():
     assert one.cloud.log_weights.tobytes() == other.cloud.log_weights.tobytes()
 
 
-def test_without_readings_the_cloud_spreads_and_stays_equally_weighted():
+def test_without_measurements_the_cloud_spreads_and_stays_equally_weighted():
     state = localisation.begun(np.zeros(3), 2000, IDS, LANDMARKS)
     random = np.random.default_rng(3)
     for _ in range(4):
@@ -191,7 +191,7 @@ def test_without_readings_the_cloud_spreads_and_stays_equally_weighted():
 
 @functools.cache
 def short_run(seed, repeat):
-    """NEES of the pose after eight steps and their NIS, each reading told `repeat` times."""
+    """NEES of the pose after eight steps and their NIS, each measurement told `repeat` times."""
     random, judged = np.random.default_rng(seed), innovations.NOTHING
     truth, state = np.zeros(3), localisation.begun(np.zeros(3), 1000, IDS, LANDMARKS)
     for _ in range(8):
@@ -209,7 +209,7 @@ def short_run(seed, repeat):
 
 
 @pytest.mark.parametrize("column", [0, 2], ids=["NEES", "NIS"])
-def test_it_is_consistent_and_one_that_counts_readings_twice_is_not(column):
+def test_it_is_consistent_and_one_that_counts_measurements_twice_is_not(column):
     for repeat in (1, 2):
         runs = np.array([short_run(seed, repeat) for seed in range(200)])
         dof = runs[:, column + 1].sum()

@@ -21,9 +21,9 @@ PROPOSALS = ["fastslam1", "fastslam2"]
 
 def filtered(drive_, sensor, state, random, repeat=1):
     for (distance, turn), epoch in zip(drive_.motions, drive_.epochs, strict=True):
-        readings = (np.repeat(part, repeat) for part in epoch)
+        measurements = (np.repeat(part, repeat) for part in epoch)
         increment = increment_of(ROBOT, 1.0, distance, turn)
-        state = plain_fastslam.stepped(state, increment, sensor, *readings, random)
+        state = plain_fastslam.stepped(state, increment, sensor, *measurements, random)
     return state
 
 
@@ -105,7 +105,7 @@ def test_the_threshold_says_when_a_step_begins_with_a_resampling():
 
 
 def short_run(seed, repeat):
-    """NEES and dof of the map after a short drive, each reading told `repeat` times."""
+    """NEES and dof of the map after a short drive, each measurement told `repeat` times."""
     told = drive(seed, ACCURATE, steps=8)
     start = plain_fastslam.begun(np.zeros(3), 500, "fastslam2", 0.5)
     state = filtered(told, ACCURATE, start, np.random.default_rng(seed), repeat)
@@ -116,7 +116,7 @@ def short_run(seed, repeat):
     return nees(error, landmarks.covariance), len(error)
 
 
-def test_a_short_run_is_consistent_and_one_that_counts_readings_twice_is_not():
+def test_a_short_run_is_consistent_and_one_that_counts_measurements_twice_is_not():
     honest, twice = (np.array([short_run(seed, k) for seed in range(200)]) for k in (1, 2))
     low, high = chi2_interval(int(honest[:, 1].sum()), 0.999, 1)
     assert low < honest[:, 0].sum() / honest[:, 1].sum() < high

@@ -1,4 +1,6 @@
-"""Which readings of a window are taken: what agrees stays, garbage goes, nobody else is asked."""
+"""Which measurements of a window are taken: what agrees stays, garbage goes, nobody else is
+asked.
+"""
 
 from dataclasses import dataclass
 
@@ -26,15 +28,15 @@ PLACES = np.array([[5.0, 4.0], [9.0, -3.0], [12.0, 6.0], [2.0, -5.0]])
 
 @dataclass
 class Drive:
-    """A window as the robot has it: motions and readings, by epoch."""
+    """A window as the robot has it: motions and measurements, by epoch."""
 
     motions: list[Increment]
     epochs: np.ndarray
     ids: np.ndarray
-    readings: np.ndarray
+    measurements: np.ndarray
 
     def judged(self, by=confirmed, garbage: float = 0.3) -> np.ndarray:
-        return by(self.motions, self.epochs, self.ids, self.readings, SENSOR, garbage)
+        return by(self.motions, self.epochs, self.ids, self.measurements, SENSOR, garbage)
 
 
 def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
@@ -57,20 +59,20 @@ def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
 
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 10_000), spoilt=st.sets(st.integers(0, 39), max_size=14))
-def test_spoilt_readings_go_and_the_others_stay(seed, spoilt):
+def test_spoilt_measurements_go_and_the_others_stay(seed, spoilt):
     window = drive(seed)
     rng = np.random.default_rng([seed, 1])
     bad = np.array(sorted(spoilt), dtype=np.int64)
-    away = window.readings[bad] + np.column_stack(
+    away = window.measurements[bad] + np.column_stack(
         (rng.choice([-1.0, 1.0], len(bad)) * 2.0, rng.choice([-1.0, 1.0], len(bad)) * 0.7)
     )
-    window.readings[bad] = np.abs(away)
+    window.measurements[bad] = np.abs(away)
     taken = window.judged()
     assert not taken[bad].any()
     assert np.count_nonzero(~np.delete(taken, bad)) <= 2, "3 sigma in one of 40 is nothing special"
 
 
-def test_a_reading_that_is_alone_is_not_taken_nor_are_two_that_disagree():
+def test_a_measurement_that_is_alone_is_not_taken_nor_are_two_that_disagree():
     window = drive(1)
     window.ids[3] = 99
     window.ids[[8, 21]] = 77
@@ -93,41 +95,41 @@ def test_a_landmark_beside_another_one_is_taken():
     assert window.judged().all()
 
 
-def test_the_order_of_readings_and_the_names_of_landmarks_do_not_matter():
+def test_the_order_of_measurements_and_the_names_of_landmarks_do_not_matter():
     window = drive(4)
-    window.readings[[5, 17, 30]] += [1.5, 0.4]
+    window.measurements[[5, 17, 30]] += [1.5, 0.4]
     taken = window.judged()
     order = np.random.default_rng(0).permutation(len(taken))
     names = np.array([0, 40, 7, 9, 3], dtype=np.uint32)
     other = Drive(
-        window.motions, window.epochs[order], names[window.ids[order]], window.readings[order]
+        window.motions, window.epochs[order], names[window.ids[order]], window.measurements[order]
     )
     np.testing.assert_array_equal(other.judged(), taken[order])
 
 
-def test_a_window_without_readings_or_with_one_has_nothing_to_take():
+def test_a_window_without_measurements_or_with_one_has_nothing_to_take():
     window = drive(5)
     for count in (0, 1):
         few = Drive(
-            window.motions, window.epochs[:count], window.ids[:count], window.readings[:count]
+            window.motions, window.epochs[:count], window.ids[:count], window.measurements[:count]
         )
         for by in (agreeing, confirmed):
             assert not few.judged(by).any()
 
 
-def test_epochs_without_readings_change_nothing():
+def test_epochs_without_measurements_change_nothing():
     window = drive(6)
-    window.readings[[5, 17]] += [1.5, 0.4]
+    window.measurements[[5, 17]] += [1.5, 0.4]
     still = Increment.identity()
     motions = [each for motion in window.motions for each in (motion, still)]
-    sparse = Drive(motions, 2 * window.epochs, window.ids, window.readings)
+    sparse = Drive(motions, 2 * window.epochs, window.ids, window.measurements)
     np.testing.assert_array_equal(sparse.judged(), window.judged())
 
 
 def smoothed(window: Drive, used: np.ndarray):
     """Path, landmarks and covariance at rest."""
-    of = consensus._Readings(
-        window.motions, window.epochs, window.ids, window.readings, SENSOR, 0.3
+    of = consensus._Measurements(
+        window.motions, window.epochs, window.ids, window.measurements, SENSOR, 0.3
     )
     path = np.zeros((len(of.means), 3))
     for k in range(1, len(path)):
@@ -139,27 +141,27 @@ def smoothed(window: Drive, used: np.ndarray):
     return of, path, landmarks, P
 
 
-def test_a_reading_is_judged_by_what_the_others_predict_of_it():
+def test_a_measurement_is_judged_by_what_the_others_predict_of_it():
     window = drive(7)
     used = np.ones(40, dtype=bool)
     of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.epochs, of.slots, of.readings, used, of.sensor)
-    own = kernel.left_out(*found, of.epochs, of.slots, of.readings, ~used, of.sensor)
+    logs = kernel.left_out(*found, of.epochs, of.slots, of.measurements, used, of.sensor)
+    own = kernel.left_out(*found, of.epochs, of.slots, of.measurements, ~used, of.sensor)
     for n in (0, 9, 22, 39):
         without = used.copy()
         without[n] = False
         _, *other = smoothed(window, without)
-        left = kernel.left_out(*other, of.epochs, of.slots, of.readings, without, of.sensor)
+        left = kernel.left_out(*other, of.epochs, of.slots, of.measurements, without, of.sensor)
         assert logs[n] == pytest.approx(left[n], abs=0.05)
-    assert np.abs(own - logs).max() > 0.1, "a reading that judges itself is another matter"
+    assert np.abs(own - logs).max() > 0.1, "a measurement that judges itself is another matter"
 
 
-def test_of_a_landmarks_only_reading_the_others_say_nothing():
+def test_of_a_landmarks_only_measurement_the_others_say_nothing():
     window = drive(8)
     used = window.ids != 1
     used[0] = True
     of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.epochs, of.slots, of.readings, used, of.sensor)
+    logs = kernel.left_out(*found, of.epochs, of.slots, of.measurements, used, of.sensor)
     assert logs[0] < -3.0
     assert logs[0] < logs[1:].min() - 1.0 or logs[0] == -np.inf
 
@@ -171,14 +173,16 @@ def world_of(name: str, kind: str, garbage: float) -> WorldStreams:
 
 
 def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
-    """The shares of good readings that are kept and of garbage that passes, in windows of 12 s."""
+    """The shares of good measurements that are kept and of garbage that passes, in windows of 12
+    s.
+    """
     robots = load(name).robots
     kept, passed = [], []
     clean, spoilt = world_of(name, kind, 0.0), world_of(name, kind, 0.3)
     for robot, a, b in zip(robots, clean.streams, spoilt.streams, strict=True):
         seen, before = b.landmark_detections, a.landmark_detections
         bad = (seen.ids != before.ids) | (seen.ranges != before.ranges)
-        readings = np.column_stack((seen.ranges, seen.bearings))
+        measurements = np.column_stack((seen.ranges, seen.bearings))
         for first in range(0, 480, 12):
             rows = slice(int(seen.offsets[first]), int(seen.offsets[first + 12]))
             epochs = np.repeat(np.arange(12), np.diff(seen.offsets[first : first + 13]))
@@ -188,7 +192,7 @@ def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
                 strict=True,
             )
             motions = [increment_of(robot.motion, 1.0, *each) for each in odometry]
-            taken = by(motions, epochs, seen.ids[rows], readings[rows], robot.sensor, 0.3)
+            taken = by(motions, epochs, seen.ids[rows], measurements[rows], robot.sensor, 0.3)
             kept.append(taken[~bad[rows]])
             passed.append(taken[bad[rows]])
     return float(np.concatenate(kept).mean()), float(np.concatenate(passed).mean())
@@ -203,7 +207,7 @@ def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
         ("thesis-b", "identity", 0.97, 0.02),
     ],
 )
-def test_of_three_tenths_garbage_little_passes_and_good_readings_are_kept(
+def test_of_three_tenths_garbage_little_passes_and_good_measurements_are_kept(
     name: str, kind: str, least_kept: float, most_passed: float
 ) -> None:
     kept, passed = rates(name, kind)
@@ -230,7 +234,7 @@ def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly, monk
         for k, motion in enumerate(window.motions):
             pose = compose(pose, motion.mean)
             for i in np.flatnonzero(window.epochs == k):
-                window.readings[i] = predicted(pose, PLACES[window.ids[i] - 1])
+                window.measurements[i] = predicted(pose, PLACES[window.ids[i] - 1])
 
     def factor(H, lower):
         found = dpotrf(H, lower=lower)
@@ -241,8 +245,8 @@ def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly, monk
     sensor = Sensor(
         range_sigma=1e-10 if exactly else 1e-12, bearing_sigma=0.01 if exactly else 1e-3
     )
-    readings = (window.motions, window.epochs, window.ids, window.readings, sensor, 0.3)
-    taken = confirmed(*readings)
+    measurements = (window.motions, window.epochs, window.ids, window.measurements, sensor, 0.3)
+    taken = confirmed(*measurements)
     assert failures[-1] != 0, "the equations have a solution here: nothing is tried"
     assert len([each for each in failures if each]) == 1, "what has failed is not gone on with"
-    np.testing.assert_array_equal(taken, agreeing(*readings))
+    np.testing.assert_array_equal(taken, agreeing(*measurements))

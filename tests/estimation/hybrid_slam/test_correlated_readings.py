@@ -11,13 +11,13 @@ PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 
 LANDMARK = np.array([4.0, 2.5])
 
 
-def readings(rng: np.random.Generator) -> np.ndarray:
+def measurements(rng: np.random.Generator) -> np.ndarray:
     seen = np.array([predicted(pose, LANDMARK) for pose in PATH])
     return seen + rng.normal(size=(4, 2)) * [0.05, 0.01] + rng.normal(size=2) * [0.1, 0.02]
 
 
 def dense(noise: Noise, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Generalised least squares with the full correlation matrix of the window's readings."""
+    """Generalised least squares with the full correlation matrix of the window's measurements."""
     n = len(PATH)
     shared = np.ones((n, n))
     R = np.zeros((2 * n, 2 * n))
@@ -41,7 +41,7 @@ def test_a_constant_error_within_a_window_equals_least_squares_with_its_correlat
     range_white: float, bearing_white: float
 ) -> None:
     noise = Noise(0.0125, 0.0, range_white, 5e-4, bearing_white)
-    seen = readings(np.random.default_rng(3))
+    seen = measurements(np.random.default_rng(3))
     means, covariances = landmarks_along_paths(
         LANDMARK.reshape(1, 1, 2) + 0.05,
         np.array([[[1.0, 0.0, 1.0]]]),
@@ -57,7 +57,7 @@ def test_a_constant_error_within_a_window_equals_least_squares_with_its_correlat
     np.testing.assert_allclose(covariances[0, 0], expected, rtol=2e-3, atol=1e-7)
 
 
-def test_repeating_a_reading_leaves_the_constant_part_of_its_error() -> None:
+def test_repeating_a_measurement_leaves_the_constant_part_of_its_error() -> None:
     sizes = []
     for repeats in (1, 1000):
         _, covariances = landmarks_along_paths(

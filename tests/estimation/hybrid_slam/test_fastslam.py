@@ -49,17 +49,17 @@ def jacobian(function, at):
 def kalman(motions, epochs):
     """Mean, covariance and log evidence of the joint Gaussian over (pose, landmarks).
 
-    A first sight places its landmark; epochs hold (landmark, reading) pairs.
+    A first sight places its landmark; epochs hold (landmark, measurement) pairs.
     """
     mean, P, log_evidence, seen = np.zeros(9), np.zeros((9, 9)), 0.0, set()
-    for motion, readings in zip(motions, epochs, strict=True):
+    for motion, measurements in zip(motions, epochs, strict=True):
         F = jacobian(lambda state, m=motion.mean: moved(state, m), mean)
         mean = moved(mean, motion.mean)
         turn = np.eye(9)[:, :3]
         c, s = np.cos(mean[2]), np.sin(mean[2])
         turn[:2, :2] = [[c, -s], [s, c]]
         P = F @ P @ F.T + turn @ motion.covariance @ turn.T
-        for k, z in readings:
+        for k, z in measurements:
             if k not in seen:
                 seen.add(k)
                 direction = mean[2] + z[1]
@@ -87,7 +87,7 @@ def kalman(motions, epochs):
 
 
 def simulated(seed, steps=5, covariance=MOTION.covariance):
-    """Increments and readings of a robot that stands at its first epoch and then moves."""
+    """Increments and measurements of a robot that stands at its first epoch and then moves."""
     rng = np.random.default_rng(seed)
     truth = np.concatenate((np.zeros(3), LANDMARKS.ravel()))
     motions, epochs = [], []
@@ -95,26 +95,26 @@ def simulated(seed, steps=5, covariance=MOTION.covariance):
         motion = STANDING if step == 0 else Increment(MOTION.mean, covariance)
         noise = rng.multivariate_normal(np.zeros(3), motion.covariance, method="svd")
         truth = moved(moved(truth, motion.mean), noise)
-        readings = []
+        measurements = []
         for k in range(3):
             z = observed(truth, k)
             sigma = np.array([np.hypot(0.1, 0.001 * z[0]), 0.002])
-            readings.append((k, z + sigma * rng.standard_normal(2)))
+            measurements.append((k, z + sigma * rng.standard_normal(2)))
         motions.append(motion)
-        epochs.append(readings)
+        epochs.append(measurements)
     return motions, epochs
 
 
 def filtered(motions, epochs, count, proposal, resample_below=0.5, seed=0):
     rng = np.random.default_rng(seed)
     particles, log_evidence, infos = fastslam.at_poses(np.zeros((count, 3))), 0.0, []
-    for motion, readings in zip(motions, epochs, strict=True):
-        z = np.array([reading for _, reading in readings])
+    for motion, measurements in zip(motions, epochs, strict=True):
+        z = np.array([measurement for _, measurement in measurements])
         particles, info = fastslam.propagated_and_updated(
             particles,
             motion,
             SENSOR,
-            IDS[[k for k, _ in readings]],
+            IDS[[k for k, _ in measurements]],
             z[:, 0].copy(),
             z[:, 1].copy(),
             proposal,
@@ -191,7 +191,7 @@ def test_without_noise_of_motion_both_proposals_are_the_same():
     np.testing.assert_allclose(one.log_weights, -np.log(8.0), atol=1e-12)
 
 
-def test_an_epoch_of_first_sights_and_one_without_readings_leave_the_weights():
+def test_an_epoch_of_first_sights_and_one_without_measurements_leave_the_weights():
     _, epochs = simulated(4)
     particles, _, _ = filtered([MOTION], epochs[1:2], 50, "fastslam2")
     np.testing.assert_allclose(particles.log_weights, -np.log(50.0), atol=1e-12)
@@ -202,15 +202,15 @@ def test_an_epoch_of_first_sights_and_one_without_readings_leave_the_weights():
 
 
 def test_a_landmark_at_first_sight_has_the_covariance_of_the_inverse_model():
-    readings = [(0, np.array([50.0, 0.4]))]
-    particles, _, _ = filtered([STANDING], [readings], 4, "fastslam2")
-    G = jacobian(lambda z: np.array([z[0] * np.cos(z[1]), z[0] * np.sin(z[1])]), readings[0][1])
+    measurements = [(0, np.array([50.0, 0.4]))]
+    particles, _, _ = filtered([STANDING], [measurements], 4, "fastslam2")
+    G = jacobian(lambda z: np.array([z[0] * np.cos(z[1]), z[0] * np.sin(z[1])]), measurements[0][1])
     expected = G @ np.diag([0.1**2 + 0.05**2, 0.002**2]) @ G.T
     xx, xy, yy = particles.covariances[0, 0]
     np.testing.assert_allclose([[xx, xy], [xy, yy]], expected, rtol=1e-7)
 
 
-def test_two_readings_of_one_landmark_in_one_epoch_count_as_two_epochs_without_motion():
+def test_two_measurements_of_one_landmark_in_one_epoch_count_as_two_epochs_without_motion():
     _, epochs = simulated(5, steps=2)
     first, second = [(0, epochs[0][0][1])], [(0, epochs[1][0][1])]
     together = filtered([STANDING], [first + second], 4, "fastslam2")
@@ -220,7 +220,7 @@ def test_two_readings_of_one_landmark_in_one_epoch_count_as_two_epochs_without_m
     np.testing.assert_allclose(together[1], apart[1])
 
 
-def test_resampling_happens_before_the_motion_and_never_after_the_readings():
+def test_resampling_happens_before_the_motion_and_never_after_the_measurements():
     motions, epochs = simulated(6)
     particles, _, infos = filtered(motions, epochs, 200, "fastslam1")
     thin = [info.effective_sample_size < 100 for info in infos]

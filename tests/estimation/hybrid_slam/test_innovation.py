@@ -35,7 +35,7 @@ def particles(count, spread=0.05):
     )
 
 
-def by_differences(of, ids, readings):
+def by_differences(of, ids, measurements):
     """ν and S of `innovation`'s docstring with every Jacobian by central differences."""
     slots = [int(np.flatnonzero(of.ids == i)[0]) for i in ids]
     weights = np.exp(of.log_weights)
@@ -62,7 +62,7 @@ def by_differences(of, ids, readings):
     mean = weights @ np.array(predictions)
     d = np.array(predictions) - mean
     S = np.einsum("i,ijk->jk", weights, covariances) + (d * weights[:, None]).T @ d
-    error = readings.ravel() - mean
+    error = measurements.ravel() - mean
     error[1::2] = wrap(error[1::2])
     return error, S
 
@@ -158,7 +158,7 @@ SLUGGISH = MotionModel(
         ({"motion": SLUGGISH}, True),
         ({"twice": True}, False),
     ],
-    ids=["sensor noise too small", "too large", "motion noise too small", "each reading twice"],
+    ids=["sensor noise too small", "too large", "motion noise too small", "each measurement twice"],
 )
 def test_wrong_models_have_another(wrong, above):
     low, found, high = per_dof(ACCURATE, **wrong)

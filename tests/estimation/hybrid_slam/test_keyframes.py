@@ -199,7 +199,7 @@ def test_a_keyframe_holds_the_median_of_each_landmark():
     st.lists(st.integers(1, SECOND), min_size=1, max_size=5),
 )
 def test_a_keyframes_scans_are_moved_by_the_odometry_to_its_end(forward, yaw_rate, stamps):
-    """Exact readings of one point from anywhere on the arc are one reading from its end."""
+    """Exact measurements of one point from anywhere on the arc are one measurement from its end."""
     point = 4.0 + 3.0j
 
     def seen_at(seconds):

@@ -1,4 +1,6 @@
-"""A robot whose readings are in part garbage: its submaps do without it, and it says how much."""
+"""A robot whose measurements are in part garbage: its submaps do without it, and it says how
+much.
+"""
 
 from dataclasses import replace
 
@@ -26,7 +28,7 @@ def robot(garbage: float) -> RobotConfig:
 
 
 def spoilt(given: RobotStream) -> RobotStream:
-    """Every fifth reading of the stream is somewhere else."""
+    """Every fifth measurement of the stream is somewhere else."""
     seen = given.landmark_detections
     rows = np.arange(len(seen.ids)) % 5 == 2
     ranges = np.where(rows, 2.0 + seen.ranges, seen.ranges)
@@ -34,8 +36,8 @@ def spoilt(given: RobotStream) -> RobotStream:
     return replace(given, landmark_detections=replace(seen, ranges=ranges, bearings=bearings))
 
 
-def submaps(of: RobotConfig, readings: list[m.Reading]) -> list[m.Submap]:
-    sent = driven(RobotNode(of), readings)
+def submaps(of: RobotConfig, measurements: list[m.Measurement]) -> list[m.Submap]:
+    sent = driven(RobotNode(of), measurements)
     return [each.message for each in sent if isinstance(each.message, m.Submap)]
 
 
@@ -58,11 +60,9 @@ def test_a_submap_is_as_if_the_garbage_had_never_been_read() -> None:
     assert sum(s.gated for s in found) - sum(s.gated for s in expected) == np.count_nonzero(rows)
 
 
-def test_of_clean_readings_only_what_stands_alone_is_gated_and_the_rest_is_as_without_a_gate() -> (
-    None
-):
-    readings = published(stream("r1", 20))
-    gated, plain = (submaps(robot(garbage), readings) for garbage in (0.05, 0.0))
+def test_of_clean_measurements_only_lone_ones_are_gated_and_the_rest_is_as_without_a_gate() -> None:
+    measurements = published(stream("r1", 20))
+    gated, plain = (submaps(robot(garbage), measurements) for garbage in (0.05, 0.0))
     assert sum(s.gated for s in plain) == 0
     for one, other in zip(gated, plain, strict=True):
         if not one.gated:
@@ -72,18 +72,18 @@ def test_of_clean_readings_only_what_stands_alone_is_gated_and_the_rest_is_as_wi
     assert any(not s.gated and len(s.ids) for s in gated)
 
 
-def test_a_robot_that_was_started_again_gates_the_same_readings() -> None:
-    readings = published(spoilt(stream("r1", 20)))
+def test_a_robot_that_was_started_again_gates_the_same_measurements() -> None:
+    measurements = published(spoilt(stream("r1", 20)))
     of = robot(0.2)
-    whole = submaps(of, readings)
+    whole = submaps(of, measurements)
     node = RobotNode(of)
-    node.resume(readings[0], whole[:2])
-    sent = driven(node, readings[whole[1].last_reading + 1 :])
+    node.resume(measurements[0], whole[:2])
+    sent = driven(node, measurements[whole[1].last_measurement + 1 :])
     again = [each.message for each in sent if isinstance(each.message, m.Submap)]
     assert again == whole[2:]
 
 
-def test_the_status_tells_how_many_readings_were_gated() -> None:
+def test_the_status_tells_how_many_measurements_were_gated() -> None:
     node = RobotNode(robot(0.2))
     driven(node, published(spoilt(stream("r1", 20))))
     assert node.status().figures["gated"] >= 5.0
@@ -93,7 +93,9 @@ def test_the_status_tells_how_many_readings_were_gated() -> None:
 
 
 def world_with(kind: str, gate: float, steps: int = 200) -> Scenario:
-    """The thesis' world B in longer steps, three in ten readings garbage, robust at the centre."""
+    """The thesis' world B in longer steps, three in ten measurements garbage, robust at the
+    centre.
+    """
     scenario = load("thesis-b")
     world = msgspec.structs.replace(scenario.world, steps=steps, garbage=0.3, garbage_kind=kind)
     robots = tuple(
@@ -118,12 +120,12 @@ def aligned_rmse(scenario: Scenario) -> float:
 
 @pytest.fixture(scope="module")
 def clean_rmse() -> float:
-    """Of the run in which the same readings are left out."""
+    """Of the run in which the same measurements are left out."""
     return aligned_rmse(world_with("drop", 0.0))
 
 
 @pytest.mark.parametrize("kind", ["reading", "identity"])
-def test_with_garbage_the_map_is_nearly_that_of_the_good_readings(
+def test_with_garbage_the_map_is_nearly_that_of_the_good_measurements(
     kind: str, clean_rmse: float
 ) -> None:
     assert aligned_rmse(world_with(kind, 0.3)) < 1.3 * clean_rmse

@@ -86,9 +86,9 @@ def test_a_sighting_is_carried_along_the_arc_to_its_node(at_s, distance, bearing
     drive(segmenter, 4.0, 250_000_000)
     (found,) = grid.sightings()
     to = seen_from(arc(2.0), point)
-    assert (found.stamp_ns, found.teammate, found.readings) == (2 * SECOND, "r2", (5,))
-    assert found.reading[0] == pytest.approx(abs(to), abs=1e-6)
-    assert wrap(found.reading[1] - np.angle(to)) == pytest.approx(0.0, abs=1e-6)
+    assert (found.stamp_ns, found.teammate, found.measurements) == (2 * SECOND, "r2", (5,))
+    assert found.measurement[0] == pytest.approx(abs(to), abs=1e-6)
+    assert wrap(found.measurement[1] - np.angle(to)) == pytest.approx(0.0, abs=1e-6)
     assert np.linalg.eigvalsh(found.covariance).min() > 0.0
 
 
@@ -111,9 +111,9 @@ def test_looks_at_one_teammate_near_one_node_are_one_sighting_of_the_median():
     grid.observe(2_300_000_000, 9, look("r2", 5.0))
     drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
     first, second = grid.sightings()
-    assert (first.teammate, first.readings, first.reading[0]) == ("r2", (9,), 5.0)
-    assert (second.teammate, second.readings) == ("r3", (0, 1, 2, 3))
-    assert second.reading[0] == pytest.approx(3.15)
+    assert (first.teammate, first.measurements, first.measurement[0]) == ("r2", (9,), 5.0)
+    assert (second.teammate, second.measurements) == ("r3", (0, 1, 2, 3))
+    assert second.measurement[0] == pytest.approx(3.15)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_the_sensors_calibration_and_the_markers_offset_are_taken_off():
     assert grid.observe(2 * SECOND, 1, looks) is None
     drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
     (found,) = grid.sightings()
-    assert (found.teammate, found.reading[0]) == ("r2", pytest.approx(1.5))
+    assert (found.teammate, found.measurement[0]) == ("r2", pytest.approx(1.5))
     assert grid.observe(4 * SECOND, 2, look("r3", 9.5)) == "outside the sensor's limits"
 
 
@@ -162,7 +162,7 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
         [1_500_000_000, 3 * SECOND],
         [4_500_000_000, 6 * SECOND],
     ]
-    assert [[(s.stamp_ns, s.readings) for s in w.sightings] for w in closed] == [
+    assert [[(s.stamp_ns, s.measurements) for s in w.sightings] for w in closed] == [
         [(1_500_000_000, (2,)), (3 * SECOND, (3,))],
         [(4_500_000_000, (5,)), (6 * SECOND, (6,))],
     ]

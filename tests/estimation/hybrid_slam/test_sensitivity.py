@@ -68,7 +68,7 @@ def window_of(bearing, forward_scale, range_scale, white=1.0):
 @pytest.mark.parametrize(
     ("bias", "size"), [("bearing", 4e-3), ("range_scale", 4e-3), ("forward_scale", 1e-2)]
 )
-def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_readings(bias, size, white):
+def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements(bias, size, white):
     errors = dict.fromkeys(BIASES, 0.0)
     up, down = (window_of(**(errors | {bias: sign * size}), white=white) for sign in (1.0, -1.0))
     row = window_of(**errors, white=white).sensitivity[BIASES.index(bias)]

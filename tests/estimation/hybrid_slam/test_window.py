@@ -1,6 +1,7 @@
 """One window becomes one honest Gaussian: against batch least squares, in odd cases, in many runs.
 
-The truth and the readings are made here by a few lines of their own, without the filter's models.
+The truth and the measurements are made here by a few lines of their own, without the filter's
+models.
 """
 
 import dataclasses
@@ -70,15 +71,15 @@ def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **fron
     front_end = FrontEnd(particles=particles, **front_end)
     window, random = windows.opened(front_end, sensor), generator(seed, "r1", 0, 0)
     for (distance, turn), epoch in zip(run.motions, run.epochs, strict=True):
-        readings = tuple(np.repeat(part, 2) for part in epoch) if twice else epoch
+        measurements = tuple(np.repeat(part, 2) for part in epoch) if twice else epoch
         window = windows.advanced(
-            window, increment_of(motion, 1.0, distance, turn), *readings, random
+            window, increment_of(motion, 1.0, distance, turn), *measurements, random
         )
     return window
 
 
 def bytes_of(window):
-    values = [window.paths, window.epochs, window.ids, window.readings]
+    values = [window.paths, window.epochs, window.ids, window.measurements]
     values += [getattr(window.particles, f.name) for f in dataclasses.fields(window.particles)]
     return [value.tobytes() for value in values]
 
@@ -125,7 +126,7 @@ def batch(run, sensor, ids):
     return reported(found.x), J @ np.linalg.solve(found.jac.T @ found.jac, J.T)
 
 
-def test_a_window_agrees_with_batch_least_squares_over_the_same_readings():
+def test_a_window_agrees_with_batch_least_squares_over_the_same_measurements():
     sensor = Sensor(range_sigma=0.1, bearing_sigma=0.01)
     run = drive(11, sensor, steps=8)
     local = windows.gaussian(driven(run, sensor, particles=4000))
@@ -160,7 +161,9 @@ def test_the_submaps_of_many_particles_are_consistent(sensor):
 
 
 @pytest.mark.parametrize("sensor", [ACCURATE, COARSE], ids=["accurate", "coarse"])
-def test_a_hundred_particles_are_consistent_within_a_tenth_and_two_of_each_reading_are_not(sensor):
+def test_a_hundred_particles_are_consistent_within_a_tenth_and_two_of_each_measurement_are_not(
+    sensor,
+):
     # Moments of 100 weighted samples leave NEES some 7 % high (1.08 and 1.06 over 1200 windows).
     honest = submap_errors(sensor, particles=100, runs=300)
     assert 0.9 < ratio(honest) < 1.1
@@ -169,7 +172,7 @@ def test_a_hundred_particles_are_consistent_within_a_tenth_and_two_of_each_readi
     assert ratio(submap_errors(sensor, particles=100, runs=60, twice=True)) > 1.5
 
 
-def test_solving_the_landmarks_again_takes_out_the_bias_of_the_first_reading():
+def test_solving_the_landmarks_again_takes_out_the_bias_of_the_first_measurement():
     with_ekf, again = [], []
     for seed in range(300):
         run = drive(seed, COARSE)
@@ -249,7 +252,7 @@ def test_a_path_is_that_of_the_particles_own_line_of_descent():
         np.testing.assert_allclose(after[:, 1], before[:, 1] + 0.98 * s + 0.1 * c)
 
 
-def test_motion_to_the_windows_end_moves_the_pose_and_keeps_weights_and_readings():
+def test_motion_to_the_windows_end_moves_the_pose_and_keeps_weights_and_measurements():
     window = driven(drive(7, ACCURATE), ACCURATE, resample_below=0.0)
     after = windows.moved(window, increment_of(ROBOT, 1.0, 1.0, 0.0), generator(1, "a", 0, 0))
     np.testing.assert_array_equal(after.particles.log_weights, window.particles.log_weights)
@@ -269,14 +272,18 @@ UNDERFOOT = (np.array([4], np.uint32), np.array([1e-9]), np.array([2.0]))
 DRIVEN = increment_of(ROBOT, 1.0, 1.0, 0.1)
 CASES = {
     "nothing at all": [],
-    "standing without a reading": [(STANDING, NOTHING)],
-    "moving without a reading": [(DRIVEN, NOTHING)] * 5,
-    "one reading from the start": [(STANDING, SIGHT)],
-    "one reading after motion": [(DRIVEN, SIGHT)],
+    "standing without a measurement": [(STANDING, NOTHING)],
+    "moving without a measurement": [(DRIVEN, NOTHING)] * 5,
+    "one measurement from the start": [(STANDING, SIGHT)],
+    "one measurement after motion": [(DRIVEN, SIGHT)],
     "standing before one landmark": [(STANDING, SIGHT)] * 8,
     "a gap": [(GAP, NOTHING)],
-    "a gap and a reading": [(GAP, SIGHT)],
-    "a reading, a gap and the reading again": [(DRIVEN, SIGHT), (GAP, SIGHT), (DRIVEN, SIGHT)],
+    "a gap and a measurement": [(GAP, SIGHT)],
+    "a measurement, a gap and the measurement again": [
+        (DRIVEN, SIGHT),
+        (GAP, SIGHT),
+        (DRIVEN, SIGHT),
+    ],
     "a very far landmark": [(DRIVEN, FAR), (DRIVEN, FAR)],
     "a landmark that jumps": [(DRIVEN, SIGHT), (DRIVEN, ELSEWHERE), (STANDING, ELSEWHERE)],
     "a landmark underfoot": [(DRIVEN, UNDERFOOT), (STANDING, UNDERFOOT), (DRIVEN, SIGHT)],
@@ -307,7 +314,7 @@ def test_a_gap_leaves_the_uncertainty_of_its_odometry():
     assert abs(windows.gaussian(window).covariance[2, 2] / (np.pi**2 / 3.0) - 1.0) < 0.05
 
 
-def test_a_landmark_seen_once_from_the_start_is_its_reading_and_its_noise():
+def test_a_landmark_seen_once_from_the_start_is_its_measurement_and_its_noise():
     window = windows.advanced(
         windows.opened(FrontEnd(), ACCURATE), STANDING, *SIGHT, generator(2, "a", 0, 0)
     )
@@ -364,7 +371,7 @@ def test_headings_about_half_a_turn_have_their_mean_there():
 
 
 @pytest.mark.parametrize("ranges", [(np.nan,), (8.0, np.nan)])
-def test_a_reading_that_is_not_a_number_gives_an_error_that_names_the_matrix(ranges):
+def test_a_measurement_that_is_not_a_number_gives_an_error_that_names_the_matrix(ranges):
     def taken():
         window = windows.opened(FrontEnd(), ACCURATE)
         for z in ranges:

@@ -1,4 +1,6 @@
-"""Joined submaps equal the batch over all raw readings, in any order of arrival, and are honest."""
+"""Joined submaps equal the batch over all raw measurements, in any order of arrival, and are
+honest.
+"""
 
 from dataclasses import replace
 
@@ -46,13 +48,14 @@ def joined(submaps, starts, options=EXACTLY, tick=4):
     return fold
 
 
-# --- the linear case: a robot that knows its heading, so raw readings and submaps are linear ---
+# --- the linear case: a robot that knows its heading, so raw measurements and submaps are linear
+# ---
 
 STEPS, POINTS = 12, 3
 HEADING_VARIANCE = 1e-12
 
 
-def raw_readings(seed=5):
+def raw_measurements(seed=5):
     """Steps (12, 2) and landmarks seen from the end of each step (12, 3, 2), sigma 0.1 and 0.3."""
     rng = np.random.default_rng(seed)
     truth = np.cumsum(rng.normal(1.0, 0.5, (STEPS, 2)), axis=0)
@@ -100,8 +103,8 @@ def windows(steps, sights, length):
 
 
 @pytest.mark.parametrize("length", [1, 2, 3, 4, 6, 12])
-def test_joined_submaps_equal_the_batch_over_all_raw_readings(length):
-    steps, sights = raw_readings()
+def test_joined_submaps_equal_the_batch_over_all_raw_measurements(length):
+    steps, sights = raw_measurements()
     fold = converged(joined(windows(steps, sights, length), [Start("r0", 0, np.zeros(3))]), EXACTLY)
     mean, covariance = batch(steps, sights)
     prior = prior_for(fold, "r0", 0)
@@ -112,7 +115,7 @@ def test_joined_submaps_equal_the_batch_over_all_raw_readings(length):
 
 
 def test_a_chain_split_into_submaps_and_joined_equals_never_having_split_it():
-    steps, sights = raw_readings(6)
+    steps, sights = raw_measurements(6)
     start = [Start("r0", 0, np.array([3.0, -2.0, 0.7]))]
     whole, split = (
         landmark_map(converged(joined(windows(steps, sights, length), start), EXACTLY))

@@ -161,7 +161,7 @@ def test_a_second_place_that_fits_as_well_is_found_and_said():
     assert "another map fits about as well" in text
 
 
-def test_a_place_that_the_readings_exclude_is_no_second_place():
+def test_a_place_that_the_measurements_exclude_is_no_second_place():
     search = searched(mirrored(0.02, OPTIONS))
     assert not search.ambiguous
     assert doubts(search) == []

@@ -24,9 +24,9 @@ EXACTLY = JoinSettings(step_tolerance=1e-11)
 poses = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1)).map(np.array)
 
 
-def residual(observer, teammate, reading):
+def residual(observer, teammate, measurement):
     to = seen_from(observer, teammate[0] + 1j * teammate[1])
-    return np.array([reading[0] - abs(to), wrap(reading[1] - np.angle(to))])
+    return np.array([measurement[0] - abs(to), wrap(measurement[1] - np.angle(to))])
 
 
 @settings(deadline=None, max_examples=60)
@@ -34,13 +34,13 @@ def residual(observer, teammate, reading):
 def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distance, bearing):
     if np.hypot(*(b - a)[:2]) < 0.1:
         return
-    reading = np.array([distance, bearing])
-    r, jacobian = sighting_residual(a, b, reading)
-    np.testing.assert_allclose(wrap(r - residual(a, b, reading)), 0.0, atol=1e-9)
+    measurement = np.array([distance, bearing])
+    r, jacobian = sighting_residual(a, b, measurement)
+    np.testing.assert_allclose(wrap(r - residual(a, b, measurement)), 0.0, atol=1e-9)
     h = 1e-6
     both = np.concatenate([a, b])
     for k, shift in enumerate(h * np.eye(6)):
-        up, down = (residual((both + s)[:3], (both + s)[3:], reading) for s in (shift, -shift))
+        up, down = (residual((both + s)[:3], (both + s)[3:], measurement) for s in (shift, -shift))
         difference = np.array([(up - down)[0], wrap((up - down)[1])]) / (2.0 * h)
         np.testing.assert_allclose(jacobian[:, k], difference, rtol=1e-4, atol=1e-4)
 
@@ -172,7 +172,7 @@ def test_the_fold_without_a_robot_does_not_know_that_it_was_seen():
 def test_one_sighting_that_is_garbage_does_not_bend_the_robust_map():
     world = meeting(8, robots=3)
     options = JoinSettings(robust_c=1.0)
-    wrong = replace(world.sightings[4], reading=np.array([25.0, 2.0]))
+    wrong = replace(world.sightings[4], measurement=np.array([25.0, 2.0]))
     clean, spoilt = (
         landmark_map(converged(joined_with(world.submaps, world.starts, s, options), options))
         for s in (world.sightings, [*world.sightings[:4], wrong, *world.sightings[5:]])
@@ -220,7 +220,7 @@ def test_one_sighting_does_not_join_two_islands_and_the_fold_says_why():
 def test_sightings_that_contradict_each_other_join_nothing():
     submaps, starts, sightings, _ = strangers(1, 6)
     turned = [
-        replace(s, reading=np.array([s.reading[0], wrap(s.reading[1] + 0.9 * k)]))
+        replace(s, measurement=np.array([s.measurement[0], wrap(s.measurement[1] + 0.9 * k)]))
         for k, s in enumerate(sightings)
     ]
     fold = converged(joined_with(submaps, starts, turned, EXACTLY), EXACTLY)
@@ -270,10 +270,10 @@ def test_looks_about_one_direction_reduce_to_their_middle_on_the_circle(distance
         for a in (-spread, 0.0, spread)
     ]
     looks = [look for look in looks if np.hypot(*look.point) > 0.0]
-    reading, covariance = reduced(looks)
+    measurement, covariance = reduced(looks)
     if distance > spread:
-        assert reading[0] == pytest.approx(distance)
-        assert wrap(reading[1] - bearing) == pytest.approx(0.0, abs=1e-9)
+        assert measurement[0] == pytest.approx(distance)
+        assert wrap(measurement[1] - bearing) == pytest.approx(0.0, abs=1e-9)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
 
 

@@ -26,7 +26,7 @@ from team.wire.arrays import from_floats, from_ids
 from tests.teams import LANDMARKS, config, driven, of, published, stream
 
 STREAM = stream("r1", 12)
-READINGS = published(STREAM)
+MEASUREMENTS = published(STREAM)
 KNOWN = KnownMap(np.arange(1, len(LANDMARKS) + 1, dtype=np.uint32), LANDMARKS)
 TOLD = m.KnownMap(0, from_ids(KNOWN.ids), from_floats(KNOWN.landmarks))
 ALL = sorted({estimator for estimator, _ in PAIRS})
@@ -39,14 +39,19 @@ def of_name(estimator, **options):
     return config(estimator=estimator, fusion="alone", **options)
 
 
-def fed(member, readings=READINGS):
+def fed(member, measurements=MEASUREMENTS):
     """Everything that is new, in order."""
     driven = []
-    for reading in readings:
-        if isinstance(reading, m.Observations):
-            member.observe(reading.stamp_ns, translate.scan_of(reading))
-        if isinstance(reading, m.Odometry):
-            interval = reading.stamp_ns, reading.duration_ns, reading.forward, reading.yaw_rate
+    for measurement in measurements:
+        if isinstance(measurement, m.Observations):
+            member.observe(measurement.stamp_ns, translate.scan_of(measurement))
+        if isinstance(measurement, m.Odometry):
+            interval = (
+                measurement.stamp_ns,
+                measurement.duration_ns,
+                measurement.forward,
+                measurement.yaw_rate,
+            )
             driven.append(member.drive(*interval))
     return driven
 
@@ -81,9 +86,9 @@ def by_hand(estimator, robot, start=None):
     for k in range(len(told.end_ns)):
         step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
         rows = seen.rows(k)
-        readings = corrected(robot.sensor, seen.ranges[rows], seen.bearings[rows])
+        measurements = corrected(robot.sensor, seen.ranges[rows], seen.bearings[rows])
         increment = increment_of(robot.motion, *map(float, step))
-        state = stepped(state, increment, robot.sensor, seen.ids[rows], *readings, *more)
+        state = stepped(state, increment, robot.sensor, seen.ids[rows], *measurements, *more)
     return of_pose(state), of_map(state)
 
 
@@ -123,7 +128,7 @@ def test_an_uncertain_start_is_turned_into_the_axes_of_the_pose():
 
 def test_a_map_is_said_once_per_window_and_at_the_end():
     member = estimator_of(of_name("ekf-slam"), 1)
-    said = [each.map_ns for each in fed(member, READINGS[:-2]) if each.map_ns is not None]
+    said = [each.map_ns for each in fed(member, MEASUREMENTS[:-2]) if each.map_ns is not None]
     assert said == [3_000_000_000, 6_000_000_000, 9_000_000_000]
     ended, _ = member.finish()
     assert ended.map_ns == 11_000_000_000
@@ -131,11 +136,11 @@ def test_a_map_is_said_once_per_window_and_at_the_end():
 
 
 @pytest.mark.parametrize("estimator", ALL)
-def test_a_node_says_how_well_its_readings_were_predicted(estimator):
+def test_a_node_says_how_well_its_measurements_were_predicted(estimator):
     node = RobotNode(config(estimator=estimator, fusion=rules_for(estimator)[-1]))
-    said = of(node.handle(TOLD, 0) + driven(node, READINGS), ch.INNOVATION)
+    said = of(node.handle(TOLD, 0) + driven(node, MEASUREMENTS), ch.INNOVATION)
     if estimator == "dead-reckoning":
-        assert not said, "it predicts no readings"
+        assert not said, "it predicts no measurements"
         return
     dof = sum(each.dof for each in said)
     squared = sum(each.squared for each in said)
@@ -156,7 +161,7 @@ def test_a_node_says_how_well_its_readings_were_predicted(estimator):
 def test_the_last_keyframe_is_used_at_the_end(keyframe_s):
     front = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
     member = estimator_of(of_name("ekf-slam", front_end=front), 1)
-    fed(member, READINGS[:-2])
+    fed(member, MEASUREMENTS[:-2])
     before = member.sequence
     ended, uncovered = member.finish()
     assert uncovered == 0
@@ -167,7 +172,7 @@ def test_the_last_keyframe_is_used_at_the_end(keyframe_s):
 @pytest.mark.parametrize("estimator", LOCALISERS)
 def test_who_only_localises_himself_says_no_map(estimator):
     node = RobotNode(of_name(estimator))
-    out = node.handle(TOLD, 0) + driven(node, READINGS)
+    out = node.handle(TOLD, 0) + driven(node, MEASUREMENTS)
     assert of(out, ch.OWN_POSE)
     assert not of(out, ch.OWN_MAP)
     (done,) = of(out, ch.ROBOT_DONE)
@@ -176,17 +181,17 @@ def test_who_only_localises_himself_says_no_map(estimator):
 
 def test_dead_reckoning_has_a_pose_at_every_interval_and_rejects_landmarks():
     node = RobotNode(of_name("dead-reckoning"))
-    out = driven(node, READINGS)
+    out = driven(node, MEASUREMENTS)
     assert [x.stamp_ns for x in of(out, ch.OWN_POSE)] == STREAM.intervals.end_ns.tolist()
     (done,) = of(out, ch.ROBOT_DONE)
-    told = {entry.disposition: entry.readings for entry in done.ledger}
+    told = {entry.disposition: entry.measurements for entry in done.ledger}
     assert told["rejected: this estimator uses no landmarks"] == 12
     assert told["in the running pose"] == 12
 
 
 def test_localisation_waits_for_the_map_that_it_is_told():
     node = RobotNode(of_name("localisation"))
-    assert driven(node, READINGS) == []
+    assert driven(node, MEASUREMENTS) == []
     out = node.handle(TOLD, 0)
     assert len(of(out, ch.OWN_POSE)) == 12
     assert len(of(out, ch.ROBOT_DONE)) == 1
@@ -205,12 +210,12 @@ def test_localisation_finds_itself_from_an_unknown_start():
 
 
 def test_the_last_word_names_the_last_map():
-    out = driven(RobotNode(of_name("ekf-slam")), READINGS[:-2])
+    out = driven(RobotNode(of_name("ekf-slam")), MEASUREMENTS[:-2])
     maps, (done,) = of(out, ch.OWN_MAP), of(out, ch.ROBOT_DONE)
     assert (done.epoch, done.last_map) == (maps[-1].epoch, maps[-1].sequence)
     assert [x.sequence for x in maps] == [3, 6, 9, 11]
     assert all(x.joint for x in maps)
-    own = driven(RobotNode(config()), READINGS)
+    own = driven(RobotNode(config()), MEASUREMENTS)
     assert of(own, ch.ROBOT_DONE)[0].last_map == -1, "under `join` nobody consumes own maps"
 
 
@@ -220,6 +225,6 @@ def test_what_has_no_meaning_is_refused_with_the_estimators_name(estimator):
     assert not isinstance(member, AbsorbsMaps)
     assert not isinstance(member, MakesSubmaps)
     node = RobotNode(of_name(estimator))
-    (submap,) = of(driven(RobotNode(config()), READINGS), ch.SUBMAP)[:1]
+    (submap,) = of(driven(RobotNode(config()), MEASUREMENTS), ch.SUBMAP)[:1]
     with pytest.raises(ValueError, match="no submaps to resume from"):
-        node.resume(READINGS[0], [submap])
+        node.resume(MEASUREMENTS[0], [submap])

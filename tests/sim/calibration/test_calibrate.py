@@ -1,4 +1,4 @@
-"""Calibration: what was put into readings comes out of them, within its own uncertainty."""
+"""Calibration: what was put into measurements comes out of them, within its own uncertainty."""
 
 import re
 from collections.abc import Sequence
@@ -115,7 +115,7 @@ def bases() -> list[Reference]:
     return [driven(seed) for seed in range(1, 6)]
 
 
-def test_the_odometrys_figures_come_out_of_readings_within_their_uncertainty(
+def test_the_odometrys_figures_come_out_of_measurements_within_their_uncertainty(
     bases: list[Reference],
 ) -> None:
     found = by_name(jackknifed(lambda part: fit_motion(part, None), bases, MOTION_UNITS))
@@ -157,7 +157,7 @@ def test_a_turn_of_the_odometry_that_is_not_the_robots_own_is_found_out(
     assert found["yaw_scale"] == pytest.approx(-0.9, abs=0.02)
 
 
-def test_the_sensors_figures_come_out_of_readings_within_their_uncertainty() -> None:
+def test_the_sensors_figures_come_out_of_measurements_within_their_uncertainty() -> None:
     data = [seeing(seed) for seed in range(1, 6)]
     found = by_name(jackknifed(fit_sensor, data, SENSOR_UNITS))
     true = {"range_scale": 0.95, "range_offset": 0.1, "bearing_offset": 0.02}
@@ -193,7 +193,9 @@ def test_what_hangs_on_one_group_is_no_figure(bases: list[Reference]) -> None:
     ]
 
 
-def test_one_robots_log_is_cut_into_stretches_that_lose_no_reading(bases: list[Reference]) -> None:
+def test_one_robots_log_is_cut_into_stretches_that_lose_no_measurement(
+    bases: list[Reference],
+) -> None:
     groups = groups_of(bases[:1])
     ends = np.concatenate([part.intervals.end_ns for group in groups for part in group])
     np.testing.assert_array_equal(ends, bases[0].intervals.end_ns)
@@ -246,14 +248,14 @@ def test_two_robots_that_turn_as_far_as_they_like_are_calibrated(turns_first: bo
     assert abs(wrong["forward_scale"] - 1.05) + wrong["turn_drag"] > 0.05
 
 
-def test_too_little_motion_or_too_few_readings_are_said(bases: list[Reference]) -> None:
+def test_too_little_motion_or_too_few_measurements_are_said(bases: list[Reference]) -> None:
     with pytest.raises(CalibrationError, match="stretches of 10 s of motion"):
         fit_motion([bases[0].between(0, 60 * SECOND)], None)
-    with pytest.raises(CalibrationError, match="readings of landmarks"):
+    with pytest.raises(CalibrationError, match="measurements of landmarks"):
         fit_sensor(bases)
 
 
-def test_the_readings_of_a_log_are_the_worlds() -> None:
+def test_the_measurements_of_a_log_are_the_worlds() -> None:
     team = scenario(robots=2)
     told = streams(team)
     read = recorded_streams([opened(sample)[2] for sample in world_log(team)], "a log")

@@ -1,4 +1,4 @@
-"""Models that do not fit the data: told from the team's own readings, and a way through it."""
+"""Models that do not fit the data: told from the team's own measurements, and a way through it."""
 
 from dataclasses import dataclass
 

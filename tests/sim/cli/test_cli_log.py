@@ -60,7 +60,7 @@ def test_info_fits_eighty_columns_and_steers_no_terminal(
     assert ("source/r1/odometry" if options else "odometry") in out
 
 
-def test_what_is_said_before_the_readings_has_neither_time_nor_rate(tmp_path: Path) -> None:
+def test_what_is_said_before_the_measurements_has_neither_time_nor_rate(tmp_path: Path) -> None:
     late = [s for s in published() if "odometry" in s.key and s.counter > 5]
     config = next(s for s in published() if s.key == "world/config")
     with Recorder(tmp_path / "late.mcap", "small", {}) as recorder:
@@ -143,7 +143,7 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
         recorder.write(own)
     status, _, err = run("export", alone, "--format", "utias", "-o", tmp_path / "out")
     assert status == 2
-    assert "r1.mcap: it sights r2, of whom it has no readings; `teamslam log merge`" in err
+    assert "r1.mcap: it sights r2, of whom it has no measurements; `teamslam log merge`" in err
     with Recorder(tmp_path / "gap.mcap", "small", {}) as recorder:
         recorder.write([s for s in own if s.counter != 3 and "sight" not in s.key])
     status, _, err = run("export", tmp_path / "gap.mcap", "--format", "utias", "-o", tmp_path / "o")
@@ -159,7 +159,7 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
         (["cut", "LOG", "-o", "LOG"], "exists: choose another name or remove it"),
         (["cut", "LOG", "-o", "new", "--from", "5", "--to", "5"], "the first before the second"),
         (["cut", "LOG", "-o", "new", "--from", "nan"], "give seconds"),
-        (["cut", "LOG", "-o", "new", "--from", "50"], "its readings are from 0 to 20.000 s"),
+        (["cut", "LOG", "-o", "new", "--from", "50"], "its measurements are from 0 to 20.000 s"),
         (["cut", "LOG", "-o", "new", "--channels", "odo"], "no channel 'odo'; there are start, "),
         (["merge", "LOG", "nowhere.mcap", "-o", "new"], "nowhere.mcap: not found"),
         (["merge", "LOG", "-o", "LOG"], "exists: choose another name"),

@@ -1,7 +1,7 @@
 """Data sets with a fault each: the team still ends with a sound map, and it is said what was wrong.
 
 The faults are those of sets that people have: files that are missing, foreign barcodes, rows out
-of order, gaps. Readings and repairs themselves are tested in test_utias.
+of order, gaps. Measurements and repairs themselves are tested in test_utias.
 """
 
 import zipfile
@@ -85,7 +85,7 @@ class Fault:
     surveyed: bool = True
 
 
-NO_START = "no ground truth at its first reading: its start pose is not known"
+NO_START = "no ground truth at its first measurement: its start pose is not known"
 FAULTS = {
     "none, in a zip of another name": Fault(zipped, ()),
     "no truth of one robot": Fault(
@@ -105,7 +105,7 @@ FAULTS = {
     "no odometry of one robot": Fault(
         removed("Robot2_Odometry"), ("r2: no odometry: only what it saw is given",)
     ),
-    "no readings of one robot": Fault(
+    "no measurements of one robot": Fault(
         removed("Robot2_Measurement"), ("r2: no measurements: only its odometry is given",)
     ),
     "unknown barcodes": Fault(

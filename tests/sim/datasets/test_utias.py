@@ -61,7 +61,7 @@ def without_empty_messages(stream: RobotStream) -> np.ndarray:
     return keep
 
 
-def assert_same_readings(given: RobotStream, found: RobotStream, shift: int) -> None:
+def assert_same_measurements(given: RobotStream, found: RobotStream, shift: int) -> None:
     keep = without_empty_messages(given)
     assert np.array_equal(found.kinds, given.kinds[keep])
     assert np.array_equal(found.stamps_ns, given.stamps_ns[keep])
@@ -85,7 +85,7 @@ def test_what_is_written_is_read_again(folder: Path, simulated: WorldStreams) ->
     assert np.allclose(found.landmarks, simulated.landmarks, rtol=0, atol=1e-9)
     assert found.source == "UTIAS data set MRCLAM_Dataset0"
     for given, read_again in zip(simulated.streams, found.streams, strict=True):
-        assert_same_readings(given, read_again, 5)
+        assert_same_measurements(given, read_again, 5)
         assert read_again.start.covariance is None
         assert np.allclose(read_again.start.pose, given.start.pose, rtol=0, atol=1e-9)
 
@@ -103,7 +103,7 @@ def test_more_robots_than_the_rig_had_can_be_written_and_read(tmp_path: Path) ->
     found = read(tmp_path, 7)
     assert landmark_shift(given) == 7
     for a, b in zip(given.streams, found.streams, strict=True):
-        assert_same_readings(a, b, 7)
+        assert_same_measurements(a, b, 7)
 
 
 def test_what_was_read_and_written_is_read_the_same(folder: Path, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_odometry_acts_later_by_its_delay(folder: Path) -> None:
     assert np.array_equal(seen.ranges, before.ranges), "the camera's clock stays"
 
 
-def test_a_robots_clock_offset_orders_its_readings_and_leaves_its_stamps(folder: Path) -> None:
+def test_a_robots_clock_offset_orders_its_measurements_and_leaves_its_stamps(folder: Path) -> None:
     world = UtiasWorld(path=str(folder), odometry_delay_s=0.1)
     robots = [msgspec.structs.replace(team(1)[0], clock_offset_s=0.4)]
     (stream,) = utias(world, robots).streams
@@ -168,7 +168,7 @@ def test_a_simulated_clock_offset_is_written_as_the_odometry_stamps_it(
     assert first == [0.0, 0.0], "the world began 0.25 s later, the odometry's clock reads 0 there"
     found = utias(UtiasWorld(path=str(tmp_path / "late")), [off, *team(3)[1:]])
     given = streams_of(late)
-    assert_same_readings(given.streams[0], found.streams[0], 5)
+    assert_same_measurements(given.streams[0], found.streams[0], 5)
 
 
 @pytest.mark.parametrize("name", ["waypoints", "downs-100"])
@@ -312,7 +312,7 @@ def test_without_its_truth_a_robots_start_is_unknown_and_it_is_said(folder: Path
     (folder / "Robot2_Groundtruth.dat").unlink()
     found = read(folder).streams
     assert (found[1].start, found[1].truth, found[1].truth_ns) == (None, None, None)
-    assert "no ground truth at its first reading: its start pose is not known" in found[1].notes
+    assert "no ground truth at its first measurement: its start pose is not known" in found[1].notes
     assert found[0].start is not None
 
 
@@ -331,7 +331,9 @@ def test_long_gaps_are_said(folder: Path) -> None:
     assert "ground truth has gaps, the longest of 6.0 s" in notes
 
 
-def test_a_set_without_a_survey_has_no_true_landmarks_but_the_same_readings(folder: Path) -> None:
+def test_a_set_without_a_survey_has_no_true_landmarks_but_the_same_measurements(
+    folder: Path,
+) -> None:
     expected = read(folder)
     (folder / "Landmark_Groundtruth.dat").unlink()
     found = read(folder)
@@ -424,7 +426,7 @@ def barcodes(*rows: str) -> Callable[[Path], None]:
         ),
         (
             lambda folder: [path.unlink() for path in folder.glob("Robot1_*")],
-            "the data set has no readings of a robot r1; it has r2, r3",
+            "the data set has no measurements of a robot r1; it has r2, r3",
         ),
         (
             lambda folder: [path.unlink() for path in folder.glob("Robot*")],
@@ -446,7 +448,7 @@ def test_damage_is_named_with_file_line_and_text(
 
 
 def test_a_robot_of_another_name_is_refused(folder: Path) -> None:
-    with pytest.raises(DatasetError, match="no readings of a robot alice; it has r1, r2, r3"):
+    with pytest.raises(DatasetError, match="no measurements of a robot alice; it has r1, r2, r3"):
         utias(UtiasWorld(path=str(folder)), [RobotConfig(id="alice")])
 
 
@@ -515,18 +517,18 @@ def range_errors(world: WorldStreams, landmark: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("number", "odometry_rows", "measurements"), [(2, 597_764, 46_499), (6, 301_431, 19_377)]
 )
-def test_of_a_real_set_every_row_is_a_reading_or_in_a_note(
+def test_of_a_real_set_every_row_is_a_measurement_or_in_a_note(
     number: int, odometry_rows: int, measurements: int
 ) -> None:
     world = real(number)
     counts = [int(note.split()[0]) for s in world.streams for note in s.notes if "drop" in note]
-    readings = sum(
+    measurements = sum(
         len(stream.landmark_detections.ids) + len(stream.teammate_detections.ids)
         for stream in world.streams
     )
     intervals = sum(len(stream.intervals.end_ns) for stream in world.streams)
     last_rows = len(world.streams)  # the last row of a robot has no next one that ends it
-    assert intervals + last_rows + readings + sum(counts) == odometry_rows + measurements
+    assert intervals + last_rows + measurements + sum(counts) == odometry_rows + measurements
     for landmark in world.landmark_ids.tolist():
         assert abs(np.median(range_errors(world, landmark))) < 0.25
     for stream in world.streams:

@@ -42,10 +42,10 @@ def test_the_thesis_team_ends_with_a_map_of_finite_values(estimator, fusion):
     for sample in samples:
         channel, name, message = opened(sample)
         if channel is ch.ROBOT_DONE:
-            assert sum(e.readings for e in message.ledger) == message.readings
-            consumed[name] = message.readings
+            assert sum(e.measurements for e in message.ledger) == message.measurements
+            consumed[name] = message.measurements
     (end,) = (opened(s)[2] for s in samples if s.key == ch.END.key())
-    assert consumed == {s.robot: s.readings for s in end.streams}
+    assert consumed == {s.robot: s.measurements for s in end.streams}
 
 
 def test_run_twice_everything_is_equal():  # of every pair: tests/test_bits.py

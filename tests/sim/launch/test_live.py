@@ -23,12 +23,12 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
     watch = Watch(robots=3, place="--team t --connect tcp/127.0.0.1:1")
-    watch.statuses["world"] = status("world", "waiting", readings=0.0, of=100.0)
+    watch.statuses["world"] = status("world", "waiting", measurements=0.0, of=100.0)
     watch.statuses["robot/r1"] = status("robot/r1", "waiting")
     lines.show(watch)
-    watch.statuses["world"] = status("world", "publishing", readings=90.0, of=100.0)
-    watch.statuses["robot/r1"] = status("robot/r1", "mapping", readings=30.0)
-    watch.statuses["robot/r2"] = status("robot/r2", "mapping", readings=20.0)
+    watch.statuses["world"] = status("world", "publishing", measurements=90.0, of=100.0)
+    watch.statuses["robot/r1"] = status("robot/r1", "mapping", measurements=30.0)
+    watch.statuses["robot/r2"] = status("robot/r2", "mapping", measurements=20.0)
     lines.show(watch)
     place, waiting, running = out.getvalue().splitlines()
     assert place.endswith("by --team t --connect tcp/127.0.0.1:1")
@@ -38,7 +38,7 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
 
 def told(robots: int, *, truth: bool) -> Watch:
     watch = Watch(robots=robots)
-    watch.statuses["world"] = status("world", "publishing", readings=5.0, of=10.0)
+    watch.statuses["world"] = status("world", "publishing", measurements=5.0, of=10.0)
     watch.statuses["central"] = status("central", "joining", joint_cost_per_dof=1.07, submaps=9.0)
     for k in range(1, robots + 1):
         watch.statuses[f"robot/r{k}"] = status(
@@ -93,13 +93,13 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.Mo
     watch = Watch(robots=2)
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
     watch.statuses["recorder"] = m.Status(0, "recorder", "recording", {}, missing)
-    late = m.Status(0, "robot/r1", "waiting", {}, ("no readings of this team yet",))
+    late = m.Status(0, "robot/r1", "waiting", {}, ("no measurements of this team yet",))
     watch.statuses["robot/r1"] = late
     assert live._warnings(watch) == [f"recorder: {'; '.join(missing)}"]
     watch.statuses["world"] = m.Status(0, "world", "waiting", {}, ("waiting for robot/r2",))
     assert live._warnings(watch) == ["world: waiting for robot/r2"]
     watch.statuses["world"] = m.Status(0, "world", "publishing", {}, ())
-    assert "robot/r1: no readings of this team yet" in live._warnings(watch)
+    assert "robot/r1: no measurements of this team yet" in live._warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
     assert live._warnings(watch)[0] == "robot-r2 (pid 7) was killed"
 
@@ -109,7 +109,7 @@ def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.Monk
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
     watch = Watch(robots=1)
-    watch.statuses["world"] = status("world", "publishing", readings=1.0, of=2.0)
+    watch.statuses["world"] = status("world", "publishing", measurements=1.0, of=2.0)
     for cost in ("8.8", "9.1", "9.4"):
         warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
         watch.statuses["central"] = m.Status(0, "central", "joining", {}, (warning,))

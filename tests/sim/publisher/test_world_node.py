@@ -34,8 +34,8 @@ def all_of(node, clock=0.0):
     return out
 
 
-def readings(out):
-    return [o.message for o in out if isinstance(o.message, m.Reading)]
+def measurements(out):
+    return [o.message for o in out if isinstance(o.message, m.Measurement)]
 
 
 def progress(robot, count, epoch=1, node="robot"):
@@ -51,7 +51,7 @@ def test_it_waits_for_everyone_and_says_for_whom():
         assert name in node.status().warnings[0]
         alive(node, name)
     assert node.waiting_for == []
-    assert readings(node.publish(5.0))
+    assert measurements(node.publish(5.0))
 
 
 def test_it_does_not_begin_without_one_that_came_and_went():
@@ -62,12 +62,12 @@ def test_it_does_not_begin_without_one_that_came_and_went():
     assert node.publish(0.0) == []
 
 
-def test_readings_come_by_stamp_then_robot_and_count_from_0():
-    out = readings(all_of(world()))
+def test_measurements_come_by_stamp_then_robot_and_count_from_0():
+    out = measurements(all_of(world()))
     assert [(r.stamp_ns, r.robot) for r in out] == sorted((r.stamp_ns, r.robot) for r in out)
     for each in STREAMS.streams:
         mine = [r for r in out if r.robot == each.robot]
-        assert [r.reading for r in mine] == list(range(len(each)))
+        assert [r.number for r in mine] == list(range(len(each)))
         assert {r.epoch for r in mine} == {1}
         assert isinstance(mine[0], m.Start)
 
@@ -76,9 +76,9 @@ def test_a_batch_spans_no_more_than_it_may():
     node = world(batch_s=0.4)
     batches = []
     while not node.ended:
-        batches.append([r.stamp_ns for r in readings(node.publish(0.0))])
+        batches.append([r.stamp_ns for r in measurements(node.publish(0.0))])
     in_order = [stamp_ns for batch in batches for stamp_ns in batch]
-    assert in_order == [r.stamp_ns for r in readings(all_of(world()))]
+    assert in_order == [r.stamp_ns for r in measurements(all_of(world()))]
     assert all(batches)
     assert max(max(batch) - min(batch) for batch in batches) < 400_000_000
     for batch, later in pairwise(batches):
@@ -102,7 +102,7 @@ def test_it_ends_once_with_the_last_counters():
     out = all_of(node)
     (end,) = of(out, ch.END)
     assert out[-1].message is end
-    assert [(s.robot, s.epoch, s.readings) for s in end.streams] == [
+    assert [(s.robot, s.epoch, s.measurements) for s in end.streams] == [
         (each.robot, 1, len(each)) for each in STREAMS.streams
     ]
     assert node.publish(1e9) == []
@@ -112,16 +112,16 @@ def test_it_ends_once_with_the_last_counters():
 
 @pytest.mark.parametrize("slow", ["r1", "r2"])
 def test_it_is_never_more_than_its_credit_ahead_of_a_living_robot(monkeypatch, slow):
-    monkeypatch.setattr(world_node, "CREDIT_READINGS", 5)
+    monkeypatch.setattr(world_node, "CREDIT_MEASUREMENTS", 5)
     node = world()
     for name in ("robot/r1", "robot/r2"):
         alive(node, name)
     consumed = {"r1": 0, "r2": 0}
     sent = {"r1": 0, "r2": 0}
     for _ in range(2):
-        for reading in readings(node.publish(0.0)):
-            sent[reading.robot] += 1
-            assert sent[reading.robot] - consumed[reading.robot] <= 5
+        for measurement in measurements(node.publish(0.0)):
+            sent[measurement.robot] += 1
+            assert sent[measurement.robot] - consumed[measurement.robot] <= 5
         (other,) = {"r1", "r2"} - {slow}
         consumed[other] = sent[other]
         node.handle(progress(other, sent[other]), 0)
@@ -129,11 +129,11 @@ def test_it_is_never_more_than_its_credit_ahead_of_a_living_robot(monkeypatch, s
     assert not node.ended
     node.handle(progress(slow, 3), 0)
     node.handle(progress(slow, 1), 0)
-    for reading in readings(node.publish(0.0)):
-        sent[reading.robot] += 1
+    for measurement in measurements(node.publish(0.0)):
+        sent[measurement.robot] += 1
     assert sent[slow] == 8, "progress that comes late takes no credit back"
     node.handle(progress(slow, 100, epoch=9), 0)
-    assert readings(node.publish(0.0)) == [], "nor does another epoch's give any"
+    assert measurements(node.publish(0.0)) == [], "nor does another epoch's give any"
     node.handle(progress(other, 1000), 0)
     alive(node, f"robot/{slow}", here=False)
     all_of(node)
@@ -144,11 +144,11 @@ def test_the_recorder_is_waited_for_while_it_lives(monkeypatch):
     monkeypatch.setattr(world_node, "CREDIT_RECORDER", 10)
     node = world()
     alive(node, "recorder")
-    assert len(readings(node.publish(0.0))) == 10
-    assert readings(node.publish(0.0)) == []
+    assert len(measurements(node.publish(0.0))) == 10
+    assert measurements(node.publish(0.0)) == []
     node.handle(progress("r1", 2, node="recorder"), 0)
     node.handle(progress("r2", 2, node="recorder"), 0)
-    assert len(readings(node.publish(0.0))) == 4
+    assert len(measurements(node.publish(0.0))) == 4
     alive(node, "recorder", here=False)
     all_of(node)
 
@@ -158,14 +158,14 @@ def test_a_recorder_that_comes_late_is_waited_for_until_it_has_what_can_be_had(m
     monkeypatch.setattr(world_node, "CREDIT_RECORDER", 10)
     monkeypatch.setattr(world_node, "BATCH", 15)
     node = world(cache=cache)
-    sent = len(readings(node.publish(0.0)))
+    sent = len(measurements(node.publish(0.0)))
     for _ in range(2):
         alive(node, "recorder")
         if cache is None:
-            assert readings(node.publish(0.0)) == [], "it has not said yet what its log has"
+            assert measurements(node.publish(0.0)) == [], "it has not said yet what its log has"
             node.handle(progress("r1", sent, node="recorder"), 0)
             assert node.unrecorded == 0
-        taken = len(readings(node.publish(0.0)))
+        taken = len(measurements(node.publish(0.0)))
         assert 0 < taken <= 10
         sent += taken
         assert node.unrecorded > 0
@@ -176,7 +176,7 @@ def test_a_recorder_that_comes_late_is_waited_for_until_it_has_what_can_be_had(m
 
 
 def test_who_holds_the_team_up_is_named(monkeypatch):
-    monkeypatch.setattr(world_node, "CREDIT_READINGS", 5)
+    monkeypatch.setattr(world_node, "CREDIT_MEASUREMENTS", 5)
     node = world()
     alive(node, "robot/r1")
     for clock in (0.0, 4.0):
@@ -191,9 +191,9 @@ def test_who_holds_the_team_up_is_named(monkeypatch):
 
 def test_at_a_given_speed_it_publishes_what_is_due():
     node = world(speed=2.0)
-    last = [max((r.stamp_ns for r in readings(node.publish(100.0))), default=None)]
+    last = [max((r.stamp_ns for r in measurements(node.publish(100.0))), default=None)]
     for clock in (100.25, 101.0, 102.0):
-        due = readings(node.publish(clock))
+        due = measurements(node.publish(clock))
         assert all(r.stamp_ns <= (clock - 100.0) * 2e9 for r in due)
         last.append(max((r.stamp_ns for r in due), default=None))
     assert last == [0, None, 2_000_000_000, 4_000_000_000]
@@ -203,16 +203,16 @@ def test_at_a_given_speed_it_publishes_what_is_due():
 def test_at_speed_max_only_credit_holds_it_back():
     node = world()
     out = node.publish(7.0)
-    assert len(readings(out)) == sum(len(each) for each in STREAMS.streams)
+    assert len(measurements(out)) == sum(len(each) for each in STREAMS.streams)
 
 
 def wanted(node, robot="r1", epoch=1, first=0, last=-1):
-    return list(node.readings(encoded(m.ReadingsWanted(0, robot, epoch, first, last))))
+    return list(node.measurements(encoded(m.MeasurementsRequest(0, robot, epoch, first, last))))
 
 
 def test_what_is_asked_for_is_answered_with_the_bytes_that_were_published():
     node = world()
-    out = [encoded(r) for r in readings(all_of(node)) if r.robot == "r1"]
+    out = [encoded(r) for r in measurements(all_of(node)) if r.robot == "r1"]
     assert wanted(node) == wanted(node, epoch=0) == out
     assert wanted(node, first=3, last=5) == out[3:6]
     assert wanted(node, first=len(out) - 1, last=10_000) == out[-1:]
@@ -225,7 +225,7 @@ def test_only_what_was_published_is_answered_and_in_portions(monkeypatch):
     monkeypatch.setattr(world_node, "ANSWER", 3)
     node = world()
     assert wanted(node) == []
-    out = [encoded(r) for r in readings(node.publish(0.0)) if r.robot == "r2"]
+    out = [encoded(r) for r in measurements(node.publish(0.0)) if r.robot == "r2"]
     got = []
     while part := wanted(node, robot="r2", first=len(got)):
         assert len(part) <= 3
@@ -235,20 +235,20 @@ def test_only_what_was_published_is_answered_and_in_portions(monkeypatch):
 
 def test_a_query_that_is_damaged_is_an_error_that_says_so():
     with pytest.raises(WireError):
-        list(world().readings(b"\x93nonsense"))
+        list(world().measurements(b"\x93nonsense"))
 
 
 def test_who_asks_for_what_is_no_longer_kept_gets_a_new_epoch_at_a_free_pose(monkeypatch):
     monkeypatch.setattr(world_node, "BATCH", 12)
     node = world(cache=3)
-    before = [r for r in readings(node.publish(0.0)) if r.robot == "r1"]
+    before = [r for r in measurements(node.publish(0.0)) if r.robot == "r1"]
     assert wanted(node, first=len(before) - 3) == [encoded(r) for r in before[-3:]]
     assert wanted(node, first=0) == []
     assert wanted(node, first=0) == [], "asked twice, there is still one new epoch"
     out = all_of(node)
-    mine = [r for r in readings(out) if r.robot == "r1"]
+    mine = [r for r in measurements(out) if r.robot == "r1"]
     assert {r.epoch for r in mine} == {2}
-    assert [r.reading for r in mine] == list(range(len(mine)))
+    assert [r.number for r in mine] == list(range(len(mine)))
     assert isinstance(mine[0], m.Start)
     assert (mine[0].pose, mine[0].covariance) == (b"", b"")
     (end,) = of(out, ch.END)
@@ -313,7 +313,7 @@ def test_it_is_finished_with_the_final_map():
 
 
 def again(r1: int, r2: int, recorder=None, **options):
-    """A world that is started anew while its robots have so many readings."""
+    """A world that is started anew while its robots have so many measurements."""
     expected = expected_nodes(["r1", "r2"], recorder=recorder is not None)
     node = world(expected=expected, **options)
     for name in sorted(expected):
@@ -326,29 +326,29 @@ def again(r1: int, r2: int, recorder=None, **options):
 
 
 def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
-    before = readings(all_of(world()))
+    before = measurements(all_of(world()))
     node = again(7, 5)
-    out = readings(all_of(node))
+    out = measurements(all_of(node))
     starts = [r for r in out if isinstance(r, m.Start)]
-    assert {(r.robot, r.reading, r.epoch) for r in starts} == {("r1", 0, 1), ("r2", 0, 1)}
+    assert {(r.robot, r.number, r.epoch) for r in starts} == {("r1", 0, 1), ("r2", 0, 1)}
     least = {"r1": 7, "r2": 5}
-    assert out[len(starts) :] == [r for r in before if r.reading >= least[r.robot]]
-    assert node.status().figures["readings"] == len(before)
-    request = encoded(m.ReadingsWanted(0, "r1", 1, 0, -1))
-    assert [decoded(reply).reading for reply in node.readings(request)] == list(range(26))
+    assert out[len(starts) :] == [r for r in before if r.number >= least[r.robot]]
+    assert node.status().figures["measurements"] == len(before)
+    request = encoded(m.MeasurementsRequest(0, "r1", 1, 0, -1))
+    assert [decoded(reply).number for reply in node.measurements(request)] == list(range(26))
 
 
 def test_a_world_that_is_started_again_gives_the_recorder_what_it_lacks():
-    out = readings(all_of(again(7, 5, recorder=3)))
-    assert min(r.reading for r in out if not isinstance(r, m.Start)) == 3
+    out = measurements(all_of(again(7, 5, recorder=3)))
+    assert min(r.number for r in out if not isinstance(r, m.Start)) == 3
 
 
 def test_a_world_that_is_started_again_is_paced_from_where_it_goes_on():
     node = again(12, 12, speed=2.0)
-    first = [r for r in readings(node.publish(100.0)) if not isinstance(r, m.Start)]
+    first = [r for r in measurements(node.publish(100.0)) if not isinstance(r, m.Start)]
     begins_ns = min(r.stamp_ns for r in first)
     assert begins_ns > 4_000_000_000
-    later = readings(node.publish(101.0))
+    later = measurements(node.publish(101.0))
     assert max(r.stamp_ns for r in later) == begins_ns + 2_000_000_000
 
 
@@ -356,15 +356,15 @@ def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_eve
     node = world(expected=expected_nodes(["r1", "r2"], recorder=False))
     node.handle(progress("r1", 7), 0)
     assert node.publish(100.0) == []
-    assert readings(node.publish(100.0 + world_node.RESUME_S))
+    assert measurements(node.publish(100.0 + world_node.RESUME_S))
 
 
 def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot_is():
     node = world()
     node.handle(m.Progress(5_000_000_000, "robot/r1", "r1", 3, 4, 0), 0)
-    out = [r for r in readings(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
+    out = [r for r in measurements(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
     assert {r.epoch for r in out} == {4}
-    assert [r.reading for r in out] == list(range(len(out)))
+    assert [r.number for r in out] == list(range(len(out)))
     assert min(r.stamp_ns for r in out) == 5_000_000_000
 
 
@@ -373,4 +373,4 @@ def test_a_world_begins_without_a_node_that_is_given_up():
     alive(node, "robot/r1")
     assert node.publish(0.0) == []
     node.handle(m.GivenUp(0, "recorder", "launch", "it died 5 times"), 0)
-    assert readings(node.publish(0.0))
+    assert measurements(node.publish(0.0))

@@ -38,7 +38,7 @@ ODOMETRY_OF_SUBMAP_3 = 35
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory: pytest.TempPathFactory) -> list[Sample]:
-    """A run whose readings come second by second, so that maps come back while robots drive."""
+    """A run whose measurements come second by second, so that maps come back while robots drive."""
     hurried = written(tmp_path_factory.mktemp("log") / "log.mcap", team_samples(thesis(STEPS)))
     return changed_run(hurried, Changes())
 
@@ -64,11 +64,11 @@ def with_one_bit(message: m.Message) -> m.Message:
 
 
 def flipped(samples: list[Sample]) -> list[Sample]:
-    """One bit of one odometry reading of r2 is another."""
-    counter = messages(samples, ch.ODOMETRY, "r2")[ODOMETRY_OF_SUBMAP_3].reading
+    """One bit of one odometry measurement of r2 is another."""
+    counter = messages(samples, ch.ODOMETRY, "r2")[ODOMETRY_OF_SUBMAP_3].number
 
     def change(message: m.Message) -> m.Message:
-        hit = (message.robot, message.reading) == ("r2", counter)
+        hit = (message.robot, message.number) == ("r2", counter)
         return with_one_bit(message) if hit else message
 
     return changed(samples, ch.ODOMETRY, change)
@@ -118,7 +118,7 @@ def test_a_tampered_own_map_is_found_and_so_is_what_was_made_of_it(
     assert found == {"own_map": 1, "final_map": 1}
 
 
-def test_a_flipped_bit_of_one_odometry_reading_is_traced_to_its_submap(
+def test_a_flipped_bit_of_one_odometry_measurement_is_traced_to_its_submap(
     samples: list[Sample], tmp_path: Path
 ) -> None:
     result = verify(written(tmp_path / "log.mcap", flipped(samples)))
@@ -126,7 +126,7 @@ def test_a_flipped_bit_of_one_odometry_reading_is_traced_to_its_submap(
     assert first is not None
     assert (first.key, first.counter) == ("robot/r2/submap", 3)
     assert first.field.startswith("mean[")
-    assert counts(result)["submap"] == (12, 11), "no other submap depends on that reading"
+    assert counts(result)["submap"] == (12, 11), "no other submap depends on that measurement"
     for name in ("fused_map", "prior", "final_map", "trajectory"):
         assert counts(result)[name][0] == counts(result)[name][1], "maps follow from submaps"
 
@@ -149,7 +149,7 @@ def test_a_tampered_map_is_the_only_one_that_differs(samples: list[Sample], tmp_
     assert recorded == pytest.approx(recomputed + 0.25)
 
 
-def test_a_missing_reading_is_named_and_the_windows_behind_it_come_out(
+def test_a_missing_measurement_is_named_and_the_windows_behind_it_come_out(
     samples: list[Sample], tmp_path: Path
 ) -> None:
     lost = messages(samples, ch.ODOMETRY, "r2")[ODOMETRY_OF_SUBMAP_3]
@@ -157,7 +157,7 @@ def test_a_missing_reading_is_named_and_the_windows_behind_it_come_out(
     result = verify(written(tmp_path / "log.mcap", cut))
     assert counts(result)["submap"] == (12, 11)
     assert result.first is not None
-    assert f"reading {lost.reading} is not in the log" in result.first.recomputed
+    assert f"measurement {lost.number} is not in the log" in result.first.recomputed
 
 
 def test_on_another_platform_numbers_are_compared_within_a_tolerance(
@@ -185,7 +185,7 @@ def test_on_another_platform_numbers_are_compared_within_a_tolerance(
 def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team:
     """Two robots in any order of delivery; r1 is killed on the way, and comes again or not.
 
-    cache: how many readings its source has kept then; with too few a new epoch begins.
+    cache: how many measurements its source has kept then; with too few a new epoch begins.
     """
     robots = [stream("r1", 40), stream("r2", 40, y=1.0)]
     team = Team(world_of(*robots), [config("r1"), config("r2")], random.Random(seed))
@@ -197,8 +197,8 @@ def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team
         if not dies:
             team.resume(config("r1"))
             team.world.cache = cache
-            first = team.robots["r1"].next_reading
-            team.world.readings(encoded(m.ReadingsWanted(0, "r1", 0, first, -1)))
+            first = team.robots["r1"].next_measurement
+            team.world.measurements(encoded(m.MeasurementsRequest(0, "r1", 0, first, -1)))
             team.world.cache = None
         team.run()
     return team
@@ -300,7 +300,7 @@ def test_without_a_robot_the_map_is_that_of_a_team_that_never_had_it(
 ) -> None:
     run = changed_run(log, Changes(without=("r2",)))
     assert messages(run, ch.SUBMAP, "r1") == messages(samples, ch.SUBMAP, "r1")
-    alone = team_samples(thesis(STEPS, robots=1))  # there nobody is sighted: fewer readings
+    alone = team_samples(thesis(STEPS, robots=1))  # there nobody is sighted: fewer measurements
     (one,), (other,) = (messages(each, ch.FINAL_MAP) for each in (run, alone))
     assert (one.means, one.covariance) == (other.means, other.covariance)
     assert one.members == other.members == (m.Member("r1", 1, STEPS // 10 - 1),)
@@ -322,7 +322,7 @@ def test_another_rule_is_the_run_that_would_have_used_it(log: Log) -> None:
     ],
     ids=str,
 )
-def test_another_estimator_sees_the_same_readings_and_gives_another_map(
+def test_another_estimator_sees_the_same_measurements_and_gives_another_map(
     changes: Changes, log: Log, samples: list[Sample]
 ) -> None:
     run = changed_run(log, changes)
@@ -375,12 +375,12 @@ def test_a_change_without_a_meaning_is_refused(changes: Changes, why: str, log: 
         changed_run(log, changes)
 
 
-def test_a_log_that_lacks_a_reading_runs_under_no_other_conditions(
+def test_a_log_that_lacks_a_measurement_runs_under_no_other_conditions(
     samples: list[Sample], tmp_path: Path
 ) -> None:
     lost = messages(samples, ch.ODOMETRY, "r1")[5]
     cut = changed(samples, ch.ODOMETRY, lambda x: None if x == lost else x)
     with pytest.raises(
-        RerunError, match=f"reading {lost.reading} of r1, epoch 1 is not in the log"
+        RerunError, match=f"measurement {lost.number} of r1, epoch 1 is not in the log"
     ):
         changed_run(written(tmp_path / "log.mcap", cut), Changes())

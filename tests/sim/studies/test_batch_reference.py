@@ -68,7 +68,7 @@ def test_the_tangent_of_a_pose_is_the_derivative_of_a_perturbation(heading: floa
     np.testing.assert_allclose(tangent(heading), np.array(columns).T, atol=1e-8)
 
 
-def test_a_chain_has_the_readings_in_order_each_once() -> None:
+def test_a_chain_has_the_measurements_in_order_each_once() -> None:
     log, of = world_log(scenario()), scenario()
     chain = chains_of([*reversed(log), *log], of)[0]
     stream = streams(of).streams[0]
@@ -118,8 +118,8 @@ def nees_of(of: Scenario, *, twice: bool) -> Limit:
     return batch_map(counted_twice(log) if twice else log)
 
 
-@pytest.mark.parametrize("twice", [False, True], ids=["each reading once", "mutant: twice"])
-def test_the_map_is_consistent_and_a_reading_used_twice_is_found(twice: bool) -> None:
+@pytest.mark.parametrize("twice", [False, True], ids=["each measurement once", "mutant: twice"])
+def test_the_map_is_consistent_and_a_measurement_used_twice_is_found(twice: bool) -> None:
     runs = [nees_of(scenario(seed), twice=twice) for seed in range(100, 300)]
     errors = [run.errors for run in runs if run.errors is not None]
     dof = sum(2 * e.count for e in errors)

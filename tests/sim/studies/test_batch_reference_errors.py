@@ -52,7 +52,7 @@ def standing(sensor: Sensor, robot: str = "r1", start: Pose | None = None) -> Ch
 
 
 def marginal_cost(chain: Chain, shares: tuple[float, float]) -> float:
-    """rᵀ(C + H B Hᵀ)⁻¹r of all readings at once, by the definition of the process."""
+    """rᵀ(C + H B Hᵀ)⁻¹r of all measurements at once, by the definition of the process."""
     looks = looks_of([chain])
     times = 1e-9 * chain.stamps_ns[[look.pose for look in looks]]
     same = np.equal.outer([look.landmark for look in looks], [look.landmark for look in looks])

@@ -61,7 +61,7 @@ def test_a_goal_is_passed_within_its_bounds_only(value: float | None, passed: bo
     assert Goal("nees", value, 0.8, 1.15).passed == passed
 
 
-def test_a_team_that_counts_readings_twice_misses_the_goals() -> None:
+def test_a_team_that_counts_measurements_twice_misses_the_goals() -> None:
     options = Options((1,), quick=True)
     tasks = accuracy_worlds.tasks(options)
     honest = Results({task.name: run(0.5) | _POSES for task in tasks})

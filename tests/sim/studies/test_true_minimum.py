@@ -60,7 +60,7 @@ def test_a_map_that_is_folded_wrongly_is_another_minimum() -> None:
 
 @pytest.mark.parametrize(("bearing_sigma", "lower"), [(30.0, False), (0.02, True)])
 def test_the_other_one_of_two_places_is_wrong(bearing_sigma: float, lower: bool) -> None:
-    """Where both are as likely, and where the readings exclude it."""
+    """Where both are as likely, and where the measurements exclude it."""
     island, across = mirrored(bearing_sigma, OPTIONS)
     stamps = np.array([1000, 2000, 3000, 4000, 5000])
     poses = {

@@ -1,4 +1,4 @@
-"""The thesis' figures: its readings are told apart, and its filter's steps do what they say."""
+"""The thesis' figures: its measurements are told apart, and its filter's steps do what they say."""
 
 import math
 from collections.abc import Mapping
@@ -90,7 +90,7 @@ def test_the_coded_inputs_are_the_appendix_numbers() -> None:
     assert parameters["late"]
 
 
-def test_late_readings_are_those_of_the_step_before() -> None:
+def test_late_measurements_are_those_of_the_step_before() -> None:
     streams = streams_of(scenario(steps=30, look_at_start=True))
     now, late = (s.streams[0].landmark_detections for s in (streams, a_step_late(streams)))
     np.testing.assert_array_equal(late.stamps_ns, now.stamps_ns[1:])
@@ -99,7 +99,7 @@ def test_late_readings_are_those_of_the_step_before() -> None:
         np.testing.assert_array_equal(late.ranges[late.rows(k)], now.ranges[now.rows(k)])
 
 
-def test_a_reading_narrows_the_cloud_and_resampling_changes_its_copies_only() -> None:
+def test_a_measurement_narrows_the_cloud_and_resampling_changes_its_copies_only() -> None:
     options = Options((1, 2))
     task = xu_localisation.tasks(options)[0]
     run = task.run()

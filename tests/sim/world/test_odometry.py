@@ -156,7 +156,7 @@ def cost_per_dof(of: m.FusedMap) -> float:
     return of.chi2 / of.dof
 
 
-def test_a_centre_that_takes_raw_readings_puts_the_clock_right_too() -> None:
+def test_a_centre_that_takes_raw_measurements_puts_the_clock_right_too() -> None:
     exact, off = (
         team_epochs(each.robots[0], streams_of(each))
         for each in (mixed_team(), mixed_team(clock_offset_s=-0.75))
@@ -171,10 +171,10 @@ def team_epochs(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, byte
     """Stamp, motion and ranges of each epoch of the first robot, as the centre cuts them."""
     epochs = TeamKeyframes([robot.id])
     epochs.configure(robot.id, robot)
-    readings = published(world.streams[0])
-    for reading in readings:
-        epochs.put(reading)
-    epochs.end(m.End(0, (m.StreamEnd(robot.id, 1, len(readings)),)))
+    measurements = published(world.streams[0])
+    for measurement in measurements:
+        epochs.put(measurement)
+    epochs.end(m.End(0, (m.StreamEnd(robot.id, 1, len(measurements)),)))
     return [
         (each.stamp_ns, each.epoch.increment.mean.tobytes(), each.epoch.ranges.tobytes())
         for step in epochs.steps()

@@ -26,7 +26,7 @@ def joined(world: WorldStreams, field: str) -> np.ndarray:
     return np.concatenate([getattr(s.landmark_detections, field) for s in world.streams])
 
 
-def test_three_in_ten_readings_are_spoilt_the_same_ones_for_every_kind(
+def test_three_in_ten_measurements_are_spoilt_the_same_ones_for_every_kind(
     clean: WorldStreams,
 ) -> None:
     spoilt = world_with(0.3, "reading")
@@ -42,7 +42,7 @@ def test_three_in_ten_readings_are_spoilt_the_same_ones_for_every_kind(
     assert np.array_equal(joined(other, "ranges"), joined(clean, "ranges"))
 
 
-def test_what_is_spoilt_is_the_landmarks_readings_alone(clean: WorldStreams) -> None:
+def test_what_is_spoilt_is_the_landmarks_measurements_alone(clean: WorldStreams) -> None:
     for kind in ("reading", "identity", "drop"):
         for before, after in zip(clean.streams, world_with(0.3, kind).streams, strict=True):
             assert np.array_equal(before.stamps_ns, after.stamps_ns), "no message is lost"
@@ -53,7 +53,7 @@ def test_what_is_spoilt_is_the_landmarks_readings_alone(clean: WorldStreams) -> 
             assert np.array_equal(before.truth, after.truth)
 
 
-def test_a_spoilt_reading_is_uniform_over_what_can_be_seen(clean: WorldStreams) -> None:
+def test_a_spoilt_measurement_is_uniform_over_what_can_be_seen(clean: WorldStreams) -> None:
     spoilt = world_with(1.0, "reading")
     assert kstest((joined(spoilt, "ranges") - 3.0) / 17.0, "uniform").pvalue > 1e-3
     assert kstest(joined(spoilt, "bearings") / (2.0 * np.pi) + 0.5, "uniform").pvalue > 1e-3
@@ -82,7 +82,7 @@ def test_without_limits_of_sight_garbage_lies_within_the_place() -> None:
         assert stream.landmark_detections.ranges.max() <= 100.0 * np.sqrt(2.0)
 
 
-def test_the_readings_that_stay_are_true() -> None:
+def test_the_measurements_that_stay_are_true() -> None:
     world = world_with(0.3, "drop")
     for stream in world.streams:
         true_range, _ = true_detections(stream, world.landmarks)

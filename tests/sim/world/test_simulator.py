@@ -55,7 +55,9 @@ def inside_two_sided(normalised: np.ndarray) -> bool:
     return bool(low < np.sum(normalised**2) < high)
 
 
-def test_readings_are_numbered_by_time_with_what_was_seen_before_the_interval_that_ends() -> None:
+def test_measurements_are_numbered_by_time_with_what_was_seen_before_the_interval_that_ends() -> (
+    None
+):
     stream = world_of(load("thesis")).streams[0]
     assert stream.kinds[0] == START
     assert np.all(np.diff(stream.stamps_ns) >= 0)
@@ -65,13 +67,13 @@ def test_readings_are_numbered_by_time_with_what_was_seen_before_the_interval_th
     assert np.count_nonzero(stream.kinds == OBSERVATIONS) == 500, "empty messages too"
 
 
-def test_accessors_give_the_reading_of_a_counter() -> None:
+def test_accessors_give_the_measurement_of_a_counter() -> None:
     stream = world_of(load("thesis")).streams[0]
     odometry = np.flatnonzero(stream.kinds == ODOMETRY).tolist()
-    readings = [stream.odometry(i) for i in odometry]
-    assert [r.stamp_ns for r in readings] == [10**9 * k for k in range(1, 501)]
-    assert {r.duration_ns for r in readings} == {10**9}
-    assert readings[6].forward == stream.intervals.forward[6]
+    measurements = [stream.odometry(i) for i in odometry]
+    assert [r.stamp_ns for r in measurements] == [10**9 * k for k in range(1, 501)]
+    assert {r.duration_ns for r in measurements} == {10**9}
+    assert measurements[6].forward == stream.intervals.forward[6]
     seen = [stream.observations(i) for i in np.flatnonzero(stream.kinds == OBSERVATIONS).tolist()]
     assert np.array_equal(
         np.concatenate([r.bearings for r in seen]), stream.landmark_detections.bearings
@@ -79,7 +81,7 @@ def test_accessors_give_the_reading_of_a_counter() -> None:
     met = stream.sightings(int(np.flatnonzero(stream.kinds == SIGHTINGS)[0]))
     assert met.teammates == ("r2",)
     assert 3.0 - 8.0 < met.ranges[0] < 20.0 + 8.0
-    with pytest.raises(LookupError, match="reading 0 of r1: start pose, not odometry"):
+    with pytest.raises(LookupError, match="measurement 0 of r1: start pose, not odometry"):
         stream.odometry(0)
 
 
@@ -172,7 +174,7 @@ def test_sight_is_limited_by_the_true_range_so_that_the_noise_does_not_select() 
             kept_far.append(noise[stream.landmark_detections.ranges[far] <= 20.0])
     noise, kept = np.concatenate(noise_far), np.concatenate(kept_far)
     assert abs(noise.mean()) < 3.3 / np.sqrt(noise.size)
-    assert kept.mean() < -20.0 / np.sqrt(kept.size), "a gate on the readings would bias them"
+    assert kept.mean() < -20.0 / np.sqrt(kept.size), "a gate on the measurements would bias them"
 
 
 def test_a_robot_sees_its_teammates_where_they_are() -> None:
@@ -353,7 +355,7 @@ def test_random_way_points_lead_through_the_place_and_not_far_out_of_it() -> Non
         assert np.all(np.ptp(stream.truth[:, :2], axis=0) > 25.0)
 
 
-def test_readings_of_one_stamp_are_one_message() -> None:
+def test_measurements_of_one_stamp_are_one_message() -> None:
     stamps = np.array([5, 5, 7, 9, 9, 9])
     ids = np.arange(6, dtype=np.uint32)
     seen = grouped(stamps, ids, np.arange(6.0), np.zeros(6))

@@ -417,7 +417,7 @@ function drawConsistency() {
   }
 }
 
-/** NIS of each robot: how well its readings agree with what it expected of them. */
+/** NIS of each robot: how well its measurements agree with what it expected of them. */
 function drawInnovations() {
   const lines = [];
   let high = 2, count = 0;
@@ -433,7 +433,7 @@ function drawInnovations() {
   $('plot-nis').hidden = !lines.length;
   if (lines.length) {
     plots[4].draw({
-      key: `${count}|${lines.length}`, title: "NIS per degree of freedom, of each robot's readings", unit: '', end: end(),
+      key: `${count}|${lines.length}`, title: "NIS per degree of freedom, of each robot's measurements", unit: '', end: end(),
       time: state.time, low: 0, high, lines, levels: [{ v: 1, colour: 'good' }],
     });
   }
