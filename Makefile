@@ -24,7 +24,7 @@ export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
 # All hashes of each version: of every platform's wheel and of the sources.
-HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
+HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes \
   --no-annotate --no-header
 
 .DEFAULT_GOAL := run
