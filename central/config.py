@@ -11,10 +11,12 @@ from team.config import Bounds, FusionRule, NonNegative, Positive
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How large the errors are that all submaps of a robot share, before they are estimated.
 
-    bearing [rad]; range_scale, forward_scale: shares of the range and of the way driven.
+    bearing [rad]; range_offset [m]; range_scale, forward_scale: shares of the range and of the way
+    driven.
     """
 
     bearing: Positive = 0.01
+    range_offset: Positive = 0.02
     range_scale: Positive = 0.005
     forward_scale: Positive = 0.05
 
@@ -26,6 +28,7 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     bearing: NonNegative = 0.0
+    range_offset: NonNegative = 0.0
     range_scale: NonNegative = 0.0
     forward_scale: NonNegative = 0.0
 

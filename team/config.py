@@ -15,7 +15,7 @@ NonNegative = Annotated[float, Meta(ge=0.0)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 
-Bias = Literal["bearing", "forward_scale", "range_scale"]
+Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
 Estimator = Literal[
     "hybrid",
     "hybrid-thesis",
@@ -124,9 +124,26 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return final or self.final_turn != MotionNoise() or self.lateral != MotionNoise()
 
 
+class Lens(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a raw bearing b [rad] reads too much: linear·b + square·b² + cubic·b³ [rad]."""
+
+    linear: float = 0.0
+    square: float = 0.0
+    cubic: float = 0.0
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether bearings are what they read."""
+        return self == Lens()
+
+
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A range-bearing sensor: true range = (measurement − range_offset)/range_scale.
 
+    range_is_depth: what is read is the distance along the optical axis, as by a camera that tells
+    it from an object's height in the image: true range = (measured − range_offset)/(range_scale ·
+    cos β), where the raw bearing is optical_axis + β. Measurements with |β| above 80° are rejected.
+    bearing_lens: what bearings read too much beside bearing_offset, as through a camera's lens.
     Range sigma at a predicted range r is hypot(range_sigma, range_sigma_per_m · r); the predicted
     range is used, not the measured one (else maps shrink: Peelle's puzzle).
     Measurements outside [min_range, max_range] or more than field_of_view/2 from the axis are
@@ -147,7 +164,10 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     field_of_view: Positive = 6.283185307179586
     range_offset: float = 0.0
     range_scale: Positive = 1.0
+    range_is_depth: bool = False
+    optical_axis: float = 0.0
     bearing_offset: float = 0.0
+    bearing_lens: Lens = Lens()
     range_white: Share = 1.0
     bearing_white: Share = 1.0
     range_correlation_s: NonNegative = 10.0

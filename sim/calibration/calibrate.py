@@ -1,32 +1,34 @@
 """What measurements say about odometry and sensor: with the truth, or by the team's own map.
 
-With truth of poses and landmarks every figure is learnt by maximum likelihood against it. The range
-scale is then taken times the scale of the map that the team joins with these models: at the centre
-a submap that came out short weighs more (its error is proportional to its ranges), so an unbiased
-sensor would give too small a map.
+With truth of poses and landmarks every figure is learnt by maximum likelihood against it; constants
+of the sensor for each robot by itself where robots differ beyond doubt (`own`).
 
 Without truth the reference is the joined map and the paths in it, with an odometry that is trusted
 less, so that scale comes from the ranges (expectation and maximisation in turn). Only what the
 ranges and bearings determine is learnt then: the odometry's scales, drag and veer. The sensor's own
 figures stay: a team can not see the scale of its own measure.
 
-How sure the submaps are (`covariance_factor`) is learnt without the truth in both cases, from the
-maps of single robots (`consistency`).
+How sure the submaps are (`covariance_factor`, and the monitor's `normal_scale` under it) is learnt
+without the truth in both cases, from the maps of single robots (`consistency`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from math import hypot
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
 
+from central.config import CentralConfig
 from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.calibration import motion as motion
 from sim.calibration import sensor as sensor
-from sim.calibration.consistency import covariance_factor
+from sim.calibration.consistency import covariance_factor, normal_scale
 from sim.calibration.data import Reference, references, true_paths
 from sim.calibration.figures import CalibrationError, Figure, jackknifed
-from sim.calibration.join import JoinedTeam, config_of, joined_team
+from sim.calibration.join import config_of, joined_team
+from sim.calibration.own import own_constants
 from sim.scenarios.scenario import Scenario
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
@@ -39,21 +41,30 @@ MISTRUST = 4.0
 ROUNDS = 2
 SYSTEMATIC = 0.02
 """Standard deviation of the forward scale, relative, that is due to a scale from the joined map."""
+TYPICAL_M = 3.0
+BETTER = 0.8
+"""Of the ranges' σ at TYPICAL_M: a model of theirs that leaves less than this share is told."""
 ALARM = 0.015
 """A scale that differs by more from the scenario's does not fit the data."""
+
+NOTHING: Mapping[str, Sequence[Figure]] = MappingProxyType({})
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The figures by their part of a robot's configuration, and what a user should know."""
+    """The figures by their part of a robot's configuration, and what a user should know.
+
+    robots: of single robots' sensors, where they differ.
+    """
 
     motion: tuple[Figure, ...]
     sensor: tuple[Figure, ...]
     by_truth: bool
     notes: tuple[str, ...]
     central: tuple[Figure, ...] = ()
+    robots: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)
 
 
 def calibrated(
@@ -81,25 +92,37 @@ def _by_truth(
         progress(note)
     progress(f"odometry and sensor against the truth of {len(data)} robots")
     of_motion = _motion_figures(data, scenario)
-    of_sensor = jackknifed(sensor.fit_sensor, data, sensor.UNITS)
-    for turn in range(ROUNDS):
-        learnt = with_figures(scenario, of_motion, of_sensor)
-        scales, folds = [], []
-        for label, world in worlds:
-            progress(f"scale of the joined map of {label}, {turn + 1} of {ROUNDS}")
-            team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
-            scales.append(_scale(team, world))
-            folds.append(team.fold)
-        factor, spread = float(np.mean(scales)), float(np.std(scales) / np.sqrt(len(scales)))
-        of_sensor = tuple(
-            replace(f, value=f.value * factor, sigma=float(np.hypot(f.sigma, spread)))
-            if f.name == "range_scale"
-            else f
-            for f in of_sensor
-        )
-    of_central = _central_figures(folds, scenario, progress)
-    said = (*notes, *_alarms(of_motion, scenario))
-    return Calibration(of_motion, of_sensor, True, said, of_central)
+    depth = scenario.robots[0].sensor.range_is_depth
+
+    def fit(part: Sequence[Reference]) -> Mapping[str, float]:
+        return sensor.fit_sensor(part, depth=depth)
+
+    of_sensor = jackknifed(fit, data, sensor.UNITS)
+    own = own_constants(data, depth=depth)
+    learnt = with_figures(scenario, of_motion, of_sensor, own.robots)
+    folds = []
+    for label, world in worlds:
+        progress(f"joined map of {label} with what was learnt")
+        team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
+        folds.append(team.fold)
+    of_central = _central_figures(folds, learnt, own.strays, progress)
+    said = (*notes, *_alarms(of_motion, scenario), *_other_model(data, depth))
+    return Calibration(of_motion, of_sensor, True, said, of_central, own.robots)
+
+
+def _other_model(data: Sequence[Reference], depth: bool) -> tuple[str, ...]:
+    """A word where ranges are explained better as what the scenario does not take them for."""
+    taken, other = (
+        hypot(found["range_sigma"], TYPICAL_M * found["range_sigma_per_m"])
+        for found in (sensor.fit_sensor(data, depth=each) for each in (depth, not depth))
+    )
+    if other > BETTER * taken:
+        return ()
+    return (
+        f"ranges fit {'the distance' if depth else 'the depth along an optical axis'} better: σ "
+        f"{other:.3f} m instead of {taken:.3f} m at {TYPICAL_M:g} m; "
+        f"set range_is_depth = {str(not depth).lower()} in [defaults.sensor] and calibrate again",
+    )
 
 
 def _by_the_map(
@@ -123,18 +146,28 @@ def _by_the_map(
     for label, world in worlds:
         progress(f"joined map of {label} with what was learnt")
         folds.append(joined_team(world, learnt).fold)
-    of_central = _central_figures(folds, scenario, progress)
+    of_central = _central_figures(folds, scenario, (), progress)
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
     said = (note, *notes, *_alarms(figures, scenario))
     return Calibration(figures, (), False, said, of_central)
 
 
 def _central_figures(
-    folds: Sequence[Fold], scenario: Scenario, progress: Progress
+    folds: Sequence[Fold], scenario: Scenario, strays: Sequence[Figure], progress: Progress
 ) -> tuple[Figure, ...]:
+    """The errors of each robot's own, the factor that they leave, and the monitor's scale then."""
     progress("maps of single robots against the rest of their team")
-    factor = covariance_factor(folds, scenario.central)
-    return () if factor is None else (factor,)
+    fields = nested(msgspec.to_builtins(scenario.central), strays, CentralConfig)
+    told = msgspec.to_builtins(scenario.central.bias_sigma)
+    fields["bias_sigma"] = told | (fields["bias_sigma"] if strays else {})
+    central = msgspec.convert(fields, CentralConfig)
+    factor = covariance_factor(folds, central)
+    if factor is None:
+        return tuple(strays)
+    found = (*strays, factor)
+    central = msgspec.structs.replace(central, covariance_factor=factor.value)
+    normal = normal_scale(folds, central)
+    return found if normal is None else (*found, normal)
 
 
 def _turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:
@@ -178,19 +211,6 @@ def _positions(world: WorldStreams) -> dict[int, np.ndarray]:
     return dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
 
 
-def _scale(team: JoinedTeam, world: WorldStreams) -> float:
-    """Size of the map over size of the true one: Σ aᵀ R b/Σ bᵀ b at the best rotation (Umeyama)."""
-    truth = _positions(world)
-    common = sorted(set(truth) & set(team.landmarks))
-    if len(common) < 2:
-        raise CalibrationError("the joined map has fewer than two landmarks of the true one")
-    a, b = (np.array([of[i] for i in common]) for of in (team.landmarks, truth))
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    along = float(np.sum(a * b))
-    across = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
-    return float(np.hypot(along, across) / np.sum(b * b))
-
-
 def _alarms(figures: Sequence[Figure], scenario: Scenario) -> tuple[str, ...]:
     before = scenario.robots[0].motion
     notes = []
@@ -221,9 +241,12 @@ def _mistrusting(scenario: Scenario) -> Scenario:
 
 
 def with_figures(
-    scenario: Scenario, of_motion: Sequence[Figure], of_sensor: Sequence[Figure]
+    scenario: Scenario,
+    of_motion: Sequence[Figure],
+    of_sensor: Sequence[Figure],
+    of_robots: Mapping[str, Sequence[Figure]] = NOTHING,
 ) -> Scenario:
-    """The scenario with the learnt figures in every robot's models."""
+    """The scenario with the learnt figures in every robot's models, a robot's own above all's."""
     robots = tuple(
         msgspec.structs.replace(
             robot,
@@ -231,7 +254,12 @@ def with_figures(
                 nested(msgspec.to_builtins(robot.motion), of_motion, MotionModel), MotionModel
             ),
             sensor=msgspec.convert(
-                nested(msgspec.to_builtins(robot.sensor), of_sensor, Sensor), Sensor
+                nested(
+                    msgspec.to_builtins(robot.sensor),
+                    (*of_sensor, *of_robots.get(robot.id, ())),
+                    Sensor,
+                ),
+                Sensor,
             ),
         )
         for robot in scenario.robots

@@ -20,10 +20,12 @@ from central.config import CentralConfig
 from central.desk.evaluation.errors import map_errors, moved, rigid_alignment
 from central.tick_fold import join_settings
 from sim.calibration.figures import Figure
+from team.estimation.consistency import covariance_scale
 from team.estimation.contribution import Start, Stream
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
 from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.marginals import joint_cost
 from team.estimation.map_joining.merging import ages
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 
@@ -62,6 +64,33 @@ def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure |
             break
     spread = float(np.std(chi2 / dof, ddof=1) / np.sqrt(len(found)))
     return Figure("covariance_factor", factor, factor * spread / ratio, "")
+
+
+def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
+    """The monitor's covariance scale under these settings: what it says where all is right.
+
+    The geometric mean over the worlds, ± from their scatter (of one world: as the monitor knows
+    it). None where there are too few submaps to say.
+    """
+    settings = join_settings(central)
+    scales, sigmas = [], []
+    for fold in teams:
+        key = fold.main_key
+        if key is None:
+            continue
+        island, _, _ = settled(replace(fold.main, settings=settings))
+        solved = replace(fold, islands={**fold.islands, key: island})
+        submaps = joint_cost(solved).submaps
+        chi2, dof = np.array([(each.chi2, each.dof) for each in submaps]).reshape(-1, 2).T
+        found = covariance_scale(chi2, dof)
+        if found is not None:
+            scales.append(np.log(found.value))
+            sigmas.append(found.log_sigma)
+    if not scales:
+        return None
+    value = float(np.exp(np.mean(scales)))
+    spread = float(np.std(scales, ddof=1)) if len(scales) > 1 else float(sigmas[0])
+    return Figure("normal_scale", value, value * spread / np.sqrt(len(scales)), "")
 
 
 def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:

@@ -20,6 +20,7 @@ FASTEST_TURN_RAD_S = 3.0
 class Reference:
     """One robot's odometry and landmark measurements, and the poses and landmarks of reference.
 
+    name: the world's label, then the robot's id.
     gap_ns: between poses of `path` that are at most this far apart it is interpolated.
     landmarks: position of each id in the path's frame; `teammates`: the paths of the others.
     turns_first: between two poses the robot turns, then drives straight on (else: an arc).
@@ -35,6 +36,11 @@ class Reference:
     names: tuple[str, ...]
     teammates: Mapping[str, Path]
     turns_first: bool = False
+
+    @property
+    def robot(self) -> str:
+        """The robot's id, the last word of the name."""
+        return self.name.rpartition(" ")[2]
 
     def between(self, begin_ns: int, end_ns: int) -> "Reference":
         """The same with the odometry and the measurements of [begin_ns, end_ns) only."""

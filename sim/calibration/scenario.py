@@ -29,7 +29,20 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
     for name, figures, declared in parts:
         if figures:
             lines += ["", f"[{name}]", *_table(figures, declared)]
+    differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
+    told_apart = calibration.robots or (calibration.by_truth and differ)
+    for robot in scenario.robots if told_apart else ():
+        fields = nested({}, calibration.robots.get(robot.id, ()), Sensor)
+        own = [f"sensor = {_inline(fields)}"] if fields else []
+        lines += ["", "[[robots]]", f'id = "{robot.id}"', *own]
     return "\n".join(lines) + "\n"
+
+
+def _inline(value: object) -> str:
+    """A number, or a table of numbers and tables, on one line."""
+    if not isinstance(value, dict):
+        return f"{value:.5g}"
+    return "{ " + ", ".join(f"{key} = {_inline(each)}" for key, each in value.items()) + " }"
 
 
 def _table(figures: Sequence[Figure], declared: type[msgspec.Struct]) -> list[str]:

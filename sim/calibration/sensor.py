@@ -1,7 +1,13 @@
-"""Maximum likelihood of the range-bearing sensor's model: affine range, noise, its persistence."""
+"""Maximum likelihood of the range-bearing sensor's model: affine range, noise, its persistence.
+
+Where the range is a depth along the optical axis, range = scale · distance · cos(b − axis) + offset
+with the raw bearing b. Each robot's constants (scale, offset, axis, bearing offset) are its own in
+the fit of the noise, which all share; the constants of all together stand for an unknown robot.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -10,6 +16,8 @@ from scipy.optimize import least_squares, minimize
 from central.desk.evaluation.errors import on_circle
 from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import CalibrationError, huber
+from team.config import Sensor
+from team.estimation.models import corrected
 
 LEAST_MEASUREMENTS = 100
 ROUNDS = 4
@@ -24,11 +32,15 @@ NEIGHBOURS = 64
 UNITS = {
     "range_offset": "m",
     "range_scale": "",
+    "optical_axis": "rad",
     "range_sigma": "m",
     "range_sigma_per_m": "m/m",
     "range_white": "",
     "range_correlation_s": "s",
     "bearing_offset": "rad",
+    "bearing_lens.linear": "",
+    "bearing_lens.square": "1/rad",
+    "bearing_lens.cubic": "1/rad²",
     "bearing_sigma": "rad",
     "bearing_white": "",
     "bearing_correlation_s": "s",
@@ -47,12 +59,13 @@ class _Rows:
     series: Int64[np.ndarray, " n"]
     seconds: Float[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
     distances: Float[np.ndarray, " n"]
     bearing_errors: Float[np.ndarray, " n"]
 
 
 def _rows(data: Sequence[Reference]) -> _Rows:
-    parts = [np.zeros((0, 5))]
+    parts = [np.zeros((0, 6))]
     for k, each in enumerate(data):
         seen = each.seen
         ids = np.array(sorted(each.landmarks), dtype=np.int64)
@@ -68,6 +81,7 @@ def _rows(data: Sequence[Reference]) -> _Rows:
             k * 1_000_000.0 + seen.ids[known],
             (stamps[known] - each.path.stamps_ns[0]) * 1e-9,
             seen.ranges[known],
+            seen.bearings[known],
             np.hypot(ahead[:, 0], ahead[:, 1]),
             on_circle(seen.bearings[known] - expected),
         )
@@ -77,52 +91,145 @@ def _rows(data: Sequence[Reference]) -> _Rows:
     return _Rows(rows[:, 0].astype(np.int64), *rows[:, 1:].T)
 
 
-def fit_sensor(data: Sequence[Reference]) -> Mapping[str, float]:
-    """The model of `Sensor` under which the measurements are most likely.
+class Constants(NamedTuple):
+    """What one camera reads: range = scale · d · cos(b − axis) + offset [m], bearing + offset.
 
-    range = scale · distance + offset under Huber's loss in units of the noise, then the noise
-    σ² = σ₀² + (σ₁ d)² by likelihood, in turn. Bearings: median and median absolute deviation, since
-    outliers come in bursts. Shares: ρ(τ) = (1 − white) exp(−τ/T) fitted to the correlation of one
-    landmark's errors. Raises CalibrationError where there are too few measurements.
+    axis: None where the range is the distance itself. lens: coefficients of b, b² and b³ that
+    bearings read too much in addition, of a camera.
     """
-    rows = _rows(data)
+
+    range_scale: float
+    range_offset: float
+    bearing_offset: float
+    axis: float | None
+    lens: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """By the names of the fields of `Sensor`."""
+        named = {
+            "range_offset": self.range_offset,
+            "range_scale": self.range_scale,
+            "bearing_offset": self.bearing_offset,
+        }
+        if self.axis is None:
+            return named
+        bent = zip(("linear", "square", "cubic"), self.lens, strict=True)
+        named |= {f"bearing_lens.{name}": value for name, value in bent}
+        return named | {"optical_axis": self.axis}
+
+    def distances(
+        self, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """The distances [m] that raw ranges and bearings say; NaN beside the axis."""
+        sensor = Sensor(
+            range_offset=self.range_offset,
+            range_scale=self.range_scale,
+            range_is_depth=self.axis is not None,
+            optical_axis=self.axis or 0.0,
+        )
+        return corrected(sensor, ranges, bearings)[0]
+
+
+def constants(data: Sequence[Reference], *, depth: bool) -> Constants:
+    """The constants of all measurements together, as of one camera.
+
+    Ranges under Huber's loss in units of their noise, bearings by their median, since outliers come
+    in bursts. Raises CalibrationError where there are too few measurements.
+    """
+    return _constants(_enough(_rows(data)), depth)
+
+
+def _enough(rows: _Rows) -> _Rows:
     if len(rows.series) < LEAST_MEASUREMENTS:
         raise CalibrationError(
             f"{len(rows.series)} measurements of landmarks from known poses, "
             f"{LEAST_MEASUREMENTS} needed"
         )
-    affine, noise = np.array([1.0, 0.0]), np.array([0.05, 0.04])
-    error = rows.ranges - rows.distances
+    return rows
 
-    def residual(p: Float[np.ndarray, "2"]) -> Float[np.ndarray, " n"]:
-        return np.asarray(rows.ranges - p[0] * rows.distances - p[1])
+
+def _constants(rows: _Rows, depth: bool) -> Constants:
+    affine, noise = np.array([1.0, 0.0, 0.0][: 3 if depth else 2]), np.array([0.05, 0.04])
+
+    def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        along = np.cos(rows.bearings - p[2]) if depth else 1.0
+        return np.asarray(rows.ranges - p[0] * rows.distances * along - p[1])
 
     for _ in range(ROUNDS):
         sigma = np.hypot(noise[0], noise[1] * rows.distances)
         affine = huber(residual, sigma, affine)
-        error = residual(affine) / affine[0]
-        noise = _range_noise(error, rows.distances, sigma)
-    relative = error / np.hypot(noise[0], noise[1] * rows.distances)
+        noise = _range_noise(residual(affine) / affine[0], rows.distances, sigma)
     offset = float(np.median(rows.bearing_errors))
-    turned = on_circle(rows.bearing_errors - offset)
+    scale, shift = float(affine[0]), float(affine[1])
+    if not depth:
+        return Constants(scale, shift, offset, None)
+    bent = _lens(rows, offset)
+    return Constants(scale, shift, bent[0], float(affine[2]), (bent[1], bent[2], bent[3]))
+
+
+def _lens(rows: _Rows, offset: float) -> list[float]:
+    """The bearings' offset and lens: a cubic of the raw bearing under Huber's loss."""
+    error = on_circle(rows.bearing_errors - offset)
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(error)))
+    powers = rows.bearings[:, np.newaxis] ** np.arange(4)
+
+    def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        return np.asarray(error - powers @ p)
+
+    found = huber(residual, np.full(len(error), sigma), np.zeros(4))
+    found[0] += offset
+    return [float(each) for each in found]
+
+
+def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str, float]:
+    """The model of `Sensor` under which the measurements are most likely.
+
+    The constants are those of all robots together, the noise is what each robot's own constants
+    leave: σ² = σ₀² + (σ₁ d)² by likelihood, of bearings the median absolute deviation. Shares:
+    ρ(τ) = (1 − white) exp(−τ/T) fitted to the correlation of one landmark's errors. Raises
+    CalibrationError where there are too few measurements.
+    """
+    common = constants(data, depth=depth)
+    parts = []
+    owns: dict[str, Constants] = {}
+    for k, each in enumerate(_by_robot(data).values()):
+        rows = _rows(each)
+        if len(rows.series) < LEAST_MEASUREMENTS:
+            continue
+        own = owns[each[0].robot] = _constants(rows, depth)
+        range_errors = own.distances(rows.ranges, rows.bearings) - rows.distances
+        bent = rows.bearings[:, np.newaxis] ** np.arange(1, 4) @ own.lens
+        turned = on_circle(rows.bearing_errors - own.bearing_offset - bent)
+        columns = (rows.series + k * 1e9, rows.seconds, rows.distances, range_errors, turned)
+        parts.append(np.stack(columns, axis=1)[np.isfinite(range_errors)])
+    series, seconds, distances, error, turned = np.concatenate(parts).T
+    series = series.astype(np.int64)
+    sigma = np.hypot(0.05, 0.04 * distances)
+    for _ in range(ROUNDS):
+        noise = _range_noise(error, distances, sigma)
+        sigma = np.hypot(noise[0], noise[1] * distances)
     bearing_sigma = MAD_TO_SIGMA * float(np.median(np.abs(turned)))
-    range_white, range_time = _persistence(rows, relative)
-    bearing_white, bearing_time = _persistence(rows, turned / bearing_sigma)
-    figures = {
-        "range_offset": float(affine[1]),
-        "range_scale": float(affine[0]),
+    range_white, range_time = _persistence(series, seconds, error / sigma)
+    bearing_white, bearing_time = _persistence(series, seconds, turned / bearing_sigma)
+    figures = common.figures | {
         "range_sigma": float(noise[0]),
         "range_sigma_per_m": float(noise[1]),
         "range_white": range_white,
         "range_correlation_s": range_time,
-        "bearing_offset": offset,
         "bearing_sigma": bearing_sigma,
         "bearing_white": bearing_white,
         "bearing_correlation_s": bearing_time,
         "bearing_outliers": float(np.mean(np.abs(turned) > 5.0 * bearing_sigma)),
     }
-    marker = _marker_offset(data, affine)
-    return figures if marker is None else figures | {"marker_range_offset": marker}
+    return figures | _marker(data, owns)
+
+
+def _by_robot(data: Sequence[Reference]) -> dict[str, list[Reference]]:
+    by_robot: dict[str, list[Reference]] = {}
+    for each in data:
+        by_robot.setdefault(each.robot, []).append(each)
+    return by_robot
 
 
 def _range_noise(
@@ -142,14 +249,18 @@ def _range_noise(
     return np.asarray(np.exp(found.x))
 
 
-def _persistence(rows: _Rows, relative: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _persistence(
+    series: Int64[np.ndarray, " n"],
+    seconds: Float[np.ndarray, " n"],
+    relative: Float[np.ndarray, " n"],
+) -> tuple[float, float]:
     """(white share, correlation time [s]) of errors in units of σ; (1, 0) if there is none."""
     inside = np.abs(relative) < OUTLIER
     variance = float(np.mean(relative[inside] ** 2))
     counts, sums, times = (np.zeros(len(LAGS_S) - 1) for _ in range(3))
     for apart in range(1, min(NEIGHBOURS, len(relative))):
-        pair = (rows.series[apart:] == rows.series[:-apart]) & inside[apart:] & inside[:-apart]
-        lag = (rows.seconds[apart:] - rows.seconds[:-apart])[pair]
+        pair = (series[apart:] == series[:-apart]) & inside[apart:] & inside[:-apart]
+        lag = (seconds[apart:] - seconds[:-apart])[pair]
         product = (relative[apart:] * relative[:-apart])[pair]
         at = np.searchsorted(LAGS_S, lag) - 1
         kept = (at >= 0) & (at < len(counts))
@@ -170,18 +281,25 @@ def _persistence(rows: _Rows, relative: Float[np.ndarray, " n"]) -> tuple[float,
     return 1.0 - float(found.x[0]), float(np.exp(found.x[1]))
 
 
-def _marker_offset(data: Sequence[Reference], affine: Float[np.ndarray, "2"]) -> float | None:
-    """The median of corrected range − distance over the sightings of teammates; None without."""
-    errors = [np.zeros(0)]
+def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[str, float]:
+    """How much too far teammates are seen, the median of the nearer half; none where few are."""
+    errors, distances = [np.zeros(0)], [np.zeros(0)]
     for each in data:
-        seen = each.sighted
+        seen, own = each.sighted, owns.get(each.robot)
+        if own is None:
+            continue
         stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
         here, known = poses_at(each.path, stamps, each.gap_ns, turns_first=each.turns_first)
+        measured = own.distances(seen.ranges, seen.bearings)
         for index, name in enumerate(each.names):
             if name in each.teammates:
                 there, there_known = poses_at(each.teammates[name], stamps, each.gap_ns)
-                chosen = known & there_known & (seen.ids == index)
+                chosen = known & there_known & (seen.ids == index) & np.isfinite(measured)
                 distance = np.hypot(*(there - here)[chosen, :2].T)
-                errors.append((seen.ranges[chosen] - affine[1]) / affine[0] - distance)
-    found = np.concatenate(errors)
-    return float(np.median(found)) if len(found) >= LEAST_MEASUREMENTS else None
+                errors.append(measured[chosen] - distance)
+                distances.append(distance)
+    error, distance = np.concatenate(errors), np.concatenate(distances)
+    if len(error) < LEAST_MEASUREMENTS:
+        return {}
+    near = distance <= np.median(distance)
+    return {"marker_range_offset": float(np.median(error[near]))}

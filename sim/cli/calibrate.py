@@ -55,7 +55,12 @@ def calibrate(
     except CalibrationError as error:
         fail(str(error), FAILED)
     table = Table("part", "figure", "value", "± (1 σ)", "unit")
-    parts = (("motion", found.motion), ("sensor", found.sensor), ("central", found.central))
+    parts = (
+        ("motion", found.motion),
+        ("sensor", found.sensor),
+        *((robot, figures) for robot, figures in found.robots.items()),
+        ("central", found.central),
+    )
     for part, figures in parts:
         for figure in figures:
             numbers = (f"{figure.value:.5g}", f"{figure.sigma:.2g}")

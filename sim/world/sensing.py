@@ -72,17 +72,31 @@ def persistent(
     return both
 
 
+LENS_ROUNDS = 20
+"""Of the fixed point of a raw bearing: a lens bends by a few per cent, and each round has those."""
+
+
 def measurements(
     seen: Visible, sensor: Sensor, errors: Float[np.ndarray, "V 2"]
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
     """Ranges [m] and bearings [rad] as the sensor reads them, from errors n of unit variance.
 
     range = range_scale · (r + σ(r) n₁) + range_offset with σ(r)² = range_sigma² +
-    (range_sigma_per_m r)²; bearing = b + bearing_sigma n₂ + bearing_offset.
+    (range_sigma_per_m r)²; bearing = raw + bearing_sigma n₂ with raw = b + bearing_offset +
+    lens(raw). With range_is_depth r + σ(r) n₁ is projected on the optical axis first.
     """
+    raw = seen.bearings + sensor.bearing_offset
+    lens = sensor.bearing_lens
+    if not lens.is_ideal:
+        straight = raw
+        for _ in range(LENS_ROUNDS):
+            raw = straight + raw * (lens.linear + raw * (lens.square + raw * lens.cubic))
     sigma = np.hypot(sensor.range_sigma, sensor.range_sigma_per_m * seen.ranges)
-    ranges = sensor.range_scale * (seen.ranges + sigma * errors[:, 0]) + sensor.range_offset
-    bearings = seen.bearings + sensor.bearing_sigma * errors[:, 1] + sensor.bearing_offset
+    distances = seen.ranges + sigma * errors[:, 0]
+    if sensor.range_is_depth:
+        distances = distances * np.cos(raw - sensor.optical_axis)
+    ranges = sensor.range_scale * distances + sensor.range_offset
+    bearings = raw + sensor.bearing_sigma * errors[:, 1]
     return np.maximum(ranges, SHORTEST_MEASUREMENT_M), on_circle(bearings)
 
 

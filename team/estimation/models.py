@@ -17,6 +17,8 @@ from team.estimation.geometry import Point, Pose, adjoint, compose, exponential,
 
 NEAREST_M = 1e-3
 """A point that is nearer than this has no bearing; ranges are taken as at least this [m]."""
+OFF_AXIS = math.cos(math.radians(80.0))
+"""Least cosine of the angle to the optical axis at which a depth tells a range."""
 
 
 @dataclass(frozen=True)
@@ -257,10 +259,22 @@ def variances(sensor: Sensor) -> tuple[float, float, float]:
 def corrected(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The sensor's calibration applied: ((r − range_offset)/range_scale, b − bearing_offset)."""
+    """The calibration applied: ((r − range_offset)/range_scale, b − bearing_offset − lens(b)).
+
+    A depth is divided by cos(b − optical_axis) too; where that is below OFF_AXIS it is NaN.
+    """
     turned = bearings - sensor.bearing_offset
+    lens = sensor.bearing_lens
+    if not lens.is_ideal:
+        turned = turned - bearings * (
+            lens.linear + bearings * (lens.square + bearings * lens.cubic)
+        )
     turns = np.floor((np.pi - turned) / (2.0 * np.pi))
-    return (ranges - sensor.range_offset) / sensor.range_scale, turned + 2.0 * np.pi * turns
+    distances = (ranges - sensor.range_offset) / sensor.range_scale
+    if sensor.range_is_depth:
+        cosine = np.cos(bearings - sensor.optical_axis)
+        distances = np.where(cosine > OFF_AXIS, distances / np.maximum(cosine, OFF_AXIS), np.nan)
+    return distances, turned + 2.0 * np.pi * turns
 
 
 def acceptable(
@@ -268,7 +282,8 @@ def acceptable(
 ) -> Bool[np.ndarray, " n"]:
     """Which raw measurements lie in [min_range, max_range] and in the field of view.
 
-    Measurements that are not finite do not; neither does one whose corrected range is not positive.
+    Measurements that are not finite do not; neither does one whose corrected range is not positive,
+    or a depth beyond OFF_AXIS.
     """
     distances, _ = corrected(sensor, ranges, bearings)
     inside: Bool[np.ndarray, " n"] = (

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.config import MotionModel, MotionNoise, Sensor
+from team.config import Lens, MotionModel, MotionNoise, Sensor
 from team.estimation import models
 from team.estimation.geometry import compose, exponential, inverse, logarithm
 from team.estimation.models import Increment, increment_of
@@ -265,7 +265,27 @@ def test_calibration_takes_back_what_the_sensor_does():
     np.testing.assert_allclose(corrected, bearings)
 
 
-def test_measurements_outside_the_sensors_reach_and_broken_ones_are_not_acceptable():
+def test_a_depth_along_the_optical_axis_becomes_the_distance():
+    sensor = Sensor(range_offset=0.05, range_scale=1.02, bearing_offset=0.01)
+    sensor = msgspec.structs.replace(sensor, range_is_depth=True, optical_axis=0.1)
+    distances, raw = np.array([1.0, 4.0, 2.0]), np.array([0.1, -0.5, 0.9])
+    depths = 1.02 * distances * np.cos(raw - 0.1) + 0.05
+    ranges, bearings = models.corrected(sensor, depths, raw)
+    np.testing.assert_allclose(ranges, distances)
+    np.testing.assert_allclose(bearings, raw - 0.01)
+    beside = 0.1 + np.radians([79.0, 81.0, -81.0, 100.0, 180.0])
+    seen = models.acceptable(sensor, np.ones(5), beside)
+    np.testing.assert_array_equal(seen, [True, False, False, False, False])
+
+
+def test_what_a_lens_bends_is_taken_back():
+    sensor = Sensor(bearing_offset=0.02, bearing_lens=Lens(linear=0.03, square=-0.05, cubic=-0.1))
+    raw = np.linspace(-0.6, 0.6, 7)
+    _, bearings = models.corrected(sensor, np.ones(7), raw)
+    np.testing.assert_allclose(bearings, raw - 0.02 - 0.03 * raw + 0.05 * raw**2 + 0.1 * raw**3)
+
+
+def test_readings_outside_the_sensors_reach_and_broken_ones_are_not_acceptable():
     sensor = Sensor(min_range=0.5, max_range=10.0, field_of_view=np.pi, range_offset=0.6)
     ranges = np.array([1.0, 0.55, 0.2, 11.0, 1.0, 1.0, np.nan, 1.0])
     bearings = np.array([1.5, 0.0, 0.0, 0.0, 1.7, -2.0, 0.0, np.nan])

@@ -3,12 +3,12 @@
 A measurement (range r, bearing b) of a landmark at distance d from robot k at time t is
 
     b = β(x, l) + bias_b + σ_b √(1 − w_b) e_b(t) + σ_b √w_b ε,
-    r = (1 + bias_r) d(x, l) + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,    ε ~ N(0, 1) and white,
+    r = (1 + bias_r) d(x, l) + offset + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,  ε ~ N(0, 1), white,
 
 with the shares w that the sensor calls white. e is a first-order Gauss-Markov process of unit
 variance for each robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ) with the
 sensor's correlation times; so it is in the simulator, and the robots' windows take it as constant.
-The biases are one pair per robot with the centre's priors. A teammate's sighting is a factor
+The biases are three numbers per robot with the centre's priors. A teammate's sighting is a factor
 between two poses of the same time, as the robots reduce them. GTSAM has no factor for such a
 measurement: it is a Python function of (pose, landmark, e, biases) with its own derivatives.
 """
@@ -27,6 +27,8 @@ from team.config import Sensor
 from team.estimation.geometry import Point, wrapped
 from team.estimation.models import NEAREST_M, noise, predicted
 
+BIASES = ("bearing", "range_offset", "range_scale")
+"""The errors of a robot's sensor that the centre would estimate, in their order here."""
 FORGOTTEN = 1e-3
 """A correlation below this is none: the process begins anew."""
 _ERRORS = 2**56
@@ -50,7 +52,7 @@ class Look(NamedTuple):
 
 
 def bias_key(chain: int) -> int:
-    """The key of the biases (bearing [rad], range scale) of a chain."""
+    """The key of the biases (`BIASES`: bearing [rad], range offset [m], range scale) of a chain."""
     return _BIASES + chain
 
 
@@ -88,9 +90,9 @@ def profile_graph(
     for c, chain in enumerate(chains):
         biases = chain.config.front_end.biases
         if has_biases(chain):
-            held = [getattr(sigmas, b) if b in biases else 1e-6 for b in ("bearing", "range_scale")]
+            held = [getattr(sigmas, b) if b in biases else 1e-6 for b in BIASES]
             model = gtsam.noiseModel.Diagonal.Sigmas(np.array(held))
-            graph.push_back(gtsam.PriorFactorPoint2(bias_key(c), np.zeros(2), model))
+            graph.push_back(gtsam.PriorFactorPoint3(bias_key(c), np.zeros(3), model))
     for look in looks_of(chains):
         sensor = chains[look.chain].config.sensor
         graph.push_back(_process_factor(gtsam, look, sensor))
@@ -111,7 +113,7 @@ def profile_graph(
 
 def has_biases(chain: Chain) -> bool:
     """Whether the centre would estimate an error of this robot's sensor."""
-    return bool({"bearing", "range_scale"} & set(chain.config.front_end.biases))
+    return bool(set(BIASES) & set(chain.config.front_end.biases))
 
 
 def add_errors(values: Any, chains: Sequence[Chain]) -> Any:
@@ -120,7 +122,7 @@ def add_errors(values: Any, chains: Sequence[Chain]) -> Any:
         values.insert(look.key, np.zeros(2))
     for c, chain in enumerate(chains):
         if has_biases(chain):
-            values.insert(bias_key(c), np.zeros(2))
+            values.insert(bias_key(c), np.zeros(3))
     return values
 
 
@@ -133,7 +135,7 @@ def _measurement(
     def residual(_: Any, values: Any, derivatives: Any) -> np.ndarray:
         pose = values.atPose2(keys[0])
         point, e = values.atPoint2(keys[1]), values.atPoint2(keys[2])
-        turned, scaled = values.atPoint2(keys[3]) if len(keys) > 3 else (0.0, 0.0)
+        turned, offset, scaled = values.atPoint3(keys[3]) if len(keys) > 3 else (0.0, 0.0, 0.0)
         dx, dy = point[0] - pose.x(), point[1] - pose.y()
         distance = max(math.hypot(dx, dy), NEAREST_M)
         direction = math.atan2(dy, dx)
@@ -146,11 +148,11 @@ def _measurement(
             derivatives[1] = np.array([[-s / distance, c / distance], [k * c, k * s]])
             derivatives[2] = np.array([[across, 0.0], [0.0, along]])
             if len(keys) > 3:
-                derivatives[3] = np.array([[1.0, 0.0], [0.0, distance]])
+                derivatives[3] = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, distance]])
         return np.array(
             [
                 wrapped(bearing + turned + across * e[0] - look.bearing),
-                k * distance + along * e[1] - look.distance,
+                k * distance + offset + along * e[1] - look.distance,
             ]
         )
 

@@ -41,6 +41,7 @@ LARGEST_DECREMENT = 1e-3
 A robust loss is minimised by weighting again and again, which converges by a constant factor."""
 ITERATIONS = 1000
 NoiseKind = Literal["white", "profile"]
+NO_BIASES = (None, None, None)
 
 
 class LimitError(RuntimeError):
@@ -54,7 +55,8 @@ class Limit:
     gradient_norm: of the optimum's cost, in the units of the state; newton_decrement: √(gᵀH⁻¹g).
     paths: all poses; final_pose_nees_per_dof and position_rmse_m where there is truth.
     left_out: robots whose place in the team's frame is not known, and why.
-    biases: (bearing [rad], range scale) of each robot, estimated. team: the run's own final map.
+    biases: (bearing [rad], range offset [m], range scale) of each robot.
+    team: the run's own final map.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -71,7 +73,7 @@ class Limit:
     robust: bool
     left_out: tuple[str, ...]
     noise: NoiseKind
-    biases: Mapping[str, tuple[float, float]]
+    biases: Mapping[str, tuple[float, float, float]]
     team: MapErrors | None
 
     def to_json(self) -> dict[str, Any]:
@@ -90,8 +92,9 @@ class Limit:
                     "poses": len(path.stamps_ns),
                     "position_rmse_m": self.position_rmse_m.get(robot),
                     "final_pose_nees_per_dof": self.final_pose_nees_per_dof.get(robot),
-                    "bearing_bias_rad": self.biases.get(robot, (None, None))[0],
-                    "range_scale_bias": self.biases.get(robot, (None, None))[1],
+                    "bearing_bias_rad": self.biases.get(robot, NO_BIASES)[0],
+                    "range_offset_bias_m": self.biases.get(robot, NO_BIASES)[1],
+                    "range_scale_bias": self.biases.get(robot, NO_BIASES)[2],
                 }
                 for robot, path in self.paths.items()
             },
@@ -294,8 +297,8 @@ def _limit(
         true_poses, seen = interpolated(true_path, path.stamps_ns)
         paths[robot] = path
         if figures["noise"] == "profile" and has_biases(chain):
-            turned, scaled = optimum.atPoint2(bias_key(c)).tolist()
-            biases[robot] = (turned, scaled)
+            turned, offset, scaled = optimum.atPoint3(bias_key(c)).tolist()
+            biases[robot] = (turned, offset, scaled)
         if seen.any():
             errors[robot] = distance_rmse(path.poses[seen, :2], true_poses[seen, :2])
         turn = tangent(path.poses[-1, 2])

@@ -24,6 +24,7 @@ from team.estimation.models import NEAREST_M
 
 BIASES: tuple[Bias, ...] = get_args(Bias)
 """In the order of the columns."""
+BEARING, FORWARD_SCALE, RANGE_OFFSET, RANGE_SCALE = range(len(BIASES))
 MOTION_JITTER = (1e-7, 1e-7, 1e-9)
 """Added to each motion's variances [m², m², rad²]: noise of rank 2 has no information matrix."""
 
@@ -92,7 +93,8 @@ def columns(
 
     path: the pose at the end of each motion; the first motion begins at zero. measurements: of each
     the pose (an index into path) and the landmark. The bias b is the error: a bearing reads b too
-    much, a range (1 + b) times itself, and the way driven is (1 + b) times the odometry's.
+    much, a range b too much or (1 + b) times itself, and the way driven is (1 + b) times the
+    odometry's.
     """
     size = 3 * len(path) + 2 * len(landmarks)
     A, right = np.zeros((size, size)), np.zeros((size, len(BIASES)))
@@ -135,7 +137,7 @@ def _add_motions(
                 for b in range(3):
                     weighted[b] += J[a, i] * metrics[k, a, b]
             for b in range(3):
-                right[row, 1] += weighted[b] * shifts[k, b]
+                right[row, FORWARD_SCALE] += weighted[b] * shifts[k, b]
             for j in range(6):
                 if k > 0 or j >= 3:
                     for b in range(3):
@@ -197,7 +199,11 @@ def _add_measurements(
             row = rows[n, kind]
             for i in range(5):
                 weighted = row[i] / row[6]
-                right[at[i], 0 if kind else 2] -= weighted * row[5]
+                if kind:
+                    right[at[i], BEARING] -= weighted * row[5]
+                else:
+                    right[at[i], RANGE_OFFSET] -= weighted
+                    right[at[i], RANGE_SCALE] -= weighted * row[5]
                 for j in range(5):
                     A[at[i], at[j]] += weighted * row[j]
 
@@ -256,7 +262,10 @@ def _landmarks_given(
             shifts = np.zeros((len(own), biases))
             for k in range(len(own)):
                 row = rows[own[k], kind]
-                shifts[k, 0 if kind else 2] = row[5]
+                if kind:
+                    shifts[k, BEARING] = row[5]
+                else:
+                    shifts[k, RANGE_OFFSET], shifts[k, RANGE_SCALE] = 1.0, row[5]
                 for b in range(biases):
                     twist = twists[b, poses[own[k]]]
                     shifts[k, b] += row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]

@@ -27,7 +27,7 @@ from team.wire import channels as ch
 from tests.estimation.submap_world import local_truth, solved, team, wrap
 from tests.teams import config, driven, of, published
 
-SIGMA = {"bearing": 0.01, "forward_scale": 0.05, "range_scale": 0.01}
+SIGMA = {"bearing": 0.01, "forward_scale": 0.05, "range_offset": 0.02, "range_scale": 0.01}
 MOTION = MotionModel(
     "turn-then-drive",
     MotionNoise(per_s=0.02),
@@ -39,7 +39,7 @@ MOTION = MotionModel(
 # --- the columns of a window ---
 
 
-def window_of(bearing, forward_scale, range_scale, white=1.0):
+def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
     """A robot drives a curve among six landmarks, read without noise but with these errors."""
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01, range_white=white, bearing_white=white)
     front = FrontEnd(particles=400, resample_below=0.0, biases=BIASES)
@@ -56,7 +56,7 @@ def window_of(bearing, forward_scale, range_scale, white=1.0):
             window,
             increment_of(MOTION, 1.0, 1.0 / (1.0 + forward_scale), 0.1),
             seen.astype(np.uint32),
-            ranges[seen] * (1.0 + range_scale),
+            ranges[seen] * (1.0 + range_scale) + range_offset,
             bearings + bearing,
             random,
             forward_column(MOTION, 1.0, 1.0, 0.1),
@@ -66,7 +66,8 @@ def window_of(bearing, forward_scale, range_scale, white=1.0):
 
 @pytest.mark.parametrize("white", [1.0, 0.3])
 @pytest.mark.parametrize(
-    ("bias", "size"), [("bearing", 4e-3), ("range_scale", 4e-3), ("forward_scale", 1e-2)]
+    ("bias", "size"),
+    [("bearing", 4e-3), ("range_offset", 0.02), ("range_scale", 4e-3), ("forward_scale", 1e-2)],
 )
 def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements(bias, size, white):
     errors = dict.fromkeys(BIASES, 0.0)
@@ -83,8 +84,8 @@ def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
     seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
     step, column = increment_of(motion, 1.0, 1.0, 0.1), forward_column(motion, 1.0, 1.0, 0.1)
     local = windows.gaussian(windows.advanced(window, step, *seen, random, column))
-    assert local.biases == ("bearing", "range_scale")
-    assert local.sensitivity.shape == (2, 5)
+    assert local.biases == ("bearing", "range_offset", "range_scale")
+    assert local.sensitivity.shape == (3, 5)
 
 
 def test_columns_change_nothing_else():

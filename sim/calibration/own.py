@@ -1,0 +1,83 @@
+"""What each robot's sensor has of its own, and how far that strays from one world to the next.
+
+A constant of robot r in world w is v = m + a_r + e_rw. Each robot's value is its mean over the
+worlds, drawn towards the mean of all robots by what the spread s of e leaves uncertain:
+
+    m + (v̄_r − m) τ²/(τ² + s²/n_r),    τ² = var(v̄_r) − mean(s²/n_r).
+
+Where no constant's τ² is beyond doubt (F test) all robots are alike. s is a robust estimate: one
+camera that was touched between two worlds is not the rule.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import f as f_distribution
+
+from sim.calibration.data import Reference
+from sim.calibration.figures import CalibrationError, Figure, groups_of
+from sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants
+
+LEAST_ROBOTS = 3
+"""Of fewer it is not known how far robots differ."""
+BEYOND_DOUBT = 0.99
+BIAS_OF = {
+    "bearing_offset": "bearing",
+    "range_offset": "range_offset",
+    "range_scale": "range_scale",
+}
+"""The error that the centre estimates of each constant that has one."""
+
+
+class Own(NamedTuple):
+    """robots: figures of each robot's sensor, empty where all are alike; strays: s of each bias."""
+
+    robots: Mapping[str, tuple[Figure, ...]]
+    strays: tuple[Figure, ...]
+
+
+NOTHING_OF_ITS_OWN = Own({}, ())
+
+
+def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
+    """Each robot's own constants by the worlds (or by stretches of time where there are few)."""
+    found: dict[str, list[Mapping[str, float]]] = {}
+    for group in groups_of(data):
+        try:
+            values = constants(group, depth=depth).figures
+        except CalibrationError:
+            continue
+        found.setdefault(group[0].robot, []).append(values)
+    found = {robot: each for robot, each in sorted(found.items()) if len(each) > 1}
+    if len(found) < LEAST_ROBOTS:
+        return NOTHING_OF_ITS_OWN
+    counts = np.array([len(each) for each in found.values()], dtype=float)
+    robots: dict[str, list[Figure]] = {robot: [] for robot in found}
+    strays, differ = [], False
+    for name in next(iter(found.values()))[0]:
+        parts = [np.array([values[name] for values in each]) for each in found.values()]
+        means = np.array([part.mean() for part in parts])
+        stray = _within(parts)
+        of_means = stray**2 / counts
+        between = float(np.var(means, ddof=1))
+        dof = len(means) - 1, int(counts.sum()) - len(means)
+        differ |= between > float(of_means.mean() * f_distribution.ppf(BEYOND_DOUBT, *dof))
+        tau2 = max(between - float(of_means.mean()), 0.0)
+        share = tau2 / (tau2 + of_means) if tau2 > 0.0 else np.zeros(len(means))
+        drawn = means.mean() + share * (means - means.mean())
+        for robot, value, sigma in zip(found, drawn, np.sqrt(of_means * share), strict=True):
+            robots[robot].append(Figure(name, float(value), float(sigma), UNITS[name]))
+        if name in BIAS_OF:
+            error = stray / np.sqrt(2.0 * dof[1])
+            strays.append(Figure(f"bias_sigma.{BIAS_OF[name]}", stray, error, UNITS[name]))
+    if not differ:
+        return NOTHING_OF_ITS_OWN
+    return Own({robot: tuple(each) for robot, each in robots.items()}, tuple(strays))
+
+
+def _within(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
+    """The spread of a robot's values about their mean, by the median of |v − v̄| √(n/(n − 1))."""
+    off = [np.abs(part - part.mean()) * np.sqrt(len(part) / (len(part) - 1)) for part in parts]
+    return MAD_TO_SIGMA * float(np.median(np.concatenate(off)))

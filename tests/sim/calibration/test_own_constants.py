@@ -1,0 +1,88 @@
+"""Cameras that differ are told apart by calibration, and a depth from a distance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from central.desk.evaluation.errors import Path, on_circle
+from sim.calibration.calibrate import _other_model
+from sim.calibration.data import Reference
+from sim.calibration.own import own_constants
+from sim.calibration.sensor import fit_sensor
+from sim.world.streams import Intervals, grouped
+
+PLACES = {i: (1.0 + 0.4 * i) * np.array([np.cos(a), np.sin(a)])
+          for i, a in enumerate(np.linspace(-0.6, 0.6, 8), 1)}  # fmt: skip
+NOTHING = grouped(np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0), np.empty(0))
+CAMERAS = {"r1": (1.02, 0.05, 0.0), "r2": (1.05, 0.0, 0.01), "r3": (0.99, 0.1, -0.04)}
+"""range_scale, range_offset [m], optical_axis [rad]."""
+BENT = -0.05
+"""What bearings read too much by their cube."""
+
+
+def looking(
+    robot: str, world: int, camera: tuple[float, float, float], *, depth: bool = True
+) -> Reference:
+    """A robot that stands at the origin and reads eight landmarks 300 times, 1 % of the range."""
+    rng = np.random.default_rng([int(robot[1:]), world])
+    scale, offset, axis = camera
+    ids = np.repeat(np.array(list(PLACES), np.uint32), 300)
+    places = np.repeat(np.array(list(PLACES.values())), 300, axis=0)
+    bearings = np.arctan2(places[:, 1], places[:, 0])
+    distances = np.hypot(*places.T) * (1.0 + 0.01 * rng.standard_normal(len(ids)))
+    raw = bearings + 0.01
+    for _ in range(20):
+        raw = bearings + 0.01 + BENT * raw**3
+    along = np.cos(raw - axis) if depth else 1.0
+    read = on_circle(raw + 0.002 * rng.standard_normal(len(ids)))
+    stamps = rng.permutation(len(ids)).astype(np.int64) * 100_000_000
+    order = np.argsort(stamps)
+    seen = grouped(
+        stamps[order], ids[order], (scale * distances * along + offset)[order], read[order]
+    )
+    last = int(stamps.max())
+    intervals = Intervals(np.array([last]), np.array([last]), np.zeros(1), np.zeros(1))
+    path = Path(np.array([0, last]), np.zeros((2, 3)))
+    label = f"{world} {robot}"
+    return Reference(label, intervals, seen, path, last, PLACES, NOTHING, (), {})
+
+
+def team(cameras: dict[str, tuple[float, float, float]], *, depth: bool = True) -> list[Reference]:
+    return [looking(r, w, camera, depth=depth) for w in (1, 2) for r, camera in cameras.items()]
+
+
+def test_each_cameras_own_constants_come_out_where_they_differ() -> None:
+    own = own_constants(team(CAMERAS), depth=True)
+    assert list(own.robots) == list(CAMERAS)
+    for robot, (scale, offset, axis) in CAMERAS.items():
+        found = {figure.name: figure for figure in own.robots[robot]}
+        assert found["range_scale"].value == pytest.approx(scale, abs=0.003)
+        assert found["range_offset"].value == pytest.approx(offset, abs=0.006)
+        assert found["bearing_lens.cubic"].value == pytest.approx(BENT, abs=0.01)
+        assert found["optical_axis"].value == pytest.approx(axis, abs=0.003)
+    assert {figure.name for figure in own.strays} == {
+        "bias_sigma.bearing", "bias_sigma.range_offset", "bias_sigma.range_scale",
+    }  # fmt: skip
+
+
+def test_cameras_that_are_alike_have_nothing_of_their_own() -> None:
+    alike = dict.fromkeys(CAMERAS, CAMERAS["r1"])
+    assert own_constants(team(alike), depth=True).robots == {}
+
+
+def test_a_camera_that_was_changed_between_worlds_does_not_widen_what_all_have() -> None:
+    data = team(CAMERAS | {"r4": CAMERAS["r1"]})
+    before = {figure.name: figure.value for figure in own_constants(data, depth=True).strays}
+    data[-1] = replace(looking("r4", 2, (1.08, 0.0, 0.0)), name="2 r4")
+    after = {figure.name: figure.value for figure in own_constants(data, depth=True).strays}
+    assert after["bias_sigma.range_scale"] < 3.0 * before["bias_sigma.range_scale"] + 1e-3
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_the_wrong_model_of_the_range_is_told(depth: bool) -> None:
+    data = team(CAMERAS, depth=depth)
+    assert fit_sensor(data, depth=depth)["range_sigma_per_m"] == pytest.approx(0.01, rel=0.1)
+    assert _other_model(data, depth) == ()
+    (told,) = _other_model(data, not depth)
+    assert f"set range_is_depth = {str(depth).lower()}" in told
