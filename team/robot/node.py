@@ -17,6 +17,7 @@ from team.config import Exchange, RobotConfig
 from team.door import absurd
 from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pipeline import NOT_USED
 from team.estimation.hybrid_slam.pose_grid import NO_NODE
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
@@ -59,6 +60,11 @@ MOST_SET_ASIDE = 8
 """Measurements of one window after which the estimator is not put back behind them any more."""
 UNSOLVED = "its window has no solution"
 """Why a scan is rejected after all: of its window the odometry's motion alone is in the submap."""
+UNEXPECTED = 3.0
+"""NIS per degree of freedom above which measurements are not what the models say: 1 is right, and
+5 % of outliers give 3 with a coarse sensor, a hundred with an accurate one."""
+UNEXPECTED_DOF = 60
+"""… judged from so many degrees of freedom on."""
 JOINT_LANDMARKS = 2000
 """An own map of more landmarks carries their own covariances only: a message has 64 MiB at most."""
 
@@ -288,9 +294,26 @@ class RobotNode:
         node = ch.robot_node(self.robot)
         waiting = ("no measurements of this team yet",) if state == "waiting" else ()
         doubt = (self._team_map.doubt,) if self._team_map.doubt else ()
-        warnings = (*waiting, *doubt, *self.warnings[-3:])
+        warnings = (*waiting, *doubt, *self._unexpected(nis), *self.warnings[-3:])
         told = {name: value for name, value in figures.items() if abs(value) <= 1e300}
         return m.Status(self._now_ns, node, state, told, warnings)
+
+    def _unexpected(self, nis: Innovation) -> tuple[str, ...]:
+        """Says that measurements lie far from their predictions, and what to configure then."""
+        ratio = nis.per_dof
+        if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
+            return ()
+        share = self.config.front_end.garbage
+        remedy = (
+            f"is front_end.garbage = {share:g} too few, or the sensor's noise too small?"
+            if share
+            else "outliers, or noise that is larger than the sensor's sigmas? Outliers need "
+            "front_end.garbage (their share), central.robust_c = 2, central.landmark_submaps = 2"
+        )
+        return (
+            f"measurements lie far from their predictions, NIS {ratio:.0f} per degree of freedom "
+            f"(1 is right): {remedy}",
+        )
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Go on behind a measurement whose handling raised, as if it had never been there.

@@ -14,7 +14,7 @@ from team.robot import pace
 from team.robot.node import LATE, RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
+from team.wire.arrays import floats, from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
 from tests.support import packed, spd
@@ -409,6 +409,33 @@ def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
     rest = of(driven(node, MEASUREMENTS[-8:]), ch.INNOVATION)
     figures = node.status().figures
     assert figures["nis_dof"] == closed + sum(window.dof for window in rest)
+
+
+def outliers(readings, share):
+    """Some of the ranges and bearings have nothing to do with what is there."""
+    rng, spoilt = np.random.default_rng(7), []
+    for reading in readings:
+        if isinstance(reading, m.Observations):
+            ranges, bearings = (floats(x, "z").copy() for x in (reading.ranges, reading.bearings))
+            bad = rng.random(len(ranges)) < share
+            ranges[bad] = rng.uniform(1.0, 10.0, bad.sum())
+            bearings[bad] = rng.uniform(-np.pi, np.pi, bad.sum())
+            reading = msgspec.structs.replace(
+                reading, ranges=from_floats(ranges), bearings=from_floats(bearings)
+            )
+        spoilt.append(reading)
+    return spoilt
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_measurements_far_from_their_predictions_are_said_with_what_to_configure(share):
+    node = RobotNode(config())
+    driven(node, outliers(published(stream("r1", 30)), share), end=False)
+    status = node.status()
+    assert status.figures["nis_dof"] > 60
+    said = [each for each in status.warnings if "far from their predictions" in each]
+    assert len(said) == (share > 0.0), status
+    assert all("front_end.garbage" in each for each in said)
 
 
 @pytest.mark.parametrize("exchange", ["continuous", "rendezvous"])
