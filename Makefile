@@ -35,10 +35,10 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 run: $(VENV)/.runtime
 	$(BIN)/teamslam launch waypoints --speed max
 
-# loadgroup: what starts processes shares one worker, everything else is spread over both.
+# tests/conftest.py says which worker gets what.
 test: $(VENV)/.dev
 	tests/get-chromium
-	$(BIN)/pytest --numprocesses 2 --dist loadgroup
+	$(BIN)/pytest --numprocesses 2
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

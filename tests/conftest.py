@@ -1,6 +1,6 @@
 """What holds in every test run: one BLAS thread, checked shapes, repeatable examples.
 
-System tests run one by one.
+System tests run one by one, beside the others.
 """
 
 import os
@@ -11,6 +11,8 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 import tests.shapes
 
@@ -27,8 +29,26 @@ def pytest_runtest_setup() -> None:
     tests.shapes.begin_test()
 
 
+SYSTEM = "tests/system/"
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that start processes share one worker, so that they do not starve each other."""
-    for item in items:
-        if "system" in item.path.relative_to(item.config.rootpath).parts:
-            item.add_marker(pytest.mark.xdist_group("system"))
+    """The tests that start processes come first: theirs is the longest share."""
+    items.sort(key=lambda item: not item.nodeid.startswith(SYSTEM))
+
+
+class Shares(LoadScopeScheduling):
+    """A worker gets a file, whose tests share what is made for them, or all tests of processes.
+
+    Those run one by one, so that they do not starve each other.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        return SYSTEM if nodeid.startswith(SYSTEM) else nodeid.partition("::")[0]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Shares:
+    """Shares are given out in the order of the tests, not by how many tests they hold."""
+    config.option.loadscopereorder = False
+    return Shares(config, log)

@@ -1,10 +1,11 @@
 """Short worlds for the system tests, and what a team in one process makes of them."""
 
 import hashlib
+from functools import cache
 from pathlib import Path
 
 from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load, with_options
+from sim.scenarios.scenario import dumps, load, loads, with_options
 from sim.scenarios.source import streams_of
 from team.wire.channels import FINAL_MAP
 
@@ -26,7 +27,13 @@ def final_map(samples: "list[tuple[str, bytes]]") -> bytes:
 
 def map_in_memory(scenario: Path, seed: int = 1) -> bytes:
     """The bytes of the final map that the same nodes send on the bus in memory."""
-    resolved = with_options(load(scenario), seed=seed)
+    return _map_of(dumps(with_options(load(scenario), seed=seed)))
+
+
+@cache
+def _map_of(scenario: str) -> bytes:
+    """Several tests launch the same short world."""
+    resolved = loads(scenario)
     samples = run_team(resolved, streams_of(resolved))
     return final_map([(sample.key, sample.payload) for sample in samples])
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -17,19 +18,19 @@ from tests.system.observer import Observer, endpoint_of
 from tests.system.processes import Process, Processes, until
 from tests.system.scenarios import final_map, map_in_memory, short
 
-SLOW = "3"
-"""What is to be met alive is still running on a busy machine."""
+PACE = "5"
+"""Ten seconds are left after r1's first submap: what is to be met alive still runs by then."""
 
 
-async def launched(team: Processes, speed: str = "5") -> tuple[Process, Path]:
-    """A launch that has r1's second submap, seconds before its end; and its run's folder."""
+async def launched(team: Processes, speed: str = PACE) -> tuple[Process, Path]:
+    """A launch that has r1's first submap, seconds before its end; and its run's folder."""
     folder = team.folder / "run"
     launch = await team.start(
         *("launch", short(team.folder), "--speed", speed, "--no-report"),
         *("--output", folder, "--json", "result.json"),
     )
     with Observer(await endpoint_of(folder), [ch.SUBMAP]) as seen:
-        await seen.sees(2, ch.SUBMAP, "r1")
+        await seen.sees(1, ch.SUBMAP, "r1")
     return launch, folder
 
 
@@ -43,7 +44,7 @@ def submaps_in(log: Path) -> int:
 
 async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team: Processes) -> None:
     """A robot, the centre, the world and the router, one after the other in one run."""
-    launch, folder = await launched(team, SLOW)
+    launch, folder = await launched(team, "4")
     killed = []
     for words in (("robot", "r1"), ("central",), ("world",), ("router",)):
         pid = await team.pid(*words)
@@ -72,7 +73,7 @@ def other(team: Processes, words: tuple[str, ...]) -> int | None:
 async def test_a_recorder_that_is_killed_goes_on_and_what_it_had_reads_and_can_be_repaired(
     team: Processes,
 ) -> None:
-    launch, folder = await launched(team, SLOW)
+    launch, folder = await launched(team)
     path = folder / "log.mcap"
     await until(lambda: submaps_in(path) > 0, "the recorder flushes", 10.0)
     os.kill(await team.pid("record"), signal.SIGKILL)
@@ -136,17 +137,20 @@ async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that
 ) -> None:
     folder = team.folder / "run"
     launch = await team.start(
-        *("launch", short(team.folder), "--speed", "5", "--no-report", "--end-silent", "11"),
+        *("launch", short(team.folder), "--speed", PACE, "--no-report", "--end-silent", "11"),
         *("--output", folder, "--json", "result.json"),
     )
     with Observer(await endpoint_of(folder), [ch.SUBMAP]) as seen:
-        await seen.sees(2, ch.SUBMAP, "r1")
+        await seen.sees(1, ch.SUBMAP, "r1")
     pid = await team.pid("world")
     os.kill(pid, signal.SIGSTOP)
     assert await launch.ended(120.0) == 0, launch.said()
     await team.none_left(0.0)
     assert f"world (pid {pid}) is stopped (SIGSTOP?) and has said nothing for" in launch.said()
-    assert json.loads((team.folder / "result.json").read_text())["restarts"] == {"world": 1}
+    restarts = json.loads((team.folder / "result.json").read_text())["restarts"]
+    assert "world" in restarts
+    for name in restarts:  # on a busy machine another one may be silent, too
+        assert re.search(rf"{name} \(pid \d+\) was silent \d+ s: ended", launch.said())
     samples = open_log(folder / "log.mcap").samples([ch.FINAL_MAP])
     assert final_map([(s.key, s.payload) for s in samples]) == map_in_memory(
         team.folder / "short.toml"
@@ -157,7 +161,7 @@ async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that
 async def test_an_interrupt_ends_every_process_and_completes_the_log(
     number: signal.Signals, team: Processes
 ) -> None:
-    launch, folder = await launched(team, SLOW)
+    launch, folder = await launched(team)
     launch.signal(number)
     assert await launch.ended(20.0) == 1
     await team.none_left(0.0)
@@ -169,7 +173,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
 
 
 async def test_no_process_outlives_a_launch_that_is_killed(team: Processes) -> None:
-    launch, folder = await launched(team, SLOW)
+    launch, folder = await launched(team)
     assert len(team.alive()) == 8
     launch.signal(signal.SIGKILL)
     assert await launch.ended() == -signal.SIGKILL
