@@ -92,9 +92,9 @@ def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(
 
 
 async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, object]:
-    """Launch at full speed without a report; the JSON."""
+    """Launch at full speed without a report and views; the JSON."""
     process = await team.start(
-        *("launch", scenario, "--speed", "max", "--no-report", "--output", "run"),
+        *("launch", scenario, "--speed", "max", "--no-report", "--no-views", "--output", "run"),
         *("--json", "result.json", *options),
     )
     assert await process.ended() == 0, process.said()
