@@ -10,10 +10,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated, get_origin
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # a kernel is then the function that is written there
 HERE = Path(__file__).parent
-STUDIES = ("experiments", "studies")
+LEFT_OUT = ("sim/studies", "team/library.py")
+"""Of the API reference: programs that make the sources' tables; what has a page of its own."""
 GENERATED = HERE / "generated"
 sys.path.insert(0, str(HERE.parent))
 
@@ -47,8 +49,7 @@ apidoc_modules = [
         "separate_modules": False,
         "module_first": True,
         "automodule_options": {"members"},
-        # Studies reproduce the sources' tables: programs, and no part of what others build on.
-        "exclude_patterns": [str(HERE.parent / "sim" / name) for name in STUDIES],
+        "exclude_patterns": [str(HERE.parent / left_out) for left_out in LEFT_OUT],
     }
     for package in ("team", "central", "sim")
 ]
@@ -101,6 +102,13 @@ def _as_restructured_text(
     lines[:] = written
 
 
+def _is_annotated(
+    app: object, what: str, name: str, value: object, skip: bool, options: object
+) -> bool | None:
+    """Whether a member is left out: a type with a constraint says no more than its definition."""
+    return True if get_origin(value) is Annotated else None
+
+
 def _inline(self: object, node: object) -> None:
     """An equation within a line, as MathML."""
     _write(self, node, "inline")
@@ -132,5 +140,6 @@ def _write_commands(app: object) -> None:
 def setup(app: object) -> None:
     """Called by Sphinx."""
     app.connect("builder-inited", _write_commands, priority=100)  # type: ignore[attr-defined]
+    app.connect("autodoc-skip-member", _is_annotated)  # type: ignore[attr-defined]
     app.connect("autodoc-process-docstring", _as_restructured_text)  # type: ignore[attr-defined]
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))  # type: ignore[attr-defined]

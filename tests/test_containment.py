@@ -16,9 +16,10 @@ from sim.in_memory.team import final_map
 from team.containment import Boundary
 from team.recording.recorder import Recorder
 from team.recording.shell import RecordLoop
+from team.rejection import Rejection
 from team.robot.hybrid import HybridEstimator
 from team.robot.main import RobotShell
-from team.robot.node import SET_ASIDE, RobotNode
+from team.robot.node import RobotNode
 from team.shell import FaultyRunError, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -71,7 +72,8 @@ def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_n
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)
         assert isinstance(done, m.Done)
-        assert {d.disposition: d.measurements for d in done.ledger}[SET_ASIDE] == 1
+        ledger = {each.disposition: each.measurements for each in done.ledger}
+        assert ledger[Rejection.SET_ASIDE.disposition] == 1
     assert {x.robot for x in final_map(samples).members} == {"r1", "r2"}
     (r1, r2), evaluation = told, evaluate(samples)
     assert evaluation.faults == 2

@@ -9,8 +9,9 @@ from typing import NamedTuple
 from team import translate
 from team.config import Bounds, RobotConfig
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from team.rejection import Rejection
 from team.stream.inbox import Inbox
-from team.stream.judge import SPEED, StreamJudge
+from team.stream.judge import StreamJudge
 from team.wire import messages as m
 
 
@@ -80,7 +81,7 @@ class _Stream:
             case m.Odometry() if self.segmenter is not None:
                 motion = translate.motion_of(measurement, config.clock_offset_s)
                 reason = self.judge.odometry(*motion)
-                if reason not in {None, SPEED}:
+                if reason not in {None, Rejection.SPEED}:
                     return
                 end_ns, duration_ns, _, _ = motion
                 if self.segmenter.now_ns is None:

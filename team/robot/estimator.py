@@ -17,6 +17,7 @@ from team.estimation.hybrid_slam.pose_grid import Looks
 from team.estimation.submap import LocalMap
 from team.pairs import ESTIMATORS
 from team.registry import loaded
+from team.rejection import Rejection
 
 CLOUD_PARTICLES = 32
 """Particles in a cloud for viewers."""
@@ -94,7 +95,7 @@ class RobotEstimator(Protocol):
     @property
     def innovation(self) -> Innovation: ...  # noqa: D102
 
-    def observe(self, stamp_ns: int, scan: Scan) -> str | None:
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan of landmarks; the reason if it is rejected."""
 
     def drive(
@@ -128,7 +129,7 @@ class MakesSubmaps(Protocol):
     def resume(self, closed: ClosedWindow) -> None:
         """Go on behind a submap of an earlier life."""
 
-    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> str | None:
+    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
         """Take inter-robot measurements; the reason if they are rejected."""
 
     def open_window(self) -> LocalMap | None:

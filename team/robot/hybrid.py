@@ -17,6 +17,7 @@ from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.map_joining.whole_map import WholeMap, absorbed, begun, joined
 from team.estimation.plausible import are_landmarks
 from team.estimation.submap import LocalMap
+from team.rejection import Rejection
 from team.robot.estimator import (
     AT_ORIGIN,
     NOTHING_KNOWN,
@@ -65,11 +66,11 @@ class HybridEstimator:
         self.whole, self._open = self._joined(closed.local), None
         self._slam.resume(closed)
 
-    def observe(self, stamp_ns: int, scan: Scan) -> str | None:
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan of landmarks; the reason if it is rejected."""
         return self._slam.observe(stamp_ns, scan)
 
-    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> str | None:
+    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
         """Take inter-robot measurements; the reason if they are rejected."""
         return self._slam.sight(stamp_ns, measurement, looks)
 

@@ -18,12 +18,11 @@ from team.door import absurd
 from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.hybrid_slam.pipeline import NOT_USED
-from team.estimation.hybrid_slam.pose_grid import NO_NODE
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond, start_beyond
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
+from team.rejection import Rejection
 from team.robot.estimator import (
     AT_ORIGIN,
     NOTHING_KNOWN,
@@ -42,7 +41,7 @@ from team.robot.sent import Sent
 from team.robot.statements import Speaker
 from team.robot.team_map import TeamMap
 from team.stream.inbox import Inbox
-from team.stream.judge import RANGE, SPEED, StreamJudge
+from team.stream.judge import StreamJudge
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -53,13 +52,8 @@ AHEAD = 64
 """Submaps of an earlier life that the centre may have taken since it was asked for them."""
 IN_SIGHTING = "in a sighting factor"
 """The disposition of a measurement of teammates that was used."""
-SET_ASIDE = "rejected: its handling raised"
-LATE = "rejected: counted in a window that ends before its stamp"
-"""The disposition of a measurement that was set aside."""
 MOST_SET_ASIDE = 8
 """Measurements of one window after which the estimator is not put back behind them any more."""
-UNSOLVED = "its window has no solution"
-"""Why a scan is rejected after all: of its window the odometry's motion alone is in the submap."""
 UNEXPECTED = 3.0
 """NIS per degree of freedom above which measurements are not what the models say: 1 is right, and
 5 % of outliers give 3 with a coarse sensor, a hundred with an accurate one."""
@@ -105,7 +99,7 @@ class RobotNode:
         self._last_map = -1
         self._ledger: Counter[str] = Counter()
         self._judge = StreamJudge(config.bounds)
-        self._unused: str | None = None
+        self._unused: Rejection | None = None
         self._sighted: set[int] = set()
         self._withdrawn: set[str] = set()
         self._ended: list[m.Done] = []
@@ -323,7 +317,7 @@ class RobotNode:
         """
         if self._taking is not None:
             self._taking = None
-            self._ledger[SET_ASIDE] += 1
+            self._ledger[Rejection.SET_ASIDE.disposition] += 1
             self._aside += 1
             if self._consumer == "submap" and self._start and self._aside <= MOST_SET_ASIDE:
                 self._put_back(self._start)
@@ -481,14 +475,14 @@ class RobotNode:
     def _observe(self, measurement: m.Observations) -> None:
         self._goes_in(measurement)
         reason = self._look(measurement)
-        self._ledger[self._estimator.used if reason is None else f"rejected: {reason}"] += 1
+        self._ledger[self._estimator.used if reason is None else reason.disposition] += 1
 
     def _sight(self, measurement: m.Sightings) -> list[Outgoing]:
         self._goes_in(measurement)
         reason = self._see(measurement)
         if reason is None:
             self._sighted.add(measurement.number)
-        self._ledger[IN_SIGHTING if reason is None else f"rejected: {reason}"] += 1
+        self._ledger[IN_SIGHTING if reason is None else reason.disposition] += 1
         return self._release(measurement.teammates)
 
     def _drive(self, measurement: m.Odometry) -> list[Outgoing]:
@@ -502,30 +496,30 @@ class RobotNode:
 
     # A measurement within the bounds goes to the estimator; of one beyond them the reason is said.
 
-    def _look(self, measurement: m.Observations) -> str | None:
+    def _look(self, measurement: m.Observations) -> Rejection | None:
         scan = translate.scan_of(measurement)
         near = self._judge.near(scan[1])
         reason = self._judge.time(measurement.stamp_ns)
         if reason is None and len(near) and not near.any():
-            reason = RANGE
+            reason = Rejection.RANGE
         if reason is None:
             ids, ranges, bearings = (each[near] for each in scan)
             reason = self._estimator.observe(measurement.stamp_ns, (ids, ranges, bearings))
         return reason
 
-    def _see(self, measurement: m.Sightings) -> str | None:
+    def _see(self, measurement: m.Sightings) -> Rejection | None:
         teammates, ranges, bearings = translate.looks_of(measurement)
         others = np.array([name != self.robot for name in teammates], dtype=np.bool_)
         near = self._judge.near(ranges) & others
         reason = self._judge.time(measurement.stamp_ns)
         if reason is None and len(near) and not near.any():
-            reason = RANGE if others.any() else "a robot does not see itself"
+            reason = Rejection.RANGE if others.any() else Rejection.ITSELF
         if reason is None:
             seen = tuple(name for name, is_near in zip(teammates, near, strict=True) if is_near)
             looks = seen, ranges[near], bearings[near]
             windows = self._windows
             reason = (
-                NOT_USED
+                Rejection.NO_TEAMMATES
                 if windows is None
                 else windows.sight(measurement.stamp_ns, measurement.number, looks)
             )
@@ -534,7 +528,7 @@ class RobotNode:
     def _go(self, measurement: m.Odometry) -> Estimates:
         motion = translate.motion_of(measurement, self.config.clock_offset_s)
         self._unused = self._judge.odometry(*motion)
-        if self._unused not in {None, SPEED}:
+        if self._unused not in {None, Rejection.SPEED}:
             return NOTHING_NEW
         return self._estimator.drive(*motion, measured=self._unused is None)
 
@@ -547,7 +541,7 @@ class RobotNode:
     def _used(self, measurement: m.Measurement) -> None:
         """The ledger has an interval of odometry; it is used, or rejected with its reason."""
         unused = self._unused
-        self._ledger[self._estimator.used if unused is None else f"rejected: {unused}"] += 1
+        self._ledger[self._estimator.used if unused is None else unused.disposition] += 1
         self._taken(measurement)
 
     def _told(self, driven: Estimates) -> list[Outgoing]:
@@ -573,12 +567,12 @@ class RobotNode:
         self._sighted_in(closed)
         if closed.late:
             self._ledger[self._estimator.used] -= closed.late
-            self._ledger[LATE] += closed.late
+            self._ledger[Rejection.LATE.disposition] += closed.late
         self._locals.append(closed.local)
         self._judge = StreamJudge(self.config.bounds, closed.end_ns)
         if closed.unsolved:
             self._ledger[self._estimator.used] -= closed.unsolved
-            self._ledger[f"rejected: {UNSOLVED}"] += closed.unsolved
+            self._ledger[Rejection.UNSOLVED.disposition] += closed.unsolved
         plain = ClosedWindow(
             sequence=closed.sequence,
             first_measurement=closed.first_measurement,
@@ -630,7 +624,7 @@ class RobotNode:
         lost = len(self._sighted - used)
         if lost:
             self._ledger[IN_SIGHTING] -= lost
-            self._ledger[f"rejected: {NO_NODE}"] += lost
+            self._ledger[Rejection.NO_NODE.disposition] += lost
         self._sighted.clear()
 
     def _mapped(self, stamp_ns: int) -> list[Outgoing]:
@@ -758,7 +752,7 @@ class RobotNode:
             self._sighted_in(None)
         if uncovered:
             self._ledger[self._estimator.used] -= uncovered
-            self._ledger["rejected: no odometry covers it"] += uncovered
+            self._ledger[Rejection.NOT_COVERED.disposition] += uncovered
         return out
 
     def _leave_epoch(self) -> list[Outgoing]:

@@ -4,13 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from team.config import Bounds
-
-NO_TIME = "odometry over no time"
-OLDER = "older than the odometry"
-SPEED = "odometry beyond the bounds"
-"""Its time is believed, its motion is not."""
-TIME = "a time beyond the bounds"
-RANGE = "a range beyond the bounds"
+from team.rejection import Rejection
 
 
 class StreamJudge:
@@ -28,18 +22,18 @@ class StreamJudge:
 
     def odometry(
         self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
-    ) -> str | None:
-        """Why an interval is refused: `SPEED` for its motion alone, else the whole of it."""
+    ) -> Rejection | None:
+        """Why an interval is refused: by `Rejection.SPEED` its motion alone, else all of it."""
         if duration_ns == 0:
-            return NO_TIME
+            return Rejection.NO_TIME
         if self._now_ns is not None:
             if stamp_ns <= self._now_ns:
-                return OLDER
+                return Rejection.OLDER
             near_ns = self._now_ns if self._jumped_ns is None else self._jumped_ns
             ahead_ns = stamp_ns - self._now_ns
             if ahead_ns > self._jump_ns and not 0 < stamp_ns - near_ns <= self._jump_ns:
                 self._jumped_ns = stamp_ns
-                return TIME
+                return Rejection.TIME
         self._now_ns, self._jumped_ns = stamp_ns, None
         bounds = self._bounds
         sensible = (
@@ -47,12 +41,12 @@ class StreamJudge:
             and abs(forward) <= bounds.speed_m_s
             and abs(yaw_rate) <= bounds.yaw_rate_rad_s
         )
-        return None if sensible else SPEED
+        return None if sensible else Rejection.SPEED
 
-    def time(self, stamp_ns: int) -> str | None:
+    def time(self, stamp_ns: int) -> Rejection | None:
         """Why what was seen at this time is refused."""
         ahead_ns = 0 if self._now_ns is None else stamp_ns - self._now_ns
-        return TIME if ahead_ns > self._jump_ns else None
+        return Rejection.TIME if ahead_ns > self._jump_ns else None
 
     def near(self, ranges: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Which ranges are within the bounds."""

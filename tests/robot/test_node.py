@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from team import translate
 from team.pairs import PAIRS
+from team.rejection import Rejection
 from team.robot import pace
-from team.robot.node import LATE, RobotNode
+from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids
@@ -198,7 +199,8 @@ def test_what_is_stamped_behind_its_window_is_in_no_submap_also_after_a_restart(
     whole = of(out, ch.SUBMAP)
     (done,) = of(out, ch.ROBOT_DONE)
     assert sum(entry.measurements for entry in done.ledger) == len(measurements)
-    assert {e.disposition: e.measurements for e in done.ledger}[LATE] == len(whole) - 1
+    ledger = {entry.disposition: entry.measurements for entry in done.ledger}
+    assert ledger[Rejection.LATE.disposition] == len(whole) - 1
     for taken in range(1, len(whole)):
         node = RobotNode(config(front_end=front_end))
         node.resume(measurements[0], whole[:taken])

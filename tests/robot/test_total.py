@@ -18,8 +18,8 @@ from team.config import (
     MotionNoise,
     RobotConfig,
 )
+from team.rejection import Rejection
 from team.robot.node import RobotNode
-from team.stream.judge import OLDER, RANGE, SPEED, TIME
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, ids
 from tests.hostile_team import S, hostile_stream, robot_session
@@ -82,7 +82,7 @@ def lived(messages, **fields) -> tuple[RobotNode, list[m.Submap], Counter[str]]:
 def test_an_interval_that_is_too_fast_is_rejected_and_the_robot_drives_on(speed):
     glitch = m.Odometry(15 * S, "r1", 1, 30, S, speed, 0.0)
     _, submaps, ledger = lived(drive(40, {15: glitch}, sees=False))
-    assert ledger[f"rejected: {SPEED}"] == 1
+    assert ledger[Rejection.SPEED.disposition] == 1
     _, good, _ = lived(drive(40, sees=False))
     sigmas = [[floats(each.covariance, "")[0] ** 0.5 for each in some] for some in (submaps, good)]
     more = np.array(sigmas[0]) / np.array(sigmas[1])
@@ -97,8 +97,8 @@ def test_time_that_stands_goes_back_or_leaps_is_rejected():
         16: m.Odometry(16 * S + 10**18, "r1", 1, 32, S, 1.0, 0.1),
     }
     _, submaps, ledger = lived(drive(40, odd))
-    assert ledger[f"rejected: {OLDER}"] == 2
-    assert ledger[f"rejected: {TIME}"] == 1
+    assert ledger[Rejection.OLDER.disposition] == 2
+    assert ledger[Rejection.TIME.disposition] == 1
     assert submaps[-1].stamp_ns == 40 * S
 
 
@@ -106,7 +106,7 @@ def test_a_clock_that_has_truly_leapt_is_followed_from_the_second_interval_on():
     away = 10**18
     odd = {k: m.Odometry(k * S + away, "r1", 1, 2 * k, S, 1.0, 0.1) for k in range(21, 41)}
     _, submaps, ledger = lived(drive(40, odd))
-    assert ledger[f"rejected: {TIME}"] == 1
+    assert ledger[Rejection.TIME.disposition] == 1
     assert submaps[-1].stamp_ns == 40 * S + away
 
 
@@ -114,7 +114,7 @@ def test_a_range_beyond_the_bounds_is_not_taken():
     far = m.Observations(5 * S, "r1", 1, 9, from_ids([1]), from_floats([9e5]), from_floats([0.0]))
     messages = [far if getattr(x, "number", None) == 9 else x for x in drive(20)]
     _, _, ledger = lived(messages, bounds=Bounds(extent_m=1e4))
-    assert ledger[f"rejected: {RANGE}"] == 1
+    assert ledger[Rejection.RANGE.disposition] == 1
 
 
 def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bounds():

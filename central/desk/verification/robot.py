@@ -9,10 +9,10 @@ import msgspec
 from central.desk.verification.recorded import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
-from team.estimation.hybrid_slam.pose_grid import NO_NODE
 from team.pairs import FEEDBACK
+from team.rejection import Rejection
 from team.robot.hybrid import HybridEstimator
-from team.robot.node import LATE, RobotNode
+from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -206,18 +206,18 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     for counter in takewhile(
         measurements.__contains__, range(len(measurements) if done is None else done)
     ):
-        took = node.took(measurements[counter])
-        if LATE in took:  # an odometry interval that ends a window, and scans that it leaves behind
+        took, late = node.took(measurements[counter]), Rejection.LATE.disposition
+        if late in took:  # an odometry interval that ends a window, and scans that it leaves behind
             scans = [n for n in said if isinstance(measurements[n], m.Observations)]
             scans = [n for n in scans if not said[n].startswith("rejected")]
-            said |= dict.fromkeys(scans[-took.pop(LATE) :], LATE)
+            said |= dict.fromkeys(scans[-took.pop(late) :], late)
             said[counter] = HybridEstimator.used
         else:
             said[counter] = next(iter(took), "lost")
     if said and done is not None:
         end = m.StreamEnd(robot, epoch, len(said))
         for reason, count in node.took(m.End(0, (end,))).items():
-            kind = m.Sightings if reason == f"rejected: {NO_NODE}" else m.Observations
+            kind = m.Sightings if reason == Rejection.NO_NODE.disposition else m.Observations
             taken = [n for n in said if isinstance(measurements[n], kind)]
             taken = [n for n in taken if not said[n].startswith("rejected")]
             said |= dict.fromkeys(taken[-count:], reason)

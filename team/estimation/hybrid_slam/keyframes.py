@@ -11,6 +11,7 @@ from team.estimation import geometry
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.hybrid_slam.sensitivity import carried_on, forward_column
 from team.estimation.models import Increment, acceptable, corrected, increment_of, located
+from team.rejection import Rejection
 
 UNMEASURED = (1.0, 0.5)
 """Where motion was not measured it is uncertain by as much as it is, and by this [m/s, rad/s]."""
@@ -90,13 +91,13 @@ class Segmenter:
         ids: UInt32[np.ndarray, " n"],
         ranges: Float[np.ndarray, " n"],
         bearings: Float[np.ndarray, " n"],
-    ) -> str | None:
+    ) -> Rejection | None:
         """Keep a scan until the odometry covers its time; the reason if it is rejected instead."""
         if self.now_ns is not None and stamp_ns < self.now_ns:
-            return "older than the odometry"
+            return Rejection.OLDER
         mask = acceptable(self._sensor, ranges, bearings)
         if len(ids) and not mask.any():
-            return "outside the sensor's limits"
+            return Rejection.SENSOR_LIMITS
         r, b = corrected(self._sensor, ranges[mask], bearings[mask])
         scan = _Scan(stamp_ns, ids[mask], r, b, np.zeros(3))
         insort(self._waiting, scan, key=lambda each: each.stamp_ns)

@@ -30,9 +30,8 @@ from team.estimation.models import Increment
 from team.estimation.plausible import submap_beyond
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
+from team.rejection import Rejection
 
-NOT_USED = "sightings are not used by this estimator"
-"""Why an inter-robot measurement is rejected where there are no pose nodes."""
 Scan = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Landmark ids, ranges [m] and bearings [rad] of one message."""
 
@@ -69,18 +68,18 @@ class HybridSlam:
         """The measurement belongs to the open window (or was rejected while it was open)."""
         self._last_measurement = measurement
 
-    def observe(self, stamp_ns: int, scan: Scan) -> str | None:
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan of landmarks; the reason if it is rejected."""
         reason = self._segmenter.observe(stamp_ns, *scan)
         self._scans += reason is None
         return reason
 
-    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> str | None:
+    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
         """Take inter-robot measurements; the reason if they are rejected."""
         if self._grid is None:
-            return NOT_USED
+            return Rejection.NO_TEAMMATES
         if self._start_ns is None:
-            return "older than the odometry"
+            return Rejection.OLDER
         return self._grid.observe(stamp_ns, measurement, looks)
 
     def drive(

@@ -14,9 +14,8 @@ from jaxtyping import Float
 from team.config import FrontEnd, Sensor
 from team.estimation.inter_robot import Carried, carried_back, carried_on, point_seen, reduced
 from team.estimation.models import Increment, acceptable, corrected
+from team.rejection import Rejection
 
-NO_NODE = "no pose node near it"
-"""Why a sighting is not used."""
 Looks = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Teammates, ranges [m] and bearings [rad] of one message."""
 
@@ -74,13 +73,13 @@ class PoseGrid:
         if stamp_ns >= self._begin_ns + self._window_ns:
             self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
 
-    def observe(self, stamp_ns: int, counter: int, looks: Looks) -> str | None:
+    def observe(self, stamp_ns: int, counter: int, looks: Looks) -> Rejection | None:
         """Keep sightings until the odometry covers their time; the reason if all are rejected."""
         teammates, ranges, bearings = looks
         node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
         away_ns = abs(stamp_ns - node_ns)
         if away_ns > self._near_ns or not self._begin_ns < node_ns <= self._last_ns:
-            return NO_NODE
+            return Rejection.NO_NODE
         mask = acceptable(self._sensor, ranges, bearings)
         distances, directions = corrected(self._sensor, ranges, bearings)
         distances = distances - self._sensor.marker_range_offset
@@ -90,7 +89,7 @@ class PoseGrid:
             seen = point_seen(self._sensor, float(distances[k]), float(directions[k]), drift)
             look = _Look(stamp_ns, counter, teammates[k], seen, node_ns, Increment.identity())
             self._uncovered.append(look)
-        return None if mask.any() else "outside the sensor's limits"
+        return None if mask.any() else Rejection.SENSOR_LIMITS
 
     @property
     def next_ns(self) -> int | None:

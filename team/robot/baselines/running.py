@@ -16,6 +16,7 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
 from team.pairs import FEEDBACK
+from team.rejection import Rejection
 from team.robot.baselines.filters import FILTERS, Step
 from team.robot.estimator import Cloud, Estimates, InitialPose, KnownMap, Scan, thinned
 
@@ -63,10 +64,10 @@ class RunningEstimator:
         """Of all epochs so far."""
         return self._innovation.plus(self._unsaid)
 
-    def observe(self, stamp_ns: int, scan: Scan) -> str | None:
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
         if not self._filter.looks:
-            return "this estimator uses no landmarks"
+            return Rejection.NO_LANDMARKS
         return self._segmenter.observe(stamp_ns, *scan)
 
     def drive(

@@ -1,0 +1,33 @@
+"""Why a measurement is in no submap and in no inter-robot factor: every reason that there is."""
+
+from enum import StrEnum
+
+
+class Rejection(StrEnum):
+    """A reason, as the robot's ledger, its last word and `teamslam verify-ledger` spell it.
+
+    A robot's ledger counts `disposition` of each; the rest of its measurements were used.
+    """
+
+    OLDER = "older than the odometry"
+    NOT_COVERED = "no odometry covers it"
+    NO_TIME = "odometry over no time"
+    SPEED = "odometry beyond the bounds"
+    """Of odometry: its time is believed, its motion is not."""
+    TIME = "a time beyond the bounds"
+    RANGE = "a range beyond the bounds"
+    SENSOR_LIMITS = "outside the sensor's limits"
+    ITSELF = "a robot does not see itself"
+    NO_LANDMARKS = "this estimator uses no landmarks"
+    NO_TEAMMATES = "sightings are not used by this estimator"
+    NO_NODE = "no pose node near it"
+    """Of an inter-robot measurement: no pose of the submap is near its time."""
+    LATE = "counted in a window that ends before its stamp"
+    UNSOLVED = "its window has no solution"
+    """Of the window the odometry's motion alone is in the submap."""
+    SET_ASIDE = "its handling raised"
+
+    @property
+    def disposition(self) -> str:
+        """What the ledger counts it as."""
+        return f"rejected: {self.value}"

@@ -1,0 +1,123 @@
+"""What the documentation names is there: files, names in files, commands, options, make targets."""
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from sim.cli.main import app
+from tests.support import ROOT
+
+PAGES = sorted(
+    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")],
+    key=lambda page: page.name,
+)
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("0*.md"))
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
+FOLDERS = ("team", "central", "sim", "tests", "docs", "examples", "benchmarks")
+NAMED = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]+\.\w+):\s+([^`]+)`")
+PATHS = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w.-]+(?:/[\w.-]+)*(?:\.\w+|/))[`:]")
+"""Of a folder with its slash at the end: keys of the wire look alike."""
+
+
+@cache
+def names_of(path: Path) -> frozenset[str]:
+    """What a module defines, and `Class.member` of its classes; of a page, its headings."""
+    text = path.read_text()
+    if path.suffix == ".md":
+        return frozenset(re.findall(r"^#+ (.+)$", text, re.MULTILINE))
+    found = set()
+    for node in ast.parse(text).body:
+        for name in _defined(node):
+            found.add(name)
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}.{name}" for each in node.body for name in _defined(each)}
+    return frozenset(found)
+
+
+def _defined(node: ast.stmt) -> list[str]:
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return [node.name]
+    if isinstance(node, ast.Assign | ast.AnnAssign):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        return [each.id for each in targets if isinstance(each, ast.Name)]
+    return []
+
+
+def wrong(text: str) -> list[str]:
+    """What a page names as `file: name` or as a path, and what is not there."""
+    found = [
+        f"{path}: {name}"
+        for path, name in NAMED.findall(text)
+        if not (ROOT / path).is_file() or " ".join(name.split()) not in names_of(ROOT / path)
+    ]
+    return found + [path for path in PATHS.findall(text) if not (ROOT / path).exists()]
+
+
+@pytest.mark.parametrize("page", PAGES + DECISIONS, ids=lambda page: page.name)
+def test_every_file_and_name_that_a_page_names_is_there(page: Path) -> None:
+    assert wrong(page.read_text()) == []
+
+
+def test_what_is_not_there_is_found() -> None:
+    assert wrong("see `team/shell.py: Shell.run` and `team/nothing.py`") == ["team/nothing.py"]
+    assert wrong("`team/shell.py: Shell.walk`") == ["team/shell.py: Shell.walk"]
+    assert wrong("`docs/wire.md: Keys`, `team/wire/`") == []
+
+
+def test_each_of_the_twelve_questions_has_its_answer_in_one_step() -> None:
+    rows = re.findall(r"^\| (\d+)\. [^|]+\? \| (.+) \|$", ARCHITECTURE, re.MULTILINE)
+    assert [int(number) for number, _ in rows] == [*range(1, 13)]
+    for number, answer in rows:
+        assert NAMED.search(answer), f"question {number}: {answer}"
+
+
+def test_the_laws_are_named_with_what_enforces_and_what_proves_them() -> None:
+    rows = re.findall(r"^\| \*\*(\d)\. .+$", ARCHITECTURE, re.MULTILINE)
+    assert rows == ["1", "2", "3", "4"]
+    table = ARCHITECTURE[ARCHITECTURE.index("## The four laws") :]
+    table = table[: table.index("## Frames")]
+    laws = re.findall(r"^\| \*\*.+$", table, re.MULTILINE)
+    for law in laws:
+        files = {path for path, _ in NAMED.findall(law)}
+        assert any(path.startswith("tests/") for path in files)
+        assert any(not path.startswith("tests/") for path in files)
+
+
+COMMAND = re.compile(r"^\s*(?:\$ )?teamslam ([a-z][^\n#]*)", re.MULTILINE)
+SPOKEN = re.compile(r"`teamslam ([a-z][^`]*)`")
+CLI = typer.main.get_command(app)
+
+
+def unknown(line: str) -> str | None:
+    """What a command line of a page has that the program has not: a command, or an option."""
+    command: Any = CLI
+    words = line.split()
+    while words and hasattr(command, "commands") and not words[0].startswith("-"):
+        word = words.pop(0)
+        if word not in command.commands:
+            return f"no command {word!r} in: teamslam {line}"
+        command = command.commands[word]
+    options = {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
+    extra = sorted(
+        set(re.findall(r"(?<!\S)--?[a-z][\w-]*", " ".join(words))) - {*options, "--help"}
+    )
+    return f"no option {extra[0]} in: teamslam {line}" if extra else None
+
+
+@pytest.mark.parametrize("page", PAGES + DECISIONS, ids=lambda page: page.name)
+def test_every_command_and_option_that_a_page_names_exists(page: Path) -> None:
+    text = page.read_text()
+    named = [" ".join(each.split()) for each in COMMAND.findall(text) + SPOKEN.findall(text)]
+    assert [why for each in named if (why := unknown(each.replace("…", "")))] == []
+
+
+def test_a_command_or_an_option_that_is_not_there_is_found() -> None:
+    assert unknown("launch thesis --seed 2") is None
+    assert unknown("log cut LOG --from 60 -o NEW") is None
+    assert unknown("fly me") == "no command 'fly' in: teamslam fly me"
+    assert unknown("launch thesis --sed 2") == "no option --sed in: teamslam launch thesis --sed 2"
