@@ -89,18 +89,18 @@ def lacking(folder: Path) -> list[str]:
                 message = opened(sample)[2]
                 match message:
                     case m.Measurement():
-                        stream = ("measurements", message.robot, message.epoch)
+                        stream = ("measurements", message.robot, message.incarnation)
                         counted.setdefault(stream, set()).add(message.number)
                     case m.Submap():
-                        stream = ("submaps", message.robot, message.epoch)
+                        stream = ("submaps", message.robot, message.incarnation)
                         counted.setdefault(stream, set()).add(message.sequence)
                     case m.End():
                         said |= {
-                            ("measurements", s.robot, s.epoch): s.measurements
+                            ("measurements", s.robot, s.incarnation): s.measurements
                             for s in message.streams
                         }
                     case m.Done():
-                        said["submaps", message.robot, message.epoch] = message.submaps
+                        said["submaps", message.robot, message.incarnation] = message.submaps
     except (LogError, OSError) as error:
         return [str(error)]
     gaps = {k: n - len(counted.get(k, set()) & set(range(n))) for k, n in said.items()}

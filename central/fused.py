@@ -19,7 +19,7 @@ def fused_message(
     config: CentralConfig,
     digest: bytes,
     value: LandmarkGaussian,
-    members: tuple[m.Member, ...],
+    members: tuple[m.VersionEntry, ...],
     *,
     stamp_ns: int,
     final: bool = False,

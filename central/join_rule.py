@@ -65,7 +65,7 @@ class JoinRule(SubmapRule):
         self._ticks.take_until(float("inf"))
         return self._broadcast(self._ticks.fold, tail, 0)
 
-    def _began(self, start: m.Start) -> None:
+    def _began(self, start: m.InitialPose) -> None:
         value = translate.start_of(start)
         if value is not None:
             self._ticks.know_start(value)
@@ -234,7 +234,7 @@ class JoinRule(SubmapRule):
             tail == "final",
             tail == "provisional",
             0,
-            tuple(m.Member(*s, n) for s, n in self._ticks.members(fold).items()),
+            tuple(m.VersionEntry(*s, n) for s, n in self._ticks.members(fold).items()),
             self._set.missing(),
             joint,
             from_ids(ids),
@@ -273,8 +273,8 @@ class JoinRule(SubmapRule):
         if not fold.contributions:
             return []
         latest: dict[str, int] = {}
-        for robot, epoch in fold.home:
-            latest[robot] = max(latest.get(robot, 0), epoch)
+        for robot, incarnation in fold.home:
+            latest[robot] = max(latest.get(robot, 0), incarnation)
         streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
         priors = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, self._shown(fold))
         stamp_ns = fold.contributions[-1].end_ns
@@ -289,15 +289,15 @@ class JoinRule(SubmapRule):
 
     def _paths(self, fold: Fold, digest: bytes) -> list[tuple[Stream, m.Trajectory]]:
         paths = []
-        for robot, epoch in sorted(fold.home):
-            if fold.home[(robot, epoch)] != fold.main_key:
+        for robot, incarnation in sorted(fold.home):
+            if fold.home[(robot, incarnation)] != fold.main_key:
                 continue
-            poses, covariances = marginals.trajectory(fold, robot, epoch)
-            ends = [s.stamp_ns for s in self._set.chain((robot, epoch))][: len(poses)]
+            poses, covariances = marginals.trajectory(fold, robot, incarnation)
+            ends = [s.stamp_ns for s in self._set.chain((robot, incarnation))][: len(poses)]
             message = translate.trajectory_message(
-                ends[-1], robot, epoch, digest, ends, poses, covariances
+                ends[-1], robot, incarnation, digest, ends, poses, covariances
             )
-            paths.append(((robot, epoch), message))
+            paths.append(((robot, incarnation), message))
         return paths
 
 

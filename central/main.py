@@ -58,7 +58,7 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
-        self._bus.request(ch.ORDERS_KEPT, "", m.OrdersWanted(0))
+        self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(0))
         self._shell.look_for_the_end()
         self._shell.begin()
         while self._shell.going:
@@ -158,9 +158,9 @@ class CentralShell:
         """
         robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
         for robot in sorted(robots - self._greeted):
-            self._bus.request(ch.SENT, robot, m.SubmapsWanted(0, robot))
+            self._bus.request(ch.SENT, robot, m.SubmapsRequest(0, robot))
         self._greeted |= robots
-        wanted = {(each.robot, each.epoch): each for each in self.node.lacking()}
+        wanted = {(each.robot, each.incarnation): each for each in self.node.lacking()}
         firsts = {stream: each.first for stream, each in wanted.items()}
         for stream in self._patience.due(firsts, time.monotonic()):
             _LOG.warning(

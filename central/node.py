@@ -145,11 +145,13 @@ class CentralNode:
         return [] if self.finished else self._rule.wanted(self._roll.now_ns)
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:
-        """The answer to `SubmapsWanted`: what is here of the robot, its latest epoch first."""
-        kept = self._rule.kept(decoded(request, m.SubmapsWanted).robot)
+        """The answer to `SubmapsRequest`: what is here of the robot, its latest incarnation
+        first.
+        """
+        kept = self._rule.kept(decoded(request, m.SubmapsRequest).robot)
         return [encoded(message) for message in kept]
 
-    def lacking(self) -> list[m.SubmapsWanted]:
+    def lacking(self) -> list[m.SubmapsRequest]:
         """What robots have sent by their own word and is not here: to be asked of them."""
         return [] if self.finished else self._rule.lacking(self._roll)
 

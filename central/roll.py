@@ -55,8 +55,8 @@ class Roll:
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Done() if message.robot in self.robots:
                 robot = self.robots[message.robot]
-                # A robot's last word is that of its last epoch, in whichever order they come.
-                if robot.done is None or robot.done.epoch <= message.epoch:
+                # A robot's last word is that of its last incarnation, in whichever order they come.
+                if robot.done is None or robot.done.incarnation <= message.incarnation:
                     robot.done = message
             case m.End():
                 self.end = later_end(message, self.end)
@@ -79,17 +79,19 @@ class Roll:
     def whole(self, name: str, dealt: Dealt) -> bool:
         """The robot is done, and all of it is here."""
         done = self.robots[name].done
-        return done is not None and self._is_last_epoch(name, done.epoch) and dealt(done)
+        return (
+            done is not None and self._is_last_incarnation(name, done.incarnation) and dealt(done)
+        )
 
     def contradicts(self, end: m.End) -> str | None:
         """Why this can not be the end of the team's streams, in words."""
-        ends = {(s.robot, s.epoch): s.measurements for s in end.streams}
+        ends = {(s.robot, s.incarnation): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
             return f"an end that does not know of {', '.join(silent)}"
         for name, robot in self.robots.items():
             said = robot.progress
-            last = None if said is None else ends.get((name, said.epoch))
+            last = None if said is None else ends.get((name, said.incarnation))
             if said is not None and last is not None and last < said.measurements:
                 return (
                     f"ends with measurement {last} of {name}, which has consumed "
@@ -119,11 +121,11 @@ class Roll:
         """The robots that are not there, were or not, and that are waited for."""
         return [r for r, a in self.robots.items() if not (a.alive or self.settled(r, dealt))]
 
-    def _is_last_epoch(self, name: str, epoch: int) -> bool:
+    def _is_last_incarnation(self, name: str, incarnation: int) -> bool:
         if self.end is None:
             return False
         ends = [s for s in self.end.streams if s.robot == name]
-        return not ends or epoch >= ends[0].epoch
+        return not ends or incarnation >= ends[0].incarnation
 
     def concluded(self, dealt: Dealt) -> bool:
         """The world has ended and no robot is waited for."""
@@ -144,7 +146,7 @@ class Roll:
             if robot.lost or self.settled(name, dealt):
                 continue
             progress = robot.progress
-            if progress is None or count((name, progress.epoch)) < progress.submaps:
+            if progress is None or count((name, progress.incarnation)) < progress.submaps:
                 return float("-inf")
             least = min(least, progress.stamp_ns)
         return least

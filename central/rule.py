@@ -19,7 +19,7 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 Stream = tuple[str, int]
-"""(robot, epoch)."""
+"""(robot, incarnation)."""
 Tail = Literal["final", "closed", "provisional"]
 """Which map it is: the last one; one that holds all submaps up to a time; one ahead of that."""
 
@@ -29,12 +29,12 @@ class Inputs:
     """What one map rests on.
 
     starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
-    by (robot, epoch, sequence) of their submap. maps: the robots' own. withdrawals: whom the team
-    goes on without, by robot. heard: raw measurements, the robots' models and the end of the
+    by (robot, incarnation, sequence) of their submap. maps: the robots' own. withdrawals: whom the
+    team goes on without, by robot. heard: raw measurements, the robots' models and the end of the
     streams, for rules that take these. exchange: the round, of rules in lockstep.
     """
 
-    starts: Mapping[Stream, m.Start] = field(default_factory=dict)
+    starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
     submaps: Mapping[Stream, Sequence[m.Submap]] = field(default_factory=dict)
     sightings: Mapping[tuple[str, int, int], Sequence[m.SightingFactor]] = field(
         default_factory=dict
@@ -116,11 +116,12 @@ class FusionRule(ABC):
     def kept(self, robot: str) -> Sequence[m.Message]:
         """What the robot's next life takes over; nothing: it begins its stream again.
 
-        Of each epoch, the latest first: its start, the submaps without a gap, their sightings.
+        Of each incarnation, the latest first: its start, the submaps without a gap, their
+        sightings.
         """
         return ()
 
-    def lacking(self, roll: Roll) -> list[m.SubmapsWanted]:
+    def lacking(self, roll: Roll) -> list[m.SubmapsRequest]:
         """What robots say that they have sent, and what is not here."""
         return []
 

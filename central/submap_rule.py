@@ -25,7 +25,7 @@ class SubmapRule(FusionRule):
     def _begin(self) -> None:
         """Nothing is here."""
         self._set = SubmapSet()
-        self._starts: dict[Stream, m.Start] = {}
+        self._starts: dict[Stream, m.InitialPose] = {}
         self._entered: dict[Stream, int] = {}
         self._refusals: dict[Stream, set[int]] = {}
         self._orders: set[str] = set()
@@ -34,7 +34,7 @@ class SubmapRule(FusionRule):
     def _enters(self, submap: m.Submap, sightings: Sequence[m.SightingFactor]) -> None:
         """A submap is there without a gap, and all sightings from it."""
 
-    def _began(self, start: m.Start) -> None:
+    def _began(self, start: m.InitialPose) -> None:
         """A stream begins."""
 
     def _goes(self, robot: str) -> None:
@@ -45,12 +45,12 @@ class SubmapRule(FusionRule):
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Admit a submap or a sighting; the last sighting of a submap completes it."""
         match message:
-            case m.Start():
+            case m.InitialPose():
                 self.take_start(message)
             case m.Submap():
                 return _credit(message, self.take_submap(message), now_ns)
             case m.SightingFactor():
-                before = self.count((message.robot, message.epoch))
+                before = self.count((message.robot, message.incarnation))
                 count = self.take_sighting(message)
                 return _credit(message, count, now_ns) if count > before else []
             case m.Withdrawal():
@@ -62,9 +62,9 @@ class SubmapRule(FusionRule):
                 pass
         return []
 
-    def take_start(self, start: m.Start) -> None:
+    def take_start(self, start: m.InitialPose) -> None:
         """A stream begins; its submaps wait for this."""
-        stream = (start.robot, start.epoch)
+        stream = (start.robot, start.incarnation)
         if stream not in self._starts:
             self._starts[stream] = start
             self._began(start)
@@ -72,14 +72,14 @@ class SubmapRule(FusionRule):
 
     def take_submap(self, submap: m.Submap) -> int:
         """Admit a submap; how many of its stream have been dealt with."""
-        stream = (submap.robot, submap.epoch)
+        stream = (submap.robot, submap.incarnation)
         self._judge(submap, self._set.admit(submap))
         self._enter(stream)
         return self._dealt_with(stream, self._set.count(stream))
 
     def take_sighting(self, sighting: m.SightingFactor) -> int:
         """Admit a sighting; how many submaps of its stream have been dealt with."""
-        stream = (sighting.robot, sighting.epoch)
+        stream = (sighting.robot, sighting.incarnation)
         self._judge(sighting, self._set.admit_sighting(sighting))
         self._enter(stream)
         return self._dealt_with(stream, self._set.count(stream))
@@ -125,14 +125,14 @@ class SubmapRule(FusionRule):
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
         self._judge(message, why)
-        return _credit(message, self.count((message.robot, message.epoch)), now_ns)
+        return _credit(message, self.count((message.robot, message.incarnation)), now_ns)
 
     def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
         """A refused submap, or one with a refused sighting, may never be in the map."""
         if reason is not None:
             self.refused += 1
             self.warnings.append(f"refused: {reason}")
-            self._refusals.setdefault((of.robot, of.epoch), set()).add(of.sequence)
+            self._refusals.setdefault((of.robot, of.incarnation), set()).add(of.sequence)
 
     def _dealt_with(self, stream: Stream, count: int) -> int:
         """`count`, unless the next one was refused: then nobody need wait for it.
@@ -162,10 +162,12 @@ class SubmapRule(FusionRule):
 
     def dealt(self, done: m.Done) -> bool:
         """Every submap that the robot has sent is in the map's reach."""
-        return self.count((done.robot, done.epoch)) >= done.submaps
+        return self.count((done.robot, done.incarnation)) >= done.submaps
 
     def kept(self, robot: str) -> list[m.Message]:
-        """Of each epoch of one robot, the latest first: start, submaps without a gap, sightings."""
+        """Of each incarnation of one robot, the latest first: start, submaps without a gap,
+        sightings.
+        """
         found: list[m.Message] = []
         for stream in sorted((s for s in self._set.streams if s[0] == robot), reverse=True):
             chain, start = self._set.chain(stream), self._starts.get(stream)
@@ -174,22 +176,22 @@ class SubmapRule(FusionRule):
                 found += [each for submap in chain for each in self._set.sightings(submap)]
         return found
 
-    def lacking(self, roll: Roll) -> list[m.SubmapsWanted]:
+    def lacking(self, roll: Roll) -> list[m.SubmapsRequest]:
         """What robots say that they have sent, and what is not in the map's reach."""
         said = (s for robot in roll.robots.values() for s in (robot.progress, robot.done))
         sent: dict[Stream, int] = {}
         for each in said:
             if each is not None:
-                stream = (each.robot, each.epoch)
+                stream = (each.robot, each.incarnation)
                 sent[stream] = max(sent.get(stream, 0), each.submaps)
         here = {stream: self.count(stream) for stream in sent}
         return [
-            m.SubmapsWanted(roll.now_ns, *stream, here[stream])
+            m.SubmapsRequest(roll.now_ns, *stream, here[stream])
             for stream in sorted(sent)
             if here[stream] < sent[stream]
         ]
 
 
 def _credit(of: m.Submap | m.SightingFactor, count: int, now_ns: int) -> list[Outgoing]:
-    progress = m.Progress(now_ns, "central", of.robot, of.epoch, 0, count)
+    progress = m.Progress(now_ns, "central", of.robot, of.incarnation, 0, count)
     return [Outgoing(ch.CENTRAL_PROGRESS, of.robot, progress)]

@@ -8,10 +8,10 @@ something else under a name that is taken, is refused with its reason.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from team.wire.messages import Member, SightingFactor, Submap
+from team.wire.messages import SightingFactor, Submap, VersionEntry
 
 Stream = tuple[str, int]
-"""(robot, epoch)."""
+"""(robot, incarnation)."""
 
 
 @dataclass
@@ -35,8 +35,8 @@ class SubmapSet:
 
         The nearest ones in sequence bound the measurements: law 1 says that each is used once.
         """
-        stream = self.streams.setdefault((submap.robot, submap.epoch), {})
-        name = f"submap {submap.sequence} of {submap.robot}, epoch {submap.epoch}"
+        stream = self.streams.setdefault((submap.robot, submap.incarnation), {})
+        name = f"submap {submap.sequence} of {submap.robot}, incarnation {submap.incarnation}"
         there = stream.get(submap.sequence)
         if there is not None:
             return None if there == submap else f"{name} differs from the one in the set"
@@ -62,9 +62,9 @@ class SubmapSet:
 
     def admit_sighting(self, sighting: SightingFactor) -> str | None:
         """Take a sighting; the reason if it is refused. Law 1: each look is used once."""
-        stream, teammate = (sighting.robot, sighting.epoch), sighting.teammate
+        stream, teammate = (sighting.robot, sighting.incarnation), sighting.teammate
         from_submap = self.seen.setdefault(stream, {}).setdefault(sighting.sequence, {})
-        name = f"a sighting of {teammate} by {sighting.robot}, epoch {sighting.epoch}"
+        name = f"a sighting of {teammate} by {sighting.robot}, incarnation {sighting.incarnation}"
         there = from_submap.get((sighting.stamp_ns, teammate))
         if there is not None:
             return None if there == sighting else f"{name} differs from the one in the set"
@@ -81,7 +81,7 @@ class SubmapSet:
 
     def sightings(self, submap: Submap) -> list[SightingFactor]:
         """The sightings from a submap that are here, by stamp and teammate."""
-        stream = self.seen.get((submap.robot, submap.epoch), {})
+        stream = self.seen.get((submap.robot, submap.incarnation), {})
         found = stream.get(submap.sequence, {})
         return [found[key] for key in sorted(found)]
 
@@ -102,13 +102,13 @@ class SubmapSet:
             chain.append(submap)
         return chain
 
-    def missing(self) -> tuple[Member, ...]:
+    def missing(self) -> tuple[VersionEntry, ...]:
         """Of every stream that holds more than its chain, the submap that this waits for."""
         gaps = []
-        for (robot, epoch), found in sorted(self.streams.items()):
-            first = self.count((robot, epoch))
+        for (robot, incarnation), found in sorted(self.streams.items()):
+            first = self.count((robot, incarnation))
             if found and max(found) >= first:
-                gaps.append(Member(robot, epoch, first))
+                gaps.append(VersionEntry(robot, incarnation, first))
         return tuple(gaps)
 
 

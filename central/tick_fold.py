@@ -24,12 +24,12 @@ from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,
+    InitialPoseFactor,
     JoinSettings,
     Sighting,
     converged,
     lean,
 )
-from team.estimation.map_joining.joining import Start as StartValue
 from team.estimation.map_joining.marginals import Agreement
 from team.estimation.map_joining.refusal import Tick, taken
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
@@ -85,13 +85,13 @@ class TickFold:
         self._ticks: dict[int, dict[Key, Contribution]] = defaultdict(dict)
         self._sightings: dict[Key, list[Sighting]] = {}
         self._digests: dict[Key, bytes] = {}
-        self._starts: dict[Stream, StartValue] = {}
+        self._starts: dict[Stream, InitialPoseFactor] = {}
         self._taken: list[_Taken] = []
         self._agreed: tuple[Fold, Agreement] | None = None
 
-    def know_start(self, start: StartValue) -> None:
+    def know_start(self, start: InitialPoseFactor) -> None:
         """Where a stream starts; to be told before its first submap is added."""
-        self._starts[(start.robot, start.epoch)] = start
+        self._starts[(start.robot, start.incarnation)] = start
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor] = ()) -> None:
         """Put a submap in its tick, with the sightings from it, all of which `digest` names.
@@ -293,12 +293,12 @@ class TickFold:
         starts = [
             translate.digest_of(
                 robot.encode(),
-                epoch.to_bytes(8, "little"),
+                incarnation.to_bytes(8, "little"),
                 start.pose.tobytes(),
                 b"" if start.covariance is None else start.covariance.tobytes(),
             )
-            for (robot, epoch), start in sorted(self._starts.items())
-            if (robot, epoch) in fold.home
+            for (robot, incarnation), start in sorted(self._starts.items())
+            if (robot, incarnation) in fold.home
         ]
         keys = [*(c.key for c in fold.contributions), *fold.refused]
         members = [self._digests[key] for key in sorted(keys)]
@@ -308,6 +308,6 @@ class TickFold:
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """The version vector: the last sequence of each stream that was taken or refused."""
         last = {stream: fold.next_sequence(stream) - 1 for stream in fold.home}
-        for _, robot, epoch, sequence in fold.refused:
-            last[robot, epoch] = max(last.get((robot, epoch), -1), sequence)
+        for _, robot, incarnation, sequence in fold.refused:
+            last[robot, incarnation] = max(last.get((robot, incarnation), -1), sequence)
         return {stream: last[stream] for stream in sorted(last)}

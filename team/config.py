@@ -183,7 +183,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window_m: a window in which the odometry drove less than this goes on, up to standing_s: what a
     robot sees from one place it sees with one error, which is counted once for each window.
     keyframe_s: sightings within this time are reduced to one per landmark (median, moved with the
-    odometry to the keyframe's end); 0 takes every observation message as an epoch of its own.
+    odometry to the keyframe's end); 0 takes every observation message as a keyframe of its own.
     node_s: each submap carries the robot's poses at the multiples of this team time that lie in its
     window, so that sightings of teammates are factors between poses; 0: none, sightings unused.
     sighting_s: a sighting is used if such a time is no farther from it than this. teammate_speed:
@@ -241,7 +241,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything that a robot's estimate depends on beside its measurements.
 
     exchange_s: under a rule with feedback, the least team time between two exchanges of maps (at
-    window ends; for `hybrid-thesis` at epochs). pose_s: the least team time between two running
+    window ends; for `hybrid-thesis` at keyframes). pose_s: the least team time between two running
     poses. clock_offset_s: what the odometry's clock stamps t happened at t + clock_offset_s of team
     time, which is the sensor's clock; the robot corrects it before it uses a stamp. bounds: what
     lies beyond them is rejected.

@@ -37,14 +37,14 @@ class Door:
         if strangers:
             return f"of {', '.join(strangers)}, not in this team"
         refused = absurd(message) or self._another_time(message)
-        if refused is None and isinstance(message, m.Start):
-            self._began.setdefault((message.robot, message.epoch), message.stamp_ns)
+        if refused is None and isinstance(message, m.InitialPose):
+            self._began.setdefault((message.robot, message.incarnation), message.stamp_ns)
         return refused
 
     def _another_time(self, message: m.Message) -> str | None:
         if not isinstance(message, OF_ROBOTS):
             return None
-        began = self._began.get((message.robot, message.epoch))
+        began = self._began.get((message.robot, message.incarnation))
         return None if began is None else another_time(message.stamp_ns, began)
 
 
@@ -58,9 +58,9 @@ def another_time(stamp_ns: int, began_ns: int) -> str | None:
 
 def absurd(message: m.Message) -> str | None:
     """Why nobody could have counted so far, in words."""
-    for epoch in _lives(message):
-        if epoch > MOST_LIVES:
-            return f"of incarnation {epoch}; no stream has more than {MOST_LIVES}"
+    for incarnation in _lives(message):
+        if incarnation > MOST_LIVES:
+            return f"of incarnation {incarnation}; no stream has more than {MOST_LIVES}"
     for count in _counts(message):
         if count > MOST_COUNT:
             return f"counts to {count}; nobody has come further than {MOST_COUNT}"
@@ -84,9 +84,9 @@ def _robots(message: m.Message) -> Iterator[str]:
 
 def _lives(message: m.Message) -> Iterator[int]:
     if isinstance(message, m.End):
-        yield from (stream.epoch for stream in message.streams)
+        yield from (stream.incarnation for stream in message.streams)
     elif isinstance(message, OF_ROBOTS):
-        yield message.epoch
+        yield message.incarnation
 
 
 def _counts(message: m.Message) -> Iterator[int]:

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt32
 
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation.contribution import Contribution, Start, Stream, named
+from team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
 from team.estimation.geometry import compose, inverse
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.fastslam import (
@@ -216,7 +216,7 @@ def join(
         raise ValueError(f"there are no submaps {missing}: give each robot's in their order")
     fold = joining.EMPTY_FOLD
     for robot, initial in sorted(initial_poses.items()):
-        start = Start(robot, _INCARNATION, initial.pose, initial.covariance)
+        start = InitialPoseFactor(robot, _INCARNATION, initial.pose, initial.covariance)
         fold = joining.started(fold, start)
     chosen = settings or JoinSettings()
     for tick in _ticks(submaps):
@@ -311,6 +311,6 @@ def submaps_in(log: Log | Path | str) -> dict[str, list[LocalMap]]:
     found: dict[str, dict[int, LocalMap]] = {}
     for sample in opened.samples([ch.SUBMAP]):
         message = decoded(sample.payload, m.Submap)
-        if message.epoch == _INCARNATION:
+        if message.incarnation == _INCARNATION:
             found.setdefault(message.robot, {})[message.sequence] = translate.local_map_of(message)
     return {robot: [of[k] for k in sorted(of)] for robot, of in sorted(found.items())}

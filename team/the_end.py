@@ -7,7 +7,7 @@ import time
 from team.wire.bus import Bus, BusError, Sample
 from team.wire.channels import FINAL_KEPT, FINAL_MAP
 from team.wire.codec import WireError, decoded
-from team.wire.messages import FinalKept, FinalWanted, FusedMap
+from team.wire.messages import FinalMapReply, FinalMapRequest, FusedMap
 
 FINAL_S = 3.0
 """The router is asked so often for a final map that was missed."""
@@ -44,8 +44,8 @@ class TheEnd:
         try:
             # Before the question: its age is told as of the answer, which may take its time.
             life_s = time.monotonic() - self._began + max(self._before_s, 0.0)
-            replies = self._bus.ask(FINAL_KEPT, "", FinalWanted(0, self._node), FINAL_ASK_S)
-            kept = [decoded(reply, FinalKept) for reply in replies]
+            replies = self._bus.ask(FINAL_KEPT, "", FinalMapRequest(0, self._node), FINAL_ASK_S)
+            kept = [decoded(reply, FinalMapReply) for reply in replies]
             return [_sample(k.final) for k in kept[:1] if k.missed or 1e-9 * k.age_ns <= life_s]
         except (BusError, WireError) as error:
             _LOG.debug("%s", error)

@@ -10,8 +10,7 @@ from jaxtyping import Float, UInt32
 
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
-from team.estimation.map_joining.joining import Contribution, Sighting
-from team.estimation.map_joining.joining import Start as StartValue
+from team.estimation.map_joining.joining import Contribution, InitialPoseFactor, Sighting
 from team.estimation.submap import NO_COLUMNS, LocalMap
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, stamps
@@ -30,13 +29,15 @@ def digest_of(*parts: bytes) -> bytes:
     return digest.digest()
 
 
-def configured(node: str, epoch: int, stamp_ns: int, configuration: msgspec.Struct) -> m.Configured:
+def configured(
+    node: str, incarnation: int, stamp_ns: int, configuration: msgspec.Struct
+) -> m.Configuration:
     """The announcement of a configuration, with its digest."""
     text = msgspec.json.encode(configuration, order="deterministic")
-    return m.Configured(stamp_ns, node, epoch, digest_of(text), text.decode())
+    return m.Configuration(stamp_ns, node, incarnation, digest_of(text), text.decode())
 
 
-def pose_of(message: m.Start) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
+def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
     """The start pose and its covariance (None: unknown; exactly known)."""
     pose = floats(message.pose, "pose").copy() if message.pose else None
     covariance = (
@@ -47,10 +48,14 @@ def pose_of(message: m.Start) -> tuple[Float[np.ndarray, "3"] | None, Matrix | N
     return pose, covariance
 
 
-def start_of(message: m.Start) -> StartValue | None:
+def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
     """The start as the join takes it; None for an unknown pose."""
     pose, covariance = pose_of(message)
-    return None if pose is None else StartValue(message.robot, message.epoch, pose, covariance)
+    return (
+        None
+        if pose is None
+        else InitialPoseFactor(message.robot, message.incarnation, pose, covariance)
+    )
 
 
 def scan_of(message: m.Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -88,7 +93,7 @@ def looks_of(
 
 def submap_message(
     robot: str,
-    epoch: int,
+    incarnation: int,
     sequence: int,
     measurements: tuple[int, int],
     span_ns: tuple[int, int],
@@ -101,7 +106,7 @@ def submap_message(
     return m.Submap(
         span_ns[1],
         robot,
-        epoch,
+        incarnation,
         sequence,
         measurements[0],
         measurements[1],
@@ -145,7 +150,7 @@ def sighting_message(
     return m.SightingFactor(
         sighting.stamp_ns,
         sighting.robot,
-        sighting.epoch,
+        sighting.incarnation,
         sighting.sequence,
         config,
         sighting.teammate,
@@ -160,7 +165,7 @@ def sighting_of(message: m.SightingFactor) -> Sighting:
     """A sighting message as the join takes it."""
     return Sighting(
         message.robot,
-        message.epoch,
+        message.incarnation,
         message.sequence,
         message.stamp_ns,
         message.teammate,
@@ -172,14 +177,18 @@ def sighting_of(message: m.SightingFactor) -> Sighting:
 def contribution_of(message: m.Submap) -> Contribution:
     """A submap message as the join takes it."""
     return Contribution(
-        message.robot, message.epoch, message.sequence, message.stamp_ns, local_map_of(message)
+        message.robot,
+        message.incarnation,
+        message.sequence,
+        message.stamp_ns,
+        local_map_of(message),
     )
 
 
 def pose_message(
     stamp_ns: int,
     robot: str,
-    epoch: int,
+    incarnation: int,
     sequence: int,
     digest: bytes,
     pose: Float[np.ndarray, "3"],
@@ -188,7 +197,7 @@ def pose_message(
     """A pose with its covariance, symmetric to the last bit."""
     symmetric = 0.5 * (covariance + covariance.T)
     return m.PoseEstimate(
-        stamp_ns, robot, epoch, sequence, digest, from_floats(pose), from_floats(symmetric)
+        stamp_ns, robot, incarnation, sequence, digest, from_floats(pose), from_floats(symmetric)
     )
 
 
@@ -294,25 +303,25 @@ def landmarks_of(
 def prior_message(
     stamp_ns: int,
     robot: str,
-    epoch: int,
+    incarnation: int,
     sequence: int,
     digest: bytes,
     prior: RobotPrior,
-    members: Sequence[m.Member] = (),
+    members: Sequence[m.VersionEntry] = (),
     heard: int = 0,
 ) -> m.Prior:
     """The joint marginal of a robot's last fused end pose and the landmarks; of which set."""
     return m.Prior(
         stamp_ns,
         robot,
-        epoch,
+        incarnation,
         sequence,
         digest,
         from_ids(prior.ids),
         from_floats(np.concatenate((prior.pose, prior.means.ravel()))),
         joint_bytes(prior.covariance),
         prior.shared.covariance_factor,
-        tuple(m.BiasEstimate(robot, epoch, *each) for each in prior.shared.biases),
+        tuple(m.BiasEstimate(robot, incarnation, *each) for each in prior.shared.biases),
         tuple(members),
         heard,
     )
@@ -331,7 +340,7 @@ def prior_of(message: m.Prior) -> RobotPrior:
 def trajectory_message(
     stamp_ns: int,
     robot: str,
-    epoch: int,
+    incarnation: int,
     digest: bytes,
     pose_stamps: list[int],
     poses: Float[np.ndarray, "K 3"],
@@ -342,7 +351,7 @@ def trajectory_message(
     return m.Trajectory(
         stamp_ns,
         robot,
-        epoch,
+        incarnation,
         digest,
         from_stamps(pose_stamps),
         from_floats(poses),

@@ -35,7 +35,9 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
     )
     for name in names:
         yield sample(Outgoing(ch.ALIVE, f"robot/{name}", m.Liveliness(0, f"robot/{name}", True)))
-        yield sample(Outgoing(ch.START, name, m.Start(0, name, 1, 0, from_floats([0, 0, 0]), b"")))
+        yield sample(
+            Outgoing(ch.START, name, m.InitialPose(0, name, 1, 0, from_floats([0, 0, 0]), b""))
+        )
     phase = rng.uniform(0.0, 2.0 * np.pi, robots)
     reach = rng.uniform(0.1, 0.45, robots) * size_m
     P = from_floats(np.diag([0.04, 0.09, 1e-3]))
@@ -66,7 +68,7 @@ def _map(
     sigma = 0.1 + 0.4 * (1.0 - min(share, 1.0))
     blocks = np.tile([sigma**2, 0.3 * sigma**2, 0.6 * sigma**2], (count, 1))
     means = places[:count] + sigma * rng.normal(size=(count, 2))
-    members = (m.Member("r1", 1, 0),)
+    members = (m.VersionEntry("r1", 1, 0),)
     return m.FusedMap(
         at, "join", bytes(8), "r1/1", final, not final, 0, members, (), False,
         from_ids(range(count)), from_floats(means), from_floats(blocks), 0.0, 0,

@@ -91,14 +91,18 @@ class Team:
             self.messages.append(found)
         return found is not None
 
-    def start(self, robot: str, epoch: int = 1) -> m.Start:
+    def start(self, robot: str, incarnation: int = 1) -> m.InitialPose:
         rng = self._rng
         if rng.random() < 0.5:
-            return m.Start(0, robot, epoch, 0, b"", b"")
+            return m.InitialPose(0, robot, incarnation, 0, b"", b"")
         pose = np.append(numbers(rng, 2), rng.uniform(-3.0, 3.0))
         spread = b"" if rng.random() < 0.5 else from_floats(covariance(rng, 3))
-        exact = m.Start(0, robot, epoch, 0, from_floats(pose), spread)
-        return exact if valid(exact) else m.Start(0, robot, epoch, 0, from_floats(pose), b"")
+        exact = m.InitialPose(0, robot, incarnation, 0, from_floats(pose), spread)
+        return (
+            exact
+            if valid(exact)
+            else m.InitialPose(0, robot, incarnation, 0, from_floats(pose), b"")
+        )
 
     def submap(self, robot: str) -> m.Submap:
         rng, k = self._rng, self._next[robot]

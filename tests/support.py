@@ -126,7 +126,7 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
 def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
     """The message as the node says it that publishes on the channel's key for this name."""
     speaker = channel.speaker(name)
-    says = m.Configured | m.Progress | m.Status | m.Liveliness | m.Fault
+    says = m.Configuration | m.Progress | m.Status | m.Liveliness | m.Fault
     return msgspec.structs.replace(message, node=speaker) if isinstance(message, says) else message
 
 
@@ -135,15 +135,15 @@ def examples() -> Iterator[m.Message]:
     two, three = from_ids([4, 7]), from_floats([1.0, -0.5, 0.25])
     means, blocks = from_floats([1.0, 2.0, 3.0, 4.0]), from_floats([2.0, 0.5, 1.0] * 2)
     digest = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
-    member = m.Member("alpha", 1, 5)
-    yield m.Start(0, "alpha", 1, 0, three, from_floats(spd(3)))
+    member = m.VersionEntry("alpha", 1, 5)
+    yield m.InitialPose(0, "alpha", 1, 0, three, from_floats(spd(3)))
     yield m.Odometry(1_000, "alpha", 1, 2, 100_000_000, 0.25, -0.125)
     yield m.Observations(2_000, "alpha", 1, 3, two, from_floats([2.0, 3.5]), from_floats([0.5, -1]))
     yield m.Sightings(3_000, "alpha", 1, 4, ("bravo",), from_floats([6.0]), from_floats([-3.0]))
     yield m.Truth(4_000, "alpha", from_stamps([0, 4_000]), from_floats(range(6)))
     yield m.TruthLandmarks(-5, two, means)
     yield m.KnownMap(-5, two, means)
-    yield m.Configured(0, "robot/alpha", 1, digest, '{"seed": 7}')
+    yield m.Configuration(0, "robot/alpha", 1, digest, '{"seed": 7}')
     yield m.Submap(
         9_000, "alpha", 1, 5, 10, 19, 8_000, digest, two, from_floats(range(10)), packed(spd(10)),
         from_stamps([8_500]), 1, ("bearing", "range_scale"), from_floats(np.arange(20) / 16.0),
@@ -159,7 +159,8 @@ def examples() -> Iterator[m.Message]:
     yield m.ParticleCloud(9_000, "alpha", from_floats(range(6)), from_floats([0.25, 0.75]))
     yield m.Innovation(9_000, "alpha", 1, 5, 20.5, 22)
     yield m.FusedMap(
-        9_000, "join", digest, "alpha/1", True, False, 0, (member,), (m.Member("bravo", 0, 2),),
+        9_000, "join", digest, "alpha/1", True, False, 0,
+        (member,), (m.VersionEntry("bravo", 0, 2),),
         True, two, means, packed(spd(4)), 12.5, 14, ("bravo: 1 shared landmark, 2 needed",),
         (m.BiasEstimate("alpha", 1, "bearing", 0.25, 0.125),), ("charlie joined: 5 landmarks",),
         ("charlie",), 1.25, (), 9,
@@ -171,13 +172,13 @@ def examples() -> Iterator[m.Message]:
     yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))
     yield m.Progress(9_000, "central", "alpha", 1, 128, 6)
     yield m.Rendezvous(9_000, "alpha", 1, ("bravo",), 3, 12.5)
-    yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposed("in a submap", 200),), 7)
+    yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposition("in a submap", 200),), 7)
     yield m.End(9_000, (m.StreamEnd("alpha", 1, 200),), ("gap of 3 s",))
     yield m.Status(9_000, "recorder", "recording", {"messages": 12.0}, ("slow disk",))
     yield m.GivenUp(9_000, "robot/alpha", "operator", "it fell into the water")
-    yield m.FinalWanted(0, "robot/alpha")
-    yield m.FinalKept(0, 5_000_000_000, b"\x91\xc0", True)
-    yield m.OrdersWanted(0)
+    yield m.FinalMapRequest(0, "robot/alpha")
+    yield m.FinalMapReply(0, 5_000_000_000, b"\x91\xc0", True)
+    yield m.OrdersRequest(0)
     yield m.Fault(
         9_000, "central", "robot/alpha/submap", 7, "submap/1", "ValueError", "no frame",
         "central.node:CentralNode.handle:58", b"\x01\x02\x03\x04\x05\x06\x07\x08",
@@ -185,4 +186,4 @@ def examples() -> Iterator[m.Message]:
     yield m.Liveliness(0, "robot/alpha", True)
     yield m.Tally(9_000, "robot/alpha", 10**18, ("robot/alpha/submap",), (6,))
     yield m.MeasurementsRequest(0, "alpha", 1, 5, -1)
-    yield m.SubmapsWanted(0, "alpha")
+    yield m.SubmapsRequest(0, "alpha")

@@ -112,7 +112,7 @@ def world_of(*streams: RobotStream) -> WorldStreams:
 
 def published(each: RobotStream) -> list[m.Measurement]:
     """The measurements of one stream as the world publishes them."""
-    world = WorldNode(world_of(each), frozenset(), m.Configured(0, "world", 0, bytes(8), "{}"))
+    world = WorldNode(world_of(each), frozenset(), m.Configuration(0, "world", 0, bytes(8), "{}"))
     out: list[Outgoing] = []
     while not world.ended:
         out += world.publish(0.0)
@@ -126,7 +126,7 @@ def driven(
     out = [o for measurement in measurements for o in node.handle(measurement, 0)]
     if end:
         last = measurements[-1]
-        ends = (m.StreamEnd(node.robot, last.epoch, last.number + 1),)
+        ends = (m.StreamEnd(node.robot, last.incarnation, last.number + 1),)
         out += node.handle(m.End(last.stamp_ns, ends), 0)
     return out
 
@@ -158,7 +158,7 @@ class Team:
     def __post_init__(self) -> None:
         names = [c.id for c in self.configs]
         rule = msgspec.structs.replace(self.central, fusion=self.configs[0].fusion)
-        announced = m.Configured(0, "world", 0, bytes(8), "{}")
+        announced = m.Configuration(0, "world", 0, bytes(8), "{}")
         self.world = WorldNode(
             self.streams,
             expected_nodes(names, recorder=False),
@@ -204,7 +204,7 @@ class Team:
         """The process is there again: it takes over the submaps that the centre has."""
         name, node = ch.robot_node(robot.id), RobotNode(robot, self.exchange)
         self.nodes[name] = self.robots[robot.id] = node
-        request = encoded(m.SubmapsWanted(0, robot.id))
+        request = encoded(m.SubmapsRequest(0, robot.id))
         kept = [decoded(reply) for reply in self.centre.answer_submaps(request)]
         if kept:
             node.take_over(kept)
@@ -236,7 +236,9 @@ class Team:
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
             wanted = node.wanted()
             if wanted is None and not node.finished and not node._inbox.waiting:
-                wanted = m.MeasurementsRequest(0, node.robot, node.epoch, node.next_measurement, -1)
+                wanted = m.MeasurementsRequest(
+                    0, node.robot, node.incarnation, node.next_measurement, -1
+                )
             if wanted is None:
                 continue
             for reply in self.world.measurements(encoded(wanted)):

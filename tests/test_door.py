@@ -58,7 +58,7 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
 STRANGE = msgspec.structs.replace(SUBMAPS["r1"][0], robot="r9")
 ATTACKS = [
     (ch.SUBMAP, "r9", STRANGE, "of r9, not in this team"),
-    (ch.START, "r1", m.Start(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
+    (ch.START, "r1", m.InitialPose(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
     (ch.ROBOT_DONE, "r1", m.Done(0, "r1", HUGE, 0, 0, 0, ()), f"of incarnation {HUGE}"),
     (ch.ROBOT_DONE, "r1", m.Done(0, "r1", 1, 5, 0, HUGE, ()), f"counts to {HUGE}"),
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, HUGE), f"counts to {HUGE}"),
@@ -113,8 +113,8 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
     far = msgspec.structs.replace(odometry, stamp_ns=odometry.stamp_ns + 2 * LATE_NS)
     acknowledged = m.Progress(0, "central", "r1", 1, 0, 10**6)
     attacks = [
-        (ch.START, m.Start(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
-        (ch.START, m.Start(0, "r1", 100, 0, b"", b""), "of incarnation 100, while 1 is in"),
+        (ch.START, m.InitialPose(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
+        (ch.START, m.InitialPose(0, "r1", 100, 0, b"", b""), "of incarnation 100, while 1 is in"),
         (ch.ODOMETRY, msgspec.structs.replace(odometry, number=HUGE), f"counts to {HUGE}"),
         (ch.ODOMETRY, far, "days after its stream began"),
         (ch.CENTRAL_PROGRESS, acknowledged, "acknowledges 1000000 submaps of"),

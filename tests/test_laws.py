@@ -60,7 +60,7 @@ def assert_each_measurement_once(samples):
     counted = {}
     for _, name, message in messages:
         if isinstance(message, m.Measurement):
-            counted.setdefault(name, set()).add((message.epoch, message.number))
+            counted.setdefault(name, set()).add((message.incarnation, message.number))
     submaps = {name: [] for name in counted}
     for _, name, message in messages:
         if isinstance(message, m.Submap):
@@ -258,8 +258,8 @@ def test_configurations_maps_priors_and_poses_name_their_inputs():
     priors = [x for _, _, x in messages if isinstance(x, m.Prior)]
     assert priors
     for prior in priors:
-        members = {(x.robot, x.epoch): x.sequence for x in by_digest[prior.digest].members}
-        assert members[(prior.robot, prior.epoch)] == prior.sequence
+        members = {(x.robot, x.incarnation): x.sequence for x in by_digest[prior.digest].members}
+        assert members[(prior.robot, prior.incarnation)] == prior.sequence
     submaps = [x for _, _, x in messages if isinstance(x, m.Submap)]
     assert {(x.robot, x.config) for x in submaps} == {(n, x.digest) for n, x in announced.items()}
     poses = [x for c, _, x in messages if c is ch.TEAM_POSE]

@@ -86,14 +86,14 @@ def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
 @pytest.mark.parametrize("covariance", [None, np.diag([0.25, 0.5, 0.125])])
 def test_a_start_is_known_exactly_or_with_a_covariance(covariance):
     spread = b"" if covariance is None else from_floats(covariance)
-    start = translate.start_of(m.Start(0, "r1", 1, 0, from_floats([1.0, 2.0, 3.0]), spread))
+    start = translate.start_of(m.InitialPose(0, "r1", 1, 0, from_floats([1.0, 2.0, 3.0]), spread))
     np.testing.assert_array_equal(start.pose, [1.0, 2.0, 3.0])
     np.testing.assert_equal(start.covariance, covariance)
     assert start.stream == ("r1", 1)
 
 
 def test_an_unknown_start_is_none():
-    unknown = m.Start(0, "r1", 1, 0, b"", b"")
+    unknown = m.InitialPose(0, "r1", 1, 0, b"", b"")
     assert translate.start_of(unknown) is None
     assert translate.pose_of(unknown) == (None, None)
 

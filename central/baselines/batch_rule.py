@@ -28,7 +28,7 @@ FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
 
 
 class BatchRule(MeasurementRule):
-    """Every pose of every robot at its epochs and all landmarks, solved anew at each broadcast.
+    """Every pose of every robot at its keyframes and all landmarks, solved anew at each broadcast.
 
     Poses are said with the map, each robot's newest; with the final map the whole paths. Errors of
     sensors that persist and biases are taken as white, and that is said.
@@ -126,9 +126,9 @@ class BatchRule(MeasurementRule):
             stamps = stamps[: len(poses) - 1]
             if not stamps:
                 continue
-            epoch = self._members[robot].epoch
+            incarnation = self._members[robot].incarnation
             message = translate.trajectory_message(
-                stamps[-1], robot, epoch, self._digest, stamps, poses[1:], covariances[1:]
+                stamps[-1], robot, incarnation, self._digest, stamps, poses[1:], covariances[1:]
             )
             said.append(Outgoing(ch.TRAJECTORY, robot, message))
         return said

@@ -28,7 +28,7 @@ class ExchangeRule(FusionRule):
         super().__init__(config, digest, robots)
         self._rounds = FeedbackRule(config, digest)
         self._set = SubmapSet()
-        self._starts: dict[Stream, m.Start] = {}
+        self._starts: dict[Stream, m.InitialPose] = {}
 
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
         """A round's map from the maps that it names; the rounds follow one another."""
@@ -41,8 +41,8 @@ class ExchangeRule(FusionRule):
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """File a map for its round."""
         match message:
-            case m.Start():
-                self._starts.setdefault((message.robot, message.epoch), message)
+            case m.InitialPose():
+                self._starts.setdefault((message.robot, message.incarnation), message)
             case m.Submap():
                 self._set.admit(message)
             case m.MapEstimate():
@@ -62,10 +62,10 @@ class ExchangeRule(FusionRule):
         return self._rounds.conclude(now_ns)
 
     def kept(self, robot: str) -> Sequence[m.Message]:
-        """The start of the robot's latest epoch and its submaps without a gap."""
-        epochs = [epoch for name, epoch in self._set.streams if name == robot]
-        submaps = self._set.chain((robot, max(epochs))) if epochs else []
-        start = self._starts.get((robot, submaps[0].epoch)) if submaps else None
+        """The start of the robot's latest incarnation and its submaps without a gap."""
+        incarnations = [incarnation for name, incarnation in self._set.streams if name == robot]
+        submaps = self._set.chain((robot, max(incarnations))) if incarnations else []
+        start = self._starts.get((robot, submaps[0].incarnation)) if submaps else None
         return () if start is None else (start, *submaps)
 
 
@@ -87,7 +87,7 @@ class _OwnMaps(FusionRule):
     def dealt(self, done: m.Done) -> bool:
         """The robot's last map is here."""
         found = self._maps.get(done.robot)
-        last = (done.epoch, done.last_map)
+        last = (done.incarnation, done.last_map)
         return done.last_map < 0 or (found is not None and _name(found) >= last)
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
@@ -135,18 +135,18 @@ class LatestRule(_OwnMaps):
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
         super().__init__(config, digest, robots)
         self._placed: dict[Stream, bool] = {}
-        self._said: tuple[m.Member, ...] = ()
+        self._said: tuple[m.VersionEntry, ...] = ()
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Keep a start, and a map that is newer than the robot's last one."""
-        if isinstance(message, m.Start):
-            self._placed[message.robot, message.epoch] = bool(message.pose)
+        if isinstance(message, m.InitialPose):
+            self._placed[message.robot, message.incarnation] = bool(message.pose)
         return super().take(message, now_ns)
 
     def dealt(self, done: m.Done) -> bool:
         """The robot's last map is here, and the start of its stream."""
         return done.last_map < 0 or (
-            super().dealt(done) and (done.robot, done.epoch) in self._placed
+            super().dealt(done) and (done.robot, done.incarnation) in self._placed
         )
 
     def advance(self, roll: Roll) -> list[Outgoing]:
@@ -164,14 +164,14 @@ class LatestRule(_OwnMaps):
         values = {x.robot: _value(x) for x in maps}
         value, refused = fused_totally(kalman, values, self._config.bounds.coordinate_m)
         own = self._maps.values()
-        away = sorted(x.robot for x in own if not self._placed.get((x.robot, x.epoch)))
+        away = sorted(x.robot for x in own if not self._placed.get((x.robot, x.incarnation)))
         reasons = (*(f"{robot}: its start pose is not known" for robot in away), *refused)
         fused = self._message(maps, value, stamp_ns=0, final=final, joint=True, reasons=reasons)
         return [Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]
 
     def _known(self) -> list[m.MapEstimate]:
         """The maps in the team's frame, by robot."""
-        return [x for x in super()._known() if self._placed.get((x.robot, x.epoch))]
+        return [x for x in super()._known() if self._placed.get((x.robot, x.incarnation))]
 
 
 class AloneRule(_OwnMaps):
@@ -202,11 +202,11 @@ class AloneRule(_OwnMaps):
 
 
 def _name(estimate: m.MapEstimate) -> tuple[int, int]:
-    return estimate.epoch, estimate.sequence
+    return estimate.incarnation, estimate.sequence
 
 
-def _member(estimate: m.MapEstimate) -> m.Member:
-    return m.Member(estimate.robot, estimate.epoch, estimate.sequence)
+def _member(estimate: m.MapEstimate) -> m.VersionEntry:
+    return m.VersionEntry(estimate.robot, estimate.incarnation, estimate.sequence)
 
 
 def _payload(estimate: m.MapEstimate) -> bytes:

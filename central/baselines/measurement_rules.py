@@ -1,4 +1,4 @@
-"""What rules on raw measurements share: the team's epochs in, poses and the map out."""
+"""What rules on raw measurements share: the team's keyframes in, poses and the map out."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ class Told:
 class MeasurementRule(FusionRule):
     """An estimate over all robots' raw measurements at the centre.
 
-    The epochs of one team time are one step. The robots' models come with what they announce. A
+    The keyframes of one team time are one step. The robots' models come with what they announce. A
     robot whose start pose is not known is left out; where no start is known the first robot's is
     the frame. A map's members name each robot's last measurement in it.
     """
@@ -48,9 +48,9 @@ class MeasurementRule(FusionRule):
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
         super().__init__(config, digest, robots)
-        self._epochs = TeamKeyframes(robots)
+        self._keyframes = TeamKeyframes(robots)
         self._robots: dict[str, RobotConfig] = {}
-        self._members: dict[str, m.Member] = {}
+        self._members: dict[str, m.VersionEntry] = {}
         self._pose_ns: dict[str, int] = {}
         self._reasons: list[str] = []
         self._frame = START_POSES
@@ -84,33 +84,33 @@ class MeasurementRule(FusionRule):
         """File a measurement, a robot's models or the last counters."""
         match message:
             case m.Measurement():
-                self._epochs.put(message)
-            case m.Configured() if message.node.startswith("robot/"):
+                self._keyframes.put(message)
+            case m.Configuration() if message.node.startswith("robot/"):
                 self._configure(message)
             case m.End():
-                self._epochs.end(message)
+                self._keyframes.end(message)
             case _:
                 pass
         return []
 
-    def _configure(self, message: m.Configured) -> None:
+    def _configure(self, message: m.Configuration) -> None:
         try:
             config = msgspec.json.decode(message.configuration, type=RobotConfig)
         except msgspec.DecodeError as error:
             self.warnings.append(f"{message.node} runs another version: {error}")
         else:
-            self._epochs.configure(config.id, config)
+            self._keyframes.configure(config.id, config)
 
     def complete(self, end: m.End) -> bool:
         """Every measurement of every stream has been used."""
-        return self._epochs.complete
+        return self._keyframes.complete
 
     def advance(self, roll: Roll) -> list[Outgoing]:
         """Every step whose turn has come: the poses, and the map at broadcasts."""
         if not self._robots and not self._begin():
             return []
         out: list[Outgoing] = []
-        for step in self._epochs.steps():
+        for step in self._keyframes.steps():
             out += self._broadcast(step[0].stamp_ns)
             out += self._take_step([each for each in step if each.robot in self._robots])
         return out
@@ -121,18 +121,18 @@ class MeasurementRule(FusionRule):
 
     def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
         """Measurements that the link has lost."""
-        return self._epochs.wanted(now_ns)
+        return self._keyframes.wanted(now_ns)
 
     def _begin(self) -> bool:
         """The start poses, when all of them are here."""
-        starts = self._epochs.starts
+        starts = self._keyframes.starts
         if not starts:
             return False
         placed = {name: start for name, (_, start) in starts.items() if self._is_placed(start)}
         if not placed:
             name = min(starts)
             placed = {name: starts[name][1]}
-            self._frame = f"{name}/{placed[name].epoch}"
+            self._frame = f"{name}/{placed[name].incarnation}"
         self._robots = {name: starts[name][0] for name in sorted(placed)}
         away = sorted(starts.keys() - placed.keys())
         self._reasons += [f"{name}: its start pose is not known" for name in away]
@@ -140,7 +140,7 @@ class MeasurementRule(FusionRule):
             name: translate.pose_of(placed[name]) if self._is_placed(placed[name]) else (None, None)
             for name in self._robots
         }
-        self._members = {n: m.Member(n, placed[n].epoch, 0) for n in self._robots}
+        self._members = {n: m.VersionEntry(n, placed[n].incarnation, 0) for n in self._robots}
         self._start(
             {
                 name: (np.zeros(3) if pose is None else pose, covariance)
@@ -149,7 +149,7 @@ class MeasurementRule(FusionRule):
         )
         return True
 
-    def _is_placed(self, start: m.Start) -> bool:
+    def _is_placed(self, start: m.InitialPose) -> bool:
         """Whether the initial pose is known, and within the bounds."""
         value = translate.start_of(start)
         return value is not None and start_beyond(value, self._config.bounds) is None
@@ -160,18 +160,18 @@ class MeasurementRule(FusionRule):
         turns = [
             RobotStep(
                 each.robot,
-                each.epoch.increment,
+                each.keyframe.increment,
                 self._robots[each.robot].sensor,
-                each.epoch.ids,
-                each.epoch.ranges,
-                each.epoch.bearings,
+                each.keyframe.ids,
+                each.keyframe.ranges,
+                each.keyframe.bearings,
             )
             for each in step
         ]
         self._now_ns = step[-1].stamp_ns
         for each in step:
-            epoch = self._members[each.robot].epoch
-            self._members[each.robot] = m.Member(each.robot, epoch, each.number)
+            incarnation = self._members[each.robot].incarnation
+            self._members[each.robot] = m.VersionEntry(each.robot, incarnation, each.number)
         return self._take(step, turns)
 
     def _pose_is_due(self, each: RobotKeyframe) -> bool:
@@ -180,11 +180,11 @@ class MeasurementRule(FusionRule):
         return last_ns is None or each.stamp_ns - last_ns >= pose_ns
 
     def _pose(self, each: RobotKeyframe, pose: PoseGaussian) -> Outgoing:
-        """The pose at the end of an epoch."""
+        """The pose at the end of a keyframe."""
         self._pose_ns[each.robot] = each.stamp_ns
-        epoch = self._members[each.robot].epoch
+        incarnation = self._members[each.robot].incarnation
         message = translate.pose_message(
-            each.stamp_ns, each.robot, epoch, each.number, translate.NO_MAP, *pose
+            each.stamp_ns, each.robot, incarnation, each.number, translate.NO_MAP, *pose
         )
         return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 
@@ -201,13 +201,13 @@ class MeasurementRule(FusionRule):
     def _digest(self) -> bytes:
         """The name of the measurements so far."""
         members = (self._members[robot] for robot in sorted(self._members))
-        named = b"".join(f"{x.robot}/{x.epoch}/{x.sequence} ".encode() for x in members)
+        named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
         return translate.digest_of(self._config_digest, named)
 
     def _said(self, *, final: bool) -> list[Outgoing]:
         told = self._told(final=final) if self._robots else Told()
         self.landmarks = len(told.landmarks.ids)
-        lost = [f"{robot}: its stream began anew" for robot in self._epochs.broken]
+        lost = [f"{robot}: its stream began anew" for robot in self._keyframes.broken]
         fused = fused_message(
             self._config,
             self._digest,

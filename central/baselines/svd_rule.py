@@ -56,7 +56,7 @@ class _Joined:
 class SvdJoinRule(SubmapRule):
     """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
-    A later epoch of a robot is a stream of its own, in a frame of its own.
+    A later incarnation of a robot is a stream of its own, in a frame of its own.
     """
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
@@ -123,14 +123,14 @@ class SvdJoinRule(SubmapRule):
             self._config,
             translate.digest_of(self._config_digest, *(joined[s].digest for s in sorted(joined))),
             fused,
-            tuple(m.Member(*stream, joined[stream].count - 1) for stream in sorted(joined)),
+            tuple(m.VersionEntry(*stream, joined[stream].count - 1) for stream in sorted(joined)),
             stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
             final=final,
             frame=f"{first[0]}/{first[1]}",
             reasons=(*reasons, *refused),
         )
 
-    def _believed(self, told: m.Start) -> Pose | None:
+    def _believed(self, told: m.InitialPose) -> Pose | None:
         """The initial pose of a stream, if it is known and within the bounds."""
         start = translate.start_of(told)
         if start is None or start_beyond(start, self._config.bounds) is not None:
@@ -228,14 +228,14 @@ def tied(
         frames[stream] = exchange.a_from_b.mean
         del waiting[stream]
     reasons = [
-        f"{robot}, epoch {epoch}, not joined: its common landmarks give no place"
-        for robot, epoch in unsolvable
+        f"{robot}, incarnation {incarnation}, not joined: its common landmarks give no place"
+        for robot, incarnation in unsolvable
     ]
-    for (robot, epoch), alone in waiting.items():
+    for (robot, incarnation), alone in waiting.items():
         count = len(np.intersect1d(fused.ids, alone.ids))
         plural = "" if count == 1 else "s"
         needed = f"{count} shared landmark{plural}, {svd_joining.NEEDED} needed"
-        reasons.append(f"{robot}, epoch {epoch}, not joined: {needed}")
+        reasons.append(f"{robot}, incarnation {incarnation}, not joined: {needed}")
     return fused, tuple(reasons)
 
 

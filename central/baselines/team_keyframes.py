@@ -1,4 +1,4 @@
-"""All robots' raw measurements as one sequence of epochs, the same for any order of arrival."""
+"""All robots' raw measurements as one sequence of keyframes, the same for any order of arrival."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -23,14 +23,14 @@ class RobotKeyframe(NamedTuple):
     stamp_ns: int
     robot: str
     number: int
-    epoch: Keyframe
+    keyframe: Keyframe
 
 
 @dataclass
 class _Stream:
     """The measurements of one robot, from its start pose on.
 
-    covered_ns: no epoch before this team time can still come. start: measurement 0.
+    covered_ns: no keyframe before this team time can still come. start: measurement 0.
     """
 
     robot: str
@@ -38,7 +38,7 @@ class _Stream:
     inbox: Inbox = field(default_factory=Inbox)
     segmenter: Segmenter | None = None
     judge: StreamJudge = field(default_factory=lambda: StreamJudge(Bounds()))
-    start: m.Start | None = None
+    start: m.InitialPose | None = None
     waiting: deque[RobotKeyframe] = field(default_factory=deque)
     covered_ns: float = float("-inf")
     broken: bool = False
@@ -51,7 +51,7 @@ class _Stream:
         return self.broken or (end is not None and self.inbox.complete(end))
 
     def take(self) -> None:
-        """Cut the measurements whose turn has come into epochs."""
+        """Cut the measurements whose turn has come into keyframes."""
         if self.config is None:
             return
         for measurement in self.inbox.taken():
@@ -65,12 +65,12 @@ class _Stream:
 
     def _take(self, measurement: m.Measurement, config: RobotConfig) -> None:
         match measurement:
-            case m.Start() if self.start is None:
+            case m.InitialPose() if self.start is None:
                 self.start = measurement
                 keyframe_s = config.front_end.keyframe_s
                 self.segmenter = Segmenter(config.motion, config.sensor, keyframe_s)
                 self.judge = StreamJudge(config.bounds)
-            case m.Start():
+            case m.InitialPose():
                 self.broken = True  # a later life of the stream begins who knows where
             case m.Observations() if self.segmenter is not None:
                 ids, ranges, bearings = translate.scan_of(measurement)
@@ -86,18 +86,18 @@ class _Stream:
                 end_ns, duration_ns, _, _ = motion
                 if self.segmenter.now_ns is None:
                     self.segmenter.begin(end_ns - duration_ns)
-                epochs = self.segmenter.drive(*motion, measured=reason is None)
-                self._file(epochs, measurement.number)
+                keyframes = self.segmenter.drive(*motion, measured=reason is None)
+                self._file(keyframes, measurement.number)
                 self.covered_ns = end_ns
             case _:
                 pass
 
-    def _file(self, epochs: Sequence[Keyframe], measurement: int) -> None:
-        self.waiting += [RobotKeyframe(e.stamp_ns, self.robot, measurement, e) for e in epochs]
+    def _file(self, keyframes: Sequence[Keyframe], measurement: int) -> None:
+        self.waiting += [RobotKeyframe(e.stamp_ns, self.robot, measurement, e) for e in keyframes]
 
 
 class TeamKeyframes:
-    """The team's epochs by (stamp, robot), as far as every robot's stream is known.
+    """The team's keyframes by (stamp, robot), as far as every robot's stream is known.
 
     So the sequence is a function of the streams alone. A stream that begins anew at an unknown pose
     ends there; sightings of teammates are not used.
@@ -120,10 +120,10 @@ class TeamKeyframes:
         """The last counters of the streams."""
         for name, stream in self._streams.items():
             mine = [s for s in end.streams if s.robot == name]
-            stream.end = mine[0] if mine else m.StreamEnd(name, stream.inbox.epoch, 0)
+            stream.end = mine[0] if mine else m.StreamEnd(name, stream.inbox.incarnation, 0)
 
     @property
-    def starts(self) -> dict[str, tuple[RobotConfig, m.Start]] | None:
+    def starts(self) -> dict[str, tuple[RobotConfig, m.InitialPose]] | None:
         """Every robot's models and start; None until all are here."""
         found = {}
         for name, stream in self._streams.items():
@@ -145,7 +145,7 @@ class TeamKeyframes:
         return all(stream.complete for stream in self._streams.values())
 
     def steps(self) -> Iterator[list[RobotKeyframe]]:
-        """The epochs whose turn has come, those of one team time together."""
+        """The keyframes whose turn has come, those of one team time together."""
         for stream in self._streams.values():
             stream.take()
         horizon = min(stream.covered_ns for stream in self._streams.values())
@@ -153,7 +153,7 @@ class TeamKeyframes:
         for stream in self._streams.values():
             while stream.waiting and stream.waiting[0].stamp_ns < horizon:
                 ready.append(stream.waiting.popleft())
-        # The sort is stable: the epochs of one robot keep their order.
+        # The sort is stable: the keyframes of one robot keep their order.
         ready.sort(key=lambda each: (each.stamp_ns, each.robot))
         for _, step in groupby(ready, key=lambda each: each.stamp_ns):
             yield list(step)

@@ -23,7 +23,7 @@ LOST = "lost"
 MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
 """Measurements that are missing need memory too: so many, or so many times those that are there."""
 SubmapName = tuple[str, int, int]
-"""(robot, epoch, sequence)."""
+"""(robot, incarnation, sequence)."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Ledger:
             "submaps": [
                 {
                     "robot": n[0],
-                    "epoch": n[1],
+                    "incarnation": n[1],
                     "sequence": n[2],
                     "measurements": held[n],
                     "maps": maps,
@@ -123,19 +123,22 @@ def _withdrawn(log: Recorded) -> tuple[str, ...]:
 
 
 def _named(measurement: m.Measurement) -> str:
-    return f"measurement {measurement.number} of {measurement.robot}, epoch {measurement.epoch}"
+    return (
+        f"measurement {measurement.number} of {measurement.robot}, incarnation "
+        f"{measurement.incarnation}"
+    )
 
 
 def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
     """The stream's submaps by sequence, each once; which of them contradict one another."""
-    robot, epoch = stream
+    robot, incarnation = stream
     found: dict[int, m.Submap] = {}
     wrong = []
     for submap in log.of(ch.SUBMAP):
-        if not isinstance(submap, m.Submap) or (submap.robot, submap.epoch) != stream:
+        if not isinstance(submap, m.Submap) or (submap.robot, submap.incarnation) != stream:
             continue
         if found.setdefault(submap.sequence, submap) != submap:
-            name = f"submap {submap.sequence} of {robot}, epoch {epoch}"
+            name = f"submap {submap.sequence} of {robot}, incarnation {incarnation}"
             wrong.append(f"{name} is in the log twice, and not the same")
     return [found[k] for k in sorted(found)], wrong
 
@@ -144,12 +147,12 @@ def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
     """The entry of every measurement that there is or should be; the offenders among them."""
-    robot, epoch = stream
+    robot, incarnation = stream
     measurements = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
     if count > max(MOST_LOST, MOST_LOST_SHARE * len(measurements)):
         raise RerunError(
-            f"{count:,} measurements of {robot}, epoch {epoch}, are spoken of, "
+            f"{count:,} measurements of {robot}, incarnation {incarnation}, are spoken of, "
             f"{len(measurements):,} are in the log: not believed"
         )
     holder: list[int | None] = [None] * count
@@ -157,21 +160,21 @@ def _entries(
     for submap in submaps:
         for counter in range(submap.first_measurement, submap.last_measurement + 1):
             if counter >= count:
-                name = f"submap {submap.sequence} of {robot}, epoch {epoch}"
+                name = f"submap {submap.sequence} of {robot}, incarnation {incarnation}"
                 wrong.append(f"{name} uses measurement {counter}, which the log does not have")
                 break
             if holder[counter] is not None:
                 wrong.append(
-                    f"measurement {counter} of {robot}, epoch {epoch} is in two submaps: "
-                    f"{holder[counter]} and {submap.sequence}"
+                    f"measurement {counter} of {robot}, incarnation {incarnation} is in two "
+                    f"submaps: {holder[counter]} and {submap.sequence}"
                 )
             holder[counter] = submap.sequence
-    said = dispositions(log, robot, epoch)
+    said = dispositions(log, robot, incarnation)
     last = max((s.last_measurement for s in submaps), default=-1)
     consumed = log.reported.get(stream, 0)
     entries = []
     for counter in range(count):
-        name = f"measurement {counter} of {robot}, epoch {epoch}"
+        name = f"measurement {counter} of {robot}, incarnation {incarnation}"
         held = counter in measurements and holder[counter] is not None
         disposition = said.get(counter, IN_SUBMAP if held else LOST)
         if counter not in measurements and holder[counter] is not None:
@@ -185,39 +188,46 @@ def _entries(
 
 
 def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -> Iterator[str]:
-    """Where a robot's last word on an epoch differs from what the log gives.
+    """Where a robot's last word on an incarnation differs from what the log gives.
 
     A robot that was resumed counts all measurements before as in submaps, so its sum only can
     differ.
     """
     for done in log.of(ch.ROBOT_DONE):
-        if not isinstance(done, m.Done) or (done.robot, done.epoch) != stream:
+        if not isinstance(done, m.Done) or (done.robot, done.incarnation) != stream:
             continue
         told = {d.disposition: d.measurements for d in done.ledger}
         if sum(told.values()) != done.measurements:
             yield (
-                f"{done.robot}, epoch {done.epoch}: {done.measurements} measurements, {told} "
-                "dispositions"
+                f"{done.robot}, incarnation {done.incarnation}: {done.measurements} "
+                f"measurements, {told} dispositions"
             )
         resumed = "start pose" not in told
         found = Counter(entry.disposition for entry in entries[: done.measurements])
         if not resumed and dict(found) != told:
-            yield f"{done.robot}, epoch {done.epoch} says {told}, the log gives {dict(found)}"
+            yield (
+                f"{done.robot}, incarnation {done.incarnation} says {told}, the log gives "
+                f"{dict(found)}"
+            )
 
 
 def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
     """Which maps used each submap; which use one that is not there, or one twice."""
     users: dict[SubmapName, list[str]] = {
-        (s.robot, s.epoch, s.sequence): [] for s in log.of(ch.SUBMAP) if isinstance(s, m.Submap)
+        (s.robot, s.incarnation, s.sequence): []
+        for s in log.of(ch.SUBMAP)
+        if isinstance(s, m.Submap)
     }
     wrong = []
     for fused in (*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)):
         if not isinstance(fused, m.FusedMap) or fused.rule != "join":
             continue
         digest = fused.digest.hex()
-        streams = Counter((x.robot, x.epoch) for x in fused.members)
+        streams = Counter((x.robot, x.incarnation) for x in fused.members)
         wrong += [
-            f"map {digest} counts {s[0]}, epoch {s[1]} twice" for s, n in streams.items() if n > 1
+            f"map {digest} counts {s[0]}, incarnation {s[1]} twice"
+            for s, n in streams.items()
+            if n > 1
         ]
         wrong += [
             f"map {digest} uses submaps of {robot}, which it says is withdrawn"
@@ -226,9 +236,9 @@ def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
         ]
         for member in fused.members:
             for sequence in range(member.sequence + 1):
-                name = (member.robot, member.epoch, sequence)
+                name = (member.robot, member.incarnation, sequence)
                 if name not in users:
-                    what = f"submap {sequence} of {member.robot}, epoch {member.epoch}"
+                    what = f"submap {sequence} of {member.robot}, incarnation {member.incarnation}"
                     wrong.append(f"map {digest} uses {what}, which is not in the log")
                     break
                 users[name].append(digest)

@@ -21,7 +21,7 @@ from central.desk.evaluation.errors import map_errors, moved, rigid_alignment
 from central.tick_fold import join_settings
 from sim.calibration.figures import Figure
 from team.estimation.consistency import covariance_scale
-from team.estimation.contribution import Start, Stream
+from team.estimation.contribution import InitialPoseFactor, Stream
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
 from team.estimation.map_joining.joining import Fold
@@ -110,7 +110,7 @@ def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
 def _map_of(
     island: Island,
     robots: Collection[str],
-    starts: Mapping[Stream, Start],
+    starts: Mapping[Stream, InitialPoseFactor],
     settings: JoinSettings,
 ) -> LandmarkGaussian:
     """The map of some robots' submaps alone, solved from where the whole team has it."""

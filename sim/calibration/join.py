@@ -27,7 +27,7 @@ from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,
-    Start,
+    InitialPoseFactor,
     converged,
     folded,
     started,
@@ -71,7 +71,7 @@ def joined_team(
     for stream in world.streams:
         if stream.start is not None and tracks.get(stream.robot):
             start = stream.start
-            fold = started(fold, Start(stream.robot, 1, start.pose, start.covariance))
+            fold = started(fold, InitialPoseFactor(stream.robot, 1, start.pose, start.covariance))
     contributions = [
         Contribution(robot, 1, t.closed.sequence, t.closed.end_ns, t.closed.local)
         for robot, windows in tracks.items()

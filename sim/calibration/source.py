@@ -21,14 +21,14 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
 def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
     """The measurements of a log (`.mcap`) with its scenario, or of a UTIAS set with `utias`.
 
-    Of a log the first epoch of each robot is taken; of a set, all robots that it has files of.
-    Raises DatasetError, LogError or ScenarioError.
+    Of a log the first incarnation of each robot is taken; of a set, all robots that it has files
+    of. Raises DatasetError, LogError or ScenarioError.
     """
     if path.suffix != ".mcap":
         scenario = _with_its_robots(path)
         return streams_of(scenario), scenario
     messages = [opened(sample)[2] for sample in _samples(path)]
-    configured = [each for each in messages if isinstance(each, m.Configured)]
+    configured = [each for each in messages if isinstance(each, m.Configuration)]
     if not configured:
         raise ScenarioError(f"{path}: the log does not say the world's scenario")
     scenario = loads(configured[-1].configuration)

@@ -124,7 +124,7 @@ class Conditions:
     def _losses(self, submap: m.Submap) -> int:
         if self.loss == 0.0:
             return 0
-        draws = generator(self.seed, f"{submap.robot} loses", submap.epoch, submap.sequence)
+        draws = generator(self.seed, f"{submap.robot} loses", submap.incarnation, submap.sequence)
         return int(draws.geometric(1.0 - self.loss)) - 1
 
 

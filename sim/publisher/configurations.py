@@ -21,12 +21,12 @@ class Configurations:
     A node's newest announcement counts. Nothing is compared when nothing is to be announced.
     """
 
-    def __init__(self, expected: Mapping[str, m.Configured]) -> None:
+    def __init__(self, expected: Mapping[str, m.Configuration]) -> None:
         self._expected = expected
         self._heard: set[str] = set()
         self._mismatches: dict[str, str] = {}
 
-    def take(self, announced: m.Configured) -> None:
+    def take(self, announced: m.Configuration) -> None:
         """Take one announcement."""
         if not self._expected:
             return

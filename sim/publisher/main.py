@@ -68,7 +68,7 @@ def run_world(
     shell.end(node.final)
 
 
-def expected_configurations(scenario: Scenario) -> dict[str, m.Configured]:
+def expected_configurations(scenario: Scenario) -> dict[str, m.Configuration]:
     """What the centre and the robots of a scenario announce, by node."""
     nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
     robots = {node: translate.configured(node, 0, 0, robot) for node, robot in nodes.items()}

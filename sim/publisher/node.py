@@ -33,15 +33,15 @@ HELD_UP_S = 5.0
 """A node without whose progress the world can not go on is named after so long."""
 RESUME_S = 2.0
 """A world that is started again waits so long for everyone to say how far he is."""
-FIRST_EPOCH = 1
+FIRST_INCARNATION = 1
 
 
 @dataclass
 class _Source:
-    """One robot's stream; its present epoch began at measurement `base` of the whole."""
+    """One robot's stream; its present incarnation began at measurement `base` of the whole."""
 
     stream: RobotStream
-    epoch: int = FIRST_EPOCH
+    incarnation: int = FIRST_INCARNATION
     base: int = 0
     published: int = 0
     consumed: int = 0
@@ -50,28 +50,28 @@ class _Source:
 
     @property
     def counter(self) -> int:
-        """Measurements published in this epoch."""
+        """Measurements published in this incarnation."""
         return self.published - self.base
 
     def message(self, index: int) -> m.Measurement:
-        """The measurement at `index` of the whole stream, as this epoch counts it."""
-        robot, epoch, measurement = self.stream.robot, self.epoch, index - self.base
+        """The measurement at `index` of the whole stream, as this incarnation counts it."""
+        robot, incarnation, measurement = self.stream.robot, self.incarnation, index - self.base
         stamp_ns = int(self.stream.stamps_ns[index])
-        if measurement == 0 and epoch > FIRST_EPOCH:
-            return m.Start(stamp_ns, robot, epoch, 0, b"", b"")
+        if measurement == 0 and incarnation > FIRST_INCARNATION:
+            return m.InitialPose(stamp_ns, robot, incarnation, 0, b"", b"")
         kind = self.stream.kinds[index]
         if kind == s.ODOMETRY:
             o = self.stream.odometry(index)
             stamp_ns -= self.stream.clock_offset_ns
             return m.Odometry(
-                stamp_ns, robot, epoch, measurement, o.duration_ns, o.forward, o.yaw_rate
+                stamp_ns, robot, incarnation, measurement, o.duration_ns, o.forward, o.yaw_rate
             )
         if kind == s.OBSERVATIONS:
             z = self.stream.observations(index)
             return m.Observations(
                 stamp_ns,
                 robot,
-                epoch,
+                incarnation,
                 measurement,
                 from_ids(z.ids),
                 from_floats(z.ranges),
@@ -82,7 +82,7 @@ class _Source:
             return m.Sightings(
                 stamp_ns,
                 robot,
-                epoch,
+                incarnation,
                 measurement,
                 t.teammates,
                 from_floats(t.ranges),
@@ -92,7 +92,7 @@ class _Source:
         pose = b"" if start is None else from_floats(start.pose)
         known = start is not None and start.covariance is not None
         covariance = from_floats(start.covariance) if start is not None and known else b""
-        return m.Start(stamp_ns, robot, epoch, measurement, pose, covariance)
+        return m.InitialPose(stamp_ns, robot, incarnation, measurement, pose, covariance)
 
 
 _CHANNEL_OF_KIND = {
@@ -109,16 +109,16 @@ class WorldNode:
 
     expected: the nodes that must be alive before the first measurement. speed: team seconds per
     second of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's
-    last measurements can be asked for again; None: all. Who asks for older ones gets a new epoch
-    instead: a start at an unknown pose, and measurements that count from there. configurations:
-    what the others are to announce; the world does not begin while anyone has announced something
-    else. tells_map: the robots are told the landmarks, since they only localise themselves.
-    batch_s: team time between two looks at what has come in, at the most.
+    last measurements can be asked for again; None: all. Who asks for older ones gets a new
+    incarnation instead: a start at an unknown pose, and measurements that count from there.
+    configurations: what the others are to announce; the world does not begin while anyone has
+    announced something else. tells_map: the robots are told the landmarks, since they only localise
+    themselves. batch_s: team time between two looks at what has come in, at the most.
     """
 
     streams: WorldStreams
     expected: frozenset[str]
-    scenario: m.Configured
+    scenario: m.Configuration
     speed: float = float("inf")
     cache: int | None = None
     configurations: Configurations = field(default_factory=lambda: Configurations({}))
@@ -189,8 +189,11 @@ class WorldNode:
                 source = self._sources.get(message.robot)
                 if source is None:
                     return f"of {message.robot}, not in this team"
-                if message.epoch > source.epoch:
-                    return f"of incarnation {message.epoch} of {message.robot}, {source.epoch} is"
+                if message.incarnation > source.incarnation:
+                    return (
+                        f"of incarnation {message.incarnation} of {message.robot}, "
+                        f"{source.incarnation} is"
+                    )
                 if message.measurements > len(source.stream):
                     return f"consumed {message.measurements} of {len(source.stream)} measurements"
             case m.FusedMap() if message.final and self._published and not self.ended:
@@ -205,15 +208,15 @@ class WorldNode:
             case m.Liveliness():
                 self._take_liveliness(message)
             case m.Progress() if message.node == "recorder":
-                stream = (message.robot, message.epoch)
+                stream = (message.robot, message.incarnation)
                 self._recorded[stream] = max(self._recorded.get(stream, 0), message.measurements)
             case m.Progress():
                 if self._began_at is None and message.measurements:
                     self._note_consumed(message)
                 source = self._sources.get(message.robot)
-                if source is not None and message.epoch == source.epoch:
+                if source is not None and message.incarnation == source.incarnation:
                     source.consumed = max(source.consumed, source.base + message.measurements)
-            case m.Configured():
+            case m.Configuration():
                 self.configurations.take(message)
             case m.FusedMap() if message.final:
                 self.finished, self.final = True, message
@@ -225,7 +228,7 @@ class WorldNode:
 
     def _note_consumed(self, progress: m.Progress) -> None:
         """What robots say before this world has begun is of an earlier life of it."""
-        stream = (progress.robot, progress.epoch)
+        stream = (progress.robot, progress.incarnation)
         if progress.robot in self._sources:
             self._consumed[stream] = max(self._consumed.get(stream, 0), progress.measurements)
             self._passed_ns[progress.robot] = progress.stamp_ns
@@ -244,7 +247,7 @@ class WorldNode:
 
         Robots and recorder report their progress again to whoever comes; the streams are the same
         for the same scenario, so this life goes on from the least that everybody has, in the same
-        epochs. What someone has already he drops, what he misses he asks for.
+        incarnations. What someone has already he drops, what he misses he asks for.
         """
         if not self._consumed:
             return False
@@ -258,15 +261,19 @@ class WorldNode:
         """Leave out what everybody has; the starts once more, for a centre that comes later."""
         starts = []
         for name, source in self._sources.items():
-            epoch = max((e for n, e in self._consumed if n == name), default=FIRST_EPOCH)
-            consumed = self._consumed.get((name, epoch), 0)
-            if epoch > FIRST_EPOCH:  # where it began is not known any more, but how far it came
+            incarnation = max(
+                (e for n, e in self._consumed if n == name), default=FIRST_INCARNATION
+            )
+            consumed = self._consumed.get((name, incarnation), 0)
+            if (
+                incarnation > FIRST_INCARNATION
+            ):  # where it began is not known any more, but how far it came
                 at = int(np.searchsorted(source.stream.stamps_ns, self._passed_ns[name], "right"))
-                source.epoch, source.published = epoch, max(at, 1)
-                self._begin_epoch(source)
+                source.incarnation, source.published = incarnation, max(at, 1)
+                self._begin_incarnation(source)
                 continue
             if self._recorder:
-                consumed = min(consumed, self._recorded.get((name, epoch), 0))
+                consumed = min(consumed, self._recorded.get((name, incarnation), 0))
             source.published = min(consumed, len(source.stream))
             if source.published:
                 starts.append(Outgoing(ch.START, name, source.message(0)))
@@ -300,7 +307,7 @@ class WorldNode:
 
     def publish(self, clock_s: float) -> list[Outgoing]:
         """The next measurements, at most BATCH and of batch_s: as many as pace and credit allow."""
-        if self.ended:  # a new epoch may begin after the end; it has its own last counters
+        if self.ended:  # a new incarnation may begin after the end; it has its own last counters
             out, self._starts = self._starts, []
             return [*out, Outgoing(ch.END, "", self._end())] if out else []
         if self._began_at is None:
@@ -376,7 +383,7 @@ class WorldNode:
         return [Outgoing(ch.TRUTH, stream.robot, truth)]
 
     def _end(self) -> m.End:
-        ends = tuple(m.StreamEnd(n, x.epoch, x.counter) for n, x in self._sources.items())
+        ends = tuple(m.StreamEnd(n, x.incarnation, x.counter) for n, x in self._sources.items())
         notes = [*self.streams.notes]
         for name, source in self._sources.items():
             notes += [f"{name}: {note}" for note in source.stream.notes]
@@ -388,21 +395,21 @@ class WorldNode:
         """
         wanted = decoded(request, m.MeasurementsRequest)
         source = self._sources.get(wanted.robot)
-        if source is None or wanted.epoch not in (0, source.epoch):
+        if source is None or wanted.incarnation not in (0, source.incarnation):
             return []
         first = wanted.first
         if self.cache is not None and first < source.counter - self.cache:
             if not wanted.only:
-                self._begin_epoch(source)
+                self._begin_incarnation(source)
                 return []
             first = source.counter - self.cache
         last = source.counter - 1 if wanted.last < 0 else min(wanted.last, source.counter - 1)
         last = min(last, first + ANSWER - 1)
         return [encoded(source.message(source.base + i)) for i in range(first, last + 1)]
 
-    def _begin_epoch(self, source: _Source) -> None:
+    def _begin_incarnation(self, source: _Source) -> None:
         """The stream can not be continued where the robot is: it begins anew at a free pose."""
-        source.epoch += 1
+        source.incarnation += 1
         source.base = source.published - 1
         source.consumed = source.base
         start = source.message(source.base)

@@ -31,7 +31,7 @@ def recorded_streams(
     landmark_ids, landmarks = np.empty(0, np.uint32), None
     for message in messages:
         match message:
-            case m.Measurement() if message.epoch == 1:
+            case m.Measurement() if message.incarnation == 1:
                 measurements.setdefault(message.robot, {})[message.number] = message
             case m.Truth():
                 truth.setdefault(message.robot, []).append(message)
@@ -60,7 +60,7 @@ def _stream(
     robots: tuple[str, ...],
     clock_offset_s: float,
 ) -> RobotStream:
-    starts = [each for each in measurements if isinstance(each, m.Start)]
+    starts = [each for each in measurements if isinstance(each, m.InitialPose)]
     odometry = [each for each in measurements if isinstance(each, m.Odometry)]
     seen = [each for each in measurements if isinstance(each, m.Observations)]
     sighted = [each for each in measurements if isinstance(each, m.Sightings)]

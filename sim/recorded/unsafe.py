@@ -24,7 +24,7 @@ class UnsafeRobot(RobotNode):
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
         prior = self._prior
-        if prior is not None and prior.epoch == self.epoch:
+        if prior is not None and prior.incarnation == self.incarnation:
             pending = self._locals[max(prior.sequence + 1, 0) :]
             fed = _fed(translate.prior_of(prior), pending, closed.local)
             closed = replace(closed, local=fed, sightings=())  # of its pose nodes none is left

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sim.datasets.utias_writer import write_utias
-from sim.publisher.node import FIRST_EPOCH
+from sim.publisher.node import FIRST_INCARNATION
 from sim.recorded.streams import recorded_streams
 from team.recording.reader import Log, LogError
 from team.wire import channels as ch
@@ -18,12 +18,12 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 def export_utias(log: Log, folder: Path) -> list[str]:
     """Write the data set into `folder`; the robots in the order of their numbers 1, 2, …
 
-    The format has one stream per robot: the first epoch of each is written. Raises `LogError` for
-    a log that has no measurements, or not those that the format needs.
+    The format has one stream per robot: the first incarnation of each is written. Raises `LogError`
+    for a log that has no measurements, or not those that the format needs.
     """
     messages = list(_sound(log))
     measurements = [each for each in messages if isinstance(each, m.Measurement)]
-    robots = {each.robot for each in measurements if each.epoch == FIRST_EPOCH}
+    robots = {each.robot for each in measurements if each.incarnation == FIRST_INCARNATION}
     if not robots:
         raise LogError(
             log.path, "no sensor measurements in it", "`--format csv` writes what there is"

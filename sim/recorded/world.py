@@ -29,7 +29,7 @@ class RecordedWorld:
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
 
     def __init__(self, log: Log, without: Collection[str] = ()) -> None:
-        self._configured: m.Configured | None = None
+        self._configured: m.Configuration | None = None
         self._said: list[Outgoing] = []
         self._notes: tuple[str, ...] = ()
         published: dict[tuple[str, int, int], tuple[int, Outgoing]] = {}
@@ -43,14 +43,14 @@ class RecordedWorld:
                 case m.Measurement() | m.Truth() if name in without:
                     pass
                 case m.Measurement():
-                    place = (message.robot, message.epoch, message.number)
+                    place = (message.robot, message.incarnation, message.number)
                     out = Outgoing(channel, name, message)
                     published.setdefault(place, (message.stamp_ns, out))
                 case m.Truth():
                     truths.append((message.stamp_ns, Outgoing(channel, name, message)))
                 case m.TruthLandmarks():
                     self._said.append(Outgoing(channel, "", message))
-                case m.Configured():
+                case m.Configuration():
                     self._configured = message
                 case m.End():
                     self._notes = message.notes
@@ -111,16 +111,18 @@ class RecordedWorld:
 
 
 def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...]:
-    """The last epoch of every robot and its count; raises RerunError for a gap in any epoch."""
+    """The last incarnation of every robot and its count; raises RerunError for a gap in any
+    incarnation.
+    """
     counts: dict[tuple[str, int], int] = {}
-    for robot, epoch, measurement in sorted(published):
-        if measurement != counts.setdefault((robot, epoch), 0):
+    for robot, incarnation, measurement in sorted(published):
+        if measurement != counts.setdefault((robot, incarnation), 0):
             raise RerunError(
-                f"measurement {counts[robot, epoch]} of {robot}, epoch {epoch} is not in the log: "
-                "under other conditions the robot could not go on behind it"
+                f"measurement {counts[robot, incarnation]} of {robot}, incarnation {incarnation} "
+                "is not in the log: under other conditions the robot could not go on behind it"
             )
-        counts[robot, epoch] += 1
+        counts[robot, incarnation] += 1
     last: dict[str, m.StreamEnd] = {}
-    for (robot, epoch), count in sorted(counts.items()):
-        last[robot] = m.StreamEnd(robot, epoch, count)
+    for (robot, incarnation), count in sorted(counts.items()):
+        last[robot] = m.StreamEnd(robot, incarnation, count)
     return tuple(last.values())

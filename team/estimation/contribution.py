@@ -11,35 +11,35 @@ from team.estimation.gaussian import information
 from team.estimation.submap import LocalMap
 
 Stream: TypeAlias = tuple[str, int]
-"""(robot, epoch): one unbroken life of a robot's sensor stream."""
+"""(robot, incarnation): one unbroken life of a robot's sensor stream."""
 Key: TypeAlias = tuple[int, str, int, int]
-"""(end stamp, robot, epoch, sequence): a submap's place in the canonical order."""
+"""(end stamp, robot, incarnation, sequence): a submap's place in the canonical order."""
 
 
 def named(stream: Stream) -> str:
-    """`r3 (epoch 2)`."""
-    return f"{stream[0]} (epoch {stream[1]})"
+    """`r3 (incarnation 2)`."""
+    return f"{stream[0]} (incarnation {stream[1]})"
 
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """One submap of the set: `sequence` counts the submaps of (robot, epoch) from 0."""
+    """One submap of the set: `sequence` counts the submaps of (robot, incarnation) from 0."""
 
     robot: str
-    epoch: int
+    incarnation: int
     sequence: int
     end_ns: int
     local: LocalMap
 
     @property
     def stream(self) -> Stream:
-        """(robot, epoch)."""
-        return (self.robot, self.epoch)
+        """(robot, incarnation)."""
+        return (self.robot, self.incarnation)
 
     @property
     def key(self) -> Key:
-        """Place in the canonical order: (end stamp, robot, epoch, sequence)."""
-        return (self.end_ns, self.robot, self.epoch, self.sequence)
+        """Place in the canonical order: (end stamp, robot, incarnation, sequence)."""
+        return (self.end_ns, self.robot, self.incarnation, self.sequence)
 
     @cached_property
     def information(self) -> Float[np.ndarray, "n n"]:
@@ -48,21 +48,21 @@ class Contribution:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class InitialPoseFactor:
     """Where a stream starts in the common frame: exactly (covariance None) or N(pose, covariance).
 
     The covariance is of (x [m], y [m], theta [rad]) in the common frame.
     """
 
     robot: str
-    epoch: int
+    incarnation: int
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"] | None = None
 
     @property
     def stream(self) -> Stream:
-        """(robot, epoch)."""
-        return (self.robot, self.epoch)
+        """(robot, incarnation)."""
+        return (self.robot, self.incarnation)
 
     @cached_property
     def information(self) -> Float[np.ndarray, "3 3"] | None:

@@ -23,14 +23,15 @@ from team.estimation.models import NEAREST_M, Increment, noise
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Submap `sequence` of (robot, epoch) has a pose node at stamp_ns, from where a teammate is.
+    """Submap `sequence` of (robot, incarnation) has a pose node at stamp_ns, from where a teammate
+    is.
 
     measurement: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
     covariance: of the measurement, [m², m·rad, rad²].
     """
 
     robot: str
-    epoch: int
+    incarnation: int
     sequence: int
     stamp_ns: int
     teammate: str
@@ -39,13 +40,13 @@ class Sighting:
 
     @property
     def stream(self) -> Stream:
-        """(robot, epoch) of the observer."""
-        return (self.robot, self.epoch)
+        """(robot, incarnation) of the observer."""
+        return (self.robot, self.incarnation)
 
     @property
     def key(self) -> tuple[int, str, int, str]:
-        """Place in the canonical order: (stamp, robot, epoch, teammate)."""
-        return (self.stamp_ns, self.robot, self.epoch, self.teammate)
+        """Place in the canonical order: (stamp, robot, incarnation, teammate)."""
+        return (self.stamp_ns, self.robot, self.incarnation, self.teammate)
 
     @cached_property
     def information(self) -> Float[np.ndarray, "2 2"]:

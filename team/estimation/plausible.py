@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.config import Bounds
-from team.estimation.contribution import Start
+from team.estimation.contribution import InitialPoseFactor
 from team.estimation.inter_robot import Sighting
 from team.estimation.submap import LocalMap
 
@@ -37,7 +37,7 @@ def sighting_beyond(sighting: Sighting, bounds: Bounds) -> str | None:
     return why or _spread(sighting.covariance, np.array([False, True]), bounds)
 
 
-def start_beyond(start: Start, bounds: Bounds) -> str | None:
+def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
     """Why an initial pose is refused; None if it is within the bounds."""
     if abs(start.pose[2]) > 2.0 * np.pi:
         return "a heading beyond a full turn"

@@ -5,13 +5,15 @@ import hashlib
 import numpy as np
 
 
-def generator(seed: int, robot: str, epoch: int, sequence: int) -> np.random.Generator:
+def generator(seed: int, robot: str, incarnation: int, sequence: int) -> np.random.Generator:
     """A counter-based generator (Philox 4x64) for one window of one robot.
 
-    Its 128-bit key is the BLAKE2b digest of (seed, robot, epoch, sequence), so streams of different
-    windows are independent and none depends on how many numbers another one drew.
+    Its 128-bit key is the BLAKE2b digest of (seed, robot, incarnation, sequence), so streams of
+    different windows are independent and none depends on how many numbers another one drew.
     """
     digest = hashlib.blake2b(
-        f"{seed}/{robot}/{epoch}/{sequence}".encode(), digest_size=16, person=b"teamslam window"
+        f"{seed}/{robot}/{incarnation}/{sequence}".encode(),
+        digest_size=16,
+        person=b"teamslam window",
     ).digest()
     return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))

@@ -18,7 +18,7 @@ from team.wire import messages as m
 from team.wire.bus import NO_COUNTER, Sample, opened
 from team.wire.codec import WireError
 
-_HEAD = 128  # bytes of a message: its tag, stamp, robot, epoch and number are within
+_HEAD = 128  # bytes of a message: its tag, stamp, robot, incarnation and number are within
 Kind = Literal["measurements", "submaps"]
 
 
@@ -27,7 +27,7 @@ class Stream(NamedTuple):
 
     kind: Kind
     robot: str
-    epoch: int
+    incarnation: int
 
 
 @dataclass
@@ -123,8 +123,8 @@ class Inventory:
             self._hear(sample)
         return True
 
-    def _of(self, kind: Kind, robot: str, epoch: int) -> Numbered:
-        return self.streams.setdefault(Stream(kind, robot, epoch), Numbered())
+    def _of(self, kind: Kind, robot: str, incarnation: int) -> Numbered:
+        return self.streams.setdefault(Stream(kind, robot, incarnation), Numbered())
 
     def _hear(self, sample: Sample) -> None:
         try:
@@ -133,23 +133,23 @@ class Inventory:
             return  # whoever opens it will say so
         match message:
             case m.Progress() | m.Done():
-                self._of("measurements", message.robot, message.epoch).know(
+                self._of("measurements", message.robot, message.incarnation).know(
                     message.measurements - 1
                 )
-                self._of("submaps", message.robot, message.epoch).know(message.submaps - 1)
+                self._of("submaps", message.robot, message.incarnation).know(message.submaps - 1)
             case m.End():
                 for end in message.streams:
-                    self._of("measurements", end.robot, end.epoch).know(end.measurements - 1)
+                    self._of("measurements", end.robot, end.incarnation).know(end.measurements - 1)
             case _:
                 pass
 
     def counts(self) -> dict[tuple[str, int], tuple[int, int]]:
-        """How many measurements and submaps there are of each incarnation (robot, epoch)."""
+        """How many measurements and submaps there are of each incarnation (robot, incarnation)."""
         found: dict[tuple[str, int], tuple[int, int]] = {}
-        for (kind, robot, epoch), each in self.streams.items():
-            measurements, submaps = found.get((robot, epoch), (0, 0))
+        for (kind, robot, incarnation), each in self.streams.items():
+            measurements, submaps = found.get((robot, incarnation), (0, 0))
             own = (each.count, submaps) if kind == "measurements" else (measurements, each.count)
-            found[robot, epoch] = own
+            found[robot, incarnation] = own
         return found
 
     @property
@@ -166,9 +166,9 @@ class Inventory:
 
     def findings(self) -> Iterator[tuple[str, str]]:
         """What is missing, or there twice and not the same: a key, and what is wrong with it."""
-        for (kind, robot, epoch), found in sorted(self.streams.items()):
+        for (kind, robot, incarnation), found in sorted(self.streams.items()):
             key = ch.SUBMAP.key(robot) if kind == "submaps" else f"source/{robot}"
-            of = f"of {epoch_named(epoch)}"
+            of = f"of {incarnation_named(incarnation)}"
             if missing := found.missing:
                 lost = sum(last - first + 1 for first, last in missing)
                 yield key, f"{lost} {kind} {of} missing: {intervals(missing)}"
@@ -180,9 +180,9 @@ def _name(sample: Sample) -> int:
     return hash((sample.key, sample.counter % 2**32, sample.wall_ns))
 
 
-def epoch_named(epoch: int) -> str:
+def incarnation_named(incarnation: int) -> str:
     """An incarnation in words."""
-    return f"life {epoch} of the stream"
+    return f"incarnation {incarnation}"
 
 
 SHOWN = 3
@@ -196,7 +196,9 @@ def intervals(of: list[tuple[int, int]]) -> str:
 
 
 def numbered_in(payload: bytes) -> tuple[int, int] | None:
-    """Epoch and number of a message [tag, stamp, robot, epoch, number, …]; None: it is no such."""
+    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …]; None: it is
+    no such.
+    """
     unpacker = msgpack.Unpacker()
     unpacker.feed(payload[:_HEAD])
     try:
@@ -204,8 +206,8 @@ def numbered_in(payload: bytes) -> tuple[int, int] | None:
             return None
         for _ in range(3):
             unpacker.skip()
-        epoch, number = unpacker.unpack(), unpacker.unpack()
+        incarnation, number = unpacker.unpack(), unpacker.unpack()
     except (ValueError, msgpack.UnpackException):
         return None  # unsound ones are recorded as they came; whoever opens them will say so
-    sound = all(isinstance(n, int) and n >= 0 for n in (epoch, number))
-    return (epoch, number) if sound else None
+    sound = all(isinstance(n, int) and n >= 0 for n in (incarnation, number))
+    return (incarnation, number) if sound else None

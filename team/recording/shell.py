@@ -32,7 +32,7 @@ from team.wire.messages import (
     Message,
     Progress,
     Status,
-    SubmapsWanted,
+    SubmapsRequest,
 )
 from team.wire.patience import Patience
 
@@ -110,12 +110,14 @@ class RecordLoop:
         if self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND:
             return
         every = PROGRESS_EVERY if samples else 1
-        for (robot, epoch), (measurements, submaps) in self._inventory.counts().items():
-            before = self._reported.get((robot, epoch), (0, 0))
+        for (robot, incarnation), (measurements, submaps) in self._inventory.counts().items():
+            before = self._reported.get((robot, incarnation), (0, 0))
             if measurements - before[0] >= every or submaps > before[1]:
-                progress = Progress(self._newest_ns, NODE, robot, epoch, measurements, submaps)
+                progress = Progress(
+                    self._newest_ns, NODE, robot, incarnation, measurements, submaps
+                )
                 self._bus.publish(Outgoing(RECORDER_PROGRESS, robot, progress))
-                self._reported[robot, epoch] = (measurements, submaps)
+                self._reported[robot, incarnation] = (measurements, submaps)
 
     def _write(self, samples: list[Sample]) -> None:
         """To the log, if it can be written: the run goes on without it."""
@@ -164,14 +166,18 @@ class RecordLoop:
         """Ask sources and robots for what has been missing for a while, without waiting for it."""
         self._go_on(now_s)
         for stream in self._patience.due(self._inventory.gaps, now_s):
-            kind, robot, epoch = stream
+            kind, robot, incarnation = stream
             first, last = self._inventory.span(stream)
             _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
             if kind == "measurements":
-                wanted = MeasurementsRequest(self._newest_ns, robot, epoch, first, last, only=True)
+                wanted = MeasurementsRequest(
+                    self._newest_ns, robot, incarnation, first, last, only=True
+                )
                 self._bus.request(MEASUREMENTS, robot, wanted)
             else:
-                self._bus.request(SENT, robot, SubmapsWanted(self._newest_ns, robot, epoch, first))
+                self._bus.request(
+                    SENT, robot, SubmapsRequest(self._newest_ns, robot, incarnation, first)
+                )
 
     @property
     def lacking(self) -> list[str]:

@@ -75,10 +75,12 @@ class RobotShell:
                 if sample.key == ch.RECORDER_PROGRESS.key(self.node.robot):
                     with suppress(WireError):
                         said = decoded(sample.payload, m.Progress)
-                        recorded[said.epoch] = max(recorded.get(said.epoch, 0), said.submaps)
+                        recorded[said.incarnation] = max(
+                            recorded.get(said.incarnation, 0), said.submaps
+                        )
 
         self._bus.subscribe(ch.RECORDER_PROGRESS, self.node.robot)
-        own = self.node.epoch, self.node.submaps
+        own = self.node.incarnation, self.node.submaps
         self._shell.wait_for_recorder(lambda: recorded.get(own[0], 0) < own[1], take)
 
     def _be_the_only_one(self) -> None:
@@ -94,7 +96,7 @@ class RobotShell:
 
     def _resume(self) -> bool:
         """Take over the submaps of an earlier life that the centre has; False if there are none."""
-        wanted = m.SubmapsWanted(0, self.node.robot)
+        wanted = m.SubmapsRequest(0, self.node.robot)
         try:
             replies = self._bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
         except BusError as error:  # a centre that does not answer: the same submaps once more
@@ -103,14 +105,18 @@ class RobotShell:
         if not replies:
             return False
         try:
-            start = reply_of(replies[0], m.Start)
+            start = reply_of(replies[0], m.InitialPose)
             self.node.take_over([start, *(reply_of(reply, m.Message) for reply in replies[1:])])
         except Exception as error:
             sample = Sample(ch.SUBMAPS.key(), replies[0], 0, 0, -1)
             self._shell.publish([self._shell.boundary.note(error, sample, "")])
             self.node = self._shell.node = RobotNode(self._config, self._exchange)
             return False
-        _LOG.info("resumed after submap %d of epoch %d", self.node.submaps - 1, self.node.epoch)
+        _LOG.info(
+            "resumed after submap %d of incarnation %d",
+            self.node.submaps - 1,
+            self.node.incarnation,
+        )
         return True
 
     def _catch_up(self) -> None:
@@ -118,7 +124,7 @@ class RobotShell:
         while True:
             first = self.node.next_measurement
             replies = self._ask(
-                m.MeasurementsRequest(0, self.node.robot, self.node.epoch, first, -1)
+                m.MeasurementsRequest(0, self.node.robot, self.node.incarnation, first, -1)
             )
             if not replies or self.node.next_measurement == first:
                 return

@@ -93,7 +93,7 @@ class RobotNode:
         self._prior: m.Prior | None = None
         self._team_map = TeamMap()
         self._sent = Sent()
-        self._epoch = 0
+        self._incarnation = 0
         self._consumed = 0
         self._steps = 0
         self._last_map = -1
@@ -111,7 +111,7 @@ class RobotNode:
         self._now_ns = 0
         self._passed_ns = 0
         self._done = False
-        self._start: m.Start | None = None
+        self._start: m.InitialPose | None = None
         self._closed: list[ClosedWindow] = []
         self._window: list[m.Measurement] = []
         self._taking: m.Measurement | None = None
@@ -127,9 +127,9 @@ class RobotNode:
     # What the shell asks.
 
     @property
-    def epoch(self) -> int:
-        """The epoch of the stream that is being consumed."""
-        return self._inbox.epoch
+    def incarnation(self) -> int:
+        """The incarnation of the stream that is being consumed."""
+        return self._inbox.incarnation
 
     @property
     def next_measurement(self) -> int:
@@ -138,7 +138,7 @@ class RobotNode:
 
     @property
     def submaps(self) -> int:
-        """How many submaps of this epoch have been sent, in this life or an earlier one."""
+        """How many submaps of this incarnation have been sent, in this life or an earlier one."""
         return len(self._locals) - self._held.submaps
 
     @property
@@ -164,25 +164,25 @@ class RobotNode:
         What an earlier life has sent can be asked of this one, too.
         """
         start = kept[0]
-        assert isinstance(start, m.Start)
-        of_it = (s for s in kept if isinstance(s, m.Submap) and s.epoch == start.epoch)
+        assert isinstance(start, m.InitialPose)
+        of_it = (s for s in kept if isinstance(s, m.Submap) and s.incarnation == start.incarnation)
         self.resume(start, list(of_it))
         for message in kept:
             self._sent.take(message)
 
     def answer_submaps(self, request: bytes) -> list[bytes]:
-        """The answer to `SubmapsWanted`: all that was sent, of an earlier life too."""
-        wanted = decoded(request, m.SubmapsWanted)
+        """The answer to `SubmapsRequest`: all that was sent, of an earlier life too."""
+        wanted = decoded(request, m.SubmapsRequest)
         if wanted.robot != self.robot:
             return []
         return [encoded(message) for message in self._sent.wanted(wanted)]
 
-    def resume(self, start: m.Start, submaps: Sequence[m.Submap]) -> None:
+    def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
         """Go on after the last of this robot's own submaps, as an earlier life sent them.
 
-        `submaps` are those of the latest epoch, without a gap from sequence 0.
+        `submaps` are those of the latest incarnation, without a gap from sequence 0.
         """
-        self._begin_epoch(start)
+        self._begin_incarnation(start)
         for submap in submaps:
             local = translate.local_map_of(submap)
             self._locals.append(local)
@@ -201,7 +201,7 @@ class RobotNode:
         self._pace.acknowledged = len(submaps)
         self._now_ns = self._passed_ns = last.stamp_ns
         self._judge = StreamJudge(self.config.bounds, last.stamp_ns)
-        self._inbox.resume(last.epoch, last.last_measurement + 1)
+        self._inbox.resume(last.incarnation, last.last_measurement + 1)
 
     def refusal(self, message: m.Message) -> str | None:
         """Why a message can not be true of this robot: another's, an absurd count, an early end."""
@@ -212,7 +212,7 @@ class RobotNode:
             case m.Measurement():
                 own = message.robot == self.robot
                 return self._inbox.refusal(message) if own else f"a measurement of {message.robot}"
-            case m.Progress() if message.epoch == self._epoch:
+            case m.Progress() if message.incarnation == self._incarnation:
                 if message.submaps > self.submaps + AHEAD:
                     return f"acknowledges {message.submaps} submaps of {self.submaps}"
             case m.End():
@@ -248,7 +248,7 @@ class RobotNode:
             case m.FusedMap():
                 return self._take_fused(message) + self._go_on()
             case m.Progress():
-                if message.epoch == self._epoch:
+                if message.incarnation == self._incarnation:
                     acknowledged = max(self._pace.acknowledged, message.submaps)
                     self._pace.acknowledged = acknowledged
             case m.Liveliness():
@@ -325,8 +325,8 @@ class RobotNode:
             self._pending += self._last_words()
         return self._sound(self._go_on())
 
-    def _put_back(self, start: m.Start) -> None:
-        self._begin_estimator(start.epoch, self._believed(start))
+    def _put_back(self, start: m.InitialPose) -> None:
+        self._begin_estimator(start.incarnation, self._believed(start))
         self._goes_in(start)
         for closed in self._closed:
             self._submap_estimator.resume(closed)
@@ -384,9 +384,9 @@ class RobotNode:
 
     def _take(self, measurement: m.Measurement) -> list[Outgoing]:
         out: list[Outgoing] = []
-        if isinstance(measurement, m.Start):
-            out += self._leave_epoch()
-            self._begin_epoch(measurement)
+        if isinstance(measurement, m.InitialPose):
+            out += self._leave_incarnation()
+            self._begin_incarnation(measurement)
         self._taking = measurement
         self._consumed = measurement.number + 1
         stamp_ns = self._team_time(measurement)
@@ -395,7 +395,7 @@ class RobotNode:
         ahead = 0 if isinstance(measurement, m.Odometry) else 1
         self._passed_ns = max(self._passed_ns, stamp_ns - ahead)
         match measurement:
-            case m.Start():
+            case m.InitialPose():
                 self._ledger["start pose"] += 1
             case m.Odometry():
                 out += self._drive(measurement)
@@ -421,19 +421,19 @@ class RobotNode:
             return translate.motion_of(measurement, self.config.clock_offset_s)[0]
         return measurement.stamp_ns
 
-    def _begin_epoch(self, start: m.Start) -> None:
+    def _begin_incarnation(self, start: m.InitialPose) -> None:
         initial = self._believed(start)
         self._judge = StreamJudge(self.config.bounds)
-        self._begin_estimator(start.epoch, initial)
+        self._begin_estimator(start.incarnation, initial)
         self._goes_in(start)
         self._sent.take(start)
         self._locals = []
         self._start, self._closed, self._window, self._aside = start, [], [], 0
         self._last_map = -1
         self._ledger = Counter()
-        self._epoch, self._consumed, self._steps = start.epoch, 0, 0
-        self._pace.begin_epoch()
-        if self._prior is not None and self._prior.epoch < start.epoch:
+        self._incarnation, self._consumed, self._steps = start.incarnation, 0, 0
+        self._pace.begin_incarnation()
+        if self._prior is not None and self._prior.incarnation < start.incarnation:
             self._prior = None
         self._now_ns = max(self._now_ns, start.stamp_ns)
         self._passed_ns = start.stamp_ns - 1
@@ -456,7 +456,7 @@ class RobotNode:
         if self._windows is not None:
             self._windows.consumed(measurement.number)
 
-    def _believed(self, start: m.Start) -> InitialPose:
+    def _believed(self, start: m.InitialPose) -> InitialPose:
         """The initial pose and its covariance; one beyond the bounds is taken as unknown."""
         value = translate.start_of(start)
         why = None if value is None else start_beyond(value, self.config.bounds)
@@ -536,7 +536,7 @@ class RobotNode:
 
     @property
     def _speaker(self) -> Speaker:
-        return Speaker(self.robot, self._epoch, self._announcement.digest)
+        return Speaker(self.robot, self._incarnation, self._announcement.digest)
 
     def _used(self, measurement: m.Measurement) -> None:
         """The ledger has an interval of odometry; it is used, or rejected with its reason."""
@@ -611,7 +611,7 @@ class RobotNode:
         if not self._held.waits or not (submaps or set(seen) - self._held.greeted):
             return []
         self._held.greeted.update(seen)
-        told = m.Rendezvous(self._now_ns, self.robot, self._epoch, seen, submaps, waited_s)
+        told = m.Rendezvous(self._now_ns, self.robot, self._incarnation, seen, submaps, waited_s)
         out = [Outgoing(ch.RENDEZVOUS, self.robot, told), *self._held.released()]
         self._sent.note(out)
         return [*out, self._progress()]
@@ -668,7 +668,7 @@ class RobotNode:
         own = self._estimator.own_pose()
         out = [self._pose(ch.OWN_POSE, stamp_ns, translate.NO_MAP, own)]
         prior = self._prior
-        if prior is None or prior.epoch != self._epoch:
+        if prior is None or prior.incarnation != self._incarnation:
             return out
         window = None if self._windows is None else self._windows.open_window()
         try:
@@ -698,7 +698,7 @@ class RobotNode:
                 self._passed_ns if self._held.since_ns is None else self._held.since_ns,
                 ch.robot_node(self.robot),
                 self.robot,
-                self._epoch,
+                self._incarnation,
                 max(self._consumed, self._pace.credited),
                 self.submaps,
             ),
@@ -743,9 +743,9 @@ class RobotNode:
     def _take_end(self, end: m.End) -> None:
         self._world_end = end = later_end(end, self._world_end)
         mine = [s for s in end.streams if s.robot == self.robot]
-        self._end = mine[0] if mine else m.StreamEnd(self.robot, self.epoch, 0)
+        self._end = mine[0] if mine else m.StreamEnd(self.robot, self.incarnation, 0)
 
-    def _close_epoch(self) -> list[Outgoing]:
+    def _close_incarnation(self) -> list[Outgoing]:
         driven, uncovered = self._estimator.finish()
         out = self._told(driven)
         if driven.closed is None:
@@ -755,21 +755,21 @@ class RobotNode:
             self._ledger[Rejection.NOT_COVERED.disposition] += uncovered
         return out
 
-    def _leave_epoch(self) -> list[Outgoing]:
-        """A later epoch begins: close what is open of this one, if there is one."""
+    def _leave_incarnation(self) -> list[Outgoing]:
+        """A later incarnation begins: close what is open of this one, if there is one."""
         if not self._consumed:
             return []
         self._passed_ns = self._now_ns
-        out = self._close_epoch()
+        out = self._close_incarnation()
         out += self._release(())
-        self._ended.append(self._epoch_done())
+        self._ended.append(self._incarnation_done())
         return [*out, self._progress()]
 
     def _finish(self) -> list[Outgoing]:
-        """The last epoch's `Done` goes first: with it the centre may conclude."""
+        """The last incarnation's `Done` goes first: with it the centre may conclude."""
         self._done = True
         self._passed_ns = self._now_ns
-        out = self._close_epoch()
+        out = self._close_incarnation()
         exchanged = self._consumer != "own/map" or self._map_ns == self._exchange_ns
         if self._map_ns is not None and not exchanged:
             out += self._exchange_map(self._map_ns)
@@ -777,18 +777,18 @@ class RobotNode:
 
     def _last_words(self) -> list[Outgoing]:
         out = self._release(())
-        dones = [self._epoch_done(), *self._ended]
+        dones = [self._incarnation_done(), *self._ended]
         self._said_done = True
         return [*out, self._progress(), *(Outgoing(ch.ROBOT_DONE, self.robot, d) for d in dones)]
 
-    def _epoch_done(self) -> m.Done:
+    def _incarnation_done(self) -> m.Done:
         return m.Done(
             self._now_ns,
             self.robot,
-            self._epoch,
+            self._incarnation,
             self._consumed,
             self._steps,
             self.submaps,
-            tuple(m.Disposed(k, n) for k, n in sorted(self._ledger.items()) if n),
+            tuple(m.Disposition(k, n) for k, n in sorted(self._ledger.items()) if n),
             self._last_map,
         )

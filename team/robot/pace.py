@@ -14,9 +14,9 @@ class Pace:
 
     lockstep: each map that is exchanged is answered before the robot goes on (rules with feedback).
     credit: the submaps that are sent are acknowledged. exchange: the last round that was answered;
-    awaited: the round of the last map that was sent. acknowledged: submaps of this epoch that the
-    centre has dealt with; credited: measurements of this epoch that were reported ahead of their
-    use.
+    awaited: the round of the last map that was sent. acknowledged: submaps of this incarnation that
+    the centre has dealt with; credited: measurements of this incarnation that were reported ahead
+    of their use.
     """
 
     lockstep: bool
@@ -28,7 +28,7 @@ class Pace:
     credited: int = 0
     unreported: int = 0
 
-    def begin_epoch(self) -> None:
+    def begin_incarnation(self) -> None:
         """Submaps and measurements are counted anew; rounds are the team's and go on."""
         self.acknowledged = self.credited = 0
 

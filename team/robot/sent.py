@@ -15,7 +15,7 @@ class Sent:
     too, so that a centre that is started again can be given everything.
     """
 
-    starts: dict[int, m.Start] = field(default_factory=dict)
+    starts: dict[int, m.InitialPose] = field(default_factory=dict)
     submaps: dict[int, dict[int, m.Submap]] = field(default_factory=dict)
     factors: dict[int, dict[tuple[int, int, str], m.SightingFactor]] = field(default_factory=dict)
 
@@ -27,23 +27,23 @@ class Sent:
     def take(self, message: m.Message) -> None:
         """Keep what is for fusion."""
         match message:
-            case m.Start():
-                self.starts[message.epoch] = message
+            case m.InitialPose():
+                self.starts[message.incarnation] = message
             case m.Submap():
-                self.submaps.setdefault(message.epoch, {})[message.sequence] = message
+                self.submaps.setdefault(message.incarnation, {})[message.sequence] = message
             case m.SightingFactor():
                 name = (message.sequence, message.stamp_ns, message.teammate)
-                self.factors.setdefault(message.epoch, {})[name] = message
+                self.factors.setdefault(message.incarnation, {})[name] = message
             case _:
                 pass
 
-    def wanted(self, wanted: m.SubmapsWanted) -> Iterator[m.Message]:
+    def wanted(self, wanted: m.SubmapsRequest) -> Iterator[m.Message]:
         """The answer: of each incarnation its start, then factors and submaps by sequence."""
-        for epoch in sorted(self.starts) if wanted.epoch == 0 else [wanted.epoch]:
-            first = wanted.first if wanted.epoch else 0
-            if epoch in self.starts:
-                yield self.starts[epoch]
-            factors = self.factors.get(epoch, {})
+        for incarnation in sorted(self.starts) if wanted.incarnation == 0 else [wanted.incarnation]:
+            first = wanted.first if wanted.incarnation else 0
+            if incarnation in self.starts:
+                yield self.starts[incarnation]
+            factors = self.factors.get(incarnation, {})
             yield from (factors[name] for name in sorted(factors) if name[0] >= first)
-            submaps = self.submaps.get(epoch, {})
+            submaps = self.submaps.get(incarnation, {})
             yield from (submaps[k] for k in sorted(submaps) if k >= first)

@@ -21,17 +21,17 @@ from team.wire.bus import Outgoing
 
 @dataclass(frozen=True)
 class Speaker:
-    """One epoch of a robot's stream under an announced configuration (by its digest)."""
+    """One incarnation of a robot's stream under an announced configuration (by its digest)."""
 
     robot: str
-    epoch: int
+    incarnation: int
     config: bytes
 
     def submap(self, closed: ClosedWindow) -> Outgoing:
         """The window's Gaussian with the names of its inputs."""
         message = translate.submap_message(
             self.robot,
-            self.epoch,
+            self.incarnation,
             closed.sequence,
             (closed.first_measurement, closed.last_measurement),
             (closed.start_ns, closed.end_ns),
@@ -46,7 +46,7 @@ class Speaker:
         """A teammate seen from a pose node of the window."""
         sighting = Sighting(
             self.robot,
-            self.epoch,
+            self.incarnation,
             closed.sequence,
             each.stamp_ns,
             each.teammate,
@@ -66,7 +66,7 @@ class Speaker:
 
     def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
         """How well the measurements of a window, or since the last of these, were predicted."""
-        message = m.Innovation(stamp_ns, self.robot, self.epoch, sequence, *found)
+        message = m.Innovation(stamp_ns, self.robot, self.incarnation, sequence, *found)
         return Outgoing(ch.INNOVATION, self.robot, message)
 
     def own_map(
@@ -85,7 +85,7 @@ class Speaker:
         message = m.MapEstimate(
             stamp_ns,
             self.robot,
-            self.epoch,
+            self.incarnation,
             sequence,
             exchange,
             joint,
@@ -104,5 +104,7 @@ class Speaker:
         pose: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
     ) -> Outgoing:
         """A running pose; `digest` names the fused map in it."""
-        message = translate.pose_message(stamp_ns, self.robot, self.epoch, sequence, digest, *pose)
+        message = translate.pose_message(
+            stamp_ns, self.robot, self.incarnation, sequence, digest, *pose
+        )
         return Outgoing(channel, self.robot, message)

@@ -55,7 +55,7 @@ class TeamMap:
         return ""
 
     def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
-        """The prior times those of the epoch's submaps that are not in it.
+        """The prior times those of the incarnation's submaps that are not in it.
 
         The prior may have more of them than a robot that has come back. That a prior and submaps
         have no solution is found once, not at every keyframe, and raised again.

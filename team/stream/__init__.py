@@ -1,1 +1,1 @@
-"""A robot's measurements on their way to an estimator: in their order, cut into epochs."""
+"""A robot's measurements on their way to an estimator: in their order, cut into keyframes."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from team.door import another_time
-from team.wire.messages import End, Measurement, Start, StreamEnd
+from team.wire.messages import End, InitialPose, Measurement, StreamEnd
 
 NEAR_LIVES = 16
 """A stream begins a new life when it is asked for what it has lost: seldom, one by one."""
@@ -12,33 +12,40 @@ NEAR_LIVES = 16
 class Inbox:
     """Holds measurements until their turn: Zenoh promises no order across keys.
 
-    A measurement is yielded once; duplicates and measurements of earlier epochs are dropped. A
-    later epoch begins when its measurement 0 arrives.
+    A measurement is yielded once; duplicates and measurements of earlier incarnations are dropped.
+    A later incarnation begins when its measurement 0 arrives.
     """
 
     def __init__(self) -> None:
-        self.epoch = 0
+        self.incarnation = 0
         self.next_measurement = 0
         self._waiting: dict[int, Measurement] = {}
         self._later: dict[int, dict[int, Measurement]] = {}
         self._received = 0
         self._began_ns: int | None = None
 
-    def resume(self, epoch: int, next_measurement: int) -> None:
-        """Everything before `next_measurement` of `epoch` has been consumed in an earlier life."""
-        self.epoch = epoch
+    def resume(self, incarnation: int, next_measurement: int) -> None:
+        """Everything before `next_measurement` of `incarnation` has been consumed in an earlier
+        life.
+        """
+        self.incarnation = incarnation
         self.next_measurement = next_measurement
-        waiting = self._later.pop(epoch, {}) | self._waiting
+        waiting = self._later.pop(incarnation, {}) | self._waiting
         self._waiting = {
-            n: r for n, r in waiting.items() if r.epoch == epoch and n >= next_measurement
+            n: r
+            for n, r in waiting.items()
+            if r.incarnation == incarnation and n >= next_measurement
         }
-        self._forget(epoch)
+        self._forget(incarnation)
 
     def put(self, measurement: Measurement) -> None:
         """Take a measurement, in any order."""
-        if measurement.epoch > self.epoch:
-            self._later.setdefault(measurement.epoch, {})[measurement.number] = measurement
-        elif measurement.epoch == self.epoch and measurement.number >= self.next_measurement:
+        if measurement.incarnation > self.incarnation:
+            self._later.setdefault(measurement.incarnation, {})[measurement.number] = measurement
+        elif (
+            measurement.incarnation == self.incarnation
+            and measurement.number >= self.next_measurement
+        ):
             self._waiting[measurement.number] = measurement
 
     def refusal(self, measurement: Measurement) -> str | None:
@@ -46,20 +53,24 @@ class Inbox:
 
         A stream's incarnations follow one another, and its stamps its initial pose's.
         """
-        if self.next_measurement and measurement.epoch > self.epoch + NEAR_LIVES:
-            return f"of incarnation {measurement.epoch}, while {self.epoch} is in progress"
-        if measurement.epoch == self.epoch and self._began_ns is not None:
+        if self.next_measurement and measurement.incarnation > self.incarnation + NEAR_LIVES:
+            return (
+                f"of incarnation {measurement.incarnation}, while {self.incarnation} is in progress"
+            )
+        if measurement.incarnation == self.incarnation and self._began_ns is not None:
             return another_time(measurement.stamp_ns, self._began_ns)
         return None
 
     def contradicts(self, end: End, robot: str) -> str | None:
         """Why this can not be the end of the robot's stream, in words."""
         ends = {
-            stream.epoch: stream.measurements for stream in end.streams if stream.robot == robot
+            stream.incarnation: stream.measurements
+            for stream in end.streams
+            if stream.robot == robot
         }
         if not ends and self.next_measurement:
             return f"an end that does not know of {robot}"
-        last = ends.get(self.epoch)
+        last = ends.get(self.incarnation)
         if last is not None and last < self.next_measurement:
             return (
                 f"ends with measurement {last} of {robot}, which has consumed "
@@ -73,25 +84,29 @@ class Inbox:
             measurement = self._waiting.pop(self.next_measurement, None)
             if measurement is not None:
                 self.next_measurement += 1
-                if isinstance(measurement, Start):
+                if isinstance(measurement, InitialPose):
                     self._began_ns = measurement.stamp_ns
                 yield measurement
                 continue
             following = min((e for e, r in self._later.items() if 0 in r), default=None)
             if following is None:
                 return
-            self.epoch, self.next_measurement = following, 0
+            self.incarnation, self.next_measurement = following, 0
             self._waiting = self._later.pop(following)
             self._forget(following)
 
-    def _forget(self, epoch: int) -> None:
-        """Nothing of this epoch or an earlier one can become its turn any more."""
+    def _forget(self, incarnation: int) -> None:
+        """Nothing of this incarnation or an earlier one can become its turn any more."""
         self._received = 0
-        self._later = {e: measurements for e, measurements in self._later.items() if e > epoch}
+        self._later = {
+            e: measurements for e, measurements in self._later.items() if e > incarnation
+        }
 
     @property
     def received(self) -> int:
-        """The count of measurements of this epoch that are here without a gap, consumed or not."""
+        """The count of measurements of this incarnation that are here without a gap, consumed or
+        not.
+        """
         self._received = max(self._received, self.next_measurement)
         while self._received in self._waiting:
             self._received += 1
@@ -99,16 +114,17 @@ class Inbox:
 
     @property
     def gap(self) -> tuple[int, int, int] | None:
-        """Epoch, first and last measurement that are missing before the earliest one that waits.
+        """Incarnation, first and last measurement that are missing before the earliest one that
+        waits.
 
-        Of a later epoch that is its beginning, when nothing else of this one is here.
+        Of a later incarnation that is its beginning, when nothing else of this one is here.
         """
         if self._waiting:
             first = min(self._waiting)
             return (
                 None
                 if first <= self.next_measurement
-                else (self.epoch, self.next_measurement, first - 1)
+                else (self.incarnation, self.next_measurement, first - 1)
             )
         if not self._later:
             return None
@@ -119,18 +135,20 @@ class Inbox:
     def complete(self, end: StreamEnd) -> bool:
         """Whether every measurement up to the stream's last one has had its turn."""
         return end.measurements == 0 or (
-            self.epoch == end.epoch and self.next_measurement >= end.measurements
+            self.incarnation == end.incarnation and self.next_measurement >= end.measurements
         )
 
     def missing(self, end: StreamEnd | None) -> tuple[int, int, int] | None:
-        """Epoch, first and last measurement to ask the source for: a gap, or all up to the end."""
+        """Incarnation, first and last measurement to ask the source for: a gap, or all up to the
+        end.
+        """
         gap = self.gap
         if gap is not None:
             return gap
-        if end is None or self.complete(end) or self.waiting or end.epoch < self.epoch:
+        if end is None or self.complete(end) or self.waiting or end.incarnation < self.incarnation:
             return None
-        first = self.next_measurement if end.epoch == self.epoch else 0
-        return end.epoch, first, end.measurements - 1
+        first = self.next_measurement if end.incarnation == self.incarnation else 0
+        return end.incarnation, first, end.measurements - 1
 
     @property
     def waiting(self) -> int:

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from team.wire.channels import ALIVE, ORDER, REPLIES, VIEW, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
-    Configured,
+    Configuration,
     Fault,
     FusedMap,
     Liveliness,
@@ -135,7 +135,7 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
 def _said_by(channel: Channel, message: Message) -> str | None:
     """The node that a message names as its own; None where it names none."""
     match message:
-        case Configured() | Progress() | Status() | Liveliness() | Fault():
+        case Configuration() | Progress() | Status() | Liveliness() | Fault():
             return message.node
         case Withdrawal() if channel is ORDER:
             return message.by

@@ -6,8 +6,8 @@ the key's prefix: a robot's process `robot/{robot}/…`, its driver `source/{rob
 world is the source of every robot, and the truth is its own too.
 
 `{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer` or
-`robot/<name>`, `{view}` for a view (`team.wire.views`). In the rates a life is one incarnation of a
-robot's stream (the messages' `epoch`), a keyframe one epoch of observation.
+`robot/<name>`, `{view}` for a view (`team.wire.views`). In the rates an incarnation is one life of
+a robot's stream (the messages' `incarnation`), a keyframe one incarnation of observation.
 """
 
 import re
@@ -65,8 +65,8 @@ class Channel:
         return None if match is None else match.groupdict().get("name", "")
 
 
-START = Channel("start", "source/{robot}/start", m.Start, "once per life of the stream", "all", True, False,
-                "measurement 0: the start pose, if known")  # fmt: skip
+START = Channel("start", "source/{robot}/start", m.InitialPose, "once per incarnation", "all", True, False,
+                "measurement 0: the initial pose, if known")  # fmt: skip
 ODOMETRY = Channel("odometry", "source/{robot}/odometry", m.Odometry, "8-100 Hz", "stream", True,
                    False, "one odometry interval")  # fmt: skip
 OBSERVATIONS = Channel("observations", "source/{robot}/observations", m.Observations, "1-30 Hz",
@@ -80,7 +80,7 @@ TRUTH = Channel("truth", "truth/{robot}", m.Truth, "1 Hz, batched", "all", True,
 TRUTH_LANDMARKS = Channel("truth_landmarks", "truth_landmarks", m.TruthLandmarks, "once", "latest",
                           True, False, "true landmarks; the evaluator's only")  # fmt: skip
 
-ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configured, "once per life of the stream",
+ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configuration, "once per incarnation",
                        "latest", True, False, "the robot's configuration")  # fmt: skip
 SUBMAP = Channel("submap", "robot/{robot}/submap", m.Submap, "one per window", "all", True, True,
                  "what the rule `join` consumes")  # fmt: skip
@@ -103,10 +103,10 @@ INNOVATION = Channel("innovation", "robot/{robot}/innovation", m.Innovation, "on
                      True, True, "how well a window's measurements were predicted (NIS)")  # fmt: skip
 ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 measurements",
                          "latest", True, False, "credit for the world")  # fmt: skip
-ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per life of the stream", "latest", True,
+ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per incarnation", "latest", True,
                      True, "all measurements consumed, last submap sent")  # fmt: skip
 
-CENTRAL_CONFIG = Channel("central_config", "central/config", m.Configured, "once", "latest", True,
+CENTRAL_CONFIG = Channel("central_config", "central/config", m.Configuration, "once", "latest", True,
                          False, "the centre's configuration")  # fmt: skip
 FUSED_MAP = Channel("fused_map", "central/map", m.FusedMap, "one per broadcast", "latest", True,
                     True, "the team's map")  # fmt: skip
@@ -123,14 +123,14 @@ GIVEN_UP = Channel("given_up", "operator/given_up/{node}", m.GivenUp, "once", "a
                    "an order: nobody waits for the node any more")  # fmt: skip
 FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
                     "the team's map with its joint covariance")  # fmt: skip
-TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per life of the stream",
+TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per incarnation",
                      "all", True, True, "smoothed end poses of the submaps, or of all keyframes")  # fmt: skip
 CENTRAL_POSE = Channel("central_pose", "central/pose/{robot}", m.PoseEstimate, "one per keyframe or broadcast",
                        "latest", True, True, "running pose by a rule on raw measurements")  # fmt: skip
 CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress,
                            "one per submap", "latest", True, False, "credit for the robots")  # fmt: skip
 
-WORLD_CONFIG = Channel("world_config", "world/config", m.Configured, "once", "latest", True, False,
+WORLD_CONFIG = Channel("world_config", "world/config", m.Configuration, "once", "latest", True, False,
                        "the scenario")  # fmt: skip
 KNOWN_MAP = Channel("known_map", "world/known_map", m.KnownMap, "once", "latest", True, False,
                     "the map that robots are told that only localise themselves")  # fmt: skip
@@ -151,15 +151,15 @@ TALLY = Channel("tally", "{node}/tally", m.Tally, "once, at its end", "latest", 
 
 MEASUREMENTS = Channel("readings", "source/{robot}/readings", m.MeasurementsRequest, "query", "stream", False,
                    False, "a query; the replies are the measurements")  # fmt: skip
-SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsWanted, "query", "stream", False, False,
+SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsRequest, "query", "stream", False, False,
                   "a query; the replies are the starts, submaps and sightings in the centre's set")  # fmt: skip
-SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsWanted, "query", "stream", False, False,
+SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsRequest, "query", "stream", False, False,
                "a query; the replies are the starts, submaps and sightings that the robot has sent")  # fmt: skip
 
-FINAL_KEPT = Channel("final_kept", "router/final", m.FinalWanted, "query", "stream", False, False,
+FINAL_KEPT = Channel("final_kept", "router/final", m.FinalMapRequest, "query", "stream", False, False,
                      "a query; the reply is the final map, when the centre has left, too")  # fmt: skip
 
-ORDERS_KEPT = Channel("orders_kept", "router/orders", m.OrdersWanted, "query", "stream", False, False,
+ORDERS_KEPT = Channel("orders_kept", "router/orders", m.OrdersRequest, "query", "stream", False, False,
                       "a query; the replies are the orders `given_up` that hold, when who gave them has left, too")  # fmt: skip
 
 VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "latest", True, False,

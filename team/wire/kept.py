@@ -9,7 +9,7 @@ give a robot up hold until the final map is out or nobody of the team is there a
 import threading
 from dataclasses import dataclass, field
 
-from team.wire.messages import FinalKept
+from team.wire.messages import FinalMapReply
 
 
 @dataclass
@@ -58,7 +58,7 @@ class Kept:
         with self._lock:
             return [order for _, order in sorted(self._orders.items())]
 
-    def answer(self, node: str, now_s: float) -> FinalKept | None:
+    def answer(self, node: str, now_s: float) -> FinalMapReply | None:
         """The final map for a node that asks for it; None while there is none."""
         with self._lock:
             if self._final is None:
@@ -66,4 +66,4 @@ class Kept:
             missed = node in self._owed
             self._owed.discard(node)
             since_s, final = self._final
-            return FinalKept(0, round(1e9 * (now_s - since_s)), final, missed)
+            return FinalMapReply(0, round(1e9 * (now_s - since_s)), final, missed)

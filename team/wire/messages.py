@@ -51,17 +51,17 @@ class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Measurement(Message, frozen=True, array_like=True, gc=False):
-    """What every measurement of a sensor stream has: robot, epoch and the robot's measurement
+    """What every measurement of a sensor stream has: robot, incarnation and the robot's measurement
     counter.
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     number: Count
 
 
-class Start(Measurement, frozen=True, array_like=True, gc=False, tag="start/1"):
-    """Measurement 0 of an epoch: the start pose in the team's frame, if it is known.
+class InitialPose(Measurement, frozen=True, array_like=True, gc=False, tag="start/1"):
+    """Measurement 0 of an incarnation: the start pose in the team's frame, if it is known.
 
     pose: 3 floats (x, y, theta), or empty when unknown. covariance: 3 × 3 floats, row by row; empty
     for a pose that is exactly known.
@@ -148,11 +148,11 @@ class KnownMap(Message, frozen=True, array_like=True, gc=False, tag="known_map/1
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
 
 
-class Configured(Message, frozen=True, array_like=True, gc=False, tag="configured/1"):
+class Configuration(Message, frozen=True, array_like=True, gc=False, tag="configured/1"):
     """A node's configuration (JSON), announced once; `digest` is its 8-byte name elsewhere."""
 
     node: Text
-    epoch: Count
+    incarnation: Count
     digest: Digest
     configuration: Text
 
@@ -160,19 +160,19 @@ class Configured(Message, frozen=True, array_like=True, gc=False, tag="configure
 class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
     """One window's Gaussian, the only input of the rule `join`; stamp_ns is its end pose's stamp.
 
-    It names its inputs: the measurements first_measurement … last_measurement of (robot, epoch),
-    and the configuration by digest (the seed is in it). ids: L, ascending. mean: 3 + 3K + 2L floats
-    (end pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed upper
-    triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings: how many
-    SightingFactor messages belong to it. biases: errors that the robot's submaps share, B of them,
-    ascending; sensitivity: B × n floats, the mean's derivative by each: given the error b of the
-    bearings [rad], of the scale of the ranges or of the speed, the mean is mean + b · sensitivity.
-    gated: so many of its landmark measurements no others of the window confirmed; they are not in
-    it.
+    It names its inputs: the measurements first_measurement … last_measurement of (robot,
+    incarnation), and the configuration by digest (the seed is in it). ids: L, ascending. mean: 3 +
+    3K + 2L floats (end pose, pose nodes, landmarks) in the frame of the start pose. covariance:
+    packed upper triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending.
+    sightings: how many SightingFactor messages belong to it. biases: errors that the robot's
+    submaps share, B of them, ascending; sensitivity: B × n floats, the mean's derivative by each:
+    given the error b of the bearings [rad], of the scale of the ranges or of the speed, the mean is
+    mean + b · sensitivity. gated: so many of its landmark measurements no others of the window
+    confirmed; they are not in it.
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     sequence: Count
     first_measurement: Count
     last_measurement: Count
@@ -205,7 +205,8 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
 
 
 class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sighting_factor/1"):
-    """A teammate seen from a pose node of submap (robot, epoch, sequence); stamp_ns is the node's.
+    """A teammate seen from a pose node of submap (robot, incarnation, sequence); stamp_ns is the
+    node's.
 
     range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed
     2 × 2 (range, bearing). measurements: the counters of the sightings that went into it,
@@ -213,7 +214,7 @@ class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sight
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     sequence: Count
     config: Digest
     teammate: Name
@@ -278,7 +279,7 @@ class MapEstimate(Message, frozen=True, array_like=True, gc=False, tag="map/1"):
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     sequence: Count
     exchange: Count
     joint: bool
@@ -298,7 +299,7 @@ class PoseEstimate(Message, frozen=True, array_like=True, gc=False, tag="pose/1"
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     sequence: Count
     map_digest: Digest
     pose: Floats
@@ -326,35 +327,35 @@ class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovatio
     right.
 
     dof: its degrees of freedom, two for each measurement of a landmark that the window knew
-    already. (robot, epoch, sequence) and stamp_ns are those of the window's submap; an estimator
-    over the whole stream says it of the measurements since the last of these, named by its epochs
-    so far.
+    already. (robot, incarnation, sequence) and stamp_ns are those of the window's submap; an
+    estimator over the whole stream says it of the measurements since the last of these, named by
+    its incarnations so far.
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     sequence: Count
     squared: Annotated[float, Meta(ge=0.0, le=1e300)]
     dof: Count
 
 
-class Member(msgspec.Struct, frozen=True, array_like=True):
-    """One entry of a version vector: all submaps of (robot, epoch) up to `sequence` are in.
+class VersionEntry(msgspec.Struct, frozen=True, array_like=True):
+    """One entry of a version vector: all submaps of (robot, incarnation) up to `sequence` are in.
 
     Of a rule on whole maps it is the robot's map of that sequence, of one on raw measurements the
     robot's measurements up to that counter.
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     sequence: int
 
 
 class BiasEstimate(msgspec.Struct, frozen=True, array_like=True):
-    """What the map says of an error that the submaps of (robot, epoch) share, ± one sigma."""
+    """What the map says of an error that the submaps of (robot, incarnation) share, ± one sigma."""
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     bias: Bias
     value: Real
     sigma: Real
@@ -364,18 +365,18 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     """The team's map: landmark means and covariances, its set and its frame.
 
     members: the version vector of its set, ordered; missing: submaps known to be in a gap of it, as
-    (robot, epoch, sequence). digest: 8-byte name of the set (and of the rule and its settings).
-    frame: "robot/epoch" whose start fixes it. provisional: some members lie ahead of the watermark.
-    covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 where the rule has none.
-    exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined, what
-    speaks for another minimum of the final map, and that models do not fit the data. biases: by
-    robot, epoch and name, where submaps have sensitivities. joined: how robots with an unknown
-    start were joined, and how sure that is. withdrawn: the robots that the team goes on without,
-    ascending. covariance_scale: how many times the submaps' covariances ought to be taken, by how
-    well they agree; 1 is right, 0: not known. lost: of a final map, the robots whose streams are
-    not wholly in it, since nobody waited for them any more, ascending; such a map is provisional.
-    heard: how many submaps and orders to withdraw a robot the centre had, in the map or not: of two
-    maps that with more is the newer one, and of equals that with more members.
+    (robot, incarnation, sequence). digest: 8-byte name of the set (and of the rule and its
+    settings). frame: "robot/incarnation" whose start fixes it. provisional: some members lie ahead
+    of the watermark. covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 where the rule
+    has none. exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined,
+    what speaks for another minimum of the final map, and that models do not fit the data. biases:
+    by robot, incarnation and name, where submaps have sensitivities. joined: how robots with an
+    unknown start were joined, and how sure that is. withdrawn: the robots that the team goes on
+    without, ascending. covariance_scale: how many times the submaps' covariances ought to be taken,
+    by how well they agree; 1 is right, 0: not known. lost: of a final map, the robots whose streams
+    are not wholly in it, since nobody waited for them any more, ascending; such a map is
+    provisional. heard: how many submaps and orders to withdraw a robot the centre had, in the map
+    or not: of two maps that with more is the newer one, and of equals that with more members.
     """
 
     rule: Text
@@ -384,8 +385,8 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
     final: bool
     provisional: bool
     exchange: Count
-    members: tuple[Member, ...]
-    missing: tuple[Member, ...]
+    members: tuple[VersionEntry, ...]
+    missing: tuple[VersionEntry, ...]
     joint: bool
     ids: Ids
     means: Floats
@@ -418,7 +419,7 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     sequence: int
     digest: Digest
     ids: Ids
@@ -426,7 +427,7 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
     covariance: Floats
     covariance_factor: Annotated[float, Meta(ge=1.0, le=1e9)] = 1.0
     biases: tuple[BiasEstimate, ...] = ()
-    members: tuple[Member, ...] = ()
+    members: tuple[VersionEntry, ...] = ()
     heard: Count = 0
 
     def check(self) -> None:  # noqa: D102
@@ -443,7 +444,7 @@ class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajector
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     digest: Digest
     stamps: Stamps
     poses: Floats
@@ -458,7 +459,7 @@ class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajector
 
 
 class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"):
-    """How far a node is: per (robot, epoch) the count of measurements it is done with, and of
+    """How far a node is: per (robot, incarnation) the count of measurements it is done with, and of
     submaps.
 
     A robot reports itself: measurements consumed (while it waits for an exchange of maps:
@@ -468,7 +469,7 @@ class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"
 
     node: Text
     robot: Name
-    epoch: Count
+    incarnation: Count
     measurements: Count
     submaps: Count
 
@@ -480,13 +481,13 @@ class Rendezvous(Message, frozen=True, array_like=True, gc=False, tag="rendezvou
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     teammates: tuple[Name, ...]
     submaps: Count
     waited_s: Annotated[float, Meta(ge=0.0, le=1e12)]
 
 
-class Disposed(msgspec.Struct, frozen=True, array_like=True):
+class Disposition(msgspec.Struct, frozen=True, array_like=True):
     """How many measurements of a robot ended in one way: in a submap, rejected for a reason,
     lost…
     """
@@ -502,11 +503,11 @@ class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     measurements: Count
     steps: Count
     submaps: Count
-    ledger: tuple[Disposed, ...]
+    ledger: tuple[Disposition, ...]
     last_map: int = -1
 
 
@@ -516,7 +517,7 @@ class StreamEnd(msgspec.Struct, frozen=True, array_like=True):
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     measurements: Count
 
 
@@ -579,36 +580,38 @@ class Tally(Message, frozen=True, array_like=True, gc=False, tag="tally/1"):
 
 
 class MeasurementsRequest(Message, frozen=True, array_like=True, gc=False, tag="readings_wanted/1"):
-    """A query to a source: measurements first … last of (robot, epoch); last −1: all there are.
+    """A query to a source: measurements first … last of (robot, incarnation); last −1: all there
+    are.
 
     only: the source gives what it has, and does not begin the stream anew for what it has not.
     """
 
     robot: Name
-    epoch: Count
+    incarnation: Count
     first: Count
     last: int
     only: bool = False
 
 
-class SubmapsWanted(Message, frozen=True, array_like=True, gc=False, tag="submaps_wanted/1"):
+class SubmapsRequest(Message, frozen=True, array_like=True, gc=False, tag="submaps_wanted/1"):
     """A query for the submaps of one robot: to the centre for those in its set, or to the robot.
 
-    epoch: whose alone; 0: of every incarnation. first: of that epoch, those from this sequence on.
+    incarnation: whose alone; 0: of every incarnation. first: of that incarnation, those from this
+    sequence on.
     """
 
     robot: Name
-    epoch: Count = 0
+    incarnation: Count = 0
     first: Count = 0
 
 
-class FinalWanted(Message, frozen=True, array_like=True, gc=False, tag="final_wanted/1"):
+class FinalMapRequest(Message, frozen=True, array_like=True, gc=False, tag="final_wanted/1"):
     """A query to the router: the team's final map, if there is one already. node: who asks."""
 
     node: Text = ""
 
 
-class FinalKept(Message, frozen=True, array_like=True, gc=False, tag="final_kept/1"):
+class FinalMapReply(Message, frozen=True, array_like=True, gc=False, tag="final_kept/1"):
     """The router's answer: the payload of the newest final map, and how long ago it came [ns].
 
     missed: a process of the node that asks was in that run and went without a last word.
@@ -619,7 +622,7 @@ class FinalKept(Message, frozen=True, array_like=True, gc=False, tag="final_kept
     missed: bool = False
 
 
-class OrdersWanted(Message, frozen=True, array_like=True, gc=False, tag="orders_wanted/1"):
+class OrdersRequest(Message, frozen=True, array_like=True, gc=False, tag="orders_wanted/1"):
     """A query to the router: the orders that hold in this run, from operators who have left."""
 
 

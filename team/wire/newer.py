@@ -13,21 +13,21 @@ from team.wire import messages as m
 SetOrder = tuple[int, int, tuple[tuple[str, int, int], ...]]
 
 
-def set_order(heard: int, members: Sequence[m.Member]) -> SetOrder:
+def set_order(heard: int, members: Sequence[m.VersionEntry]) -> SetOrder:
     """Of two sets the later one: that of the centre that had heard more, then the larger one.
 
     What a centre has heard only grows, whomever it withdraws or acquits; among equals a set that
     holds another one is the larger.
     """
-    vector = tuple(sorted((each.robot, each.epoch, each.sequence) for each in members))
+    vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
     return heard, sum(each.sequence + 1 for each in members), vector
 
 
 def is_newer_prior(new: m.Prior, held: m.Prior | None) -> bool:
-    """By the life of the stream, by the set, then by how far the robot's own submaps are in it."""
+    """By the incarnation, by the set, then by how far the robot's own submaps are in it."""
 
     def order(prior: m.Prior) -> tuple[int, SetOrder, int]:
-        return prior.epoch, set_order(prior.heard, prior.members), prior.sequence
+        return prior.incarnation, set_order(prior.heard, prior.members), prior.sequence
 
     return held is None or order(new) > order(held)
 
@@ -48,15 +48,15 @@ def further(new: m.Progress, held: m.Progress | None) -> m.Progress:
     Started again it says less than in its earlier life, whose words are true still: the same
     measurements give the same submaps.
     """
-    if held is None or new.epoch > held.epoch:
+    if held is None or new.incarnation > held.incarnation:
         return new
-    if new.epoch < held.epoch:
+    if new.incarnation < held.incarnation:
         return held
     return m.Progress(
         max(new.stamp_ns, held.stamp_ns),
         new.node,
         new.robot,
-        new.epoch,
+        new.incarnation,
         max(new.measurements, held.measurements),
         max(new.submaps, held.submaps),
     )
@@ -69,7 +69,10 @@ def later_end(new: m.End, held: m.End | None) -> m.End:
     streams = {each.robot: each for each in held.streams}
     for each in new.streams:
         before = streams.get(each.robot)
-        if before is None or (each.epoch, each.measurements) > (before.epoch, before.measurements):
+        if before is None or (each.incarnation, each.measurements) > (
+            before.incarnation,
+            before.measurements,
+        ):
             streams[each.robot] = each
     ordered = tuple(streams[robot] for robot in sorted(streams))
     return m.End(max(new.stamp_ns, held.stamp_ns), ordered, new.notes)

@@ -55,7 +55,7 @@ from team.wire.channels import (
 from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded
 from team.wire.handshake import router_ends, why_refused
 from team.wire.kept import Kept
-from team.wire.messages import FinalWanted, Liveliness, Message, Tally
+from team.wire.messages import FinalMapRequest, Liveliness, Message, Tally
 
 _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
@@ -781,5 +781,5 @@ def _asker(query: zenoh.Query) -> str:
     """The node that asks for a final map; nobody's name where it does not say."""
     with suppress(WireError):
         request = b"" if query.payload is None else query.payload.to_bytes()
-        return decoded(request, FinalWanted).node
+        return decoded(request, FinalMapRequest).node
     return ""

@@ -39,7 +39,7 @@ def with_covariance_times(factor, of):
             return contribution
         local = replace(contribution.local, covariance=factor * contribution.local.covariance)
         c = contribution
-        return Contribution(c.robot, c.epoch, c.sequence, c.end_ns, local)
+        return Contribution(c.robot, c.incarnation, c.sequence, c.end_ns, local)
 
     return claim
 
@@ -67,7 +67,9 @@ def test_one_submap_that_the_rest_contradicts_is_named():
             return c
         mean = c.local.mean.copy()
         mean[3:] += 3.0
-        return Contribution(c.robot, c.epoch, c.sequence, c.end_ns, replace(c.local, mean=mean))
+        return Contribution(
+            c.robot, c.incarnation, c.sequence, c.end_ns, replace(c.local, mean=mean)
+        )
 
     named = [w for w in watched(3, shifted).warnings if "disagrees" in w]
     assert named[0].startswith("r2: submap 12 disagrees")
@@ -98,7 +100,9 @@ def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
             return c
         mean = c.local.mean.copy()
         mean[3:] += 10.0
-        return Contribution(c.robot, c.epoch, c.sequence, c.end_ns, replace(c.local, mean=mean))
+        return Contribution(
+            c.robot, c.incarnation, c.sequence, c.end_ns, replace(c.local, mean=mean)
+        )
 
     clean, spoilt = watched(3, settings=ROBUST), watched(3, shifted, ROBUST)
     of = "covariance_scale"

@@ -22,12 +22,12 @@ def alive(name, *, here=True):
     return m.Liveliness(0, f"robot/{name}", here)
 
 
-def progress(name, stamp_s, submaps, epoch=1):
-    return m.Progress(round(stamp_s * 1e9), f"robot/{name}", name, epoch, 0, submaps)
+def progress(name, stamp_s, submaps, incarnation=1):
+    return m.Progress(round(stamp_s * 1e9), f"robot/{name}", name, incarnation, 0, submaps)
 
 
-def done(name, submaps=4, epoch=1):
-    return m.Done(12_000_000_000, name, epoch, 31, 12, submaps, ())
+def done(name, submaps=4, incarnation=1):
+    return m.Done(12_000_000_000, name, incarnation, 31, 12, submaps, ())
 
 
 class Centre:
@@ -76,7 +76,7 @@ def test_a_tick_closes_when_every_live_robot_has_passed_it():
     (fused,) = centre.maps
     assert (fused.provisional, fused.members) == (
         False,
-        (m.Member("r1", 1, 0), m.Member("r2", 1, 0)),
+        (m.VersionEntry("r1", 1, 0), m.VersionEntry("r2", 1, 0)),
     )
 
 
@@ -84,7 +84,7 @@ def test_a_robot_that_is_lost_is_not_waited_for():
     centre = joined()
     centre.hears(SUBMAPS["r1"][0], progress("r1", 3, 1))
     centre.hears(alive("r2", here=False))
-    assert centre.maps[0].members == (m.Member("r1", 1, 0),)
+    assert centre.maps[0].members == (m.VersionEntry("r1", 1, 0),)
     centre.hears(alive("r2"), SUBMAPS["r1"][1], progress("r1", 6, 2))
     assert len(centre.maps) == 1, "come back, it is waited for again"
 
@@ -95,7 +95,7 @@ def test_submaps_that_are_announced_but_not_here_hold_the_watermark():
     centre.hears(progress("r1", 9, 3), SUBMAPS["r1"][0], SUBMAPS["r1"][2])
     assert centre.maps == []
     centre.hears(SUBMAPS["r1"][1])
-    assert centre.maps[0].members == (m.Member("r1", 1, 2),)
+    assert centre.maps[0].members == (m.VersionEntry("r1", 1, 2),)
 
 
 def test_a_submap_is_acknowledged_after_the_map_that_it_gave():
@@ -115,7 +115,7 @@ def test_behind_the_watermark_no_later_map_takes_anything_back():
             centre.hears(SUBMAPS[name][k], progress(name, 3 * (k + 1), k + 1))
     before = {}
     for fused in centre.maps:
-        now = {(x.robot, x.epoch): x.sequence for x in fused.members}
+        now = {(x.robot, x.incarnation): x.sequence for x in fused.members}
         assert all(now[stream] >= last for stream, last in before.items())
         before = now
     assert len(centre.maps) == 4
@@ -140,7 +140,7 @@ def test_the_final_map_comes_once_when_everybody_is_done_and_everything_is_here(
         assert centre.node.finished
         assert centre.node.final == centre.final
         centre.hears(*messages, alive("r1", here=False))
-        assert centre.final.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 3))
+        assert centre.final.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 3))
 
 
 def test_a_robot_that_was_never_there_is_waited_for():
@@ -159,7 +159,7 @@ def test_a_robot_that_is_lost_at_the_end_is_waited_for_until_it_is_given_up():
     assert not centre.node.finished
     assert centre.node.awaited == ["r2"]
     centre.hears(given_up("r2"))
-    assert centre.final.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 1))
+    assert centre.final.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 1))
     assert (centre.final.lost, centre.final.provisional) == (("r2",), True)
     assert "r2 is given up" in centre.node.status().warnings[0]
 
@@ -202,7 +202,7 @@ def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_is_waited_for_
     centre.hears(alive("r2", here=False))
     assert not centre.node.finished
     centre.hears(given_up("r2"))
-    assert centre.final.missing == (m.Member("r2", 1, 1),)
+    assert centre.final.missing == (m.VersionEntry("r2", 1, 1),)
     assert centre.final.lost == ("r2",)
 
 
@@ -213,22 +213,24 @@ def test_a_refused_submap_does_not_hold_up_the_team():
     acknowledged = [o.message.submaps for o in out if o.channel is ch.CENTRAL_PROGRESS]
     assert acknowledged == [1, 2, 3, 4], "the robot has its credit"
     centre.hears(*SUBMAPS["r1"], done("r1"), done("r2"), END)
-    assert centre.final.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 0))
+    assert centre.final.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 0))
     assert centre.node.status().figures["refused"] == 1.0
     assert "overlap" in centre.node.warnings[0]
 
 
-def test_the_last_word_of_an_earlier_epoch_is_not_the_last():
+def test_the_last_word_of_an_earlier_incarnation_is_not_the_last():
     centre = joined()
     end = msgspec.structs.replace(END, streams=(END.streams[0], m.StreamEnd("r2", 2, 9)))
     centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), end, done("r2"))
     assert not centre.node.finished
-    second = [msgspec.structs.replace(x, epoch=2) for x in SUBMAPS["r2"][:2]]
-    start = m.Start(0, "r2", 2, 0, b"", b"")
-    centre.hears(start, *second, done("r2", 2, epoch=2))
+    second = [msgspec.structs.replace(x, incarnation=2) for x in SUBMAPS["r2"][:2]]
+    start = m.InitialPose(0, "r2", 2, 0, b"", b"")
+    centre.hears(start, *second, done("r2", 2, incarnation=2))
     assert centre.node.finished
     again = joined()
-    again.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), done("r2", 2, epoch=2), done("r2"), end)
+    again.hears(
+        *SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), done("r2", 2, incarnation=2), done("r2"), end
+    )
     assert not again.node.finished, "in whichever order they come"
     again.hears(start, *second)
     assert encoded(again.final) == encoded(centre.final)
@@ -239,7 +241,7 @@ def test_the_submaps_of_a_robot_are_given_to_its_next_life():
     centre.hears(SUBMAPS["r1"][0], SUBMAPS["r1"][1], SUBMAPS["r1"][3])
 
     def answer(robot):
-        request = encoded(m.SubmapsWanted(0, robot))
+        request = encoded(m.SubmapsRequest(0, robot))
         return [decoded(reply) for reply in centre.node.answer_submaps(request)]
 
     assert answer("r1") == [STARTS["r1"], *SUBMAPS["r1"][:2]]
@@ -296,12 +298,12 @@ def test_what_a_robot_has_sent_by_its_word_and_is_not_here_is_wanted():
     centre = joined()
     centre.hears(SUBMAPS["r1"][0], progress("r1", 9.0, 3), progress("r2", 3.0, 0))
     (wanted,) = centre.node.lacking()
-    assert (wanted.robot, wanted.epoch, wanted.first) == ("r1", 1, 1)
+    assert (wanted.robot, wanted.incarnation, wanted.first) == ("r1", 1, 1)
     centre.hears(SUBMAPS["r1"][1], SUBMAPS["r1"][2])
     assert centre.node.lacking() == []
     centre.hears(done("r2", 4))
     (wanted,) = centre.node.lacking()
-    assert (wanted.robot, wanted.epoch, wanted.first) == ("r2", 1, 0)
+    assert (wanted.robot, wanted.incarnation, wanted.first) == ("r2", 1, 0)
 
 
 def test_submaps_without_their_start_are_wanted_with_it():

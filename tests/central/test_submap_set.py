@@ -41,7 +41,7 @@ def test_a_gap_holds_back_the_chain_and_is_listed(here):
     assert found.count(("alpha", 0)) == first
     assert found.chain(("alpha", 0)) == CHAIN[:first]
     behind = any(i > first for i in here)
-    assert found.missing() == ((m.Member("alpha", 0, first),) if behind else ())
+    assert found.missing() == ((m.VersionEntry("alpha", 0, first),) if behind else ())
 
 
 def changed(i, **fields):
@@ -71,8 +71,8 @@ def test_what_does_not_fit_is_refused_with_its_reason_and_changes_nothing(there,
     assert found.admit(CHAIN[there[0]]) is None, "what is in stays in"
 
 
-def test_another_epoch_is_another_stream():
-    second = [msgspec.structs.replace(each, epoch=1) for each in CHAIN[:2]]
+def test_another_incarnation_is_another_stream():
+    second = [msgspec.structs.replace(each, incarnation=1) for each in CHAIN[:2]]
     found = put(*CHAIN, *second)
     assert (found.count(("alpha", 0)), found.count(("alpha", 1))) == (6, 2)
 
@@ -115,7 +115,7 @@ def test_a_submap_counts_when_its_sightings_are_here_in_any_order(order, cut):
 
 def test_an_incomplete_submap_is_what_its_stream_waits_for():
     found = put(CHAIN[0], changed(1, sightings=1))
-    assert found.missing() == (m.Member("alpha", 0, 1),)
+    assert found.missing() == (m.VersionEntry("alpha", 0, 1),)
     assert found.chain(("alpha", 0)) == CHAIN[:1]
 
 

@@ -20,7 +20,7 @@ ALL = [each for submaps in SUBMAPS.values() for each in submaps]
 def fresh(config=CONFIG):
     ticks = TickFold(config)
     for name, y in (("r1", 0.0), ("r2", 1.0)):
-        ticks.know_start(translate.StartValue(name, 1, np.array([0.0, y, 0.0]), None))
+        ticks.know_start(translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None))
     return ticks
 
 
@@ -135,7 +135,7 @@ def test_the_fold_by_ticks_is_the_fold_of_the_joined_submaps():
     contributions = sorted((translate.contribution_of(x) for x in ALL), key=lambda c: c.key)
     for name, y in (("r1", 0.0), ("r2", 1.0)):
         fold_by_hand = started(
-            fold_by_hand, translate.StartValue(name, 1, np.array([0.0, y, 0.0]), None)
+            fold_by_hand, translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None)
         )
     for tick in range(4):
         part = [c for c in contributions if (c.end_ns - 1) // 4_000_000_000 == tick]
@@ -154,10 +154,10 @@ def test_the_digest_changes_with_any_member_any_start_and_what_else_is_named():
         ticks.take_until(float("inf"))
         digests.add(ticks.digest(ticks.fold, b"x"))
     moved = straight()
-    moved.know_start(translate.StartValue("r1", 1, np.array([0.0, 0.0, 1e-9]), None))
+    moved.know_start(translate.InitialPoseFactor("r1", 1, np.array([0.0, 0.0, 1e-9]), None))
     digests.add(moved.digest(moved.fold, b"x"))
     vague = straight()
-    vague.know_start(translate.StartValue("r1", 1, np.zeros(3), np.eye(3)))
+    vague.know_start(translate.InitialPoseFactor("r1", 1, np.zeros(3), np.eye(3)))
     digests.add(vague.digest(vague.fold, b"x"))
     assert len(digests) == 6
     assert straight().digest(straight().fold, b"x") in digests

@@ -38,7 +38,7 @@ def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fiel
 
 
 def start(robot, pose=(0.0, 0.0, 0.0), spread=None):
-    return m.Start(
+    return m.InitialPose(
         0, robot, 1, 0, b"" if pose is None else from_floats(pose),
         b"" if spread is None else from_floats(spread),
     )  # fmt: skip
@@ -92,23 +92,23 @@ CASES = {
     ),
     "a landmark at 1e9 m": (
         [start("r1"), submap("r1", mean=FAR), *good("r2")],
-        "submap 0 of r1 (epoch 1) refused: a coordinate of 1e+09 m",
+        "submap 0 of r1 (incarnation 1) refused: a coordinate of 1e+09 m",
     ),
     "a pose at 1e9 m": (
         [*good("r1", pose=(1e9, 0.0, 0.0)), *good("r2")],
-        "the initial pose of r1 (epoch 1) refused, taken as unknown: a coordinate of 1e+09 m",
+        "the initial pose of r1 (incarnation 1) refused, taken as unknown: a coordinate of 1e+09 m",
     ),
     "a covariance of 1e-300": (
         [*good("r1", spread=np.eye(3) * 1e-300), *good("r2")],
-        "the initial pose of r1 (epoch 1) refused, taken as unknown: a sigma of 1e-150 m",
+        "the initial pose of r1 (incarnation 1) refused, taken as unknown: a sigma of 1e-150 m",
     ),
     "a sigma of 1e12 beside one of 1e-12": (
         [start("r1"), submap("r1", P=scaled(1e12, 1e-12)), *good("r2")],
-        "submap 0 of r1 (epoch 1) refused: a sigma of 1e",
+        "submap 0 of r1 (incarnation 1) refused: a sigma of 1e",
     ),
     "sensitivities of 1e200": (
         [start("r1"), submap("r1", biases=("bearing",), sensitivity=STEEP), *good("r2")],
-        "submap 0 of r1 (epoch 1) refused: a sensitivity beyond",
+        "submap 0 of r1 (incarnation 1) refused: a sensitivity beyond",
     ),
     "a sighting of 1e-300": (
         [
@@ -116,7 +116,7 @@ CASES = {
             submap("r1", nodes=NODES, sightings=1, P=WIDE), start("r2"),
             submap("r2", nodes=NODES, P=WIDE),
         ],
-        "an inter-robot measurement of r2 by r1 (epoch 1) refused: a sigma of 1e-150 m",
+        "an inter-robot measurement of r2 by r1 (incarnation 1) refused: a sigma of 1e-150 m",
     ),
 }  # fmt: skip
 
@@ -132,13 +132,13 @@ def test_what_is_refused_leaves_the_map_of_the_others_as_it_is():
     alone = concluded(good("r2"))
     beside = concluded([start("r1"), submap("r1", mean=FAR), *good("r2")])
     assert (beside.ids, beside.means) == (alone.ids, alone.means)
-    assert m.Member("r1", 1, 0) in beside.members, "the set that the map names has it"
+    assert m.VersionEntry("r1", 1, 0) in beside.members, "the set that the map names has it"
 
 
 def test_behind_a_refused_submap_the_chain_has_ended_and_it_is_said():
     final = concluded([*good("r1", 1), submap("r1", 1, mean=FAR), submap("r1", 2), *good("r2")])
     (words,) = [reason for reason in final.reasons if "refused" in reason]
-    assert words.startswith("submap 1 of r1 (epoch 1) refused")
+    assert words.startswith("submap 1 of r1 (incarnation 1) refused")
     assert words.endswith("the 1 behind it are not in the map either")
 
 
@@ -158,7 +158,7 @@ def test_a_standing_robot_that_is_seen_by_another_one_stays_apart_and_it_is_said
                        nodes=nodes, sightings=4 * sees)
             )  # fmt: skip
     final = concluded([_with_measurements(each, k) for k, each in enumerate(messages)])
-    assert any("r2 (epoch 1) not joined" in reason for reason in final.reasons), final.reasons
+    assert any("r2 (incarnation 1) not joined" in reason for reason in final.reasons), final.reasons
 
 
 def _with_measurements(message, k):

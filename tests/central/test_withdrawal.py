@@ -83,13 +83,13 @@ def of_set(
 ) -> TickFold:
     """The fold over a run's submaps; without a robot: as if it had never been."""
     ticks = TickFold(scenario().central if central is None else central)
-    for start in messages(samples, m.Start):
+    for start in messages(samples, m.InitialPose):
         ticks.know_start(translate.start_of(start))
     sightings = messages(samples, m.SightingFactor)
     for each in messages(samples, m.Submap):
         if each.robot != without:
-            name = (each.robot, each.epoch, each.sequence)
-            own = [s for s in sightings if (s.robot, s.epoch, s.sequence) == name]
+            name = (each.robot, each.incarnation, each.sequence)
+            own = [s for s in sightings if (s.robot, s.incarnation, s.sequence) == name]
             ticks.add(each, bytes(8), [s for s in own if s.teammate != without])
     return ticks
 
@@ -111,7 +111,7 @@ def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(
     if when == "before":
         whole = TickFold(scenario().central)
         whole.withdraw("r3")
-        for start in messages(samples, m.Start):
+        for start in messages(samples, m.InitialPose):
             whole.know_start(translate.start_of(start))
         for each in messages(samples, m.Submap):
             own = [s for s in met if (s.robot, s.sequence) == (each.robot, each.sequence)]
@@ -136,8 +136,8 @@ def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was() -> None:
 
 def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> JoinRule:
     rule = JoinRule(scenario(withdraw_above=None).central, bytes(8))
-    for message in (*messages(samples, m.Start), *withdrawals):
-        take = rule.take_start if isinstance(message, m.Start) else rule.take_withdrawal
+    for message in (*messages(samples, m.InitialPose), *withdrawals):
+        take = rule.take_start if isinstance(message, m.InitialPose) else rule.take_withdrawal
         take(message)
     for sighting in messages(samples, m.SightingFactor):
         rule.take_sighting(sighting)
@@ -203,7 +203,7 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Joi
     """A rule that takes messages in an order, is told a watermark [s] after so many, and ends."""
     rule = JoinRule(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8))
     for start in one_closes_windows_often():
-        if isinstance(start, m.Start):
+        if isinstance(start, m.InitialPose):
             rule.take_start(start)
     out = []
     for k, message in enumerate(order):
@@ -219,7 +219,7 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Joi
 
 def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent() -> None:
     """At 35 s r3 is a suspect whom nobody can convict yet; five submaps later there are enough."""
-    by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.Start)]
+    by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.InitialPose)]
     ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
     at_once, expected = delivered(by_time, {})
     assert at_once.withdrawn == ("r3",)
@@ -243,8 +243,8 @@ def test_who_was_convicted_without_what_comes_late_is_acquitted() -> None:
     assert list(ticks.convicted) == ["r3"]
     again = next(each for each in messages(samples, m.Submap) if each.robot == "r3")
     sightings = messages(samples, m.SightingFactor)
-    name = (again.robot, again.epoch, again.sequence)
-    own = [each for each in sightings if (each.robot, each.epoch, each.sequence) == name]
+    name = (again.robot, again.incarnation, again.sequence)
+    own = [each for each in sightings if (each.robot, each.incarnation, each.sequence) == name]
     ticks.add(again, bytes(8), own)
     assert (ticks.convicted, ticks.withdrawn) == ({}, ())
     ticks.take_until(math.inf)
@@ -357,9 +357,9 @@ def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
 def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
     rule = JoinRule(CentralConfig(), bytes(8))
     samples = team_run()
-    for message in (*messages(samples, m.Start), *messages(samples, m.Submap)):
+    for message in (*messages(samples, m.InitialPose), *messages(samples, m.Submap)):
         if message.robot == "r1":
-            take = rule.take_start if isinstance(message, m.Start) else rule.take_submap
+            take = rule.take_start if isinstance(message, m.InitialPose) else rule.take_submap
             take(
                 msgspec.structs.replace(message, sightings=0)
                 if isinstance(message, m.Submap)

@@ -1,4 +1,4 @@
-"""Runs of single estimators in the thesis' world: one epoch a step, as its streams have them."""
+"""Runs of single estimators in the thesis' world: one keyframe a step, as its streams have them."""
 
 import functools
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from sim.world.simulator import simulated
 from team.estimation.models import Increment, corrected, increment_of
 
 
-class Epoch(NamedTuple):
+class Keyframe(NamedTuple):
     """One step's motion and what was seen at its end."""
 
     increment: Increment
@@ -26,23 +26,23 @@ def world(name, seed):
     return loaded.robots, simulated(loaded.world, loaded.robots, seed)
 
 
-def epochs_of(config, stream):
-    """One epoch per odometry interval; every interval ends with one message of landmarks."""
+def keyframes_of(config, stream):
+    """One keyframe per odometry interval; every interval ends with one message of landmarks."""
     told, seen = stream.intervals, stream.landmark_detections
     np.testing.assert_array_equal(told.end_ns, seen.stamps_ns)
-    epochs = []
+    keyframes = []
     for k in range(len(told.end_ns)):
         step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
         increment = increment_of(config.motion, *map(float, step))
         rows = seen.rows(k)
         measurements = corrected(config.sensor, seen.ranges[rows], seen.bearings[rows])
-        epochs.append(Epoch(increment, seen.ids[rows], *measurements))
-    return epochs
+        keyframes.append(Keyframe(increment, seen.ids[rows], *measurements))
+    return keyframes
 
 
-def run(state, step, epochs, config, *generator):
-    """The state after the epochs, by an estimator's `stepped`."""
-    for increment, *measurements in epochs:
+def run(state, step, keyframes, config, *generator):
+    """The state after the keyframes, by an estimator's `stepped`."""
+    for increment, *measurements in keyframes:
         state = step(state, increment, config.sensor, *measurements, *generator)
     return state
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.estimation.submap import LocalMap
@@ -37,7 +37,7 @@ def meeting(seed, robots=2, submaps=6, landmarks=5, reach=12.0, sigmas=(0.1, 0.0
     for r in range(robots):
         robot = f"r{r}"
         pose = np.array([*rng.uniform(6.0, 14.0, 2), rng.uniform(-3.0, 3.0)])
-        starts.append(Start(robot, 0, pose))
+        starts.append(InitialPoseFactor(robot, 0, pose))
         for k in range(submaps):
             to_middle = 10.0 + 10.0j - (pose[0] + 1j * pose[1])
             way = [pose]
@@ -114,7 +114,10 @@ def mirrored(bearing_sigma, options):
         measurement = np.array([abs(to), bearing])
         covariance = np.diag([0.01, bearing_sigma]) ** 2
         ranges_seen.append(Sighting("r0", 0, 0, stamp, "r1", measurement, covariance))
-    starts = [Start("r0", 0, np.zeros(3)), Start("r1", 0, paths["r1"], np.diag([100.0, 100, 9]))]
+    starts = [
+        InitialPoseFactor("r0", 0, np.zeros(3)),
+        InitialPoseFactor("r1", 0, paths["r1"], np.diag([100.0, 100, 9])),
+    ]
     island = joined_with(submaps, starts, ranges_seen, options).main
     across = island.state.copy()
     for node in (*island.graph.streams["r1", 0], *island.graph.poses.values()):

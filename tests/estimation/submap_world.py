@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.submap import LocalMap
 
@@ -70,7 +70,7 @@ def team(seed, robots=2, submaps=8, landmarks=6, size=20.0, reach=12.0, sigmas=(
     for r in range(robots):
         robot = f"r{r}"
         pose = np.array([*rng.uniform(0.3 * size, 0.7 * size, 2), rng.uniform(-3.0, 3.0)])
-        starts.append(Start(robot, 0, pose))
+        starts.append(InitialPoseFactor(robot, 0, pose))
         paths[robot] = []
         for k in range(submaps):
             to_middle = (1 + 1j) * size / 2.0 - (pose[0] + 1j * pose[1])

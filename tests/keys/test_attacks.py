@@ -31,7 +31,7 @@ FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
 ATTACKS = {
     "ends the run": (ch.END, "", m.End(0, ())),
     "forges the final map": (ch.FINAL_MAP, "", FINAL),
-    "begins a life that nobody reaches": (ch.START, "r1", m.Start(0, "r1", HUGE, 0, b"", b"")),
+    "begins one that nobody reaches": (ch.START, "r1", m.InitialPose(0, "r1", HUGE, 0, b"", b"")),
     "says that another is done": (ch.ROBOT_DONE, "r1", m.Done(0, "r1", HUGE, 0, 0, 0, ())),
     "frees another's credit": (
         ch.ROBOT_PROGRESS, "r1", m.Progress(0, "robot/r1", "r1", 1, HUGE, HUGE),
@@ -136,7 +136,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
         serving.start()
         try:
             found = answers(robot, ch.MEASUREMENTS, "r1", wanted)
-            found += answers(robot, ch.SUBMAPS, "", m.SubmapsWanted(0, "r1"))
+            found += answers(robot, ch.SUBMAPS, "", m.SubmapsRequest(0, "r1"))
         finally:
             over.set()
             serving.join()

@@ -95,7 +95,7 @@ def far_counters(path: Path) -> Path:
         9, "alpha", 1, 0, 0, far, 1, DIGEST, from_ids([1]), joint, packed(spd(5))
     )  # fmt: skip
     told: list[tuple[ch.Channel, str, m.Message]] = [
-        (ch.START, "alpha", m.Start(0, "alpha", 1, 0, b"", b"")),
+        (ch.START, "alpha", m.InitialPose(0, "alpha", 1, 0, b"", b"")),
         (ch.ODOMETRY, "alpha", m.Odometry(5, "alpha", 1, 1, 5, 0.5, 0.1)),
         (ch.ODOMETRY, "alpha", m.Odometry(2**61, "alpha", 1, far, 5, 0.5, 0.1)),
         (ch.SUBMAP, "alpha", submap),

@@ -37,7 +37,9 @@ def recorded(path: Path, samples: list[Sample]) -> Log:
 
 def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
     by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
-    by_class[m.Configured] = c.ROBOT_CONFIG  # of the three nodes that announce one, the example's
+    by_class[m.Configuration] = (
+        c.ROBOT_CONFIG
+    )  # of the three nodes that announce one, the example's
     kept = [message for message in examples() if type(message) in by_class]
     samples = [sampled(by_class[type(x)], x, i) for i, x in enumerate(kept)]
     samples.append(Sample(samples[0].key, b"\x90", 0, 0, 99))

@@ -60,14 +60,14 @@ def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path
     assert told == [[], [PROGRESS_EVERY], [], [PROGRESS_EVERY + 10], []]
 
 
-def test_a_new_epoch_counts_from_zero(path: Path) -> None:
+def test_a_new_incarnation_counts_from_zero(path: Path) -> None:
     network = MemoryNetwork()
     world, bus = MemoryBus(network), MemoryBus(network)
     world.subscribe(c.RECORDER_PROGRESS)
     with Recorder(path, "t", {}) as recorder:
         loop = RecordLoop(bus, recorder, ())
-        for epoch, measurement in ((0, 0), (0, 1), (3, 0)):
-            message = m.Odometry(7, "alpha", epoch, measurement, 0, 0.0, 0.0)
+        for incarnation, measurement in ((0, 0), (0, 1), (3, 0)):
+            message = m.Odometry(7, "alpha", incarnation, measurement, 0, 0.0, 0.0)
             world.publish(Outgoing(c.ODOMETRY, "alpha", message))
         loop.take(bus.receive())
         loop.take([])
@@ -250,7 +250,7 @@ def test_what_nobody_has_any_more_is_named(path: Path) -> None:
         stop.set()
 
     record(bus, Recorder(path, "t", {}), on_status=saying, stop=stop)
-    lost = "source/alpha: 4 measurements of life 0 of the stream missing: 2–3, 5–6"
+    lost = "source/alpha: 4 measurements of incarnation 0 missing: 2–3, 5–6"
     assert lost in [str(finding) for finding in holes(open_log(path))]
     last = messages_of(list(open_log(path).samples()), c.STATUS)[-1]
     assert isinstance(last, m.Status)

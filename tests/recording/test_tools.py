@@ -43,7 +43,9 @@ def sampled(channel: c.Channel, name: str, message: m.Message, counter: int) -> 
 
 def drive(robot: str, seconds: int) -> list[Sample]:
     """A configuration at zero, ten odometry measurements a second and a submap each second."""
-    out = [sampled(c.ROBOT_CONFIG, robot, m.Configured(0, f"robot/{robot}", 1, bytes(8), "{}"), 0)]
+    out = [
+        sampled(c.ROBOT_CONFIG, robot, m.Configuration(0, f"robot/{robot}", 1, bytes(8), "{}"), 0)
+    ]
     for i in range(10 * seconds):
         stamp = 100 * SECOND + i * SECOND // 10
         measurement = m.Odometry(stamp, robot, 1, i, SECOND // 10, 0.5, 0.1)
@@ -86,14 +88,14 @@ def test_nothing_is_wrong_with_a_sound_log(whole: Log) -> None:
 def test_lost_messages_are_named_by_their_counters(path: Path) -> None:
     lost = [s for s in drive("alpha", 2) if s.counter not in (3, 4, 8) or "odometry" not in s.key]
     assert found(recorded(path, lost)) == [
-        "source/alpha: 3 measurements of life 1 of the stream missing: 3–4, 8"
+        "source/alpha: 3 measurements of incarnation 1 missing: 3–4, 8"
     ]
 
 
 def test_a_recorder_that_came_late_is_told_but_a_cut_is_not(tmp_path: Path) -> None:
     late = drive("alpha", 2)[6:]
     assert found(recorded(tmp_path / "a.mcap", late)) == [
-        "source/alpha: 5 measurements of life 1 of the stream missing: 0–4"
+        "source/alpha: 5 measurements of incarnation 1 missing: 0–4"
     ]
     assert found(recorded(tmp_path / "b.mcap", late, cut="said")) == []
 
@@ -119,8 +121,8 @@ def test_what_a_stream_is_known_to_have_and_the_log_has_not_is_named(path: Path)
     said.append(replace(sampled(c.TALLY, "robot/alpha", tally, 0), wall_ns=10**18 + 100))
     assert found(recorded(path, said)) == [
         "robot/alpha/team/pose: 4 messages missing: 0–3",
-        "source/alpha: 2 measurements of life 1 of the stream missing: 10–11",
-        "robot/alpha/submap: 2 submaps of life 0 of the stream missing: 1–2",
+        "source/alpha: 2 measurements of incarnation 1 missing: 10–11",
+        "robot/alpha/submap: 2 submaps of incarnation 0 missing: 1–2",
     ]
 
 
@@ -177,7 +179,7 @@ def test_what_was_asked_for_later_is_not_held_against_the_counters(path: Path) -
 def test_a_measurement_that_is_there_twice_and_not_the_same_is_named(path: Path) -> None:
     other = sampled(c.ODOMETRY, "alpha", m.Odometry(100 * SECOND, "alpha", 1, 3, 1, 0.5, 0.5), 10)
     assert found(recorded(path, [*drive("alpha", 1), other])) == [
-        "source/alpha: 1 measurements of life 1 of the stream there twice, and not the same"
+        "source/alpha: 1 measurements of incarnation 1 there twice, and not the same"
     ]
 
 

@@ -93,7 +93,7 @@ def _whole_of(measurements):
 
 def test_a_window_does_not_depend_on_what_was_read_before_it():
     other = [
-        m.Odometry(r.stamp_ns, r.robot, r.epoch, r.number, r.duration_ns, 2 * r.forward, 0.5)
+        m.Odometry(r.stamp_ns, r.robot, r.incarnation, r.number, r.duration_ns, 2 * r.forward, 0.5)
         if isinstance(r, m.Odometry) and r.stamp_ns <= 3_000_000_000
         else r
         for r in MEASUREMENTS
@@ -108,7 +108,7 @@ def test_a_window_depends_on_its_seed_and_its_robot(other):
     assert not same(fed(HybridEstimator(other, 1), MEASUREMENTS)[0], fed(begun(), MEASUREMENTS)[0])
 
 
-def test_a_window_depends_on_its_epoch():
+def test_a_window_depends_on_its_incarnation():
     assert not same(
         fed(HybridEstimator(config(), 2), MEASUREMENTS)[0], fed(begun(), MEASUREMENTS)[0]
     )

@@ -34,10 +34,10 @@ def payloads(out, channel=ch.SUBMAP):
 LONELY = payloads(driven(RobotNode(config()), MEASUREMENTS))
 
 
-def prior(sequence=0, epoch=1, scale=1.0, at=0.0, ids=(1, 2)):
+def prior(sequence=0, incarnation=1, scale=1.0, at=0.0, ids=(1, 2)):
     n = 3 + 2 * len(ids)
     return m.Prior(
-        0, "r1", epoch, sequence, b"whatever", from_ids(ids),
+        0, "r1", incarnation, sequence, b"whatever", from_ids(ids),
         from_floats(np.full(n, at)), packed(scale * spd(n)),
     )  # fmt: skip
 
@@ -95,8 +95,8 @@ def test_the_prior_does_change_the_team_pose():
 def test_an_older_prior_does_not_replace_the_one_that_is_held():
     """Closed and provisional broadcasts alternate: the closed one has fewer of everyone's."""
     poses = []
-    newer = msgspec.structs.replace(prior(2, at=3.0), members=(m.Member("r1", 1, 2),))
-    older = msgspec.structs.replace(prior(1), members=(m.Member("r1", 1, 1),))
+    newer = msgspec.structs.replace(prior(2, at=3.0), members=(m.VersionEntry("r1", 1, 2),))
+    older = msgspec.structs.replace(prior(1), members=(m.VersionEntry("r1", 1, 1),))
     for after in ((), (older,), (newer,), (older, newer, older)):
         node = RobotNode(config())
         out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
@@ -264,7 +264,7 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
     out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
     assert len(of(out, ch.SUBMAP)) == 2
     out += node.handle(m.Progress(0, "central", "r1", 7, 0, 9), 0)
-    assert len(of(out, ch.SUBMAP)) == 2, "credit of another epoch is none"
+    assert len(of(out, ch.SUBMAP)) == 2, "credit of another incarnation is none"
     out += node.handle(m.Progress(0, "central", "r1", 1, 0, 1), 0)
     assert len(of(out, ch.SUBMAP)) == 3
     out += node.handle(m.Liveliness(0, "robot/r2", False), 0)
@@ -284,12 +284,12 @@ def test_missing_measurements_are_asked_for():
     assert node.wanted() is None
     node.handle(MEASUREMENTS[8], 0)
     wanted = node.wanted()
-    assert (wanted.epoch, wanted.first, wanted.last) == (1, 4, 7)
+    assert (wanted.incarnation, wanted.first, wanted.last) == (1, 4, 7)
     for measurement in MEASUREMENTS[4:8]:
         node.handle(measurement, 0)
     node.handle(END, 0)
     wanted = node.wanted()
-    assert (wanted.epoch, wanted.first, wanted.last) == (1, 9, len(MEASUREMENTS) - 1)
+    assert (wanted.incarnation, wanted.first, wanted.last) == (1, 9, len(MEASUREMENTS) - 1)
     for measurement in MEASUREMENTS[9:]:
         node.handle(measurement, 0)
     assert node.wanted() is None
@@ -299,30 +299,32 @@ def test_a_stream_that_was_missed_entirely_is_asked_for_at_its_end():
     node = RobotNode(config())
     node.handle(END, 0)
     wanted = node.wanted()
-    assert (wanted.epoch, wanted.first, wanted.last) == (1, 0, len(MEASUREMENTS) - 1)
+    assert (wanted.incarnation, wanted.first, wanted.last) == (1, 0, len(MEASUREMENTS) - 1)
 
 
-def test_a_new_epoch_closes_the_old_one_under_its_own_name():
+def test_a_new_incarnation_closes_the_old_one_under_its_own_name():
     node = RobotNode(config())
     out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
-    second = [msgspec.structs.replace(r, epoch=2, number=r.number - 15) for r in MEASUREMENTS[15:]]
-    second[0] = m.Start(second[0].stamp_ns, "r1", 2, 0, b"", b"")
+    second = [
+        msgspec.structs.replace(r, incarnation=2, number=r.number - 15) for r in MEASUREMENTS[15:]
+    ]
+    second[0] = m.InitialPose(second[0].stamp_ns, "r1", 2, 0, b"", b"")
     out += [o for r in second for o in node.handle(r, 0)]
     ends = (m.StreamEnd("r1", 2, len(second)),)
     out += node.handle(m.End(0, ends), 0)
     submaps = of(out, ch.SUBMAP)
-    names = [(s.epoch, s.sequence) for s in submaps]
+    names = [(s.incarnation, s.sequence) for s in submaps]
     assert names == [(1, 0), (1, 1), *((2, k) for k in range(len(names) - 2))]
     assert len(names) > 2
     assert submaps[1].last_measurement == 9
-    assert next(s for s in submaps if s.epoch == 2).first_measurement == 0
+    assert next(s for s in submaps if s.incarnation == 2).first_measurement == 0
     last, first = of(out, ch.ROBOT_DONE)
-    assert (last.epoch, first.epoch) == (2, 1)
+    assert (last.incarnation, first.incarnation) == (2, 1)
     assert (first.measurements, last.measurements) == (10, len(second))
     for done in (first, last):
         assert sum(e.measurements for e in done.ledger) == done.measurements
     for progress in of(out, ch.ROBOT_PROGRESS):
-        assert progress.submaps <= sum(s.epoch == progress.epoch for s in submaps)
+        assert progress.submaps <= sum(s.incarnation == progress.incarnation for s in submaps)
 
 
 def feedback(**options):
@@ -463,17 +465,17 @@ def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
         sent += node.handle(measurement, 0)
 
     def answer(**wanted):
-        request = encoded(m.SubmapsWanted(0, "r1", **wanted))
+        request = encoded(m.SubmapsRequest(0, "r1", **wanted))
         return [decoded(reply) for reply in node.answer_submaps(request)]
 
     assert answer() == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)]
-    assert answer(epoch=1, first=2) == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)[2:]]
-    assert answer(epoch=2) == []
-    assert node.answer_submaps(encoded(m.SubmapsWanted(0, "r2"))) == []
+    assert answer(incarnation=1, first=2) == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)[2:]]
+    assert answer(incarnation=2) == []
+    assert node.answer_submaps(encoded(m.SubmapsRequest(0, "r2"))) == []
 
 
 def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
     node = RobotNode(config(), "rendezvous")
     for measurement in MEASUREMENTS:
         node.handle(measurement, 0)
-    assert node.answer_submaps(encoded(m.SubmapsWanted(0, "r1"))) == [encoded(MEASUREMENTS[0])]
+    assert node.answer_submaps(encoded(m.SubmapsRequest(0, "r1"))) == [encoded(MEASUREMENTS[0])]

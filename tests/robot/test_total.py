@@ -57,7 +57,7 @@ def drive(
     steps: int, odd: dict[int, m.Message] | None = None, *, sees: bool = True
 ) -> list[m.Message]:
     """A circle at 1 m/s, three landmarks each second; `odd`: what comes in place of a second's."""
-    out: list[m.Message] = [m.Start(0, "r1", 1, 0, from_floats([0.0, 0.0, 0.0]), b"")]
+    out: list[m.Message] = [m.InitialPose(0, "r1", 1, 0, from_floats([0.0, 0.0, 0.0]), b"")]
     for k in range(1, steps + 1):
         own = m.Odometry(k * S, "r1", 1, 2 * k, S, 1.0, 0.1)
         scan = [(i, float(np.hypot(*p)), 0.3 * i - 1.0) for i, p in LANDMARKS.items()]

@@ -7,12 +7,12 @@ from team.stream.inbox import Inbox
 from team.wire import messages as m
 
 
-def measurement(number, epoch=0):
-    return m.Odometry(number * 1_000, "r1", epoch, number, 1_000, 1.0, 0.0)
+def measurement(number, incarnation=0):
+    return m.Odometry(number * 1_000, "r1", incarnation, number, 1_000, 1.0, 0.0)
 
 
 def names(taken):
-    return [(each.epoch, each.number) for each in taken]
+    return [(each.incarnation, each.number) for each in taken]
 
 
 @settings(deadline=None)
@@ -30,14 +30,14 @@ def test_any_order_with_duplicates_comes_out_in_order_and_once(order, at_once):
 
 @settings(deadline=None)
 @given(st.permutations([(e, n) for e in (2, 3) for n in range(4)]))
-def test_of_two_epochs_the_earlier_is_taken_as_far_as_it_is_there(order):
+def test_of_two_incarnations_the_earlier_is_taken_as_far_as_it_is_there(order):
     inbox, out = Inbox(), []
-    for epoch, number in order:
-        inbox.put(measurement(number, epoch))
+    for incarnation, number in order:
+        inbox.put(measurement(number, incarnation))
         out += names(inbox.taken())
     assert out == sorted(out)
     assert [name for name in out if name[0] == 3] == [(3, number) for number in range(4)]
-    assert inbox.waiting == 0, "nothing of a past epoch is kept"
+    assert inbox.waiting == 0, "nothing of a past incarnation is kept"
 
 
 def test_a_measurement_waits_until_those_before_it_are_here():
@@ -70,31 +70,31 @@ def test_the_gap_is_what_is_missing_before_the_earliest_that_waits():
     assert inbox.gap == (0, 5, 6)
 
 
-def test_a_later_epoch_whose_beginning_is_missing_is_a_gap():
+def test_a_later_incarnation_whose_beginning_is_missing_is_a_gap():
     inbox = Inbox()
-    inbox.put(measurement(3, epoch=1))
+    inbox.put(measurement(3, incarnation=1))
     assert names(inbox.taken()) == []
     assert inbox.gap == (1, 0, 2)
 
 
-def test_a_later_epoch_begins_with_its_measurement_0_and_the_earlier_one_is_over():
+def test_a_later_incarnation_begins_with_its_measurement_0_and_the_earlier_one_is_over():
     inbox = Inbox()
     for number in (0, 2):
         inbox.put(measurement(number))
-    inbox.put(measurement(0, epoch=5))
+    inbox.put(measurement(0, incarnation=5))
     assert names(inbox.taken()) == [(0, 0), (5, 0)]
     inbox.put(measurement(1))
     assert names(inbox.taken()) == []
-    assert (inbox.epoch, inbox.next_measurement, inbox.waiting) == (5, 1, 0)
+    assert (inbox.incarnation, inbox.next_measurement, inbox.waiting) == (5, 1, 0)
 
 
 def test_what_an_earlier_life_consumed_is_not_taken_again():
     inbox = Inbox()
     for number in range(6):
-        inbox.put(measurement(number, epoch=2))
+        inbox.put(measurement(number, incarnation=2))
     inbox.put(measurement(0))
     inbox.resume(2, 4)
-    inbox.put(measurement(3, epoch=2))
+    inbox.put(measurement(3, incarnation=2))
     assert names(inbox.taken()) == [(2, 4), (2, 5)]
 
 
@@ -107,6 +107,6 @@ def test_received_counts_what_is_here_without_a_gap_consumed_or_not():
     assert inbox.received == 3
     inbox.put(measurement(3))
     assert inbox.received == 5
-    inbox.put(measurement(0, epoch=1))
+    inbox.put(measurement(0, incarnation=1))
     list(inbox.taken())
     assert inbox.received == 1

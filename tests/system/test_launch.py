@@ -13,7 +13,7 @@ from team.keys.roster import nodes_of
 from team.recording.reader import open_log
 from team.wire import channels as ch
 from team.wire.bus import opened
-from team.wire.messages import Configured
+from team.wire.messages import Configuration
 from tests.system.conftest import Launched
 from tests.system.processes import PROGRAM, Processes, Terminal
 from tests.system.scenarios import STEPS, final_map, map_in_memory, sha256, short
@@ -66,7 +66,7 @@ def test_the_log_of_a_launch_is_complete_and_says_what_ran(launched: Launched) -
     assert log.complete
     assert log.metadata["seed"] == "1"
     announced = [opened(sample)[2] for sample in log.samples([ch.WORLD_CONFIG])]
-    assert [type(message) for message in announced] == [Configured]
+    assert [type(message) for message in announced] == [Configuration]
     assert {key: count.messages for key, count in log.counts().items()} == {
         key: traffic["messages"] for key, traffic in launched.result["channels"].items()
     }

@@ -119,7 +119,7 @@ def test_a_late_joiner_gets_every_message_of_an_all_channel(joined: Joined) -> N
 def test_a_late_joiner_gets_the_newest_message_of_a_latest_channel(joined: Joined) -> None:
     source = joined()
     for i in range(5):
-        send(source, (c.WORLD_CONFIG, "", m.Configured(i, "world", 0, b"configur", "{}")))
+        send(source, (c.WORLD_CONFIG, "", m.Configuration(i, "world", 0, b"configur", "{}")))
     late = joined()
     late.subscribe(c.WORLD_CONFIG)
     assert [sample.counter for sample in received(late, 1)] == [4]
@@ -166,11 +166,11 @@ def test_a_question_gets_all_its_answers_in_order(joined: Joined) -> None:
     centre, robot = joined(), joined()
 
     def answer(request: bytes) -> Iterable[bytes]:
-        wanted = decoded(request, m.SubmapsWanted)
+        wanted = decoded(request, m.SubmapsRequest)
         return [encoded(submap(i, wanted.robot)) for i in range(300)]
 
     centre.answer(c.SUBMAPS, "", answer)
-    got = asked(robot, centre, c.SUBMAPS, "", m.SubmapsWanted(0, "bravo"))
+    got = asked(robot, centre, c.SUBMAPS, "", m.SubmapsRequest(0, "bravo"))
     assert got == [encoded(submap(i, "bravo")) for i in range(300)]
 
 
@@ -182,7 +182,7 @@ def test_one_answer_can_serve_every_name(joined: Joined) -> None:
 
 
 def test_a_question_that_nobody_answers_has_no_answers(joined: Joined) -> None:
-    assert joined().ask(c.SUBMAPS, "", m.SubmapsWanted(0, "alpha"), 5.0) == []
+    assert joined().ask(c.SUBMAPS, "", m.SubmapsRequest(0, "alpha"), 5.0) == []
 
 
 def test_an_answer_that_fails_is_told_to_the_asker(joined: Joined) -> None:
@@ -193,7 +193,7 @@ def test_an_answer_that_fails_is_told_to_the_asker(joined: Joined) -> None:
 
     centre.answer(c.SUBMAPS, "", answer)
     with pytest.raises(BusError, match="central/submaps: no such robot"):
-        asked(robot, centre, c.SUBMAPS, "", m.SubmapsWanted(0, "nobody"))
+        asked(robot, centre, c.SUBMAPS, "", m.SubmapsRequest(0, "nobody"))
 
 
 def asked(
@@ -252,7 +252,7 @@ def test_replies_to_a_request_come_with_what_arrives(joined: Joined) -> None:
 
     def all_here() -> bool:
         if not arrived:  # the answerer's declaration may still be on its way
-            centre.request(c.SENT, "alpha", m.SubmapsWanted(0, "alpha"))
+            centre.request(c.SENT, "alpha", m.SubmapsRequest(0, "alpha"))
         robot.receive(0.02)
         arrived.extend(centre.receive(0.02))
         return len(arrived) >= 30

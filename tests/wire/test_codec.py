@@ -98,9 +98,15 @@ def test_a_submap_whose_sensitivities_do_not_fit_is_refused(
 @settings(deadline=None)
 @given(stamps, names, counts, counts, st.integers(0, 2**62 - 1), finite, finite)
 def test_odometry_comes_back_as_it_went(
-    stamp: int, robot: str, epoch: int, measurement: int, duration: int, forward: float, rate: float
+    stamp: int,
+    robot: str,
+    incarnation: int,
+    measurement: int,
+    duration: int,
+    forward: float,
+    rate: float,
 ) -> None:
-    message = m.Odometry(stamp, robot, epoch, measurement, duration, forward, rate)
+    message = m.Odometry(stamp, robot, incarnation, measurement, duration, forward, rate)
     assert decoded(encoded(message), m.Odometry) == message
 
 
@@ -229,8 +235,8 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("damaged", b"\xc1", None),
         ("damaged", b"\x91\xa1\xff", None),
         ("wrong field", with_fields(SUBMAP, robot="Not A Name"), None),
-        ("wrong field", with_fields(SUBMAP, epoch=-1), None),
-        ("wrong field", with_fields(SUBMAP, epoch=1.5), None),
+        ("wrong field", with_fields(SUBMAP, incarnation=-1), None),
+        ("wrong field", with_fields(SUBMAP, incarnation=1.5), None),
         ("wrong field", with_fields(SUBMAP, mean=[0.0]), None),
         ("wrong field", with_fields(SUBMAP, stamp_ns=2**62), None),
         ("wrong field", with_fields(EXAMPLES["status/1"], figures={"x": float("nan")}), None),

@@ -13,12 +13,14 @@ MAP = next(each for each in examples() if isinstance(each, m.FusedMap))
 vectors = st.dictionaries(st.sampled_from(["r1", "r2", "r3"]), st.integers(0, 3))
 
 
-def members(vector: dict[str, int]) -> tuple[m.Member, ...]:
-    return tuple(m.Member(robot, 1, vector[robot]) for robot in sorted(vector))
+def members(vector: dict[str, int]) -> tuple[m.VersionEntry, ...]:
+    return tuple(m.VersionEntry(robot, 1, vector[robot]) for robot in sorted(vector))
 
 
-def prior(vector: dict[str, int], heard: int = 0, epoch: int = 1) -> m.Prior:
-    return msgspec.structs.replace(PRIOR, epoch=epoch, members=members(vector), heard=heard)
+def prior(vector: dict[str, int], heard: int = 0, incarnation: int = 1) -> m.Prior:
+    return msgspec.structs.replace(
+        PRIOR, incarnation=incarnation, members=members(vector), heard=heard
+    )
 
 
 @given(vectors, vectors, st.integers(0, 9))
@@ -45,7 +47,7 @@ def test_whoever_hears_the_same_priors_in_any_order_holds_the_same_one(
 
 
 def test_a_later_life_of_the_stream_and_a_settled_map_of_the_same_set_are_newer() -> None:
-    assert is_newer_prior(prior({}, epoch=2), prior({"r1": 3}, 9))
+    assert is_newer_prior(prior({}, incarnation=2), prior({"r1": 3}, 9))
     settled = msgspec.structs.replace(MAP, final=False)
     tail = msgspec.structs.replace(settled, provisional=True)
     assert is_newer_map(settled, tail)
@@ -56,8 +58,8 @@ def test_a_later_life_of_the_stream_and_a_settled_map_of_the_same_set_are_newer(
     assert not is_newer_map(less, MAP)
 
 
-def progress(stamp_ns: int, epoch: int, measurements: int, submaps: int) -> m.Progress:
-    return m.Progress(stamp_ns, "robot/r1", "r1", epoch, measurements, submaps)
+def progress(stamp_ns: int, incarnation: int, measurements: int, submaps: int) -> m.Progress:
+    return m.Progress(stamp_ns, "robot/r1", "r1", incarnation, measurements, submaps)
 
 
 counters = st.builds(progress, st.integers(0, 3), st.integers(1, 2), st.integers(0, 3),
@@ -69,13 +71,13 @@ def test_progress_never_goes_back(said: list[m.Progress]) -> None:
     held = None
     for each in said:
         before, held = held, further(each, held)
-        assert before is None or held.epoch >= before.epoch
-        if before is not None and held.epoch == before.epoch:
+        assert before is None or held.incarnation >= before.incarnation
+        if before is not None and held.incarnation == before.incarnation:
             assert held.measurements >= before.measurements
             assert held.submaps >= before.submaps
             assert held.stamp_ns >= before.stamp_ns
     assert held is not None
-    assert held.submaps == max(p.submaps for p in said if p.epoch == held.epoch)
+    assert held.submaps == max(p.submaps for p in said if p.incarnation == held.incarnation)
 
 
 def test_an_older_end_does_not_take_measurements_back() -> None:

@@ -219,7 +219,7 @@ def test_an_answer_that_never_comes_is_an_error(endpoint: str) -> None:
 
         def timed_out() -> bool:
             try:
-                asker.ask(c.SUBMAPS, "", m.SubmapsWanted(0, "alpha"), 0.2)
+                asker.ask(c.SUBMAPS, "", m.SubmapsRequest(0, "alpha"), 0.2)
             except BusError as error:
                 return "team/t/central/submaps" in str(error)
             return False  # its declaration is still on its way
@@ -352,7 +352,7 @@ def test_an_order_outlives_the_operator_and_ends_with_the_team(endpoint: str) ->
     order = m.GivenUp(0, "robot/alpha", "operator", "it fell into the water")
 
     def asked(bus: ZenohBus) -> list[m.Message]:
-        bus.request(c.ORDERS_KEPT, "", m.OrdersWanted(0))
+        bus.request(c.ORDERS_KEPT, "", m.OrdersRequest(0))
         end = time.monotonic() + 1.0
         while time.monotonic() < end:
             if found := bus.receive(0.1):

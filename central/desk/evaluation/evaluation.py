@@ -274,7 +274,7 @@ def _robot_json(robot: RobotResult) -> dict[str, Any]:
 
 def _scenario(log: Collected) -> TeamConfig | None:
     message = log.sound(log.last(ch.WORLD_CONFIG))
-    if not isinstance(message, m.Configured):
+    if not isinstance(message, m.Configuration):
         return None
     try:
         return team_config(message.configuration)

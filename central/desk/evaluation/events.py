@@ -53,9 +53,9 @@ class EventTeller:
         match message:
             case m.Liveliness():
                 return self._liveliness(message, now_ns)
-            case m.Configured():
+            case m.Configuration():
                 return self._configured(message, now_ns)
-            case m.Start():
+            case m.InitialPose():
                 return self._incarnation(message, now_ns)
             case m.Done() if robot_node(message.robot) not in self._done:
                 node = robot_node(message.robot)
@@ -95,19 +95,19 @@ class EventTeller:
             return [Event(now_ns, "left", node, f"{name} left")]
         return [Event(now_ns, "lost", node, f"{name} was lost")]
 
-    def _configured(self, message: m.Configured, now_ns: int) -> list[Event]:
+    def _configured(self, message: m.Configuration, now_ns: int) -> list[Event]:
         """A robot announces its configuration once per life of its process."""
         if self._alive.get(message.node) is not False or not message.node.startswith("robot/"):
             return []
         name = message.node.removeprefix("robot/")
         return [Event(now_ns, "restarted", message.node, f"{name} announces itself again")]
 
-    def _incarnation(self, start: m.Start, now_ns: int) -> list[Event]:
+    def _incarnation(self, start: m.InitialPose, now_ns: int) -> list[Event]:
         before = self._incarnations.get(start.robot, FIRST)
-        self._incarnations[start.robot] = max(before, start.epoch)
-        if start.epoch <= before:
+        self._incarnations[start.robot] = max(before, start.incarnation)
+        if start.incarnation <= before:
             return []
-        text = f"the stream of {start.robot} begins anew, incarnation {start.epoch}"
+        text = f"the stream of {start.robot} begins anew, incarnation {start.incarnation}"
         return [Event(now_ns, "restarted", robot_node(start.robot), text)]
 
     def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:

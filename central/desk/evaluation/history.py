@@ -187,7 +187,7 @@ class _Gathering:
                 interval = _Submap(
                     message.stamp_ns, message.first_measurement, message.last_measurement
                 )
-                self.unused[message.robot, message.epoch][message.sequence] = interval
+                self.unused[message.robot, message.incarnation][message.sequence] = interval
             case m.FusedMap():
                 self._take_map(message, sample.wall_ns)
             case m.Innovation():
@@ -206,7 +206,7 @@ class _Gathering:
         measurement = head_of(sample)
         if measurement is None:
             return
-        self.published[measurement.robot, measurement.epoch].take(
+        self.published[measurement.robot, measurement.incarnation].take(
             measurement.number, sample.wall_ns
         )
         self.span = (min(self.span[0], sample.stamp_ns), max(self.span[1], sample.stamp_ns))
@@ -217,13 +217,13 @@ class _Gathering:
         if (fit := self.truth.fit(fused)) is not None:
             self.map_nees.take(fused.stamp_ns, fit.nees_per_dof)
         for member in fused.members:
-            waiting = self.unused[member.robot, member.epoch]
+            waiting = self.unused[member.robot, member.incarnation]
             for sequence in [k for k in waiting if k <= member.sequence]:
                 submap = waiting.pop(sequence)
-                self._arrived(member.robot, member.epoch, submap, wall_ns)
+                self._arrived(member.robot, member.incarnation, submap, wall_ns)
 
-    def _arrived(self, robot: str, epoch: int, submap: _Submap, wall_ns: int) -> None:
-        clocks = self.published[robot, epoch]
+    def _arrived(self, robot: str, incarnation: int, submap: _Submap, wall_ns: int) -> None:
+        clocks = self.published[robot, incarnation]
         first_ns, last_ns = clocks.of(submap.first_measurement), clocks.of(submap.last_measurement)
         if first_ns is None or last_ns is None:
             return  # a part of a log: the measurement was published before it
@@ -262,7 +262,7 @@ def history(samples: Iterable[Sample]) -> History:
 
 def _innovations(of: list[m.Innovation]) -> Innovations:
     """By window, each once: a robot that was resumed says some of them again."""
-    once = {(each.epoch, each.sequence): each for each in of}
+    once = {(each.incarnation, each.sequence): each for each in of}
     kept = [once[name] for name in sorted(once)]
     return Innovations(
         np.array([each.stamp_ns for each in kept], np.int64),

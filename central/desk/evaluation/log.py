@@ -1,7 +1,7 @@
 """One pass over a log's samples: what an evaluation needs of them, and no more.
 
-Most of a log is sensor measurements; of those only the head (robot, epoch, measurement) is decoded,
-to be counted. Everything else that matters goes through the one door, `opened`.
+Most of a log is sensor measurements; of those only the head (robot, incarnation, measurement) is
+decoded, to be counted. Everything else that matters goes through the one door, `opened`.
 """
 
 from collections import defaultdict
@@ -43,7 +43,7 @@ class Head(msgspec.Struct, array_like=True, gc=False):
     tag: str
     stamp_ns: int
     robot: str
-    epoch: int
+    incarnation: int
     number: int
 
 
@@ -68,7 +68,9 @@ class Traffic:
 
 @dataclass
 class Measurements:
-    """The measurements of one robot on its sensor channels, each (epoch, measurement) once."""
+    """The measurements of one robot on its sensor channels, each (incarnation, measurement)
+    once.
+    """
 
     all: set[tuple[int, int]] = field(default_factory=set)
     odometry: set[tuple[int, int]] = field(default_factory=set)
@@ -144,9 +146,9 @@ class Collected:
             self.unsound += 1
             return
         of_robot = self.measurements[robot]
-        of_robot.all.add((head.epoch, head.number))
+        of_robot.all.add((head.incarnation, head.number))
         if odometry:
-            of_robot.odometry.add((head.epoch, head.number))
+            of_robot.odometry.add((head.incarnation, head.number))
 
 
 def collected(samples: Iterable[Sample]) -> Collected:

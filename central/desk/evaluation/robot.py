@@ -77,13 +77,15 @@ def robot_log(log: Collected, robot: str) -> RobotLog:
 
 def consumption(log: Collected, robot: str) -> Consumption:
     """What became of one robot's measurements."""
-    dones = {d.epoch: d for d in log.messages(ch.ROBOT_DONE, robot) if isinstance(d, m.Done)}
+    dones = {d.incarnation: d for d in log.messages(ch.ROBOT_DONE, robot) if isinstance(d, m.Done)}
     submaps = {
-        (s.epoch, s.sequence): s for s in log.messages(ch.SUBMAP, robot) if isinstance(s, m.Submap)
+        (s.incarnation, s.sequence): s
+        for s in log.messages(ch.SUBMAP, robot)
+        if isinstance(s, m.Submap)
     }
     ledger: dict[str, int] = {}
-    for epoch in sorted(dones):
-        for entry in dones[epoch].ledger:
+    for incarnation in sorted(dones):
+        for entry in dones[incarnation].ledger:
             ledger[entry.disposition] = ledger.get(entry.disposition, 0) + entry.measurements
     measurements = log.measurements.get(robot)
     consumed = sum(d.measurements for d in dones.values()) if dones else None
@@ -103,7 +105,8 @@ def consumption(log: Collected, robot: str) -> Consumption:
 def _disjoint(submaps: Sequence[m.Submap]) -> bool:
     """Whether no measurement lies in two of the submaps, which are in order."""
     return all(
-        a.epoch != b.epoch or a.last_measurement < b.first_measurement for a, b in pairwise(submaps)
+        a.incarnation != b.incarnation or a.last_measurement < b.first_measurement
+        for a, b in pairwise(submaps)
     )
 
 

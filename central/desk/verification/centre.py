@@ -56,13 +56,13 @@ class _LogInputs:
         self._log, self._consumed = log, consumed
         self._submaps, self._sightings = log.submaps(), log.sightings()
         starts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
-        self._starts = {s: start for s, start in starts.items() if isinstance(start, m.Start)}
+        self._starts = {s: start for s, start in starts.items() if isinstance(start, m.InitialPose)}
         own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
-        self._maps = {(x.robot, x.epoch, x.sequence, x.exchange): x for x in own}
+        self._maps = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
 
     def of(self, fused: m.FusedMap) -> Inputs | None:
         """None where the log lacks a submap of the map's version vector."""
-        vector = {(x.robot, x.epoch): x.sequence for x in fused.members}
+        vector = {(x.robot, x.incarnation): x.sequence for x in fused.members}
         if self._consumed == "measurements":
             return Inputs(starts=self._starts, heard=tuple(self._heard()))
         if self._consumed == "own/map":

@@ -15,7 +15,7 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
 Stream = tuple[str, int]
-"""(robot, epoch)."""
+"""(robot, incarnation)."""
 T = TypeVar("T")
 Identity = tuple[object, ...]
 """A message's key and the names of its inputs."""
@@ -38,16 +38,16 @@ class Said:
 class Recorded:
     """Everything in a log that is an input or an output of a node; each measurement once.
 
-    measurements: by (robot, epoch) and counter. configured: the last announcement of each node.
-    contradicted: measurements that the log has twice with different content. reported: how many
-    measurements a robot had consumed by its own word. published: how many the world says there are.
-    known_map: what the robots were told of the landmarks, if they were.
+    measurements: by (robot, incarnation) and counter. configured: the last announcement of each
+    node. contradicted: measurements that the log has twice with different content. reported: how
+    many measurements a robot had consumed by its own word. published: how many the world says there
+    are. known_map: what the robots were told of the landmarks, if they were.
     withdrawals: of robots that the team went on without, the first word on each.
     unsound: samples that no node would have let in.
     """
 
     measurements: dict[Stream, dict[int, m.Measurement]] = field(default_factory=dict)
-    configured: dict[str, m.Configured] = field(default_factory=dict)
+    configured: dict[str, m.Configuration] = field(default_factory=dict)
     said: list[Said] = field(default_factory=list)
     contradicted: list[m.Measurement] = field(default_factory=list)
     reported: dict[Stream, int] = field(default_factory=dict)
@@ -67,20 +67,24 @@ class Recorded:
             return
         match message:
             case m.Measurement():
-                stream = self.measurements.setdefault((message.robot, message.epoch), {})
+                stream = self.measurements.setdefault((message.robot, message.incarnation), {})
                 if stream.setdefault(message.number, message) != message:
                     self.contradicted.append(message)
-            case m.Configured():
+            case m.Configuration():
                 self.configured[message.node] = message
             case m.Progress():
-                consumed = self.reported.get((message.robot, message.epoch), 0)
-                self.reported[message.robot, message.epoch] = max(consumed, message.measurements)
+                consumed = self.reported.get((message.robot, message.incarnation), 0)
+                self.reported[message.robot, message.incarnation] = max(
+                    consumed, message.measurements
+                )
             case m.KnownMap():
                 self.known_map = message
             case m.Withdrawal():
                 self.withdrawals.setdefault(message.robot, message)
             case m.End():
-                self.published |= {(s.robot, s.epoch): s.measurements for s in message.streams}
+                self.published |= {
+                    (s.robot, s.incarnation): s.measurements for s in message.streams
+                }
             case _ if channel.recomputable:
                 self.said.append(Said(sample, channel, message))
             case _:
@@ -97,24 +101,24 @@ class Recorded:
         names |= {s.message.robot for s in self.said if isinstance(s.message, m.Submap | m.Done)}
         return sorted(names)
 
-    def epochs(self, robot: str) -> list[int]:
-        """The epochs of a robot that there are measurements of, in order."""
-        return sorted(epoch for name, epoch in self.measurements if name == robot)
+    def incarnations(self, robot: str) -> list[int]:
+        """The incarnations of a robot that there are measurements of, in order."""
+        return sorted(incarnation for name, incarnation in self.measurements if name == robot)
 
     def submaps(self) -> Mapping[Stream, dict[int, m.Submap]]:
         """The recorded submaps by stream and sequence."""
         found: dict[Stream, dict[int, m.Submap]] = {}
         for submap in self.of(ch.SUBMAP):
             assert isinstance(submap, m.Submap)
-            found.setdefault((submap.robot, submap.epoch), {})[submap.sequence] = submap
+            found.setdefault((submap.robot, submap.incarnation), {})[submap.sequence] = submap
         return found
 
     def sightings(self) -> Mapping[tuple[str, int, int], list[m.SightingFactor]]:
-        """The recorded sightings by (robot, epoch, sequence) of their submap."""
+        """The recorded sightings by (robot, incarnation, sequence) of their submap."""
         found: dict[tuple[str, int, int], list[m.SightingFactor]] = {}
         for sighting in self.of(ch.SIGHTING_FACTOR):
             assert isinstance(sighting, m.SightingFactor)
-            name = (sighting.robot, sighting.epoch, sighting.sequence)
+            name = (sighting.robot, sighting.incarnation, sighting.sequence)
             found.setdefault(name, []).append(sighting)
         return found
 
@@ -130,7 +134,7 @@ class Recorded:
         what = "the centre's configuration"
         return _parsed(announced.configuration, CentralConfig, what), announced.digest
 
-    def _announced(self, node: str) -> m.Configured:
+    def _announced(self, node: str) -> m.Configuration:
         if node not in self.configured:
             raise RerunError(
                 f"the log has no configuration of {node}: nothing of it can be computed"
@@ -164,21 +168,21 @@ def identity(key: str, message: m.Message) -> Identity:
     match message:
         case m.Submap():
             names: Identity = (
-                message.epoch,
+                message.incarnation,
                 message.sequence,
                 message.first_measurement,
                 message.last_measurement,
             )
         case m.SightingFactor():
-            names = (message.epoch, message.sequence, message.stamp_ns, message.teammate)
+            names = (message.incarnation, message.sequence, message.stamp_ns, message.teammate)
         case m.MapEstimate():
-            names = (message.epoch, message.stamp_ns, message.sequence, message.exchange)
+            names = (message.incarnation, message.stamp_ns, message.sequence, message.exchange)
         case m.PoseEstimate():
-            names = (message.epoch, message.stamp_ns, message.sequence, message.map_digest)
+            names = (message.incarnation, message.stamp_ns, message.sequence, message.map_digest)
         case m.Done():
-            names = (message.epoch, message.measurements, message.steps)
+            names = (message.incarnation, message.measurements, message.steps)
         case m.Prior() | m.Trajectory():
-            names = (message.epoch, message.digest)
+            names = (message.incarnation, message.digest)
         case m.FusedMap():
             names = (
                 message.exchange,

@@ -18,7 +18,7 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 PosesSaid = Mapping[tuple[int, int], Sequence[m.Prior | None]]
-"""By (epoch, stamp): the priors that the recorded poses name; None: none of them."""
+"""By (incarnation, stamp): the priors that the recorded poses name; None: none of them."""
 
 
 class RetoldRobot(RobotNode):
@@ -38,7 +38,7 @@ class RetoldRobot(RobotNode):
         if stamp_ns is None:
             return []
         out: list[Outgoing] = []
-        for prior in self._said.get((self._epoch, stamp_ns), ()):
+        for prior in self._said.get((self._incarnation, stamp_ns), ()):
             self._pose_ns, self._prior = None, prior
             out += super()._poses(stamp_ns)
         return out
@@ -49,7 +49,7 @@ class RetoldRobot(RobotNode):
 
     def took(self, message: m.Message) -> Counter[str]:
         """Take a measurement or the end; the dispositions that it gave, how many of each."""
-        before = Counter[str]() if isinstance(message, m.Start) else Counter(self._ledger)
+        before = Counter[str]() if isinstance(message, m.InitialPose) else Counter(self._ledger)
         self.given(message)
         return self._ledger - before
 
@@ -82,7 +82,7 @@ def _poses_said(log: Recorded, robot: str) -> PosesSaid:
         for pose in log.of(channel):
             if not isinstance(pose, m.PoseEstimate) or pose.robot != robot:
                 continue
-            wanted = said.setdefault((pose.epoch, pose.stamp_ns), [])
+            wanted = said.setdefault((pose.incarnation, pose.stamp_ns), [])
             prior = priors.get(pose.map_digest)
             if prior not in wanted if prior is not None else not wanted:
                 wanted.append(prior)
@@ -90,16 +90,17 @@ def _poses_said(log: Recorded, robot: str) -> PosesSaid:
 
 
 def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
-    """Without feedback nothing from outside matters: each epoch by itself, each life that ended.
+    """Without feedback nothing from outside matters: each incarnation by itself, each life that
+    ended.
 
     A `Done` names the life that it closes: up to which measurement, over how many steps. A life
     that began after a submap is computed from there, as a resumed robot does. Where a measurement
     is not in the log, the computation goes on behind the next recorded submap.
     """
-    for epoch in log.epochs(robot):
-        measurements = log.measurements[(robot, epoch)]
-        chain = _chain(log, robot, epoch)
-        dones = _dones(log, robot, epoch)
+    for incarnation in log.incarnations(robot):
+        measurements = log.measurements[(robot, incarnation)]
+        chain = _chain(log, robot, incarnation)
+        dones = _dones(log, robot, incarnation)
         lives = [(_first_of(done, chain, measurements), done.measurements) for done in dones]
         if not any(first == 0 for first, _ in lives):
             yield from _life(born, measurements, chain, 0, None)
@@ -107,13 +108,13 @@ def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
             yield from _life(born, measurements, chain, first, until)
 
 
-def _dones(log: Recorded, robot: str, epoch: int) -> list[m.Done]:
+def _dones(log: Recorded, robot: str, incarnation: int) -> list[m.Done]:
     said = (d for d in log.of(ch.ROBOT_DONE) if isinstance(d, m.Done))
-    return [d for d in said if (d.robot, d.epoch) == (robot, epoch)]
+    return [d for d in said if (d.robot, d.incarnation) == (robot, incarnation)]
 
 
-def _chain(log: Recorded, robot: str, epoch: int) -> list[m.Submap]:
-    found = log.submaps().get((robot, epoch), {})
+def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
+    found = log.submaps().get((robot, incarnation), {})
     return [found[k] for k in takewhile(found.__contains__, range(len(found)))]
 
 
@@ -141,7 +142,7 @@ def _life(
     did.
     """
     start = measurements.get(0)
-    if not isinstance(start, m.Start):
+    if not isinstance(start, m.InitialPose):
         return
     last = max(measurements) + 1 if until is None else until
     while True:
@@ -153,7 +154,7 @@ def _life(
             yield from node.given(measurements[counter])
             counter += 1
         if counter == last and until is not None:
-            end = m.StreamEnd(start.robot, start.epoch, until)
+            end = m.StreamEnd(start.robot, start.incarnation, until)
             yield from node.given(m.End(0, (end,)))
         behind = (s.last_measurement + 1 for s in chain if counter <= s.last_measurement < last)
         following = next((b for b in behind if b in measurements), None)
@@ -169,14 +170,14 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
     """
     fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
     node = born()
-    epochs = log.epochs(robot)
+    incarnations = log.incarnations(robot)
     inputs: list[m.Message] = [
-        log.measurements[(robot, epoch)][counter]
-        for epoch in epochs
-        for counter in sorted(log.measurements[(robot, epoch)])
+        log.measurements[(robot, incarnation)][counter]
+        for incarnation in incarnations
+        for counter in sorted(log.measurements[(robot, incarnation)])
     ]
     if any(isinstance(d, m.Done) and d.robot == robot for d in log.of(ch.ROBOT_DONE)):
-        end = m.StreamEnd(robot, epochs[-1], len(log.measurements[(robot, epochs[-1])]))
+        end = m.StreamEnd(robot, incarnations[-1], len(log.measurements[(robot, incarnations[-1])]))
         inputs.append(m.End(0, (end,)))
     inputs.reverse()
     while inputs:
@@ -188,9 +189,9 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
                 inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
 
 
-def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
-    """What the robot's node does with each measurement of an epoch that it consumed, in its own
-    words.
+def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
+    """What the robot's node does with each measurement of an incarnation that it consumed, in its
+    own words.
 
     Without a centre nothing holds it up. Scans that no odometry covers and sightings whose pose
     node did not come are known at the end only.
@@ -200,8 +201,8 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
     if log.known_map is not None:
         node.given(log.known_map)
     node.given(m.Liveliness(0, "central", False))
-    measurements = log.measurements.get((robot, epoch), {})
-    done = max((d.measurements for d in _dones(log, robot, epoch)), default=None)
+    measurements = log.measurements.get((robot, incarnation), {})
+    done = max((d.measurements for d in _dones(log, robot, incarnation)), default=None)
     said: dict[int, str] = {}
     for counter in takewhile(
         measurements.__contains__, range(len(measurements) if done is None else done)
@@ -215,7 +216,7 @@ def dispositions(log: Recorded, robot: str, epoch: int) -> dict[int, str]:
         else:
             said[counter] = next(iter(took), "lost")
     if said and done is not None:
-        end = m.StreamEnd(robot, epoch, len(said))
+        end = m.StreamEnd(robot, incarnation, len(said))
         for reason, count in node.took(m.End(0, (end,))).items():
             kind = m.Sightings if reason == Rejection.NO_NODE.disposition else m.Observations
             taken = [n for n in said if isinstance(measurements[n], kind)]

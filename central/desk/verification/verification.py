@@ -160,18 +160,21 @@ def _difference(
 
 
 def _names(message: m.Message) -> str:
-    epoch, sequence = getattr(message, "epoch", None), getattr(message, "sequence", None)
+    incarnation, sequence = (
+        getattr(message, "incarnation", None),
+        getattr(message, "sequence", None),
+    )
     if isinstance(message, m.FusedMap):
         return f"map {message.digest.hex()}"
     named = "" if sequence is None else f", sequence {sequence}"
-    return f"epoch {epoch}{named}"
+    return f"incarnation {incarnation}{named}"
 
 
 def _lacking(message: m.Message, log: Recorded) -> str:
     """Why nothing came out for a message: an input that is not in the log, if that is it."""
     match message:
         case m.Submap():
-            measurements = log.measurements.get((message.robot, message.epoch), {})
+            measurements = log.measurements.get((message.robot, message.incarnation), {})
             wanted = range(message.first_measurement, message.last_measurement + 1)
             gone = next((str(n) for n in wanted if n not in measurements), None)
             return (

@@ -39,7 +39,7 @@ class Scan(NamedTuple):
 
 @dataclass(frozen=True)
 class Chain:
-    """One epoch of a robot's stream: N + 1 poses, the first at the start.
+    """One incarnation of a robot's stream: N + 1 poses, the first at the start.
 
     increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1.
     start: the pose that measurement 0 gives (None: unknown), with its covariance (None: exact).
@@ -47,7 +47,7 @@ class Chain:
     """
 
     config: RobotConfig
-    epoch: int
+    incarnation: int
     start: Pose | None
     start_covariance: Matrix | None
     stamps_ns: Int64[np.ndarray, " K"]
@@ -67,7 +67,8 @@ class Chain:
 def chains_of(
     samples: Iterable[Sample], scenario: TeamConfig, *, sightings: bool = False
 ) -> list[Chain]:
-    """The chains of all robots by (robot, epoch); measurements in the order of their counter, once.
+    """The chains of all robots by (robot, incarnation); measurements in the order of their counter,
+    once.
 
     With sightings there is a pose at each time of the team's grid (`front_end.node_s`) too.
     Raises WireError for a measurement that is not sound.
@@ -78,19 +79,21 @@ def chains_of(
         if found is not None and found[0].name in _TAKEN:
             message = opened(sample)[2]
             if isinstance(message, m.Measurement):
-                stream = streams.setdefault((message.robot, message.epoch), {})
+                stream = streams.setdefault((message.robot, message.incarnation), {})
                 stream[message.number] = message
     configs = {robot.id: robot for robot in scenario.robots}
     chains = [
-        _chain(configs[robot], epoch, [measurements[i] for i in sorted(measurements)], sightings)
-        for (robot, epoch), measurements in sorted(streams.items())
+        _chain(
+            configs[robot], incarnation, [measurements[i] for i in sorted(measurements)], sightings
+        )
+        for (robot, incarnation), measurements in sorted(streams.items())
         if robot in configs
     ]
     return [chain for chain in chains if chain is not None]
 
 
 def _chain(
-    config: RobotConfig, epoch: int, measurements: Sequence[m.Measurement], sightings: bool
+    config: RobotConfig, incarnation: int, measurements: Sequence[m.Measurement], sightings: bool
 ) -> Chain | None:
     """None for a stream without odometry: it has no motion that links its poses."""
     odometry = [
@@ -105,10 +108,10 @@ def _chain(
     segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s, grid)
     segmenter.begin(first_ns)
     start: tuple[Pose | None, Matrix | None] = (None, None)
-    epochs: list[Keyframe] = []
+    keyframes: list[Keyframe] = []
     for measurement in measurements:
         match measurement:
-            case m.Start():
+            case m.InitialPose():
                 start = translate.pose_of(measurement)
             case m.Observations():
                 segmenter.observe(measurement.stamp_ns, *translate.scan_of(measurement))
@@ -117,21 +120,23 @@ def _chain(
                     measurement.stamp_ns, measurement.number, translate.looks_of(measurement)
                 )
             case m.Odometry():
-                epochs += segmenter.drive(*translate.motion_of(measurement, config.clock_offset_s))
+                keyframes += segmenter.drive(
+                    *translate.motion_of(measurement, config.clock_offset_s)
+                )
     last, rest = segmenter.cut(last_ns)
-    epochs += last
+    keyframes += last
     if rest.mean.any() or rest.covariance.any():
         none = np.empty(0)
         nothing = np.empty(0, np.uint32)
-        epochs.append(Keyframe(last_ns, rest, nothing, none, none))
+        keyframes.append(Keyframe(last_ns, rest, nothing, none, none))
     return Chain(
         config,
-        epoch,
+        incarnation,
         start[0],
         start[1],
-        np.array([first_ns, *(e.stamp_ns for e in epochs)]),
-        tuple(e.increment for e in epochs),
-        tuple(Scan(e.ids, e.ranges, e.bearings) for e in epochs),
+        np.array([first_ns, *(e.stamp_ns for e in keyframes)]),
+        tuple(e.increment for e in keyframes),
+        tuple(Scan(e.ids, e.ranges, e.bearings) for e in keyframes),
         () if grid is None else grid.sightings(),
     )
 

@@ -1,6 +1,6 @@
 """The limit: the batch MAP over all raw measurements of a log, by GTSAM (the extra `limit`).
 
-One pose per observation epoch of each robot. Factors: the start poses; between consecutive poses
+One pose per keyframe of each robot. Factors: the start poses; between consecutive poses
 the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of `increment_of`, which is GTSAM's
 `BetweenFactorPose2` with its logarithm; each accepted range and bearing, independent, with the
 sensor's noise (under a Cauchy loss where the centre's `robust_c` asks for a robust join).

@@ -193,7 +193,7 @@ def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
     for sample in samples:
         if sample.key == ch.START.key(robot):
             message = opened(sample)[2]
-            if isinstance(message, m.Start):
+            if isinstance(message, m.InitialPose):
                 pose = translate.pose_of(message)[0]
                 return np.zeros(3) if pose is None else pose
     return np.zeros(3)

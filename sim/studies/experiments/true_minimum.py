@@ -82,7 +82,7 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
     sightings = log.sightings()
     for stream, measurements in log.measurements.items():
         start = measurements.get(0)
-        value = translate.start_of(start) if isinstance(start, m.Start) else None
+        value = translate.start_of(start) if isinstance(start, m.InitialPose) else None
         if value is not None:
             ticks.know_start(value)
         for sequence, submap in sorted(log.submaps().get(stream, {}).items()):

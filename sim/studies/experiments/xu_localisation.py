@@ -3,7 +3,7 @@
 Its figures 3.2 to 3.5 are those of Fox et al. 2000, without figures. Here the same is shown on the
 thesis' own world: the three steps of the filter one by one at the end of a blind stretch, and a
 start anywhere. The states are those of `team.estimation.baselines.localisation`; the motions and
-measurements are what the robot of such a run hears, cut into epochs as at every node.
+measurements are what the robot of such a run hears, cut into keyframes as at every node.
 """
 
 from collections.abc import Mapping
@@ -180,7 +180,7 @@ class _Run:
     """What a robot hears in a run, the map that it is told, and where it truly is."""
 
     scenario: Scenario
-    epochs: list[RobotKeyframe]
+    keyframes: list[RobotKeyframe]
     start: np.ndarray
     ids: np.ndarray
     landmarks: Float[np.ndarray, "L 2"]
@@ -195,7 +195,7 @@ def _heard(world: Mapping[str, Any]) -> _Run:
     cut.configure(config.id, config)
     for message in (opened(sample)[2] for sample in samples):
         match message:
-            case m.Start() | m.Odometry() | m.Observations():
+            case m.InitialPose() | m.Odometry() | m.Observations():
                 cut.put(message)
             case m.End():
                 cut.end(message)
@@ -227,19 +227,19 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         localisation.begun(run.start, PARTICLES, run.ids, run.landmarks), resample_below=0.0
     )
     blind = [state]
-    for each in run.epochs:
-        motion = each.epoch.increment
+    for each in run.keyframes:
+        motion = each.keyframe.increment
         blind.append(
             localisation.stepped(blind[-1], motion, sensor, none, nothing, nothing, random)
         )
-    last = run.epochs[-1]
+    last = run.keyframes[-1]
     true = run.truth[last.stamp_ns]
     # One landmark, the one farthest to the left: as in figure 3.3.
-    k = int(np.argmax(last.epoch.bearings))
+    k = int(np.argmax(last.keyframe.bearings))
     reading = (
-        last.epoch.ids[k : k + 1],
-        last.epoch.ranges[k : k + 1],
-        last.epoch.bearings[k : k + 1],
+        last.keyframe.ids[k : k + 1],
+        last.keyframe.ranges[k : k + 1],
+        last.keyframe.bearings[k : k + 1],
     )
     weighed = localisation.stepped(blind[-1], Increment.identity(), sensor, *reading, random)
     cloud, _ = fastslam.resampled(weighed.cloud, random)
@@ -249,7 +249,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         for name, each in zip(STAGES, (blind[-1], weighed, resampled), strict=True)
     }
     if clouds:
-        places = np.linspace(0, len(run.epochs), BLIND_CLOUDS + 1).round().astype(int)[1:]
+        places = np.linspace(0, len(run.keyframes), BLIND_CLOUDS + 1).round().astype(int)[1:]
         found["clouds"] = {
             "blind": [_cloud(blind[k].cloud, DRAWN // BLIND_CLOUDS) for k in places],
             "blind_steps": places.tolist(),
@@ -257,7 +257,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
             "resampling": _cloud(resampled.cloud, DRAWN),
         }
         found["path"] = [run.start[:2].tolist()] + [
-            run.truth[each.stamp_ns][:2].tolist() for each in run.epochs
+            run.truth[each.stamp_ns][:2].tolist() for each in run.keyframes
         ]
         found["true"] = true.tolist()
         found["landmarks"] = run.landmarks.tolist()
@@ -281,11 +281,13 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     found: Figures = {"0": _summary(state, run.start)}
     kept = [_cloud(state.cloud, DRAWN)]
     poses = [run.start.tolist()]
-    for k, each in enumerate(run.epochs, 1):
-        epoch = each.epoch
-        far = np.argsort(epoch.ranges)[-1:]  # with all of them the first step would do
-        measurements = epoch.ids[far], epoch.ranges[far], epoch.bearings[far]
-        state = localisation.stepped(state, epoch.increment, config.sensor, *measurements, random)
+    for k, each in enumerate(run.keyframes, 1):
+        keyframe = each.keyframe
+        far = np.argsort(keyframe.ranges)[-1:]  # with all of them the first step would do
+        measurements = keyframe.ids[far], keyframe.ranges[far], keyframe.bearings[far]
+        state = localisation.stepped(
+            state, keyframe.increment, config.sensor, *measurements, random
+        )
         if k in ANYWHERE_STEPS:
             true = run.truth[each.stamp_ns]
             found[str(k)] = _summary(state, true)

@@ -1,7 +1,7 @@
 """The batch MAP over all raw measurements: every pose of every robot, and one map.
 
 Minimises Σ rᵀP⁻¹r of the start poses and of the odometry + Σ ρ(rᵀR⁻¹r) of the measurements (their
-residuals: `batch_factors`) over one pose per robot and epoch and all landmarks: full smoothing
+residuals: `batch_factors`) over one pose per robot and keyframe and all landmarks: full smoothing
 (Dellaert & Kaess 2006, Square root SAM), with the information matrix instead of its root. ρ is the
 identity, or Cauchy's c² log(1 + χ²/c²) by iterated re-weighting. A measurement's noise is the
 sensor's at the range that the estimate predicts, and is not differentiated. Nothing is ever
@@ -26,8 +26,8 @@ from team.estimation.models import located, variances
 from team.estimation.sparse_cholesky import sparse
 
 FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
-"""Added to each epoch's motion (forward [m], left [m], turn [rad]): the covariance of a robot that
-can not slip is singular, and that of no motion at all is zero."""
+"""Added to each keyframe's motion (forward [m], left [m], turn [rad]): the covariance of a robot
+that can not slip is singular, and that of no motion at all is zero."""
 EXACT_SIGMA = 1e-5
 """Of a start pose that is exactly known [m, rad]."""
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7

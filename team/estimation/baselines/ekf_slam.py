@@ -49,7 +49,7 @@ def stepped(
     """Move, take all measurements of known landmarks at once, then place the new ones.
 
     ranges [m] and bearings [rad] are corrected by the calibration. A further measurement of a
-    landmark that is new in this epoch updates it after it was placed. Raises NotACovarianceError
+    landmark that is new in this keyframe updates it after it was placed. Raises NotACovarianceError
     where the state's covariance is none any more, so that the measurements can not be predicted.
     """
     ids_after, slots, first = slots_of(state.ids, ids)

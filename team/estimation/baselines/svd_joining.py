@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
 from team.estimation.geometry import Pose, wrapped
 from team.estimation.map_joining import joining
@@ -70,7 +70,7 @@ def begun(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> Subma
     """No submap yet; every robot's start pose is exactly known."""
     fold = EMPTY_FOLD
     for robot, pose in poses.items():
-        fold = joining.started(fold, Start(robot, 0, pose))
+        fold = joining.started(fold, InitialPoseFactor(robot, 0, pose))
     return SubmapJoining(fold, weighting)
 
 
@@ -160,9 +160,9 @@ def exchanged(a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_
     by singular values (`procrustes`). So turning first and joining then is the whole minimum.
 
     With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have
-    σ̂² D + E Σ_T Eᵀ: D = 1 and E = 0 for those of a alone, 1 and G for those of b alone, 1/2 and G/2
-    for the common ones; σ̂² = cost/(2n − 3). What the maps say of their own errors is discarded, as
-    Downs does, so how far each has drifted as a whole is not in the covariance.
+    σ̂² D + E Σ_T Eᵀ: D = 1 and E = 0 for those of a alone, 1 and G for those of b alone, 1/2 and
+    G/2 for the common ones; σ̂² = cost/(2n − 3). What the maps say of their own errors is
+    discarded, as Downs does, so how far each has drifted as a whole is not in the covariance.
     Raises TooFewPointsError for n < 2.
     """
     ids = np.union1d(a.ids, b.ids)

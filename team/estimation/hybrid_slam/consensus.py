@@ -34,18 +34,20 @@ Taken = Bool[np.ndarray, " N"]
 
 
 class _Measurements:
-    """The measurements of the epochs that have some, by landmark slots, and the motions between."""
+    """The measurements of the keyframes that have some, by landmark slots, and the motions
+    between.
+    """
 
     def __init__(
         self,
         motions: Sequence[Increment],
-        epochs: Int64[np.ndarray, " N"],
+        keyframes: Int64[np.ndarray, " N"],
         ids: UInt32[np.ndarray, " N"],
         measurements: Float[np.ndarray, "N 2"],
         sensor: Sensor,
         garbage: float,
     ) -> None:
-        seen, self.epochs = np.unique(epochs, return_inverse=True)
+        seen, self.keyframes = np.unique(keyframes, return_inverse=True)
         _, self.slots = np.unique(ids, return_inverse=True)
         self.landmarks = int(self.slots.max()) + 1
         self.measurements = measurements
@@ -60,7 +62,7 @@ class _Measurements:
 
 def agreeing(
     motions: Sequence[Increment],
-    epochs: Int64[np.ndarray, " N"],
+    keyframes: Int64[np.ndarray, " N"],
     ids: UInt32[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
     sensor: Sensor,
@@ -69,17 +71,17 @@ def agreeing(
     """Measurements that agree with others of their landmark under the odometry alone.
 
     Of a landmark's measurements the one that the others support best places it, and they are taken
-    with it. motions[k] leads to epoch k; measurements are calibrated; 0 < garbage < 1 is ε.
+    with it. motions[k] leads to keyframe k; measurements are calibrated; 0 < garbage < 1 is ε.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Measurements(motions, epochs, ids, measurements, sensor, garbage)
+    window = _Measurements(motions, keyframes, ids, measurements, sensor, garbage)
     return _agreeing(window)[0]
 
 
 def confirmed(
     motions: Sequence[Increment],
-    epochs: Int64[np.ndarray, " N"],
+    keyframes: Int64[np.ndarray, " N"],
     ids: UInt32[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
     sensor: Sensor,
@@ -94,14 +96,14 @@ def confirmed(
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Measurements(motions, epochs, ids, measurements, sensor, garbage)
+    window = _Measurements(motions, keyframes, ids, measurements, sensor, garbage)
     agreed, placed_by = _agreeing(window)
     taken = agreed
     path = np.zeros((len(window.means), 3))
     for k in range(1, len(path)):
         path[k] = compose(path[k - 1], window.means[k])
     landmarks = np.array(
-        [located(path[window.epochs[i]], *measurements[i].tolist()) for i in placed_by]
+        [located(path[window.keyframes[i]], *measurements[i].tolist()) for i in placed_by]
     ).reshape(-1, 2)
     metrics = np.linalg.inv(window.covariances + np.diag(MOTION_JITTER))
     for _ in range(ROUNDS):
@@ -113,7 +115,7 @@ def confirmed(
             path,
             landmarks,
             covariance,
-            window.epochs,
+            window.keyframes,
             window.slots,
             measurements,
             taken,
@@ -129,7 +131,7 @@ def confirmed(
 def _between(
     motions: Sequence[Increment], seen: Sequence[int]
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
-    """The motions between the epochs of `seen`; the one to the first of them is none."""
+    """The motions between the keyframes of `seen`; the one to the first of them is none."""
     means, covariances = np.zeros((len(seen), 3)), np.zeros((len(seen), 3, 3))
     for k in range(1, len(seen)):
         motion = motions[seen[k - 1] + 1]
@@ -143,7 +145,7 @@ def _agreeing(window: _Measurements) -> tuple[Taken, Int64[np.ndarray, " L"]]:
     """The measurements that agree, and for each landmark the measurement that places it best."""
     return kernel.agreement(
         *kernel.relative_motions(window.means, window.covariances),
-        window.epochs,
+        window.keyframes,
         window.slots,
         window.measurements,
         window.sensor,
@@ -171,7 +173,7 @@ def _smoothed(
     far = float(window.measurements[:, 0].max()) ** 2
     for _ in range(2):
         H, g = kernel.normal_equations(
-            path, landmarks, window.means, metrics, window.epochs, window.slots,
+            path, landmarks, window.means, metrics, window.keyframes, window.slots,
             window.measurements, taken, window.sensor,
         )  # fmt: skip
         H[free, free] = 1.0 / far
@@ -222,7 +224,7 @@ def _misread(
     own_name = window.prior + math.log(max(window.landmarks - 1, 1))
     for other in np.flatnonzero(count >= 2):
         as_other = kernel.left_out(
-            path, landmarks, covariance, window.epochs, np.full_like(window.slots, other),
+            path, landmarks, covariance, window.keyframes, np.full_like(window.slots, other),
             window.measurements, np.zeros_like(taken), window.sensor,
         )  # fmt: skip
         predicted = np.bincount(window.slots[taken], as_other[taken], minlength=window.landmarks)

@@ -1,7 +1,7 @@
 """The arithmetic of `consensus`: measurements of one window held against each other.
 
-Poses are K epochs, the first at zero; a measurement is (range [m], bearing [rad]); all variances of
-a measurement are its whole ones, since what persists of its error is much the same in a window.
+Poses are K keyframes, the first at zero; a measurement is (range [m], bearing [rad]); all variances
+of a measurement are its whole ones, since what persists of its error is much the same in a window.
 """
 
 import math
@@ -29,9 +29,9 @@ Sensor3 = tuple[float, float, float]
 def relative_motions(
     means: Float[np.ndarray, "K 3"], covariances: Float[np.ndarray, "K 3 3"]
 ) -> tuple[Float[np.ndarray, "K K 3"], Float[np.ndarray, "K K 3 3"]]:
-    """b_from_a for every pair of epochs a, b, and its covariance in the tangent space of b.
+    """b_from_a for every pair of keyframes a, b, and its covariance in the tangent space of b.
 
-    Motion k leads from epoch k − 1 to k. Backwards (T Exp ξ)⁻¹ = T⁻¹ Exp(−Ad(T) ξ).
+    Motion k leads from keyframe k − 1 to k. Backwards (T Exp ξ)⁻¹ = T⁻¹ Exp(−Ad(T) ξ).
     """
     count = len(means)
     poses, spread = np.zeros((count, count, 3)), np.zeros((count, count, 3, 3))
@@ -109,7 +109,7 @@ def _prediction(
 def agreement(
     poses: Float[np.ndarray, "K K 3"],
     spread: Float[np.ndarray, "K K 3 3"],
-    epochs: Int64[np.ndarray, " N"],
+    keyframes: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
     sensor: Sensor3,
@@ -129,7 +129,10 @@ def agreement(
         total = 0.0
         for j in range(len(slots)):
             if j != i and slots[j] == slots[i]:
-                motion, noise = poses[epochs[i], epochs[j]], spread[epochs[i], epochs[j]]
+                motion, noise = (
+                    poses[keyframes[i], keyframes[j]],
+                    spread[keyframes[i], keyframes[j]],
+                )
                 log = _prediction(motion, noise, measurements[i], measurements[j], sensor)
                 total += max(0.0, log + odds)
         if total > support[slots[i]]:
@@ -139,7 +142,7 @@ def agreement(
     for j in range(len(slots)):
         i = placed_by[slots[j]]
         if support[slots[j]] > enough:
-            motion, noise = poses[epochs[i], epochs[j]], spread[epochs[i], epochs[j]]
+            motion, noise = poses[keyframes[i], keyframes[j]], spread[keyframes[i], keyframes[j]]
             log = _prediction(motion, noise, measurements[i], measurements[j], sensor)
             taken[j] = j == i or log + odds > 0.0
     return taken, placed_by
@@ -151,7 +154,7 @@ def normal_equations(
     landmarks: Float[np.ndarray, "L 2"],
     means: Float[np.ndarray, "K 3"],
     metrics: Float[np.ndarray, "K 3 3"],
-    epochs: Int64[np.ndarray, " N"],
+    keyframes: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
     used: Bool[np.ndarray, " N"],
@@ -173,10 +176,10 @@ def normal_equations(
         residual = logarithm(between(means[k], between(path[k - 1], path[k])))
         _added(H, g, at, J, metrics[k], -residual)
     metric = np.zeros((2, 2))
-    for n in range(len(epochs)):
+    for n in range(len(keyframes)):
         if used[n]:
             J2, at2, innovation, variances = _row(
-                path, landmarks, epochs[n], slots[n], measurements[n], sensor
+                path, landmarks, keyframes[n], slots[n], measurements[n], sensor
             )
             metric[0, 0], metric[1, 1] = 1.0 / variances[0], 1.0 / variances[1]
             _added(H, g, at2, J2, metric, innovation)
@@ -207,7 +210,7 @@ def _added(
 def _row(
     path: Float[np.ndarray, "K 3"],
     landmarks: Float[np.ndarray, "L 2"],
-    epoch: int,
+    keyframe: int,
     slot: int,
     measurement: Float[np.ndarray, "2"],
     sensor: Sensor3,
@@ -215,12 +218,12 @@ def _row(
     Float[np.ndarray, "2 5"], Int64[np.ndarray, "5"], Float[np.ndarray, "2"], tuple[float, float]
 ]:
     """∂h/∂(pose, landmark), its columns' place in the state, z − h and R of one measurement."""
-    r, b = predicted(path[epoch], landmarks[slot])
+    r, b = predicted(path[keyframe], landmarks[slot])
     J, at = np.empty((2, 5)), np.empty(5, np.int64)
     J[:, :3] = pose_jacobian(r, b)
-    J[:, 3:] = landmark_jacobian(r, path[epoch, 2] + b)
+    J[:, 3:] = landmark_jacobian(r, path[keyframe, 2] + b)
     for i in range(3):
-        at[i] = 3 * epoch + i
+        at[i] = 3 * keyframe + i
     at[3] = 3 * len(path) + 2 * slot
     at[4] = at[3] + 1
     innovation = np.array([measurement[0] - r, wrapped(measurement[1] - b)])
@@ -232,7 +235,7 @@ def left_out(
     path: Float[np.ndarray, "K 3"],
     landmarks: Float[np.ndarray, "L 2"],
     covariance: Float[np.ndarray, "n n"],
-    epochs: Int64[np.ndarray, " N"],
+    keyframes: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
     used: Bool[np.ndarray, " N"],
@@ -243,12 +246,12 @@ def left_out(
     With M = J P Jᵀ a measurement that was not used has S = R + M; of one that was, D = R − M is the
     covariance of its residual e, and without it the residual is R D⁻¹ e with S = R D⁻¹ R.
     """
-    logs = np.empty(len(epochs))
-    for n in range(len(epochs)):
-        J, at, e, variances = _row(path, landmarks, epochs[n], slots[n], measurements[n], sensor)
+    logs = np.empty(len(keyframes))
+    for n in range(len(keyframes)):
+        J, at, e, variances = _row(path, landmarks, keyframes[n], slots[n], measurements[n], sensor)
         M = np.zeros((2, 2))
-        for p in range(3 if epochs[n] == 0 else 0, 5):
-            for q in range(3 if epochs[n] == 0 else 0, 5):
+        for p in range(3 if keyframes[n] == 0 else 0, 5):
+            for q in range(3 if keyframes[n] == 0 else 0, 5):
                 P = covariance[at[p] - 3, at[q] - 3]
                 for i in range(2):
                     for j in range(2):

@@ -32,7 +32,7 @@ class Innovation(NamedTuple):
     """squared: Σ νᵀ S⁻¹ ν, χ² of `dof` degrees of freedom, two for each measurement that was
     predicted.
 
-    Innovations of different epochs are independent where the models are right, so both add up.
+    Innovations of different keyframes are independent where the models are right, so both add up.
     """
 
     squared: float
@@ -59,9 +59,10 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """ν = z − ẑ of one epoch's measurements in the metric of their joint predictive covariance S.
+    """ν = z − ẑ of one keyframe's measurements in the metric of their joint predictive covariance
+    S.
 
-    The particles of the epoch before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of all measurements of
+    The particles of the keyframe before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of all measurements of
     landmarks that they know; ẑ and S are its moments, bearings on the circle:
 
         ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,

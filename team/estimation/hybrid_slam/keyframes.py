@@ -1,4 +1,4 @@
-"""From a stream of odometry intervals and observations to the epochs that an estimator takes."""
+"""From a stream of odometry intervals and observations to the keyframes that an estimator takes."""
 
 from bisect import insort
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ UNMEASURED = (1.0, 0.5)
 
 @dataclass(frozen=True)
 class Keyframe:
-    """The motion since the last epoch and what was seen at its end (accepted and calibrated).
+    """The motion since the last keyframe and what was seen at its end (accepted and calibrated).
 
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
     forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
@@ -46,12 +46,13 @@ class _Scan:
 
 
 class Segmenter:
-    """Integrates odometry between epochs; an interval is split where an observation falls into it.
+    """Integrates odometry between keyframes; an interval is split where an observation falls into
+    it.
 
-    With keyframe_s = 0 every observation message is an epoch. Otherwise the scans within keyframe_s
-    are reduced to one range and bearing per landmark (the median, each scan first moved by the
-    odometry to the end of the interval that closes the keyframe). With a grid each of its times is
-    an epoch without measurements.
+    With keyframe_s = 0 every observation message is a keyframe. Otherwise the scans within
+    keyframe_s are reduced to one range and bearing per landmark (the median, each scan first moved
+    by the odometry to the end of the interval that closes the keyframe). With a grid each of its
+    times is a keyframe without measurements.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class Segmenter:
         *,
         measured: bool = True,
     ) -> list[Keyframe]:
-        """Integrate one odometry interval; the epochs that lie in it, in order.
+        """Integrate one odometry interval; the keyframes that lie in it, in order.
 
         Where its motion was not measured (what came could not be) the last speeds go on, with
         errors of their own size, UNMEASURED at least; a heading's stays within a turn.
@@ -122,36 +123,36 @@ class Segmenter:
         else:
             forward, yaw_rate = self._speeds
             self._unmeasured = _unmeasured(duration_ns * 1e-9, forward, yaw_rate)
-        epochs = []
+        keyframes = []
         self._here_ns = stamp_ns - duration_ns
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
             scan = self._waiting.pop(0)
-            epochs += self._nodes(scan.stamp_ns - 1, forward, yaw_rate)
+            keyframes += self._nodes(scan.stamp_ns - 1, forward, yaw_rate)
             at_ns = self._go_to(scan.stamp_ns, forward, yaw_rate)
             if self._keyframe_ns:
                 self._keyframe.append(
                     _Scan(at_ns, scan.ids, scan.ranges, scan.bearings, self._scan_motion)
                 )
             else:
-                epochs.append(self._epoch(at_ns, scan.ids, scan.ranges, scan.bearings))
-        epochs += self._nodes(stamp_ns, forward, yaw_rate)
+                keyframes.append(self._keyframe_at(at_ns, scan.ids, scan.ranges, scan.bearings))
+        keyframes += self._nodes(stamp_ns, forward, yaw_rate)
         self._go_to(stamp_ns, forward, yaw_rate)
         self.now_ns = stamp_ns
         if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
-            epochs.append(self._close_keyframe(stamp_ns))
-        return epochs
+            keyframes.append(self._close_keyframe(stamp_ns))
+        return keyframes
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
-        """A window ends here: its last epoch if one is open, and the motion after it.
+        """A window ends here: its last keyframe if one is open, and the motion after it.
 
         That motion's shift by an error of the scale of speed is `rest_forward`.
         """
-        epochs = [self._close_keyframe(stamp_ns)] if self._keyframe else []
+        keyframes = [self._close_keyframe(stamp_ns)] if self._keyframe else []
         rest, self.rest_forward = self._increment, self._forward
         self._increment, self._forward = Increment.identity(), np.zeros(3)
         self._keyframe_start_ns = stamp_ns
         self._scan_motion = np.zeros(3)
-        return epochs, rest
+        return keyframes, rest
 
     def leave(self) -> int:
         """A window ends: drop the scans that are stamped behind it, and say how many there were.
@@ -169,15 +170,15 @@ class Segmenter:
 
     def _nodes(self, until_ns: int, forward: float, yaw_rate: float) -> list[Keyframe]:
         """The grid times up to until_ns; sightings up to there find their node."""
-        epochs = []
+        keyframes = []
         grid = self._grid
         while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
             self._go_to(next_ns, forward, yaw_rate)
             if grid.reach():
                 nothing = np.empty(0)
                 seen = np.empty(0, np.uint32), nothing, nothing
-                epochs.append(replace(self._epoch(next_ns, *seen), is_node=True))
-        return epochs
+                keyframes.append(replace(self._keyframe_at(next_ns, *seen), is_node=True))
+        return keyframes
 
     def _go_to(self, stamp_ns: int, forward: float, yaw_rate: float) -> int:
         """Integrate up to a stamp; what lies before the interval's start is at its start."""
@@ -202,17 +203,17 @@ class Segmenter:
         if self._keyframe_ns:
             self._scan_motion = geometry.compose(self._scan_motion, step.mean)
 
-    def _epoch(
+    def _keyframe_at(
         self,
         stamp_ns: int,
         ids: UInt32[np.ndarray, " n"],
         ranges: Float[np.ndarray, " n"],
         bearings: Float[np.ndarray, " n"],
     ) -> Keyframe:
-        epoch = Keyframe(stamp_ns, self._increment, ids, ranges, bearings, forward=self._forward)
+        keyframe = Keyframe(stamp_ns, self._increment, ids, ranges, bearings, forward=self._forward)
         self._increment = Increment.identity()
         self._forward = np.zeros(3)
-        return epoch
+        return keyframe
 
     def _close_keyframe(self, stamp_ns: int) -> Keyframe:
         points: dict[int, list[tuple[float, float]]] = {}
@@ -227,7 +228,7 @@ class Segmenter:
         self._keyframe = []
         self._keyframe_start_ns = stamp_ns
         self._scan_motion = np.zeros(3)
-        return self._epoch(
+        return self._keyframe_at(
             stamp_ns, np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
         )
 

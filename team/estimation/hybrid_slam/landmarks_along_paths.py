@@ -20,7 +20,7 @@ def landmarks_along_paths(
     start_covariances: Float[np.ndarray, "M L 3"],
     paths: Float[np.ndarray, "K M 3"],
     bounds: Int64[np.ndarray, " L+1"],
-    epochs: Int64[np.ndarray, " N"],
+    keyframes: Int64[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
     noise: Noise,
 ) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
@@ -47,7 +47,7 @@ def landmarks_along_paths(
                 range_sum, bearing_sum, range_weight, bearing_weight = 0.0, 0.0, 0.0, 0.0
                 total = 0.0
                 for k in range(bounds[landmark], bounds[landmark + 1]):
-                    pose = paths[epochs[k], i]
+                    pose = paths[keyframes[k], i]
                     dx, dy = x - pose[0], y - pose[1]
                     distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
                     total = noise.range_variance + noise.range_per_m2 * distance * distance

@@ -23,7 +23,7 @@ class OutlierGate:
     def __init__(self, sensor: Sensor, garbage: float) -> None:
         self._sensor = sensor
         self._garbage = garbage
-        self._epochs: list[Keyframe] = []
+        self._keyframes: list[Keyframe] = []
         self.gated = 0
 
     @property
@@ -33,27 +33,29 @@ class OutlierGate:
 
     def begin(self) -> None:
         """A window begins."""
-        self._epochs = []
+        self._keyframes = []
         self.gated = 0
 
-    def admitted(self, epoch: Keyframe) -> Keyframe:
-        """The epoch with those of its measurements that agree with what was read up to it."""
+    def admitted(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe with those of its measurements that agree with what was read up to it."""
         if not self.judges:
-            return epoch
-        self._epochs.append(epoch)
-        if not len(epoch.ids):
-            return epoch
+            return keyframe
+        self._keyframes.append(keyframe)
+        if not len(keyframe.ids):
+            return keyframe
         taken = agreeing(*self._all(), self._sensor, self._garbage)
-        return _with(epoch, taken[-len(epoch.ids) :])
+        return _with(keyframe, taken[-len(keyframe.ids) :])
 
     def settled(self) -> Sequence[Keyframe]:
-        """All epochs of the window with the measurements that are confirmed; counts the others."""
+        """All keyframes of the window with the measurements that are confirmed; counts the
+        others.
+        """
         taken = confirmed(*self._all(), self._sensor, self._garbage)
         self.gated = int(np.count_nonzero(~taken))
-        bounds = np.cumsum([0, *(len(epoch.ids) for epoch in self._epochs)])
+        bounds = np.cumsum([0, *(len(keyframe.ids) for keyframe in self._keyframes)])
         return [
-            _with(epoch, taken[begin:end])
-            for epoch, begin, end in zip(self._epochs, bounds, bounds[1:], strict=False)
+            _with(keyframe, taken[begin:end])
+            for keyframe, begin, end in zip(self._keyframes, bounds, bounds[1:], strict=False)
         ]
 
     def _all(
@@ -64,18 +66,23 @@ class OutlierGate:
         UInt32[np.ndarray, " N"],
         Float[np.ndarray, "N 2"],
     ]:
-        epochs = self._epochs
-        counts = [len(epoch.ids) for epoch in epochs]
-        measurements = [np.column_stack((epoch.ranges, epoch.bearings)) for epoch in epochs]
+        keyframes = self._keyframes
+        counts = [len(keyframe.ids) for keyframe in keyframes]
+        measurements = [
+            np.column_stack((keyframe.ranges, keyframe.bearings)) for keyframe in keyframes
+        ]
         return (
-            [epoch.increment for epoch in epochs],
-            np.repeat(np.arange(len(epochs)), counts),
-            np.concatenate([np.empty(0, np.uint32), *(epoch.ids for epoch in epochs)]),
+            [keyframe.increment for keyframe in keyframes],
+            np.repeat(np.arange(len(keyframes)), counts),
+            np.concatenate([np.empty(0, np.uint32), *(keyframe.ids for keyframe in keyframes)]),
             np.concatenate([np.empty((0, 2)), *measurements]),
         )
 
 
-def _with(epoch: Keyframe, taken: Bool[np.ndarray, " n"]) -> Keyframe:
+def _with(keyframe: Keyframe, taken: Bool[np.ndarray, " n"]) -> Keyframe:
     return replace(
-        epoch, ids=epoch.ids[taken], ranges=epoch.ranges[taken], bearings=epoch.bearings[taken]
+        keyframe,
+        ids=keyframe.ids[taken],
+        ranges=keyframe.ranges[taken],
+        bearings=keyframe.bearings[taken],
     )

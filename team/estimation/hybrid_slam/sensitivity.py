@@ -40,7 +40,7 @@ class Noise(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The motion up to an epoch, or after the last one: its noise, its shift by `forward_scale`.
+    """The motion up to a keyframe, or after the last one: its noise, its shift by `forward_scale`.
 
     covariance, forward: in the tangent space of the motion's end (forward [m], left [m], turn).
     """

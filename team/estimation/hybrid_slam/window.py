@@ -34,24 +34,24 @@ POSE_JITTER = (1e-6, 1e-6, 1e-8)
 class Window:
     """Particles since the window's start, their paths, and the measurements that they have used.
 
-    paths:    the pose of each particle's line of descent at each of the K observation epochs.
-    epochs:   the epoch of each of the N measurements, in [0, K).
+    paths:    the pose of each particle's line of descent at each of the K keyframes.
+    keyframes:   the keyframe of each of the N measurements, in [0, K).
     ids:      the landmark of each measurement.
     measurements: (range [m], bearing [rad]) with the sensor's calibration applied.
-    node_stamps, node_epochs: team time [ns] of the pose nodes, and the epoch that each is.
+    node_stamps, node_keyframes: team time [ns] of the pose nodes, and the keyframe that each is.
     innovation: of all measurements so far that were predicted.
-    motions:  up to each epoch, and after the last one; kept where biases are asked for.
+    motions:  up to each keyframe, and after the last one; kept where biases are asked for.
     """
 
     front_end: FrontEnd
     sensor: Sensor
     particles: Particles
     paths: Float[np.ndarray, "K M 3"]
-    epochs: Int64[np.ndarray, " N"]
+    keyframes: Int64[np.ndarray, " N"]
     ids: UInt32[np.ndarray, " N"]
     measurements: Float[np.ndarray, "N 2"]
     node_stamps: Int64[np.ndarray, " nodes"]
-    node_epochs: Int64[np.ndarray, " nodes"]
+    node_keyframes: Int64[np.ndarray, " nodes"]
     innovation: Innovation = NOTHING
     motions: tuple[Motion, ...] = ()
 
@@ -99,7 +99,7 @@ def advanced(
     generator: np.random.Generator,
     forward: Float[np.ndarray, "3"] = STILL,
 ) -> Window:
-    """One observation epoch: the motion since the last one, then its measurements (there may be
+    """One keyframe: the motion since the last one, then its measurements (there may be
     none).
 
     The measurements are accepted and corrected already (`models.acceptable`, `models.corrected`).
@@ -120,12 +120,12 @@ def advanced(
         generator,
     )
     paths = window.paths if info.parents is None else window.paths[:, info.parents]
-    epoch = np.full(len(ids), len(paths))
+    keyframe = np.full(len(ids), len(paths))
     return replace(
         window,
         particles=particles,
         paths=np.concatenate((paths, particles.poses[None])),
-        epochs=np.concatenate((window.epochs, epoch)),
+        keyframes=np.concatenate((window.keyframes, keyframe)),
         ids=np.concatenate((window.ids, ids)),
         measurements=np.concatenate((window.measurements, np.column_stack((ranges, bearings)))),
         innovation=window.innovation.plus(expected),
@@ -142,11 +142,11 @@ def _with_motion(
 
 
 def marked(window: Window, stamp_ns: int) -> Window:
-    """The particles' poses of the last epoch become a pose node at this team time."""
+    """The particles' poses of the last keyframe become a pose node at this team time."""
     return replace(
         window,
         node_stamps=np.append(window.node_stamps, stamp_ns),
-        node_epochs=np.append(window.node_epochs, len(window.paths) - 1),
+        node_keyframes=np.append(window.node_keyframes, len(window.paths) - 1),
     )
 
 
@@ -156,7 +156,7 @@ def moved(
     generator: np.random.Generator,
     forward: Float[np.ndarray, "3"] = STILL,
 ) -> Window:
-    """Motion without an observation epoch, as from the last one to the window's end.
+    """Motion without a keyframe, as from the last one to the window's end.
 
     It never resamples: the weights of the last measurements stay as they are.
     """
@@ -196,7 +196,7 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
         covariances,
         window.paths,
         bounds,
-        window.epochs[by_slot],
+        window.keyframes[by_slot],
         window.measurements[by_slot],
         noise_of(window.sensor),
     )
@@ -213,7 +213,7 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
     """
     ids, means, covariances = landmarks
     particles = window.particles
-    poses = np.concatenate((particles.poses, *window.paths[window.node_epochs]), axis=1)
+    poses = np.concatenate((particles.poses, *window.paths[window.node_keyframes]), axis=1)
     weights = np.exp(particles.log_weights)
     mean, covariance = moments(poses, weights, means, covariances, sample_factor(weights))
     numbers = np.arange(poses.shape[1])
@@ -246,11 +246,11 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
         path,
         window.motions,
         local.landmarks,
-        (window.epochs, slots),
+        (window.keyframes, slots),
         noise_of(window.sensor),
     )
     end = poses[:, -1:] if len(path) else np.zeros((len(biases), 1, 3))
-    kept = np.concatenate((end, poses[:, window.node_epochs]), axis=1)
+    kept = np.concatenate((end, poses[:, window.node_keyframes]), axis=1)
     rows = (kept.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))
     return replace(local, biases=biases, sensitivity=np.concatenate(rows, axis=1))
 

@@ -15,7 +15,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, Key, Start, Stream, named
+from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
@@ -41,11 +41,11 @@ __all__ = [
     "Contribution",
     "Fold",
     "GapError",
+    "InitialPoseFactor",
     "JoinSettings",
     "LateStartError",
     "NotCanonicalError",
     "Sighting",
-    "Start",
     "Stream",
     "converged",
     "folded",
@@ -63,7 +63,8 @@ class NotCanonicalError(ValueError):
     def __init__(self, contribution: Contribution) -> None:
         super().__init__(
             f"submap {contribution.sequence} of {named(contribution.stream)} comes out of order; "
-            "sort by (end stamp, robot, epoch, sequence), for a late one fold again from before it"
+            "sort by (end stamp, robot, incarnation, sequence), for a late one fold again from "
+            "before it"
         )
         self.contribution = contribution
 
@@ -82,7 +83,7 @@ class GapError(ValueError):
 class LateStartError(ValueError):
     """A start was given to a stream that the fold has submaps of already."""
 
-    def __init__(self, start: Start) -> None:
+    def __init__(self, start: InitialPoseFactor) -> None:
         super().__init__(
             f"the start of {named(start.stream)} comes after its first submap; "
             "fold again with the start known from the beginning"
@@ -108,7 +109,7 @@ class Fold:
     """
 
     contributions: tuple[Contribution, ...]
-    starts: Mapping[Stream, Start]
+    starts: Mapping[Stream, InitialPoseFactor]
     islands: Mapping[Stream, Island]
     home: Mapping[Stream, Stream]
     reasons: Mapping[Stream, str]
@@ -141,9 +142,9 @@ class Fold:
         """The main island's frame is named by its smallest stream; None before any submap."""
         return None if self.main_key is None else min(self.main.graph.streams)
 
-    def island(self, robot: str, epoch: int) -> Island:
+    def island(self, robot: str, incarnation: int) -> Island:
         """The island of a stream. Raises KeyError for a stream without submaps."""
-        return self.islands[self.home[(robot, epoch)]]
+        return self.islands[self.home[(robot, incarnation)]]
 
     def next_sequence(self, stream: Stream) -> int:
         """Sequence of the submap that the fold takes next from a stream."""
@@ -155,7 +156,7 @@ class Fold:
 EMPTY_FOLD = Fold((), {}, {}, {}, {})
 
 
-def started(fold: Fold, start: Start) -> Fold:
+def started(fold: Fold, start: InitialPoseFactor) -> Fold:
     """The fold that knows where a stream starts; before that stream's first submap."""
     if start.stream in fold.home:
         raise LateStartError(start)

@@ -139,10 +139,12 @@ def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlo
     return LandmarkBlocks(np.array(chosen, dtype=np.uint32), means, covariances)
 
 
-def prior_for(fold: Fold, robot: str, epoch: int, ids: Sequence[int] | None = None) -> RobotPrior:
+def prior_for(
+    fold: Fold, robot: str, incarnation: int, ids: Sequence[int] | None = None
+) -> RobotPrior:
     """What a robot needs to place itself: its last end pose and the landmarks, jointly."""
-    stream = (robot, epoch)
-    return _priors_in(fold.island(robot, epoch), [stream], ids)[stream]
+    stream = (robot, incarnation)
+    return _priors_in(fold.island(robot, incarnation), [stream], ids)[stream]
 
 
 def main_priors(
@@ -192,10 +194,10 @@ def _priors_in(
     return priors
 
 
-def trajectory(fold: Fold, robot: str, epoch: int) -> Trajectory:
+def trajectory(fold: Fold, robot: str, incarnation: int) -> Trajectory:
     """Where the submaps of a stream end, in the frame of its island."""
-    island = fold.island(robot, epoch)
-    nodes = island.graph.streams[(robot, epoch)][1:]
+    island = fold.island(robot, incarnation)
+    nodes = island.graph.streams[(robot, incarnation)][1:]
     marginals = [_own_marginal(island, node) for node in nodes]
     return Trajectory(
         np.array([pose for pose, _ in marginals]), np.array([spread for _, spread in marginals])

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, Key, Start, Stream, named
+from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
 from team.estimation.map_joining.joining import Fold, folded, started
@@ -37,7 +37,7 @@ class Tick:
 
     contributions: Sequence[Contribution]
     sightings: Sequence[Sighting] = ()
-    starts: Sequence[Start] = ()
+    starts: Sequence[InitialPoseFactor] = ()
     outside: Mapping[Key, str] = field(default_factory=dict)
     set_aside: tuple[str, ...] = ()
 
@@ -60,8 +60,8 @@ def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 def refusals(fold: Fold) -> list[str]:
     """In words: per chain the submap at which it ended and how many lie behind, then the rest."""
     ended: dict[Stream, list[int]] = {}
-    for _, robot, epoch, sequence in fold.refused:
-        ended.setdefault((robot, epoch), []).append(sequence)
+    for _, robot, incarnation, sequence in fold.refused:
+        ended.setdefault((robot, incarnation), []).append(sequence)
     words = []
     for stream in sorted(ended):
         first, behind = min(ended[stream]), len(ended[stream]) - 1
@@ -76,7 +76,7 @@ def _in_reach(
 ) -> tuple[Fold, list[Contribution]]:
     """The submaps to be tried; those outside, and what lies behind a refused one, are refused."""
     refused = dict(fold.refused)
-    ended = {(robot, epoch) for _, robot, epoch, _ in refused}
+    ended = {(robot, incarnation) for _, robot, incarnation, _ in refused}
     members = []
     for each in contributions:
         why = "the chain ended before it" if each.stream in ended else outside.get(each.key)
@@ -97,7 +97,7 @@ def _of_members(sightings: Iterable[Sighting], fold: Fold) -> list[Sighting]:
 def _attempt(
     fold: Fold,
     members: Sequence[Contribution],
-    starts: Iterable[Start],
+    starts: Iterable[InitialPoseFactor],
     sightings: Sequence[Sighting],
     settings: JoinSettings,
 ) -> Fold | None:
@@ -120,7 +120,9 @@ def _attempt(
 class _OneByOne:
     """A tick that has no solution as a whole: grown by what has one, in canonical order."""
 
-    def __init__(self, fold: Fold, settings: JoinSettings, starts: Mapping[Stream, Start]) -> None:
+    def __init__(
+        self, fold: Fold, settings: JoinSettings, starts: Mapping[Stream, InitialPoseFactor]
+    ) -> None:
         self._fold = fold
         self._settings = settings
         self._starts = dict(starts)
@@ -150,7 +152,7 @@ class _OneByOne:
             found = replace(base, waiting=tuple(kept))
         return replace(found, set_aside=tuple(self._set_aside))
 
-    def _of(self, members: Sequence[Contribution]) -> list[Start]:
+    def _of(self, members: Sequence[Contribution]) -> list[InitialPoseFactor]:
         streams = {each.stream for each in members}
         return [start for stream, start in self._starts.items() if stream in streams]
 
@@ -159,7 +161,7 @@ class _OneByOne:
 
     def _grow(self, fold: Fold, block: Sequence[Contribution]) -> None:
         """Take a block, or its halves, or refuse the one submap that it is."""
-        ended = {(robot, epoch) for _, robot, epoch, _ in self._refused}
+        ended = {(robot, incarnation) for _, robot, incarnation, _ in self._refused}
         for each in block:
             if each.stream in ended:
                 self._refused[each.key] = "the chain ended before it"

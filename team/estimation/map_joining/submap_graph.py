@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import Bias
-from team.estimation.contribution import Contribution, Start, Stream, named
+from team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.inter_robot_kernel import Sightings
@@ -234,7 +234,7 @@ def extended(
     graph: Graph,
     state: Values,
     contributions: Sequence[Contribution],
-    starts: Mapping[Stream, Start],
+    starts: Mapping[Stream, InitialPoseFactor],
     bias_sigma: Mapping[Bias, float],
     common_bias_sigma: Mapping[Bias, float] = NONE_IN_COMMON,
 ) -> tuple[Graph, Values]:
@@ -250,7 +250,7 @@ def extended(
     for contribution in contributions:
         stream, local = contribution.stream, contribution.local
         if stream not in growth.streams:
-            start = starts.get(stream, Start(*stream, np.zeros(3)))
+            start = starts.get(stream, InitialPoseFactor(*stream, np.zeros(3)))
             node = growth.add(start.pose, start.covariance is None)
             growth.streams[stream] = (node,)
             if start.information is not None:
@@ -297,9 +297,11 @@ def extended(
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
-    """The robot's pose node at this stamp, of its first epoch that has one; None: there is none."""
-    epochs = sorted(epoch for name, epoch in graph.streams if name == robot)
-    found = (graph.poses.get(((robot, epoch), stamp_ns)) for epoch in epochs)
+    """The robot's pose node at this stamp, of its first incarnation that has one; None: there is
+    none.
+    """
+    incarnations = sorted(incarnation for name, incarnation in graph.streams if name == robot)
+    found = (graph.poses.get(((robot, incarnation), stamp_ns)) for incarnation in incarnations)
     return next((node for node in found if node is not None), None)
 
 

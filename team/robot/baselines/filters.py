@@ -32,7 +32,7 @@ IN_POSE = "in the running pose"
 
 
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray]
-"""The motion since the last epoch; landmark ids, ranges [m] and bearings [rad] at its end."""
+"""The motion since the last keyframe; landmark ids, ranges [m] and bearings [rad] at its end."""
 Begun = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
 Judged = Callable[[Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray], Innovation]

@@ -26,10 +26,10 @@ start, a motion without lateral noise, fewer than four particles that differ."""
 
 
 class RunningEstimator:
-    """The state after every epoch so far; its map is said once per window, or at every epoch.
+    """The state after every keyframe so far; its map is said once per window, or at every keyframe.
 
     It makes no submaps, so it can not be resumed: a robot that was started again takes its stream
-    from the beginning, and says the same again. sequence: epochs so far.
+    from the beginning, and says the same again. sequence: keyframes so far.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class RunningEstimator:
         self._state: Any = self._filter.begun(config, initial, known, self._generator)
         self.sequence = 0
         self.unsolved = 0
-        self.last_epoch_ns: int | None = None
+        self.last_keyframe_ns: int | None = None
 
     @property
     def used(self) -> str:
@@ -61,7 +61,7 @@ class RunningEstimator:
 
     @property
     def innovation(self) -> Innovation:
-        """Of all epochs so far."""
+        """Of all keyframes so far."""
         return self._innovation.plus(self._unsaid)
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
@@ -79,14 +79,20 @@ class RunningEstimator:
         *,
         measured: bool = True,
     ) -> Estimates:
-        """Take one odometry interval and run the epochs that lie in it."""
+        """Take one odometry interval and run the keyframes that lie in it."""
         if self._segmenter.now_ns is None:
             self._segmenter.begin(stamp_ns - duration_ns)
             self._map_ns = stamp_ns - duration_ns
         before = self.sequence
         motion = stamp_ns, duration_ns, forward, yaw_rate
-        for epoch in self._segmenter.drive(*motion, measured=measured):
-            self._advance(epoch.stamp_ns, epoch.increment, epoch.ids, epoch.ranges, epoch.bearings)
+        for keyframe in self._segmenter.drive(*motion, measured=measured):
+            self._advance(
+                keyframe.stamp_ns,
+                keyframe.increment,
+                keyframe.ids,
+                keyframe.ranges,
+                keyframe.bearings,
+            )
         if not self._filter.looks:
             _, rest = self._segmenter.cut(stamp_ns)
             nothing = np.empty(0)
@@ -94,8 +100,10 @@ class RunningEstimator:
         return self._driven(before, last=False)
 
     def _driven(self, before: int, *, last: bool) -> Estimates:
-        """What is new since `before` epochs; the map if it is due, or was not said at the end."""
-        now_ns = self.last_epoch_ns
+        """What is new since `before` keyframes; the map if it is due, or was not said at the
+        end.
+        """
+        now_ns = self.last_keyframe_ns
         if now_ns is None or self._map_ns is None:
             return Estimates()
         pose_ns = now_ns if self.sequence > before else None
@@ -132,7 +140,7 @@ class RunningEstimator:
             self._state, judged = after
             self._unsaid = self._unsaid.plus(judged)
         self.sequence += 1
-        self.last_epoch_ns = stamp_ns
+        self.last_keyframe_ns = stamp_ns
 
     def _stepped(self, step: Step) -> tuple[Any, Innovation] | None:
         """The state after a step, and how well its measurements were predicted; None: there is
@@ -158,14 +166,18 @@ class RunningEstimator:
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:
-            for epoch in self._segmenter.cut(self._segmenter.now_ns)[0]:
+            for keyframe in self._segmenter.cut(self._segmenter.now_ns)[0]:
                 self._advance(
-                    epoch.stamp_ns, epoch.increment, epoch.ids, epoch.ranges, epoch.bearings
+                    keyframe.stamp_ns,
+                    keyframe.increment,
+                    keyframe.ids,
+                    keyframe.ranges,
+                    keyframe.bearings,
                 )
         return self._driven(before, last=True), uncovered
 
     def own_pose(self) -> PoseGaussian:
-        """The pose at the last epoch."""
+        """The pose at the last keyframe."""
         pose = self._filter.pose(self._state)
         return PoseGaussian(pose.mean, pose.covariance + POSE_FLOOR)
 

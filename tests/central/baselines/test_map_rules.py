@@ -23,7 +23,7 @@ ALIVE = [m.Liveliness(0, f"robot/{name}", True) for name in ("r1", "r2")]
 
 
 def start(robot, *, known=True):
-    return m.Start(0, robot, 1, 0, from_floats(np.zeros(3)) if known else b"", b"")
+    return m.InitialPose(0, robot, 1, 0, from_floats(np.zeros(3)) if known else b"", b"")
 
 
 def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
@@ -73,7 +73,7 @@ def test_the_final_map_is_kalmans_of_the_last_maps_in_whatever_order_they_come(o
     np.testing.assert_array_equal(translate.landmarks_of(node.final)[1], expected.means)
     covariance = translate.landmark_covariance_of(node.final)
     np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12)
-    assert node.final.members == (m.Member("r1", 1, 4), m.Member("r2", 1, 6))
+    assert node.final.members == (m.VersionEntry("r1", 1, 4), m.VersionEntry("r2", 1, 6))
     assert encoded(node.final) == encoded(heard("latest", TEAM)[0].final)
 
 
@@ -95,13 +95,13 @@ def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
     assert not node.finished
     node.handle(m.GivenUp(0, "robot/r2", "operator", "it fell into the water"), 0)
     assert (node.final.lost, node.final.provisional) == (("r2",), True)
-    assert node.final.members[1] == m.Member("r2", 1, 3)
+    assert node.final.members[1] == m.VersionEntry("r2", 1, 3)
 
 
 def test_a_map_in_a_frame_of_its_own_is_left_out_and_named():
     free = [start("r2", known=False) if x == start("r2") else x for x in TEAM]
     node, _ = heard("latest", free)
-    assert node.final.members == (m.Member("r1", 1, 4),)
+    assert node.final.members == (m.VersionEntry("r1", 1, 4),)
     assert node.final.means == LAST[0].means
     assert node.final.reasons == ("r2: its start pose is not known",)
 

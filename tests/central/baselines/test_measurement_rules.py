@@ -34,7 +34,9 @@ def announced(name):
 
 
 def end(measurements=MEASUREMENTS):
-    return m.End(0, tuple(m.StreamEnd(n, r[-1].epoch, len(r)) for n, r in measurements.items()))
+    return m.End(
+        0, tuple(m.StreamEnd(n, r[-1].incarnation, len(r)) for n, r in measurements.items())
+    )
 
 
 def heard(fusion, messages, robots=("r1", "r2")):
@@ -67,7 +69,7 @@ def test_any_order_of_arrival_and_duplicates_give_the_same_messages(fusion, orde
     assert [x for x in said(out) if "robot" not in x[0]][-1] == EXPECTED[fusion][-1]
 
 
-def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_epochs():
+def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_keyframes():
     state = joint_fastslam.begun(
         {name: np.array([0.0, y, 0.0]) for name, y in (("r1", 0.0), ("r2", 1.0))},
         PARTICLES,
@@ -154,8 +156,8 @@ def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
 
 @pytest.mark.parametrize("fusion", RULES)
 def test_a_stream_that_begins_anew_ends_there(fusion):
-    later = [msgspec.structs.replace(x, epoch=2) for x in MEASUREMENTS["r2"]]
-    later[0] = m.Start(later[0].stamp_ns, "r2", 2, 0, b"", b"")
+    later = [msgspec.structs.replace(x, incarnation=2) for x in MEASUREMENTS["r2"]]
+    later[0] = m.InitialPose(later[0].stamp_ns, "r2", 2, 0, b"", b"")
     whole = {"r1": MEASUREMENTS["r1"], "r2": [*MEASUREMENTS["r2"][:8], *later]}
     ends = m.End(
         0, (m.StreamEnd("r1", 1, len(MEASUREMENTS["r1"])), m.StreamEnd("r2", 2, len(later)))

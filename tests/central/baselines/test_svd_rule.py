@@ -61,7 +61,7 @@ def test_the_final_map_is_downs_exchange_of_the_robots_own_joined_maps(rule):
     covariance = translate.landmark_covariance_of(found)
     np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12, atol=1e-15)
     assert found.frame == "r1/1"
-    assert found.members == (m.Member("r1", 1, 3), m.Member("r2", 1, 3))
+    assert found.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 3))
     assert len(of(out, ch.FUSED_MAP)) >= 2
     credit: list[Outgoing] = [o for o in out if o.channel is ch.CENTRAL_PROGRESS]
     assert len(credit) == 8, "every submap is acknowledged"
@@ -94,7 +94,7 @@ def test_a_robot_that_shares_too_little_stays_out_with_the_reason(rule):
     short = {"r1": SUBMAPS["r1"], "r2": submaps_of(stream("r2", 3, y=-40.0))}
     starts = STARTS | {"r2": published(stream("r2", 3, y=-40.0))[0]}
     found, _ = final(messages(short, starts), rule)
-    assert found.reasons == ("r2, epoch 1, not joined: 0 shared landmarks, 2 needed",)
+    assert found.reasons == ("r2, incarnation 1, not joined: 0 shared landmarks, 2 needed",)
     alone, _ = final(messages({"r1": SUBMAPS["r1"], "r2": []}), rule)
     assert found.means == alone.means
     assert alone.reasons == ()

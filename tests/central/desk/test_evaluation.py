@@ -42,7 +42,7 @@ def stamps(*seconds: float) -> np.ndarray:
 
 
 def done(measurements: int, ledger: tuple[tuple[str, int], ...]) -> Outgoing:
-    entries = tuple(m.Disposed(name, count) for name, count in ledger)
+    entries = tuple(m.Disposition(name, count) for name, count in ledger)
     return Outgoing(ch.ROBOT_DONE, "r1", m.Done(9, "r1", 1, measurements, 20, 2, entries))
 
 

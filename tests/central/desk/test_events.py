@@ -41,7 +41,7 @@ def fused(
 ) -> m.FusedMap:
     return m.FusedMap(
         0, "join", bytes(8), "r1/1", final, False, 0,
-        tuple(m.Member(robot, 1, 0) for robot in robots), (), False, b"", b"", b"", 0.0, 0,
+        tuple(m.VersionEntry(robot, 1, 0) for robot in robots), (), False, b"", b"", b"", 0.0, 0,
         reasons, (), (), withdrawn,
     )  # fmt: skip
 
@@ -86,8 +86,8 @@ def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_
 
 
 def test_another_incarnation_and_another_life_of_a_process_are_events() -> None:
-    first, again = (m.Start(9, "r1", n, 0, b"", b"") for n in (1, 2))
-    configured = m.Configured(0, "robot/r1", 0, bytes(8), "{}")
+    first, again = (m.InitialPose(9, "r1", n, 0, b"", b"") for n in (1, 2))
+    configured = m.Configuration(0, "robot/r1", 0, bytes(8), "{}")
     assert told(first, first, again, again) == [
         ("restarted", "the stream of r1 begins anew, incarnation 2")
     ]

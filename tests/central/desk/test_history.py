@@ -71,7 +71,7 @@ def at(outgoing: Outgoing, wall_ms: int) -> Sample:
 
 
 def fused(stamp_ns: int, last: int, **fields: object) -> Outgoing:
-    values = {"members": (m.Member("r1", 0, last),), "reasons": (), "final": False} | fields
+    values = {"members": (m.VersionEntry("r1", 0, last),), "reasons": (), "final": False} | fields
     message = m.FusedMap(
         stamp_ns, "join", bytes(8), "r1/0", values["final"], False, 0, values["members"], (),
         False, from_ids([1]), from_floats([0.0, 0.0]), from_floats([1.0, 0.0, 1.0]), 3.0, 2,

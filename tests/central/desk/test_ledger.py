@@ -65,16 +65,16 @@ def test_a_measurement_in_two_submaps_is_named(samples: list[Sample], tmp_path: 
     twice = submap_changed(samples, 1, first_measurement=second.first_measurement - 1)
     (offender,) = ledger_of(twice, tmp_path).offenders
     counter = second.first_measurement - 1
-    assert offender == f"measurement {counter} of r1, epoch 1 is in two submaps: 0 and 1"
+    assert offender == f"measurement {counter} of r1, incarnation 1 is in two submaps: 0 and 1"
 
 
 def test_a_measurement_that_no_submap_took_is_named(samples: list[Sample], tmp_path: Path) -> None:
     second = messages(samples, ch.SUBMAP, "r1")[1]
     skipped = submap_changed(samples, 1, first_measurement=second.first_measurement + 1)
     offenders = ledger_of(skipped, tmp_path).offenders
-    name = f"measurement {second.first_measurement} of r1, epoch 1"
+    name = f"measurement {second.first_measurement} of r1, incarnation 1"
     assert offenders[0] == f"{name} is behind its submaps and in none of them"
-    assert "r1, epoch 1 says" in offenders[1]
+    assert "r1, incarnation 1 says" in offenders[1]
 
 
 def test_a_submap_of_measurements_that_are_not_there_is_named(
@@ -83,7 +83,7 @@ def test_a_submap_of_measurements_that_are_not_there_is_named(
     last = messages(samples, ch.SUBMAP, "r1")[-1]
     beyond = submap_changed(samples, last.sequence, last_measurement=last.last_measurement + 2**40)
     (offender,) = ledger_of(beyond, tmp_path).offenders
-    assert offender.startswith(f"submap {last.sequence} of r1, epoch 1 uses measurement")
+    assert offender.startswith(f"submap {last.sequence} of r1, incarnation 1 uses measurement")
 
 
 def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(
@@ -93,7 +93,7 @@ def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(
     (final,) = messages(samples, ch.FINAL_MAP)
     found = ledger_of(gone, tmp_path)
     assert (
-        f"map {final.digest.hex()} uses submap 5 of r2, epoch 1, which is not in the log"
+        f"map {final.digest.hex()} uses submap 5 of r2, incarnation 1, which is not in the log"
         in found.offenders
     )
 
@@ -105,17 +105,20 @@ def test_a_measurement_that_was_changed_and_sent_again_is_named(
     counter = messages([copy], ch.ODOMETRY, "r1")[0].number
     (again,) = changed([copy], ch.ODOMETRY, lambda x: msgspec.structs.replace(x, forward=9.0))
     (offender,) = ledger_of([*samples, again], tmp_path).offenders
-    assert offender == f"measurement {counter} of r1, epoch 1 is in the log twice, and not the same"
+    assert (
+        offender
+        == f"measurement {counter} of r1, incarnation 1 is in the log twice, and not the same"
+    )
 
 
 def test_a_robots_false_word_is_named(samples: list[Sample], tmp_path: Path) -> None:
     def lie(done: m.Message) -> m.Message:
-        ledger = tuple(m.Disposed(d.disposition, d.measurements + 1) for d in done.ledger)
+        ledger = tuple(m.Disposition(d.disposition, d.measurements + 1) for d in done.ledger)
         return msgspec.structs.replace(done, ledger=ledger) if done.robot == "r2" else done
 
     offenders = ledger_of(changed(samples, ch.ROBOT_DONE, lie), tmp_path).offenders
     assert len(offenders) == 2
-    assert all(offender.startswith("r2, epoch 1") for offender in offenders)
+    assert all(offender.startswith("r2, incarnation 1") for offender in offenders)
 
 
 def test_a_dead_robots_last_measurements_are_open_or_lost(tmp_path: Path) -> None:
@@ -127,7 +130,7 @@ def test_a_dead_robots_last_measurements_are_open_or_lost(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("cache", [None, 0])
-def test_restarts_and_new_epochs_use_no_measurement_twice(
+def test_restarts_and_new_incarnations_use_no_measurement_twice(
     cache: int | None, tmp_path: Path
 ) -> None:
     assert ledger_of(said(restless(1, cache=cache)), tmp_path).offenders == ()

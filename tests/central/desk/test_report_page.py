@@ -122,7 +122,7 @@ def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: 
 
 def test_a_measurement_used_twice_is_named_on_the_page(log: list[Sample], tmp_path: Path) -> None:
     run = run_of(log)
-    name = "measurement 7 of r1, epoch 1 is in two submaps: 0 and 1"
+    name = "measurement 7 of r1, incarnation 1 is in two submaps: 0 and 1"
     offending = Ledger({("r1", 1): 3 * (Entry("in a submap", 0),)}, {}, (name,))
     page = page_of(replace(run, ledger=offending), tmp_path)
     assert 'class="bad">Ledger: 1 offenders: measurement 7 of r1' in page

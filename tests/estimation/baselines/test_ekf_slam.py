@@ -16,7 +16,7 @@ from team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from team.estimation.geometry import compose, exponential, transformed
 from team.estimation.hybrid_slam import innovation as innovations
 from team.estimation.models import Increment
-from tests.estimation.estimator_runs import epochs_of, map_errors, run, world
+from tests.estimation.estimator_runs import keyframes_of, map_errors, run, world
 
 SENSOR = Sensor(range_sigma=0.2, range_sigma_per_m=0.01, bearing_sigma=0.03)
 STANDING = Increment.identity()
@@ -90,7 +90,7 @@ def textbook(state, motion, slots, measurements):
 
 @quick
 @given(seeds)
-def test_a_step_is_the_textbooks_with_all_measurements_of_the_epoch_at_once(seed):
+def test_a_step_is_the_textbooks_with_all_measurements_of_the_keyframe_at_once(seed):
     rng = np.random.default_rng(seed)
     state, motion = some_state(rng), some_motion(rng)
     slots = rng.integers(0, 4, rng.integers(1, 6))
@@ -145,9 +145,9 @@ def test_turning_and_moving_the_frame_moves_the_answer_with_it(seed):
         for _ in motions
     ]
     here, there = ekf_slam.begun(np.zeros(3)), ekf_slam.begun(shift)
-    for motion, epoch in zip(motions, measurements, strict=True):
-        here = ekf_slam.stepped(here, motion, SENSOR, *epoch)
-        there = ekf_slam.stepped(there, motion, SENSOR, *epoch)
+    for motion, keyframe in zip(motions, measurements, strict=True):
+        here = ekf_slam.stepped(here, motion, SENSOR, *keyframe)
+        there = ekf_slam.stepped(there, motion, SENSOR, *keyframe)
     c, s = np.cos(shift[2]), np.sin(shift[2])
     turn = np.eye(9)
     for at in (0, 3, 5, 7):
@@ -159,7 +159,7 @@ def test_turning_and_moving_the_frame_moves_the_answer_with_it(seed):
     np.testing.assert_allclose(there.covariance, turn @ here.covariance @ turn.T, atol=1e-9)
 
 
-def test_further_measurements_of_a_new_landmark_update_it_as_in_an_epoch_of_their_own():
+def test_further_measurements_of_a_new_landmark_update_it_as_in_a_keyframe_of_their_own():
     first = (np.array([5], np.uint32), np.array([8.0]), np.array([0.4]))
     again = (np.array([5], np.uint32), np.array([8.3]), np.array([0.38]))
     start = ekf_slam.begun(np.array([1.0, 2.0, 0.3]))
@@ -171,7 +171,7 @@ def test_further_measurements_of_a_new_landmark_update_it_as_in_an_epoch_of_thei
     np.testing.assert_array_equal(one.covariance, two.covariance)
 
 
-def test_the_order_of_an_epochs_measurements_does_not_matter():
+def test_the_order_of_a_keyframes_measurements_does_not_matter():
     rng = np.random.default_rng(3)
     state = some_state(rng)
     ids = np.append(state.ids, np.array([40, 41], np.uint32))
@@ -236,9 +236,9 @@ def short_run(seed, repeat):
         z = z + np.array([0.05, 0.005]) * rng.standard_normal(z.shape)
         ids = np.repeat(seen.astype(np.uint32), repeat)
         z = np.repeat(z, repeat, axis=0)
-        epoch = ids, z[:, 0], wrap(z[:, 1])
-        judged = judged.plus(ekf_slam.innovation(state, motion, sensor, *epoch))
-        state = ekf_slam.stepped(state, motion, sensor, *epoch)
+        keyframe = ids, z[:, 0], wrap(z[:, 1])
+        judged = judged.plus(ekf_slam.innovation(state, motion, sensor, *keyframe))
+        state = ekf_slam.stepped(state, motion, sensor, *keyframe)
     local = ekf_slam.local_map(state)
     error = state_error(local.mean, np.concatenate((truth, landmarks[local.ids].ravel())))
     return nees(error, local.covariance), len(error), *judged
@@ -253,7 +253,7 @@ def test_a_short_window_is_consistent_and_one_that_counts_measurements_twice_is_
         assert (low < runs[:, column].sum() / dof < high) == is_right
 
 
-def test_what_an_epoch_shows_first_was_not_predicted():
+def test_what_a_keyframe_shows_first_was_not_predicted():
     state, motion = some_state(np.random.default_rng(3)), some_motion(np.random.default_rng(4))
     unknown = np.array([91, 92], np.uint32)
     assert (
@@ -271,7 +271,7 @@ def test_over_a_long_run_it_is_over_confident_by_nature(name, at_least):
         for config, stream in zip(robots, streams.streams, strict=True):
             state = ekf_slam.begun(stream.start.pose)
             landmarks = ekf_slam.landmark_gaussian(
-                run(state, ekf_slam.stepped, epochs_of(config, stream), config)
+                run(state, ekf_slam.stepped, keyframes_of(config, stream), config)
             )
             error = map_errors(landmarks, streams)
             values.append(nees(error, landmarks.covariance) / len(error))
@@ -282,8 +282,12 @@ def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
     rng = np.random.default_rng(6)
     state, motion = some_state(rng), some_motion(rng)
     kept = [getattr(state, f.name).copy() for f in dataclasses.fields(state)]
-    epoch = (np.array([*state.ids[:2], 77], np.uint32), np.full(3, 9.0), np.array([0.1, 1.0, -2.0]))
-    once, twice = (ekf_slam.stepped(state, motion, SENSOR, *epoch) for _ in range(2))
+    keyframe = (
+        np.array([*state.ids[:2], 77], np.uint32),
+        np.full(3, 9.0),
+        np.array([0.1, 1.0, -2.0]),
+    )
+    once, twice = (ekf_slam.stepped(state, motion, SENSOR, *keyframe) for _ in range(2))
     for field, before in zip(dataclasses.fields(state), kept, strict=True):
         assert getattr(once, field.name).tobytes() == getattr(twice, field.name).tobytes()
         np.testing.assert_array_equal(getattr(state, field.name), before)

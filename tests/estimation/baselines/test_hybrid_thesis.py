@@ -13,7 +13,7 @@ from team.estimation.consistency import nees, state_error
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
-from tests.estimation.estimator_runs import epochs_of, map_errors, world
+from tests.estimation.estimator_runs import keyframes_of, map_errors, world
 
 SENSOR = Sensor(range_sigma=0.2, bearing_sigma=0.03)
 MOTION = Increment(np.array([1.0, 0.0, 0.1]), np.diag([0.05, 0.02, 0.05]) ** 2)
@@ -135,7 +135,7 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least):
         (config, *_), streams = world(name, seed)
         stream = streams.streams[0]
         state = hybrid_thesis.started(stream.start.pose)
-        for increment, *measurements in epochs_of(config, stream):
+        for increment, *measurements in keyframes_of(config, stream):
             state = hybrid_thesis.stepped(
                 state, increment, config.sensor, *measurements, 100, generator(seed, "r1", 1, 0)
             )

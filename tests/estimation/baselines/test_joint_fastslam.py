@@ -10,7 +10,7 @@ from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.models import Increment
-from tests.estimation.estimator_runs import epochs_of, map_errors, world
+from tests.estimation.estimator_runs import keyframes_of, map_errors, world
 from tests.estimation.team_rounds import LANDMARKS, OTHER, SENSOR, STARTS, team_run, wrap
 
 PROPOSALS = ["fastslam1", "fastslam2"]
@@ -169,14 +169,14 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least):
     for seed in (1, 2):
         robots, streams = world(name, seed)
         starts = {stream.robot: stream.start.pose for stream in streams.streams}
-        teams = zip(*map(epochs_of, robots, streams.streams), strict=True)
+        teams = zip(*map(keyframes_of, robots, streams.streams), strict=True)
         state = joint_fastslam.begun(starts, 200, "fastslam1", 0.5)
         rounds = [
             [
                 RobotStep(robot.id, e.increment, robot.sensor, e.ids, e.ranges, e.bearings)
-                for robot, e in zip(robots, epochs, strict=True)
+                for robot, e in zip(robots, keyframes, strict=True)
             ]
-            for epochs in teams
+            for keyframes in teams
         ]
         landmarks = joint_fastslam.landmark_gaussian(
             filtered(rounds, state, np.random.default_rng(seed))

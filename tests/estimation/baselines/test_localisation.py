@@ -15,7 +15,7 @@ from team.estimation.geometry import compose, exponential, transformed
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam import innovation as innovations
 from team.estimation.models import Increment
-from tests.estimation.estimator_runs import epochs_of, run, world
+from tests.estimation.estimator_runs import keyframes_of, run, world
 
 IDS = np.array([2, 5, 9], np.uint32)
 LANDMARKS = np.array([[9.0, 2.0], [-4.0, 7.0], [1.0, -8.0]])
@@ -94,15 +94,15 @@ def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
     for k in range(6):
         truth = compose(truth, MOTION.mean)
         ranges, bearings = sights(truth)
-        epoch = (IDS[k % 3 :], ranges[k % 3 :] + 0.2, bearings[k % 3 :] - 0.05)
-        judged = innovations.innovation(particles, MOTION, SENSOR, *epoch)
-        assert judged.dof == 2 * len(epoch[0])
-        assert localisation.innovation(state, MOTION, SENSOR, *epoch).squared == pytest.approx(
+        keyframe = (IDS[k % 3 :], ranges[k % 3 :] + 0.2, bearings[k % 3 :] - 0.05)
+        judged = innovations.innovation(particles, MOTION, SENSOR, *keyframe)
+        assert judged.dof == 2 * len(keyframe[0])
+        assert localisation.innovation(state, MOTION, SENSOR, *keyframe).squared == pytest.approx(
             judged.squared, rel=1e-9
         )
-        state = localisation.stepped(state, MOTION, SENSOR, *epoch, random)
+        state = localisation.stepped(state, MOTION, SENSOR, *keyframe, random)
         particles, _ = fastslam.propagated_and_updated(
-            particles, MOTION, SENSOR, *epoch, "fastslam1", 0.5, other
+            particles, MOTION, SENSOR, *keyframe, "fastslam1", 0.5, other
         )
     np.testing.assert_allclose(state.cloud.log_weights, particles.log_weights, atol=1e-9)
     np.testing.assert_array_equal(state.cloud.poses, particles.poses)
@@ -172,8 +172,8 @@ def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
         np.array([0.5, *bearings, 0.6]),
     )
     one, other = (
-        localisation.stepped(state, MOTION, SENSOR, *epoch, np.random.default_rng(0))
-        for epoch in (known, more)
+        localisation.stepped(state, MOTION, SENSOR, *keyframe, np.random.default_rng(0))
+        for keyframe in (known, more)
     )
     assert one.cloud.poses.tobytes() == other.cloud.poses.tobytes()
     assert one.cloud.log_weights.tobytes() == other.cloud.log_weights.tobytes()
@@ -201,9 +201,9 @@ def short_run(seed, repeat):
         sigma = np.hypot(0.8, 0.02 * ranges)
         ranges = ranges + sigma * random.standard_normal(3)
         bearings = wrap(bearings + 0.15 * random.standard_normal(3))
-        epoch = [np.repeat(part, repeat) for part in (IDS, ranges, bearings)]
-        judged = judged.plus(localisation.innovation(state, MOTION, SENSOR, *epoch))
-        state = localisation.stepped(state, MOTION, SENSOR, *epoch, random)
+        keyframe = [np.repeat(part, repeat) for part in (IDS, ranges, bearings)]
+        judged = judged.plus(localisation.innovation(state, MOTION, SENSOR, *keyframe))
+        state = localisation.stepped(state, MOTION, SENSOR, *keyframe, random)
     pose = localisation.pose_gaussian(state)
     return nees(state_error(pose.mean, truth), pose.covariance), 3, *judged
 
@@ -227,8 +227,8 @@ def test_in_the_thesis_world_it_finds_itself_from_an_unknown_start(name):
     )
     lost = localisation.pose_gaussian(state)
     assert min(np.diag(lost.covariance)[:2]) > 25.0**2
-    epochs = epochs_of(config, stream)[:150]
-    pose = localisation.pose_gaussian(run(state, localisation.stepped, epochs, config, random))
+    keyframes = keyframes_of(config, stream)[:150]
+    pose = localisation.pose_gaussian(run(state, localisation.stepped, keyframes, config, random))
     error = state_error(pose.mean, stream.truth[150])
     assert np.hypot(*error[:2]) < 2.0
     assert nees(error, pose.covariance) < 25.0
@@ -243,9 +243,9 @@ def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
     assert (low >= [-1.0, -2.0, -np.pi]).all()
     assert (high <= [3.0, 2.0, np.pi]).all()
     kept = state.cloud.poses.copy(), state.cloud.log_weights.copy()
-    epoch = (IDS, *sights(np.zeros(3)))
+    keyframe = (IDS, *sights(np.zeros(3)))
     once, twice = (
-        localisation.stepped(state, MOTION, SENSOR, *epoch, np.random.default_rng(6))
+        localisation.stepped(state, MOTION, SENSOR, *keyframe, np.random.default_rng(6))
         for _ in range(2)
     )
     assert once.cloud.poses.tobytes() == twice.cloud.poses.tobytes()

@@ -13,15 +13,15 @@ from team.estimation.geometry import compose, transformed
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.models import increment_of
 from team.estimation.randomness import generator
-from tests.estimation.estimator_runs import epochs_of, map_errors, run, world
+from tests.estimation.estimator_runs import keyframes_of, map_errors, run, world
 from tests.estimation.hybrid_slam.test_window import ACCURATE, COARSE, ROBOT, drive, driven, wrap
 
 PROPOSALS = ["fastslam1", "fastslam2"]
 
 
 def filtered(drive_, sensor, state, random, repeat=1):
-    for (distance, turn), epoch in zip(drive_.motions, drive_.epochs, strict=True):
-        measurements = (np.repeat(part, repeat) for part in epoch)
+    for (distance, turn), keyframe in zip(drive_.motions, drive_.keyframes, strict=True):
+        measurements = (np.repeat(part, repeat) for part in keyframe)
         increment = increment_of(ROBOT, 1.0, distance, turn)
         state = plain_fastslam.stepped(state, increment, sensor, *measurements, random)
     return state
@@ -132,9 +132,9 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least, proposa
         robots, streams = world(name, seed)
         for config, stream in zip(robots, streams.streams, strict=True):
             state = plain_fastslam.begun(stream.start.pose, 50, proposal, 0.5)
-            epochs = epochs_of(config, stream)
+            keyframes = keyframes_of(config, stream)
             random = generator(seed, config.id, 0, 0)
-            state = run(state, plain_fastslam.stepped, epochs, config, random)
+            state = run(state, plain_fastslam.stepped, keyframes, config, random)
             landmarks = plain_fastslam.landmark_gaussian(state)
             error = map_errors(landmarks, streams)
             values.append(nees(error, landmarks.covariance) / len(error))

@@ -14,7 +14,7 @@ from team.estimation.geometry import compose, transformed
 from team.estimation.map_joining import joining
 from team.estimation.map_joining.joining import EMPTY_FOLD
 from team.estimation.submap import LocalMap
-from tests.estimation.estimator_runs import epochs_of, map_errors, run, world
+from tests.estimation.estimator_runs import keyframes_of, map_errors, run, world
 from tests.estimation.submap_world import local_truth, team, wrap
 
 poses = st.builds(
@@ -265,11 +265,11 @@ def test_after_a_long_run_an_exchange_is_over_confident_by_nature():
         robots, streams = world("thesis-b", seed)
         maps = []
         for config, stream in zip(robots, streams.streams, strict=True):
-            epochs = epochs_of(config, stream)
+            keyframes = keyframes_of(config, stream)
             state = svd_joining.begun({config.id: stream.start.pose})
-            for k in range(0, len(epochs), 20):
+            for k in range(0, len(keyframes), 20):
                 window = ekf_slam.begun(np.zeros(3))
-                window = run(window, ekf_slam.stepped, epochs[k : k + 20], config)
+                window = run(window, ekf_slam.stepped, keyframes[k : k + 20], config)
                 state = svd_joining.stepped(state, config.id, ekf_slam.local_map(window))
             maps.append(svd_joining.landmark_gaussian(svd_joining.solved(state)))
         landmarks = svd_joining.exchanged(*maps).landmarks

@@ -28,15 +28,15 @@ PLACES = np.array([[5.0, 4.0], [9.0, -3.0], [12.0, 6.0], [2.0, -5.0]])
 
 @dataclass
 class Drive:
-    """A window as the robot has it: motions and measurements, by epoch."""
+    """A window as the robot has it: motions and measurements, by keyframe."""
 
     motions: list[Increment]
-    epochs: np.ndarray
+    keyframes: np.ndarray
     ids: np.ndarray
     measurements: np.ndarray
 
     def judged(self, by=confirmed, garbage: float = 0.3) -> np.ndarray:
-        return by(self.motions, self.epochs, self.ids, self.measurements, SENSOR, garbage)
+        return by(self.motions, self.keyframes, self.ids, self.measurements, SENSOR, garbage)
 
 
 def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
@@ -102,7 +102,10 @@ def test_the_order_of_measurements_and_the_names_of_landmarks_do_not_matter():
     order = np.random.default_rng(0).permutation(len(taken))
     names = np.array([0, 40, 7, 9, 3], dtype=np.uint32)
     other = Drive(
-        window.motions, window.epochs[order], names[window.ids[order]], window.measurements[order]
+        window.motions,
+        window.keyframes[order],
+        names[window.ids[order]],
+        window.measurements[order],
     )
     np.testing.assert_array_equal(other.judged(), taken[order])
 
@@ -111,25 +114,28 @@ def test_a_window_without_measurements_or_with_one_has_nothing_to_take():
     window = drive(5)
     for count in (0, 1):
         few = Drive(
-            window.motions, window.epochs[:count], window.ids[:count], window.measurements[:count]
+            window.motions,
+            window.keyframes[:count],
+            window.ids[:count],
+            window.measurements[:count],
         )
         for by in (agreeing, confirmed):
             assert not few.judged(by).any()
 
 
-def test_epochs_without_measurements_change_nothing():
+def test_keyframes_without_measurements_change_nothing():
     window = drive(6)
     window.measurements[[5, 17]] += [1.5, 0.4]
     still = Increment.identity()
     motions = [each for motion in window.motions for each in (motion, still)]
-    sparse = Drive(motions, 2 * window.epochs, window.ids, window.measurements)
+    sparse = Drive(motions, 2 * window.keyframes, window.ids, window.measurements)
     np.testing.assert_array_equal(sparse.judged(), window.judged())
 
 
 def smoothed(window: Drive, used: np.ndarray):
     """Path, landmarks and covariance at rest."""
     of = consensus._Measurements(
-        window.motions, window.epochs, window.ids, window.measurements, SENSOR, 0.3
+        window.motions, window.keyframes, window.ids, window.measurements, SENSOR, 0.3
     )
     path = np.zeros((len(of.means), 3))
     for k in range(1, len(path)):
@@ -145,13 +151,13 @@ def test_a_measurement_is_judged_by_what_the_others_predict_of_it():
     window = drive(7)
     used = np.ones(40, dtype=bool)
     of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.epochs, of.slots, of.measurements, used, of.sensor)
-    own = kernel.left_out(*found, of.epochs, of.slots, of.measurements, ~used, of.sensor)
+    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, used, of.sensor)
+    own = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, ~used, of.sensor)
     for n in (0, 9, 22, 39):
         without = used.copy()
         without[n] = False
         _, *other = smoothed(window, without)
-        left = kernel.left_out(*other, of.epochs, of.slots, of.measurements, without, of.sensor)
+        left = kernel.left_out(*other, of.keyframes, of.slots, of.measurements, without, of.sensor)
         assert logs[n] == pytest.approx(left[n], abs=0.05)
     assert np.abs(own - logs).max() > 0.1, "a measurement that judges itself is another matter"
 
@@ -161,7 +167,7 @@ def test_of_a_landmarks_only_measurement_the_others_say_nothing():
     used = window.ids != 1
     used[0] = True
     of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.epochs, of.slots, of.measurements, used, of.sensor)
+    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, used, of.sensor)
     assert logs[0] < -3.0
     assert logs[0] < logs[1:].min() - 1.0 or logs[0] == -np.inf
 
@@ -185,14 +191,14 @@ def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
         measurements = np.column_stack((seen.ranges, seen.bearings))
         for first in range(0, 480, 12):
             rows = slice(int(seen.offsets[first]), int(seen.offsets[first + 12]))
-            epochs = np.repeat(np.arange(12), np.diff(seen.offsets[first : first + 13]))
+            keyframes = np.repeat(np.arange(12), np.diff(seen.offsets[first : first + 13]))
             odometry = zip(
                 b.intervals.forward[first : first + 12].tolist(),
                 b.intervals.yaw_rate[first : first + 12].tolist(),
                 strict=True,
             )
             motions = [increment_of(robot.motion, 1.0, *each) for each in odometry]
-            taken = by(motions, epochs, seen.ids[rows], measurements[rows], robot.sensor, 0.3)
+            taken = by(motions, keyframes, seen.ids[rows], measurements[rows], robot.sensor, 0.3)
             kept.append(taken[~bad[rows]])
             passed.append(taken[bad[rows]])
     return float(np.concatenate(kept).mean()), float(np.concatenate(passed).mean())
@@ -233,7 +239,7 @@ def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly, monk
         pose = np.zeros(3)
         for k, motion in enumerate(window.motions):
             pose = compose(pose, motion.mean)
-            for i in np.flatnonzero(window.epochs == k):
+            for i in np.flatnonzero(window.keyframes == k):
                 window.measurements[i] = predicted(pose, PLACES[window.ids[i] - 1])
 
     def factor(H, lower):
@@ -245,7 +251,7 @@ def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly, monk
     sensor = Sensor(
         range_sigma=1e-10 if exactly else 1e-12, bearing_sigma=0.01 if exactly else 1e-3
     )
-    measurements = (window.motions, window.epochs, window.ids, window.measurements, sensor, 0.3)
+    measurements = (window.motions, window.keyframes, window.ids, window.measurements, sensor, 0.3)
     taken = confirmed(*measurements)
     assert failures[-1] != 0, "the equations have a solution here: nothing is tried"
     assert len([each for each in failures if each]) == 1, "what has failed is not gone on with"

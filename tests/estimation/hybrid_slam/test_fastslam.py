@@ -46,13 +46,13 @@ def jacobian(function, at):
     return np.stack(columns, axis=1)
 
 
-def kalman(motions, epochs):
+def kalman(motions, keyframes):
     """Mean, covariance and log evidence of the joint Gaussian over (pose, landmarks).
 
-    A first sight places its landmark; epochs hold (landmark, measurement) pairs.
+    A first sight places its landmark; keyframes hold (landmark, measurement) pairs.
     """
     mean, P, log_evidence, seen = np.zeros(9), np.zeros((9, 9)), 0.0, set()
-    for motion, measurements in zip(motions, epochs, strict=True):
+    for motion, measurements in zip(motions, keyframes, strict=True):
         F = jacobian(lambda state, m=motion.mean: moved(state, m), mean)
         mean = moved(mean, motion.mean)
         turn = np.eye(9)[:, :3]
@@ -87,10 +87,10 @@ def kalman(motions, epochs):
 
 
 def simulated(seed, steps=5, covariance=MOTION.covariance):
-    """Increments and measurements of a robot that stands at its first epoch and then moves."""
+    """Increments and measurements of a robot that stands at its first keyframe and then moves."""
     rng = np.random.default_rng(seed)
     truth = np.concatenate((np.zeros(3), LANDMARKS.ravel()))
-    motions, epochs = [], []
+    motions, keyframes = [], []
     for step in range(steps):
         motion = STANDING if step == 0 else Increment(MOTION.mean, covariance)
         noise = rng.multivariate_normal(np.zeros(3), motion.covariance, method="svd")
@@ -101,14 +101,14 @@ def simulated(seed, steps=5, covariance=MOTION.covariance):
             sigma = np.array([np.hypot(0.1, 0.001 * z[0]), 0.002])
             measurements.append((k, z + sigma * rng.standard_normal(2)))
         motions.append(motion)
-        epochs.append(measurements)
-    return motions, epochs
+        keyframes.append(measurements)
+    return motions, keyframes
 
 
-def filtered(motions, epochs, count, proposal, resample_below=0.5, seed=0):
+def filtered(motions, keyframes, count, proposal, resample_below=0.5, seed=0):
     rng = np.random.default_rng(seed)
     particles, log_evidence, infos = fastslam.at_poses(np.zeros((count, 3))), 0.0, []
-    for motion, measurements in zip(motions, epochs, strict=True):
+    for motion, measurements in zip(motions, keyframes, strict=True):
         z = np.array([measurement for _, measurement in measurements])
         particles, info = fastslam.propagated_and_updated(
             particles,
@@ -129,9 +129,9 @@ def filtered(motions, epochs, count, proposal, resample_below=0.5, seed=0):
 @pytest.mark.parametrize(("proposal", "count"), [("fastslam2", 5000), ("fastslam1", 20000)])
 @pytest.mark.parametrize("factor", [np.linalg.cholesky(MOTION.covariance), RANK_TWO])
 def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter(proposal, count, factor):
-    motions, epochs = simulated(1, covariance=factor @ factor.T)
-    mean, P, log_evidence = kalman(motions, epochs)
-    particles, found_evidence, _ = filtered(motions, epochs, count, proposal)
+    motions, keyframes = simulated(1, covariance=factor @ factor.T)
+    mean, P, log_evidence = kalman(motions, keyframes)
+    particles, found_evidence, _ = filtered(motions, keyframes, count, proposal)
     np.testing.assert_array_equal(particles.ids, IDS)
     found, spread = moments(
         particles.poses, np.exp(particles.log_weights), particles.means, particles.covariances
@@ -147,9 +147,13 @@ def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter(proposa
 
 
 def test_the_second_proposal_keeps_many_more_particles_alive():
-    motions, epochs = simulated(2)
-    thin = [info.effective_sample_size for info in filtered(motions, epochs, 500, "fastslam1")[2]]
-    full = [info.effective_sample_size for info in filtered(motions, epochs, 500, "fastslam2")[2]]
+    motions, keyframes = simulated(2)
+    thin = [
+        info.effective_sample_size for info in filtered(motions, keyframes, 500, "fastslam1")[2]
+    ]
+    full = [
+        info.effective_sample_size for info in filtered(motions, keyframes, 500, "fastslam2")[2]
+    ]
     assert min(full) > 3.0 * min(thin)
 
 
@@ -184,16 +188,16 @@ def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
 
 
 def test_without_noise_of_motion_both_proposals_are_the_same():
-    motions, epochs = simulated(3, covariance=np.zeros((3, 3)))
-    one, two = (filtered(motions, epochs, 8, p)[0] for p in ("fastslam1", "fastslam2"))
+    motions, keyframes = simulated(3, covariance=np.zeros((3, 3)))
+    one, two = (filtered(motions, keyframes, 8, p)[0] for p in ("fastslam1", "fastslam2"))
     for field in ("poses", "log_weights", "means", "covariances"):
         np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
     np.testing.assert_allclose(one.log_weights, -np.log(8.0), atol=1e-12)
 
 
-def test_an_epoch_of_first_sights_and_one_without_measurements_leave_the_weights():
-    _, epochs = simulated(4)
-    particles, _, _ = filtered([MOTION], epochs[1:2], 50, "fastslam2")
+def test_a_keyframe_of_first_sights_and_one_without_measurements_leave_the_weights():
+    _, keyframes = simulated(4)
+    particles, _, _ = filtered([MOTION], keyframes[1:2], 50, "fastslam2")
     np.testing.assert_allclose(particles.log_weights, -np.log(50.0), atol=1e-12)
     after = fastslam.propagated(particles, MOTION, np.random.default_rng(0))
     np.testing.assert_array_equal(after.means, particles.means)
@@ -210,9 +214,9 @@ def test_a_landmark_at_first_sight_has_the_covariance_of_the_inverse_model():
     np.testing.assert_allclose([[xx, xy], [xy, yy]], expected, rtol=1e-7)
 
 
-def test_two_measurements_of_one_landmark_in_one_epoch_count_as_two_epochs_without_motion():
-    _, epochs = simulated(5, steps=2)
-    first, second = [(0, epochs[0][0][1])], [(0, epochs[1][0][1])]
+def test_two_measurements_of_one_landmark_in_one_keyframe_count_as_two_keyframes_without_motion():
+    _, keyframes = simulated(5, steps=2)
+    first, second = [(0, keyframes[0][0][1])], [(0, keyframes[1][0][1])]
     together = filtered([STANDING], [first + second], 4, "fastslam2")
     apart = filtered([STANDING, STANDING], [first, second], 4, "fastslam2")
     np.testing.assert_array_equal(together[0].means, apart[0].means)
@@ -221,8 +225,8 @@ def test_two_measurements_of_one_landmark_in_one_epoch_count_as_two_epochs_witho
 
 
 def test_resampling_happens_before_the_motion_and_never_after_the_measurements():
-    motions, epochs = simulated(6)
-    particles, _, infos = filtered(motions, epochs, 200, "fastslam1")
+    motions, keyframes = simulated(6)
+    particles, _, infos = filtered(motions, keyframes, 200, "fastslam1")
     thin = [info.effective_sample_size < 100 for info in infos]
     parents = [info.parents is not None for info in infos]
     assert any(thin)
@@ -263,8 +267,8 @@ def bytes_of(value):
 
 
 def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
-    motions, epochs = simulated(7)
-    before, _, _ = filtered(motions, epochs, 100, "fastslam2")
+    motions, keyframes = simulated(7)
+    before, _, _ = filtered(motions, keyframes, 100, "fastslam2")
     kept = bytes_of(before)
     arguments = (before, MOTION, SENSOR, IDS[:2], np.array([40.0, 60.0]), np.array([0.1, 1.0]))
     once, twice = (

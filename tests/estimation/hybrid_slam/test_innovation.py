@@ -1,4 +1,4 @@
-"""The innovation of an epoch: what it is, and that it tells right models from wrong ones."""
+"""The innovation of a keyframe: what it is, and that it tells right models from wrong ones."""
 
 import dataclasses
 
@@ -107,11 +107,13 @@ def test_what_is_seen_for_the_first_time_was_not_predicted():
     assert mixed.dof == 2
 
 
-def test_epochs_add_up_and_a_window_has_their_sum():
+def test_keyframes_add_up_and_a_window_has_their_sum():
     run = drive(3, ACCURATE, steps=6)
     window, total = driven(run, ACCURATE), NOTHING
     for steps in range(1, 7):
-        part = dataclasses.replace(run, motions=run.motions[:steps], epochs=run.epochs[:steps])
+        part = dataclasses.replace(
+            run, motions=run.motions[:steps], keyframes=run.keyframes[:steps]
+        )
         total = driven(part, ACCURATE).innovation
     assert window.innovation == total
     assert Innovation(1.5, 2).plus(Innovation(2.5, 6)) == Innovation(4.0, 8)

@@ -25,10 +25,10 @@ def scan(*rows):
     return np.array(ids, np.uint32), np.array(ranges, float), np.array(bearings, float)
 
 
-def total(epochs, rest):
+def total(keyframes, rest):
     motion = Increment.identity()
-    for epoch in epochs:
-        motion = motion.then(epoch.increment)
+    for keyframe in keyframes:
+        motion = motion.then(keyframe.increment)
     return motion.then(rest)
 
 
@@ -62,10 +62,10 @@ def test_observations_within_an_interval_split_its_mean_exactly(cuts, forward, y
         segmenter.begin(0)
     for cut in sorted(cuts):
         assert split.observe(cut, *NOTHING) is None
-    epochs = split.drive(SECOND, SECOND, forward, yaw_rate)
+    keyframes = split.drive(SECOND, SECOND, forward, yaw_rate)
     whole.drive(SECOND, SECOND, forward, yaw_rate)
-    assert [epoch.stamp_ns for epoch in epochs] == sorted(cuts)
-    motion, expected = total(epochs, split.cut(SECOND)[1]), whole.cut(SECOND)[1]
+    assert [keyframe.stamp_ns for keyframe in keyframes] == sorted(cuts)
+    motion, expected = total(keyframes, split.cut(SECOND)[1]), whole.cut(SECOND)[1]
     np.testing.assert_allclose(motion.mean, expected.mean, atol=1e-9)
 
 
@@ -79,8 +79,8 @@ def test_splitting_a_straight_interval_keeps_the_covariance_of_white_noise_forwa
         segmenter.begin(0)
         for cut in sorted(cuts):
             segmenter.observe(cut, *NOTHING)
-        epochs = segmenter.drive(SECOND, SECOND, forward, 0.0)
-        found = total(epochs, segmenter.cut(SECOND)[1]).covariance
+        keyframes = segmenter.drive(SECOND, SECOND, forward, 0.0)
+        found = total(keyframes, segmenter.cut(SECOND)[1]).covariance
         density = motion.forward if row == 0 else motion.final_turn
         expected = density.per_s**2 + density.per_m**2 * abs(forward)
         assert found[row, row] == pytest.approx(expected, abs=1e-9)
@@ -99,8 +99,8 @@ def test_the_finer_the_split_the_nearer_to_noise_that_is_white_within_the_interv
         segmenter.begin(0)
         for k in range(1, pieces):
             segmenter.observe(k * SECOND // pieces, *NOTHING)
-        epochs = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
-        found = total(epochs, segmenter.cut(SECOND)[1])
+        keyframes = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
+        found = total(keyframes, segmenter.cut(SECOND)[1])
         np.testing.assert_allclose(found.mean, mean, atol=1e-8)
         errors.append(np.abs(found.covariance - covariance).max())
     assert errors[0] < 0.2 * np.abs(covariance).max()
@@ -132,18 +132,18 @@ def test_an_observation_waits_for_the_odometry_that_covers_it():
     segmenter.observe(3 * SECOND // 2, *scan((4, 2.0, 0.0)))
     assert segmenter.drive(SECOND, SECOND, 1.0, 0.0) == []
     assert segmenter.uncovered == 1
-    (epoch,) = segmenter.drive(2 * SECOND, SECOND, 1.0, 0.0)
-    assert (epoch.stamp_ns, segmenter.uncovered) == (3 * SECOND // 2, 0)
-    np.testing.assert_allclose(epoch.increment.mean, [1.5, 0.0, 0.0], atol=1e-12)
+    (keyframe,) = segmenter.drive(2 * SECOND, SECOND, 1.0, 0.0)
+    assert (keyframe.stamp_ns, segmenter.uncovered) == (3 * SECOND // 2, 0)
+    np.testing.assert_allclose(keyframe.increment.mean, [1.5, 0.0, 0.0], atol=1e-12)
 
 
 def test_an_observation_before_the_odometry_is_taken_where_the_robot_stood():
     segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
     assert segmenter.observe(-SECOND, *scan((4, 2.0, 0.0))) is None
     segmenter.begin(0)
-    (epoch,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
-    assert epoch.stamp_ns == 0
-    assert not epoch.increment.mean.any()
+    (keyframe,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    assert keyframe.stamp_ns == 0
+    assert not keyframe.increment.mean.any()
 
 
 def test_an_observation_of_a_time_that_is_past_is_rejected_with_its_reason():
@@ -161,8 +161,8 @@ def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
     outside = segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 9.1, 0.0)))
     assert outside == "outside the sensor's limits"
     segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 4.5, 0.25)))
-    (epoch,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
-    assert (epoch.ids.tolist(), epoch.ranges.tolist(), epoch.bearings.tolist()) == (
+    (keyframe,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    assert (keyframe.ids.tolist(), keyframe.ranges.tolist(), keyframe.bearings.tolist()) == (
         [2],
         [2.0],
         [0.25],
@@ -170,13 +170,13 @@ def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
 
 
 def keyframe(scans, forward=0.0, yaw_rate=0.0):
-    """The epoch of one keyframe of 1 s with these (stamp_ns, scan)."""
+    """The keyframe of 1 s with these (stamp_ns, scan)."""
     segmenter = Segmenter(MotionModel(), Sensor(), 1.0)
     segmenter.begin(0)
     for stamp_ns, rows in scans:
         segmenter.observe(stamp_ns, *rows)
-    (epoch,) = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
-    return epoch
+    (keyframe,) = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
+    return keyframe
 
 
 def test_a_keyframe_holds_the_median_of_each_landmark():
@@ -186,10 +186,10 @@ def test_a_keyframe_holds_the_median_of_each_landmark():
         (stamp, scan((7, r, b), (3, 2.0, 1.0)))
         for stamp, r, b in zip(stamps, ranges, bearings, strict=True)
     ]
-    epoch = keyframe(scans)
-    assert epoch.ids.tolist() == [3, 7]
-    np.testing.assert_allclose(epoch.ranges, [2.0, 4.2])
-    np.testing.assert_allclose(epoch.bearings, [1.0, 0.1], atol=1e-12)
+    found = keyframe(scans)
+    assert found.ids.tolist() == [3, 7]
+    np.testing.assert_allclose(found.ranges, [2.0, 4.2])
+    np.testing.assert_allclose(found.bearings, [1.0, 0.1], atol=1e-12)
 
 
 @settings(deadline=None, max_examples=40)
@@ -208,10 +208,10 @@ def test_a_keyframes_scans_are_moved_by_the_odometry_to_its_end(forward, yaw_rat
         local = (point - forward * arc) * np.exp(-1j * turn)
         return abs(local), np.angle(local)
 
-    epoch = keyframe(
+    found = keyframe(
         [(t, scan((7, *seen_at(t * 1e-9)))) for t in sorted(stamps)], forward, yaw_rate
     )
-    np.testing.assert_allclose([epoch.ranges[0], epoch.bearings[0]], seen_at(1.0), atol=1e-9)
+    np.testing.assert_allclose([found.ranges[0], found.bearings[0]], seen_at(1.0), atol=1e-9)
 
 
 def test_the_median_of_bearings_beside_the_cut_at_pi_lies_beside_it_too():
@@ -230,11 +230,11 @@ def test_a_cut_closes_the_keyframe_and_the_next_window_starts_clean():
     segmenter.begin(0)
     segmenter.observe(SECOND // 2, *scan((7, 5.0, 0.0)))
     assert segmenter.drive(SECOND, SECOND, 1.0, 0.0) == []
-    (epoch,), rest = segmenter.cut(SECOND)
-    assert (epoch.stamp_ns, epoch.ids.tolist()) == (SECOND, [7])
-    np.testing.assert_allclose(epoch.ranges, [4.5])
+    (keyframe,), rest = segmenter.cut(SECOND)
+    assert (keyframe.stamp_ns, keyframe.ids.tolist()) == (SECOND, [7])
+    np.testing.assert_allclose(keyframe.ranges, [4.5])
     assert not rest.mean.any()
     assert segmenter.drive(2 * SECOND, SECOND, 1.0, 0.0) == []
-    epochs, rest = segmenter.cut(2 * SECOND)
-    assert epochs == []
+    keyframes, rest = segmenter.cut(2 * SECOND)
+    assert keyframes == []
     np.testing.assert_allclose(rest.mean, [1.0, 0.0, 0.0])

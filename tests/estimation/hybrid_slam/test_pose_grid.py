@@ -31,11 +31,11 @@ def look(teammate="r2", distance=3.0, bearing=0.5):
 
 
 def drive(segmenter, until_s, step_ns=SECOND, forward=0.6, yaw_rate=0.25):
-    epochs, now = [], segmenter.now_ns
+    keyframes, now = [], segmenter.now_ns
     while now < round(until_s * SECOND):
         now += step_ns
-        epochs += segmenter.drive(now, step_ns, forward, yaw_rate)
-    return epochs
+        keyframes += segmenter.drive(now, step_ns, forward, yaw_rate)
+    return keyframes
 
 
 def arc(seconds, forward=0.6, yaw_rate=0.25):
@@ -46,7 +46,7 @@ def arc(seconds, forward=0.6, yaw_rate=0.25):
 
 
 @pytest.mark.parametrize("step_ns", [SECOND, 300_000_000, 7 * SECOND])
-def test_each_grid_time_within_the_window_is_an_epoch_of_its_own(step_ns):
+def test_each_grid_time_within_the_window_is_a_keyframe_of_its_own(step_ns):
     _, segmenter = begun(at_ns=500_000_000)
     nodes = [each.stamp_ns for each in drive(segmenter, 20.0, step_ns) if each.is_node]
     assert nodes == [2 * SECOND, 4 * SECOND, 6 * SECOND]
@@ -65,13 +65,13 @@ def test_no_motion_is_lost_or_counted_twice_at_nodes_and_sightings(stamps, keyfr
             segmenter.observe(stamp, *scan)
     ends = []
     for segmenter in (with_nodes, plain):
-        epochs = drive(segmenter, 7.0)
+        keyframes = drive(segmenter, 7.0)
         rest, more = segmenter.cut(7 * SECOND)[::-1]
         total = Increment.identity()
-        for epoch in (*epochs, *more):
-            total = total.then(epoch.increment)
+        for keyframe in (*keyframes, *more):
+            total = total.then(keyframe.increment)
         ends.append(total.then(rest))
-        assert sum(len(each.ids) for each in (*epochs, *more)) > 0 or not stamps
+        assert sum(len(each.ids) for each in (*keyframes, *more)) > 0 or not stamps
     np.testing.assert_allclose(ends[0].mean, ends[1].mean, atol=1e-9)
 
 

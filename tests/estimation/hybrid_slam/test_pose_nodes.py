@@ -19,7 +19,7 @@ def seen():
 
 
 def driven(marks, particles=200):
-    """Four epochs; landmarks are seen at the first; marked as nodes: those in `marks`."""
+    """Four keyframes; landmarks are seen at the first; marked as nodes: those in `marks`."""
     generator = np.random.default_rng(1)
     window = windows.opened(FrontEnd(particles=particles), Sensor())
     for k in range(4):
@@ -29,13 +29,13 @@ def driven(marks, particles=200):
     return window
 
 
-def test_a_node_is_the_weighted_mean_of_the_particles_of_its_epoch():
+def test_a_node_is_the_weighted_mean_of_the_particles_of_its_keyframe():
     window = driven({1, 3})
     local = windows.gaussian(window)
     weights = np.exp(window.particles.log_weights)
     assert local.node_stamps.tolist() == [1000, 3000]
-    for node, epoch in zip(local.nodes, (1, 3), strict=True):
-        poses = window.paths[epoch]
+    for node, keyframe in zip(local.nodes, (1, 3), strict=True):
+        poses = window.paths[keyframe]
         np.testing.assert_allclose(node[:2], weights @ poses[:, :2])
         direction = np.angle(weights @ np.exp(1j * poses[:, 2]))
         np.testing.assert_allclose(wrap(node[2] - direction), 0.0, atol=1e-12)

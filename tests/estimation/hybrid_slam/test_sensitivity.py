@@ -14,7 +14,7 @@ from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation import geometry
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.sensitivity import BIASES, carried_on, forward_column
 from team.estimation.map_joining import joining, marginals
@@ -235,7 +235,7 @@ def test_biases_stay_when_islands_merge():
     assert len(fold.main.graph.priors) == len(fold.main.graph.biases) == 4
     graph = fold.main.graph
     assert {graph.name(node) for node in graph.biases.values()} == {
-        f"the bias {bias} of {robot} (epoch 0)"
+        f"the bias {bias} of {robot} (keyframe 0)"
         for robot in ("r0", "r1")
         for bias in ("bearing", "range_scale")
     }
@@ -279,7 +279,7 @@ def camera_team(seed, biases):
     for stream, robot in zip(streams.streams, believed, strict=True):
         sent = of(driven(RobotNode(robot), published(stream)), ch.SUBMAP)
         submaps += [translate.contribution_of(submap) for submap in sent]
-        starts.append(Start(robot.id, sent[0].epoch, stream.start.pose))
+        starts.append(InitialPoseFactor(robot.id, sent[0].incarnation, stream.start.pose))
     return streams, sorted(submaps, key=lambda each: each.key), starts
 
 

@@ -40,7 +40,7 @@ class Drive:
     """What a robot was told to do, what it read, and the truth: (end pose, all landmarks)."""
 
     motions: list
-    epochs: list
+    keyframes: list
     truth: np.ndarray
     landmarks: np.ndarray
 
@@ -49,7 +49,7 @@ def drive(seed, sensor, steps=12, noise=1.0):
     """About 3.5 landmarks in sight, 3 to 20 m away; 0.98 m and up to 9° of turn a step."""
     rng = np.random.default_rng(seed)
     landmarks = rng.uniform(-40.0, 40.0, (18, 2))
-    pose, motions, epochs = np.zeros(3), [], []
+    pose, motions, keyframes = np.zeros(3), [], []
     for _ in range(steps):
         distance, turn = 0.98, rng.uniform(-0.15, 0.15)
         motions.append((distance, turn))
@@ -63,15 +63,15 @@ def drive(seed, sensor, steps=12, noise=1.0):
         seen = np.flatnonzero((ranges > 3.0) & (ranges < 20.0))
         ranges = ranges[seen] + sensor.range_sigma * rng.standard_normal(len(seen))
         bearings = wrap(bearings[seen] + sensor.bearing_sigma * rng.standard_normal(len(seen)))
-        epochs.append((seen.astype(np.uint32), ranges, bearings))
-    return Drive(motions, epochs, pose, landmarks)
+        keyframes.append((seen.astype(np.uint32), ranges, bearings))
+    return Drive(motions, keyframes, pose, landmarks)
 
 
 def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **front_end):
     front_end = FrontEnd(particles=particles, **front_end)
     window, random = windows.opened(front_end, sensor), generator(seed, "r1", 0, 0)
-    for (distance, turn), epoch in zip(run.motions, run.epochs, strict=True):
-        measurements = tuple(np.repeat(part, 2) for part in epoch) if twice else epoch
+    for (distance, turn), keyframe in zip(run.motions, run.keyframes, strict=True):
+        measurements = tuple(np.repeat(part, 2) for part in keyframe) if twice else keyframe
         window = windows.advanced(
             window, increment_of(motion, 1.0, distance, turn), *measurements, random
         )
@@ -79,7 +79,7 @@ def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **fron
 
 
 def bytes_of(window):
-    values = [window.paths, window.epochs, window.ids, window.measurements]
+    values = [window.paths, window.keyframes, window.ids, window.measurements]
     values += [getattr(window.particles, f.name) for f in dataclasses.fields(window.particles)]
     return [value.tobytes() for value in values]
 
@@ -106,7 +106,7 @@ def batch(run, sensor, ids):
         landmarks = unknowns[2 * steps :].reshape(-1, 2)
         parts = [unknowns[: 2 * steps]]
         for pose, (seen, ranges, bearings) in zip(
-            path(unknowns[: 2 * steps]), run.epochs, strict=True
+            path(unknowns[: 2 * steps]), run.keyframes, strict=True
         ):
             offset = landmarks[np.searchsorted(ids, seen)] - pose[:2]
             parts.append((ranges - np.hypot(offset[:, 0], offset[:, 1])) / sensor.range_sigma)
@@ -214,7 +214,7 @@ def test_a_submap_reports_its_landmarks_by_id_in_the_frame_of_its_start():
     )
     local = windows.gaussian(driven(run, sensor, motion=precise))
     assert (np.diff(local.ids.astype(int)) > 0).all()
-    assert set(local.ids) == set(np.concatenate([ids for ids, _, _ in run.epochs]))
+    assert set(local.ids) == set(np.concatenate([ids for ids, _, _ in run.keyframes]))
     np.testing.assert_allclose(local.landmarks, run.landmarks[local.ids], atol=0.02)
     np.testing.assert_allclose(local.end_pose, run.truth, atol=0.01)
 
@@ -225,7 +225,7 @@ def test_the_same_window_gives_the_same_bytes_and_nothing_changes_it():
     kept = bytes_of(window)
     once, twice = windows.gaussian(window), windows.gaussian(window)
     windows.advanced(
-        window, increment_of(ROBOT, 1.0, 1.0, 0.0), *run.epochs[0], generator(1, "a", 0, 0)
+        window, increment_of(ROBOT, 1.0, 1.0, 0.0), *run.keyframes[0], generator(1, "a", 0, 0)
     )
     windows.moved(window, increment_of(ROBOT, 1.0, 1.0, 0.0), generator(1, "a", 0, 0))
     assert bytes_of(window) == kept == bytes_of(driven(run, ACCURATE, seed=9))
@@ -241,9 +241,9 @@ def test_a_path_is_that_of_the_particles_own_line_of_descent():
         generator(1, "a", 0, 0),
     )
     exact = Increment(np.array([0.98, 0.1, 0.05]), np.zeros((3, 3)))
-    for k, epoch in enumerate(run.epochs):
+    for k, keyframe in enumerate(run.keyframes):
         motion = DRIVEN if k == 1 else exact
-        window = windows.advanced(window, motion, *epoch, random)
+        window = windows.advanced(window, motion, *keyframe, random)
     assert 1 < len(np.unique(window.paths[1, :, 2])) < 60
     np.testing.assert_array_equal(window.paths[-1], window.particles.poses)
     for before, after in zip(window.paths[1:-1], window.paths[2:], strict=True):
@@ -297,8 +297,8 @@ def test_an_odd_window_still_becomes_a_covariance(case, particles):
         windows.opened(FrontEnd(particles=particles), ACCURATE),
         generator(2, "a", 0, 0),
     )
-    for motion, epoch in CASES[case]:
-        window = windows.advanced(window, motion, *epoch, random)
+    for motion, keyframe in CASES[case]:
+        window = windows.advanced(window, motion, *keyframe, random)
     local = windows.gaussian(window)
     assert np.isfinite(local.mean).all()
     cholesky_factor(local.covariance, case)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.contribution import Start
+from team.estimation.contribution import InitialPoseFactor
 from team.estimation.map_joining.alignment import Shared, aligned, procrustes, refusal
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
@@ -93,7 +93,7 @@ def test_the_alignment_and_its_chi_square_are_consistent():
 @pytest.mark.parametrize("tick", [1, 3, 100])
 def test_an_aligned_stream_ends_where_one_with_a_vague_start_ends(tick):
     world = team(3, robots=2, submaps=10)
-    vague = Start("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
+    vague = InitialPoseFactor("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
     free = converged(joined(world.submaps, world.starts[:1], tick), OPTIONS)
     known = converged(joined(world.submaps, [world.starts[0], vague], tick), OPTIONS)
     assert not free.reasons
@@ -108,7 +108,7 @@ def test_an_aligned_stream_ends_where_one_with_a_vague_start_ends(tick):
 @pytest.mark.parametrize("seed", range(6))
 def test_maps_that_drifted_far_are_merged_and_find_the_same_optimum(seed):
     world = team(seed, submaps=25, landmarks=18, size=80.0, reach=20.0, sigmas=(0.3, 0.12, 1.2))
-    vague = Start("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
+    vague = InitialPoseFactor("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
     free = converged(joined(world.submaps, world.starts[:1]), OPTIONS)
     known = converged(joined(world.submaps, [world.starts[0], vague]), OPTIONS)
     assert not free.reasons
@@ -118,14 +118,16 @@ def test_maps_that_drifted_far_are_merged_and_find_the_same_optimum(seed):
 def test_one_shared_landmark_is_not_enough_and_the_fold_says_so():
     world = team(4, robots=2, submaps=6)
     fold = joined(seeing_only(world.submaps, "r1", [2]), world.starts[:1])
-    assert fold.reasons == {("r1", 0): "r1 (epoch 0) not joined: 1 shared landmark, 2 needed"}
+    assert fold.reasons == {("r1", 0): "r1 (incarnation 0) not joined: 1 shared landmark, 2 needed"}
     assert len(fold.islands) == 2
 
 
 def test_none_shared_is_said_in_the_plural():
     world = team(4, robots=2, submaps=6)
     fold = joined(seeing_only(world.submaps, "r1", []), world.starts[:1])
-    assert list(fold.reasons.values()) == ["r1 (epoch 0) not joined: 0 shared landmarks, 2 needed"]
+    assert list(fold.reasons.values()) == [
+        "r1 (incarnation 0) not joined: 0 shared landmarks, 2 needed"
+    ]
 
 
 def test_maps_that_disagree_are_not_merged():
@@ -209,7 +211,7 @@ def test_two_free_islands_join_each_other_while_the_main_one_knows_neither():
     assert set(fold.reasons) == {("r1", 0)}
     assert "0 shared landmarks, 2 needed" in fold.reasons[("r1", 0)]
     (words,) = fold.joined.values()
-    assert words.startswith("r2 (epoch 0) joined: ")
+    assert words.startswith("r2 (incarnation 0) joined: ")
     assert "per degree of freedom, transform sigma" in words
     other = fold.island("r2", 0)
     start = other.graph.streams[("r1", 0)][0]

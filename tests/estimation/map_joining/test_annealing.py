@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.gauss_newton import (
     Island,
@@ -39,7 +39,7 @@ def closed_loop(options):
 
     Bent, the chain costs 12; a sighting that is not believed costs 22. Not solved yet.
     """
-    starts = {(robot, 0): Start(robot, 0, np.zeros(3)) for robot in ("r0", "r1")}
+    starts = {(robot, 0): InitialPoseFactor(robot, 0, np.zeros(3)) for robot in ("r0", "r1")}
     submaps = [standing("r0", (0.0, 0.0), 0.01), standing("r1", (10.0, 3.5), 1.0)]
     seen = Sighting("r0", 0, 0, 500, "r1", np.array([10.0, 0.0]), np.diag([1e-4, 1e-6]))
     graph, state = extended(EMPTY_GRAPH, np.zeros(0), submaps, starts, {})

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -105,7 +105,9 @@ def windows(steps, sights, length):
 @pytest.mark.parametrize("length", [1, 2, 3, 4, 6, 12])
 def test_joined_submaps_equal_the_batch_over_all_raw_measurements(length):
     steps, sights = raw_measurements()
-    fold = converged(joined(windows(steps, sights, length), [Start("r0", 0, np.zeros(3))]), EXACTLY)
+    fold = converged(
+        joined(windows(steps, sights, length), [InitialPoseFactor("r0", 0, np.zeros(3))]), EXACTLY
+    )
     mean, covariance = batch(steps, sights)
     prior = prior_for(fold, "r0", 0)
     keep = np.delete(np.arange(3 + 2 * POINTS), 2)
@@ -116,7 +118,7 @@ def test_joined_submaps_equal_the_batch_over_all_raw_measurements(length):
 
 def test_a_chain_split_into_submaps_and_joined_equals_never_having_split_it():
     steps, sights = raw_measurements(6)
-    start = [Start("r0", 0, np.array([3.0, -2.0, 0.7]))]
+    start = [InitialPoseFactor("r0", 0, np.array([3.0, -2.0, 0.7]))]
     whole, split = (
         landmark_map(converged(joined(windows(steps, sights, length), start), EXACTLY))
         for length in (12, 3)
@@ -183,7 +185,7 @@ def test_two_iterations_a_tick_come_near_the_full_solution():
 
 def test_a_missing_submap_is_an_error_that_names_it():
     world = team(4, robots=1)
-    with pytest.raises(GapError, match=r"r0 \(epoch 0\): submap 3 came, 2 is next"):
+    with pytest.raises(GapError, match=r"r0 \(incarnation 0\): submap 3 came, 2 is next"):
         joined([*world.submaps[:2], world.submaps[3]], world.starts)
 
 
@@ -198,7 +200,7 @@ def test_a_submap_out_of_the_canonical_order_is_an_error():
 
 def test_a_start_after_the_first_submap_is_an_error():
     world = team(4)
-    with pytest.raises(LateStartError, match=r"r1 \(epoch 0\)"):
+    with pytest.raises(LateStartError, match=r"r1 \(incarnation 0\)"):
         started(joined(world.submaps[:2], world.starts), world.starts[1])
 
 
@@ -335,8 +337,8 @@ def test_the_priors_of_all_streams_together_are_the_priors_of_each():
     fold = joined(world.submaps, world.starts)
     together = main_priors(fold, sorted(fold.main.graph.streams))
     assert sorted(together) == [("r0", 0), ("r1", 0), ("r2", 0)]
-    for (robot, epoch), prior in together.items():
-        for one, other in zip(prior[:4], prior_for(fold, robot, epoch)[:4], strict=True):
+    for (robot, incarnation), prior in together.items():
+        for one, other in zip(prior[:4], prior_for(fold, robot, incarnation)[:4], strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
 
 
@@ -346,11 +348,11 @@ def test_of_many_landmarks_a_prior_has_the_nearest():
     streams = [("r0", 0), ("r2", 0)]
     few = main_priors(fold, streams, most=4)
     assert sorted(few) == streams
-    for robot, epoch in streams:
-        prior, everything = few[robot, epoch], prior_for(fold, robot, epoch)
+    for robot, incarnation in streams:
+        prior, everything = few[robot, incarnation], prior_for(fold, robot, incarnation)
         distance = np.linalg.norm(everything.means - everything.pose[:2], axis=1)
         assert set(prior.ids) == set(everything.ids[np.argsort(distance)[:4]])
-        same = prior_for(fold, robot, epoch, prior.ids.tolist())
+        same = prior_for(fold, robot, incarnation, prior.ids.tolist())
         for one, other in zip(prior[:4], same[:4], strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
 
@@ -364,7 +366,7 @@ def test_a_known_start_stays_exactly_where_it_is():
 
 
 def test_an_uncertain_start_is_composed_with_the_submap_that_leaves_it():
-    start = Start("r0", 0, np.array([1.0, 2.0, 0.5]), np.diag([0.04, 0.09, 0.01]))
+    start = InitialPoseFactor("r0", 0, np.array([1.0, 2.0, 0.5]), np.diag([0.04, 0.09, 0.01]))
     local = LocalMap(
         np.zeros(0, np.uint32), np.array([2.0, 0.0, 0.1]), np.diag([0.01, 0.01, 0.001])
     )
@@ -381,7 +383,7 @@ def test_a_graph_without_a_gauge_names_a_node_that_is_not_determined():
     world = team(10, robots=1)
     island = joined(world.submaps, world.starts).main
     graph = replace(island.graph, fixed=np.zeros_like(island.graph.fixed))
-    with pytest.raises(NotDeterminedError, match=r"r0 \(epoch 0\)|landmark"):
+    with pytest.raises(NotDeterminedError, match=r"r0 \(incarnation 0\)|landmark"):
         _ = replace(island, graph=graph).posterior
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.map_joining import gauss_newton, minima
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
@@ -150,7 +150,7 @@ def test_a_robot_whose_heading_no_landmark_gives_is_said(landmark_sigma, said):
     starts = [world.starts[0], replace(world.starts[1], covariance=wide)]
     island = joined_with(world.submaps, starts, (), OPTIONS).main
     found = [text for text in doubts(searched([island])) if "is placed weakly" in text]
-    assert [text.split(" is ")[0] for text in found] == ["r1 (epoch 0)"] * said
+    assert [text.split(" is ")[0] for text in found] == ["r1 (incarnation 0)"] * said
 
 
 def test_a_second_place_that_fits_as_well_is_found_and_said():
@@ -186,7 +186,7 @@ def hinged(apart, turn=0.1, sigma=0.8):
             for robot, k, mean, sigmas, ids in said
         )
     ]
-    fold = started(EMPTY_FOLD, Start("r0", 0, np.zeros(3)))
+    fold = started(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3)))
     return folded(fold, sorted(submaps, key=lambda each: each.key), OPTIONS)
 
 

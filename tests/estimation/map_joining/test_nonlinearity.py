@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from central.desk.evaluation.errors import Path, pose_errors
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.map_joining import nonlinearity as bends
 from team.estimation.map_joining.gauss_newton import JoinSettings, held, joint_marginal
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
@@ -23,7 +23,7 @@ def latecomer(blind, seed=0, turn=0.09):
     turn: of each submap's end [rad].
     """
     rng = np.random.default_rng(seed)
-    fold = started(EMPTY_FOLD, Start("r0", 0, np.zeros(3)))
+    fold = started(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3)))
     submaps = [seeing("r0", 0, np.zeros(3), rng)]
     for k in range(blind):
         truth = np.array([10.0, 0.0, 0.0])
@@ -65,7 +65,7 @@ def test_the_start_of_a_robot_that_drove_long_without_a_landmark_is_said(seed):
     found = bend(fold.main, start_node(fold))
     assert found.ratio > bends.BENT
     assert found.rise < bends.UNLIKELY
-    assert any("r1 (epoch 0) may have started farther off" in text for text in fold.doubts)
+    assert any("r1 (incarnation 0) may have started farther off" in text for text in fold.doubts)
 
 
 @pytest.mark.parametrize(("blind", "least", "most"), [(14, 4, 24), (1, 0, 0)])
@@ -91,8 +91,8 @@ def test_a_robot_that_sees_landmarks_soon_is_not_said(monkeypatch):
 
 
 def test_a_straight_valley_is_no_bend_however_wide():
-    wide = Start("r1", 0, np.zeros(3), np.diag([4.0, 4.0, 0.25]))
-    fold = started(started(EMPTY_FOLD, Start("r0", 0, np.zeros(3))), wide)
+    wide = InitialPoseFactor("r1", 0, np.zeros(3), np.diag([4.0, 4.0, 0.25]))
+    fold = started(started(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3))), wide)
     rng = np.random.default_rng(1)
     submaps = [seeing("r0", 0, np.zeros(3), rng)]
     fold = folded(fold, submaps, OPTIONS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.contribution import Contribution, Start
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import packed, unpacked
 from team.estimation.geometry import compose
 from team.estimation.map_joining import joining_kernel as kernel
@@ -33,7 +33,7 @@ def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01):
     made, starts, errors = [], [], {}
     for r in range(robots):
         robot, pose = f"r{r}", np.array([0.0, 2.0 * r - 1.0, 0.0])
-        starts.append(Start(robot, 0, pose))
+        starts.append(InitialPoseFactor(robot, 0, pose))
         errors[robot] = shared + own * random.standard_normal()
         for k in range(submaps):
             end = compose(pose, np.array([0.6, 0.0, 0.1 * (-1) ** k]))

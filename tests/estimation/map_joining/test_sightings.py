@@ -213,7 +213,7 @@ def test_one_sighting_does_not_join_two_islands_and_the_fold_says_why():
     submaps, starts, sightings, _ = strangers(0, 1)
     fold = converged(joined_with(submaps, starts, sightings, EXACTLY), EXACTLY)
     assert fold.reasons == {
-        ("r1", 0): "r1 (epoch 0) not joined: 0 shared landmarks and 1 sighting, 2 needed"
+        ("r1", 0): "r1 (incarnation 0) not joined: 0 shared landmarks and 1 sighting, 2 needed"
     }
 
 

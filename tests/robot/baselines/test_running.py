@@ -57,7 +57,7 @@ def fed(member, measurements=MEASUREMENTS):
 
 
 def by_hand(estimator, robot, start=None):
-    """(pose, landmarks) after the stream's epochs; `start` is the pose's covariance."""
+    """(pose, landmarks) after the stream's keyframes; `start` is the pose's covariance."""
     drawn = generator(robot.seed, robot.id, 1, 0)
     front = robot.front_end
     begun, stepped, of_pose, of_map, draws = {
@@ -102,7 +102,7 @@ def plain(front, proposal):
 
 @pytest.mark.parametrize("start", [None, SPREAD], ids=["known start", "uncertain start"])
 @pytest.mark.parametrize("estimator", WHOLE)
-def test_a_member_gives_what_its_estimator_gives_on_the_streams_epochs(estimator, start):
+def test_a_member_gives_what_its_estimator_gives_on_the_streams_keyframes(estimator, start):
     robot = of_name(estimator)
     member = estimator_of(robot, 1, InitialPose(np.zeros(3), start), KNOWN)
     fed(member)
@@ -144,7 +144,7 @@ def test_a_node_says_how_well_its_measurements_were_predicted(estimator):
         return
     dof = sum(each.dof for each in said)
     squared = sum(each.squared for each in said)
-    assert len({(each.epoch, each.sequence) for each in said}) == len(said) >= 4
+    assert len({(each.incarnation, each.sequence) for each in said}) == len(said) >= 4
     figures = node.status().figures
     assert figures["nis_dof"] == dof
     assert figures["nis_per_dof"] == pytest.approx(squared / dof)
@@ -212,7 +212,7 @@ def test_localisation_finds_itself_from_an_unknown_start():
 def test_the_last_word_names_the_last_map():
     out = driven(RobotNode(of_name("ekf-slam")), MEASUREMENTS[:-2])
     maps, (done,) = of(out, ch.OWN_MAP), of(out, ch.ROBOT_DONE)
-    assert (done.epoch, done.last_map) == (maps[-1].epoch, maps[-1].sequence)
+    assert (done.incarnation, done.last_map) == (maps[-1].incarnation, maps[-1].sequence)
     assert [x.sequence for x in maps] == [3, 6, 9, 11]
     assert all(x.joint for x in maps)
     own = driven(RobotNode(config()), MEASUREMENTS)

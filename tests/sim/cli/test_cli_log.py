@@ -89,7 +89,7 @@ def test_check_ends_with_1_and_a_line_for_each_finding(log: Path, tmp_path: Path
         recorder.write([s for s in published() if s.counter != 3])
     status, out, _ = run("check", lost)
     assert status == 1
-    stream = "source/r1: 2 measurements of life 1 of the stream missing: 7–8"
+    stream = "source/r1: 2 measurements of incarnation 1 missing: 7–8"
     assert {stream, "truth/r1: 1 message missing: 3"} <= set(out.splitlines())
     assert all(" missing: " in line for line in out.splitlines())
 

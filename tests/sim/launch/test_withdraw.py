@@ -17,7 +17,7 @@ from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, opened
 from tests.support import examples, on_its_key, wait_until
 
 FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
-EXAMPLE = next(e for e in examples() if isinstance(e, m.Configured))
+EXAMPLE = next(e for e in examples() if isinstance(e, m.Configuration))
 CONFIG = on_its_key(ch.ROBOT_CONFIG, "r3", EXAMPLE)
 
 

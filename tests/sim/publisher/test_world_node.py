@@ -15,7 +15,7 @@ from team.wire.arrays import floats, stamps
 from team.wire.codec import WireError, decoded, encoded
 from tests.teams import of, stream, world_of
 
-SCENARIO = m.Configured(0, "world", 0, bytes(8), "{}")
+SCENARIO = m.Configuration(0, "world", 0, bytes(8), "{}")
 STREAMS = world_of(stream("r1", 12), stream("r2", 9, off_ns=300_000_000, beyond=2))
 
 
@@ -38,8 +38,8 @@ def measurements(out):
     return [o.message for o in out if isinstance(o.message, m.Measurement)]
 
 
-def progress(robot, count, epoch=1, node="robot"):
-    return m.Progress(0, node, robot, epoch, count, 0)
+def progress(robot, count, incarnation=1, node="robot"):
+    return m.Progress(0, node, robot, incarnation, count, 0)
 
 
 def test_it_waits_for_everyone_and_says_for_whom():
@@ -68,8 +68,8 @@ def test_measurements_come_by_stamp_then_robot_and_count_from_0():
     for each in STREAMS.streams:
         mine = [r for r in out if r.robot == each.robot]
         assert [r.number for r in mine] == list(range(len(each)))
-        assert {r.epoch for r in mine} == {1}
-        assert isinstance(mine[0], m.Start)
+        assert {r.incarnation for r in mine} == {1}
+        assert isinstance(mine[0], m.InitialPose)
 
 
 def test_a_batch_spans_no_more_than_it_may():
@@ -102,7 +102,7 @@ def test_it_ends_once_with_the_last_counters():
     out = all_of(node)
     (end,) = of(out, ch.END)
     assert out[-1].message is end
-    assert [(s.robot, s.epoch, s.measurements) for s in end.streams] == [
+    assert [(s.robot, s.incarnation, s.measurements) for s in end.streams] == [
         (each.robot, 1, len(each)) for each in STREAMS.streams
     ]
     assert node.publish(1e9) == []
@@ -132,8 +132,8 @@ def test_it_is_never_more_than_its_credit_ahead_of_a_living_robot(monkeypatch, s
     for measurement in measurements(node.publish(0.0)):
         sent[measurement.robot] += 1
     assert sent[slow] == 8, "progress that comes late takes no credit back"
-    node.handle(progress(slow, 100, epoch=9), 0)
-    assert measurements(node.publish(0.0)) == [], "nor does another epoch's give any"
+    node.handle(progress(slow, 100, incarnation=9), 0)
+    assert measurements(node.publish(0.0)) == [], "nor does another incarnation's give any"
     node.handle(progress(other, 1000), 0)
     alive(node, f"robot/{slow}", here=False)
     all_of(node)
@@ -206,18 +206,20 @@ def test_at_speed_max_only_credit_holds_it_back():
     assert len(measurements(out)) == sum(len(each) for each in STREAMS.streams)
 
 
-def wanted(node, robot="r1", epoch=1, first=0, last=-1):
-    return list(node.measurements(encoded(m.MeasurementsRequest(0, robot, epoch, first, last))))
+def wanted(node, robot="r1", incarnation=1, first=0, last=-1):
+    return list(
+        node.measurements(encoded(m.MeasurementsRequest(0, robot, incarnation, first, last)))
+    )
 
 
 def test_what_is_asked_for_is_answered_with_the_bytes_that_were_published():
     node = world()
     out = [encoded(r) for r in measurements(all_of(node)) if r.robot == "r1"]
-    assert wanted(node) == wanted(node, epoch=0) == out
+    assert wanted(node) == wanted(node, incarnation=0) == out
     assert wanted(node, first=3, last=5) == out[3:6]
     assert wanted(node, first=len(out) - 1, last=10_000) == out[-1:]
     assert wanted(node, first=len(out)) == []
-    assert wanted(node, epoch=2) == wanted(node, robot="r9") == []
+    assert wanted(node, incarnation=2) == wanted(node, robot="r9") == []
 
 
 def test_only_what_was_published_is_answered_and_in_portions(monkeypatch):
@@ -238,18 +240,18 @@ def test_a_query_that_is_damaged_is_an_error_that_says_so():
         list(world().measurements(b"\x93nonsense"))
 
 
-def test_who_asks_for_what_is_no_longer_kept_gets_a_new_epoch_at_a_free_pose(monkeypatch):
+def test_who_asks_for_what_is_no_longer_kept_gets_a_new_incarnation_at_a_free_pose(monkeypatch):
     monkeypatch.setattr(world_node, "BATCH", 12)
     node = world(cache=3)
     before = [r for r in measurements(node.publish(0.0)) if r.robot == "r1"]
     assert wanted(node, first=len(before) - 3) == [encoded(r) for r in before[-3:]]
     assert wanted(node, first=0) == []
-    assert wanted(node, first=0) == [], "asked twice, there is still one new epoch"
+    assert wanted(node, first=0) == [], "asked twice, there is still one new incarnation"
     out = all_of(node)
     mine = [r for r in measurements(out) if r.robot == "r1"]
-    assert {r.epoch for r in mine} == {2}
+    assert {r.incarnation for r in mine} == {2}
     assert [r.number for r in mine] == list(range(len(mine)))
-    assert isinstance(mine[0], m.Start)
+    assert isinstance(mine[0], m.InitialPose)
     assert (mine[0].pose, mine[0].covariance) == (b"", b"")
     (end,) = of(out, ch.END)
     assert end.streams[0] == m.StreamEnd("r1", 2, len(mine))
@@ -257,12 +259,12 @@ def test_who_asks_for_what_is_no_longer_kept_gets_a_new_epoch_at_a_free_pose(mon
     assert len(before) + len(mine) - 1 == total, "the start takes the place of the last one sent"
 
 
-def test_a_new_epoch_after_the_end_has_its_own_end():
+def test_a_new_incarnation_after_the_end_has_its_own_end():
     node = world(cache=3)
     all_of(node)
     wanted(node, first=0)
     out = node.publish(0.0)
-    assert [type(o.message) for o in out] == [m.Start, m.End]
+    assert [type(o.message) for o in out] == [m.InitialPose, m.End]
     assert out[-1].message.streams[0] == m.StreamEnd("r1", 2, 1)
     assert node.publish(0.0) == []
 
@@ -329,8 +331,8 @@ def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
     before = measurements(all_of(world()))
     node = again(7, 5)
     out = measurements(all_of(node))
-    starts = [r for r in out if isinstance(r, m.Start)]
-    assert {(r.robot, r.number, r.epoch) for r in starts} == {("r1", 0, 1), ("r2", 0, 1)}
+    starts = [r for r in out if isinstance(r, m.InitialPose)]
+    assert {(r.robot, r.number, r.incarnation) for r in starts} == {("r1", 0, 1), ("r2", 0, 1)}
     least = {"r1": 7, "r2": 5}
     assert out[len(starts) :] == [r for r in before if r.number >= least[r.robot]]
     assert node.status().figures["measurements"] == len(before)
@@ -340,12 +342,12 @@ def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
 
 def test_a_world_that_is_started_again_gives_the_recorder_what_it_lacks():
     out = measurements(all_of(again(7, 5, recorder=3)))
-    assert min(r.number for r in out if not isinstance(r, m.Start)) == 3
+    assert min(r.number for r in out if not isinstance(r, m.InitialPose)) == 3
 
 
 def test_a_world_that_is_started_again_is_paced_from_where_it_goes_on():
     node = again(12, 12, speed=2.0)
-    first = [r for r in measurements(node.publish(100.0)) if not isinstance(r, m.Start)]
+    first = [r for r in measurements(node.publish(100.0)) if not isinstance(r, m.InitialPose)]
     begins_ns = min(r.stamp_ns for r in first)
     assert begins_ns > 4_000_000_000
     later = measurements(node.publish(101.0))
@@ -363,7 +365,7 @@ def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot
     node = world()
     node.handle(m.Progress(5_000_000_000, "robot/r1", "r1", 3, 4, 0), 0)
     out = [r for r in measurements(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
-    assert {r.epoch for r in out} == {4}
+    assert {r.incarnation for r in out} == {4}
     assert [r.number for r in out] == list(range(len(out)))
     assert min(r.stamp_ns for r in out) == 5_000_000_000
 

@@ -185,7 +185,7 @@ def test_on_another_platform_numbers_are_compared_within_a_tolerance(
 def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team:
     """Two robots in any order of delivery; r1 is killed on the way, and comes again or not.
 
-    cache: how many measurements its source has kept then; with too few a new epoch begins.
+    cache: how many measurements its source has kept then; with too few a new incarnation begins.
     """
     robots = [stream("r1", 40), stream("r2", 40, y=1.0)]
     team = Team(world_of(*robots), [config("r1"), config("r2")], random.Random(seed))
@@ -212,9 +212,9 @@ def test_a_log_with_a_restart_and_any_order_comes_out_again(seed: int, tmp_path:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_log_with_a_new_epoch_comes_out_again(seed: int, tmp_path: Path) -> None:
+def test_a_log_with_a_new_incarnation_comes_out_again(seed: int, tmp_path: Path) -> None:
     team = restless(seed, cache=0)
-    assert {s.epoch for s in team.sent[ch.SUBMAP.key("r1")]} == {1, 2}
+    assert {s.incarnation for s in team.sent[ch.SUBMAP.key("r1")]} == {1, 2}
     assert all_equal(verify(written(tmp_path / "log.mcap", said(team))))
 
 
@@ -303,7 +303,7 @@ def test_without_a_robot_the_map_is_that_of_a_team_that_never_had_it(
     alone = team_samples(thesis(STEPS, robots=1))  # there nobody is sighted: fewer measurements
     (one,), (other,) = (messages(each, ch.FINAL_MAP) for each in (run, alone))
     assert (one.means, one.covariance) == (other.means, other.covariance)
-    assert one.members == other.members == (m.Member("r1", 1, STEPS // 10 - 1),)
+    assert one.members == other.members == (m.VersionEntry("r1", 1, STEPS // 10 - 1),)
 
 
 def test_another_rule_is_the_run_that_would_have_used_it(log: Log) -> None:
@@ -381,6 +381,6 @@ def test_a_log_that_lacks_a_measurement_runs_under_no_other_conditions(
     lost = messages(samples, ch.ODOMETRY, "r1")[5]
     cut = changed(samples, ch.ODOMETRY, lambda x: None if x == lost else x)
     with pytest.raises(
-        RerunError, match=f"measurement {lost.number} of r1, epoch 1 is not in the log"
+        RerunError, match=f"measurement {lost.number} of r1, incarnation 1 is not in the log"
     ):
         changed_run(written(tmp_path / "log.mcap", cut), Changes())

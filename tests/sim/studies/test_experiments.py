@@ -207,7 +207,7 @@ SAID = ["another map fits about as well"]
     [
         (few_run(2.0, 2.0, []), 0, 0, 0, 0, 0),
         (few_run(2.0, 2.0, SAID), 0, 0, 0, 0, 1),
-        (few_run(2.0, 2.0, ["r2 (epoch 1) is placed weakly: …"]), 0, 0, 0, 0, 0),
+        (few_run(2.0, 2.0, ["r2 (incarnation 1) is placed weakly: …"]), 0, 0, 0, 0, 0),
         (few_run(20.0, 2.0, []), 0, 0, 1, 1, 0),
         (few_run(2.0, 12.0, []), 0, 0, 1, 1, 0),
         (few_run(20.0, 2.0, SAID), 0, 0, 1, 0, 0),

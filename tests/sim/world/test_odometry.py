@@ -158,25 +158,25 @@ def cost_per_dof(of: m.FusedMap) -> float:
 
 def test_a_centre_that_takes_raw_measurements_puts_the_clock_right_too() -> None:
     exact, off = (
-        team_epochs(each.robots[0], streams_of(each))
+        team_keyframes(each.robots[0], streams_of(each))
         for each in (mixed_team(), mixed_team(clock_offset_s=-0.75))
     )
     assert len(exact) == 120
     assert exact == off
-    ignorant = team_epochs(mixed_team().robots[0], streams_of(mixed_team(clock_offset_s=-0.75)))
+    ignorant = team_keyframes(mixed_team().robots[0], streams_of(mixed_team(clock_offset_s=-0.75)))
     assert ignorant != exact
 
 
-def team_epochs(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
-    """Stamp, motion and ranges of each epoch of the first robot, as the centre cuts them."""
-    epochs = TeamKeyframes([robot.id])
-    epochs.configure(robot.id, robot)
+def team_keyframes(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
+    """Stamp, motion and ranges of each keyframe of the first robot, as the centre cuts them."""
+    keyframes = TeamKeyframes([robot.id])
+    keyframes.configure(robot.id, robot)
     measurements = published(world.streams[0])
     for measurement in measurements:
-        epochs.put(measurement)
-    epochs.end(m.End(0, (m.StreamEnd(robot.id, 1, len(measurements)),)))
+        keyframes.put(measurement)
+    keyframes.end(m.End(0, (m.StreamEnd(robot.id, 1, len(measurements)),)))
     return [
-        (each.stamp_ns, each.epoch.increment.mean.tobytes(), each.epoch.ranges.tobytes())
-        for step in epochs.steps()
+        (each.stamp_ns, each.keyframe.increment.mean.tobytes(), each.keyframe.ranges.tobytes())
+        for step in keyframes.steps()
         for each in step
     ]
