@@ -168,7 +168,7 @@ def test_everything_that_runs_with_us_has_a_permissive_licence() -> None:
 
 
 def test_only_zenoh_s_licence_needed_reading_among_what_users_install() -> None:
-    assert set(REVIEWED) & set(closure("teamslam[limit,parquet]")) == {"eclipse-zenoh"}
+    assert set(REVIEWED) & set(closure("teamslam[limit,parquet,studies]")) == {"eclipse-zenoh"}
     assert set(REVIEWED) <= set(closure("teamslam[dev]"))
 
 

@@ -1,6 +1,7 @@
 """The commands `teamslam experiment NAME`: one for each of the catalogue, and `all`."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -33,6 +34,12 @@ Output = Annotated[
     ),
 ]
 Jobs = Annotated[int | None, typer.Option(help="Processes; default: one per core.", min=1)]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Send the runs to a Dask scheduler, a cluster's too.", metavar="tcp://HOST:PORT"
+    ),
+]
 Datasets = Annotated[
     list[Path] | None,
     typer.Option("--dataset", help="A UTIAS data set, folder or zip; repeatable."),
@@ -50,6 +57,7 @@ def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
         json_file: JsonFile = None,
         output: Output = FOLDER,
         jobs: Jobs = None,
+        scheduler: Scheduler = None,
         dataset: Datasets = None,
         quick: Quick = False,
         check: Check = False,
@@ -59,59 +67,87 @@ def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
             count = seeds or (entry.quick_seeds if quick else own)
             return tuple(range(first, first + count))
 
-        _run(name, entries, chosen, json_file, output, jobs, dataset or [], quick, check)
+        asked = Asked(
+            json_file=json_file,
+            output=output,
+            jobs=jobs,
+            scheduler=scheduler,
+            paths=dataset or [],
+            quick=quick,
+            check=check,
+        )
+        _run(name, entries, chosen, asked)
 
     app.command(name, help=summary)(run)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """The options of a command, but for its seeds."""
+
+    json_file: Path | None
+    output: Path
+    jobs: int | None
+    scheduler: str | None
+    paths: Sequence[Path]
+    quick: bool
+    check: bool
 
 
 def _run(
     name: str,
     entries: Sequence[Entry],
     seeds: Callable[[Entry], tuple[int, ...]],
-    json_file: Path | None,
-    output: Path,
-    jobs: int | None,
-    paths: Sequence[Path],
-    quick: bool,
-    check: bool,
+    asked: Asked,
 ) -> None:
     import json
 
     from rich.console import Console
 
+    try:
+        import joblib  # noqa: F401 - said before the work, not after it
+    except ModuleNotFoundError:
+        fail("experiments need joblib: python -m pip install 'teamslam[studies]'", WRONG_USE)
+
+    from sim.studies.experiments.cases import SchedulerError
     from sim.studies.experiments.experiment import Options, without_datasets
     from sim.studies.experiments.output import printed, to_json, write
     from sim.studies.experiments.progress import shown
     from sim.studies.experiments.runner import FAILURES, computed, cores, dataset, planned
     from team.recording.provenance import provenance
 
-    if json_file is not None and not json_file.absolute().parent.is_dir():
-        fail(f"--json {json_file}: no such folder; make it first", WRONG_USE)
-    datasets = tuple(dataset(path) for path in paths)
-    plans = [planned(entry, Options(seeds(entry), quick, datasets)) for entry in entries]
+    if asked.json_file is not None and not asked.json_file.absolute().parent.is_dir():
+        fail(f"--json {asked.json_file}: no such folder; make it first", WRONG_USE)
+    datasets = tuple(dataset(path) for path in asked.paths)
+    plans = [planned(entry, Options(seeds(entry), asked.quick, datasets)) for entry in entries]
     if not any(plan.tasks for plan in plans):
         fail(without_datasets(name), WRONG_USE)
     try:
-        concluded = computed(plans, output, jobs or cores(), shown)
+        concluded = computed(plans, asked.output, asked.jobs or cores(), shown, asked.scheduler)
+    except SchedulerError as error:
+        fail(str(error), WRONG_USE)
     except KeyboardInterrupt:
-        fail(f"interrupted; what was computed is kept in {output}: run it again to go on", FAILED)
+        fail(
+            f"interrupted; what was computed is kept in {asked.output}: run it again to go on",
+            FAILED,
+        )
     origin = provenance()
     console = Console()
     if not console.is_terminal:
         console.width = FILE_WIDTH
     for each in concluded:
         console.print(*printed(each), sep="\n")
-    page = write(concluded, output, "index" if name == ALL else name, origin)
-    if json_file is not None:
+    page = write(concluded, asked.output, "index" if name == ALL else name, origin)
+    if asked.json_file is not None:
         contents = {each.entry.name: to_json(each, origin) for each in concluded}
         content = contents if name == ALL else contents[name]
-        json_file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
+        asked.json_file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
     typer.echo(f"{page}: all of it with its pictures; JSON and PNG beside it")
     failed = sum(len(each.failed) for each in concluded)
     if failed:
-        fail(f"{failed} runs failed; {output / FAILURES} has their tracebacks", FAILED)
+        fail(f"{failed} runs failed; {asked.output / FAILURES} has their tracebacks", FAILED)
     missed = sum(goal.passed is False for each in concluded for goal in each.outcome.goals)
-    if check and missed:
+    if asked.check and missed:
         fail(f"{missed} goals were missed", FAILED)
 
 

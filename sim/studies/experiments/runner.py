@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import cast
 
 from sim.datasets.tables import opened
+from sim.studies.experiments.cases import Cases, Done
 from sim.studies.experiments.catalogue import Entry
 from sim.studies.experiments.experiment import Dataset, Experiment, Options, Outcome, Results
 from sim.studies.experiments.parameters import kinds_of
-from sim.studies.experiments.store import Store
 from sim.studies.experiments.task import Task
-from sim.studies.experiments.workers import Done, run
 
 FAILURES = "failures.txt"
 """Beside the results: the tracebacks of the last command's failed runs."""
@@ -64,19 +63,21 @@ def computed(
     folder: Path,
     jobs: int,
     progress: Progress,
+    scheduler: str | None = None,
 ) -> list[Concluded]:
     """The outcomes of all plans; their tasks run together, one that several need runs once."""
+    folder.mkdir(parents=True, exist_ok=True)
     tasks = {task.name: task for plan in plans for task in plan.tasks}
-    store = Store(folder)
-    results = store.found(tasks.values())
+    cases = Cases(folder)
+    kept = {name: cases.found(task) for name, task in tasks.items()}
+    results = {name: result for name, result in kept.items() if result is not None}
     missing = [task for name, task in tasks.items() if name not in results]
     failures: dict[str, Done] = {}
     with progress(missing, len(results)) as tell:
-        for done in run(missing, jobs):
+        for done in cases.run(missing, jobs, scheduler):
             if done.result is None:
                 failures[done.task.name] = done
             else:
-                store.keep(done.task, done.result, done.seconds)
                 results[done.task.name] = done.result
             tell(done)
     _write_failures(folder / FAILURES, list(failures.values()))

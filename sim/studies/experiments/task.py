@@ -37,6 +37,11 @@ class Task:
         text = json.dumps([self.work, self.parameters], sort_keys=True, separators=(",", ":"))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
+    @property
+    def program(self) -> str:
+        """A digest of what the function is made of: our sources and the libraries' versions."""
+        return program_of(self.work.partition(":")[0])
+
     def run(self) -> dict[str, Any]:
         """Compute it, here and now."""
         module, _, function = self.work.partition(":")

@@ -1,9 +1,9 @@
 """Runs of experiments: in processes of their own, kept as they come, none lost by another's end."""
 
 import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing import active_children
 from pathlib import Path
 
 import msgspec
@@ -12,14 +12,13 @@ import pytest
 from sim.datasets.tables import DatasetError
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.studies.experiments import xu_localisation
+from sim.studies.experiments.cases import FOLDER, Cases, Done, SchedulerError
 from sim.studies.experiments.catalogue import ENTRIES, Entry
 from sim.studies.experiments.experiment import Options, Outcome, Results
 from sim.studies.experiments.output import write
 from sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
-from sim.studies.experiments.store import Store
 from sim.studies.experiments.task import ROOTS, Task
 from sim.studies.experiments.team_runs import team_run, team_task
-from sim.studies.experiments.workers import Done, run
 from sim.world.config import SimulatedWorld
 from team.sources import sources_of
 
@@ -72,9 +71,9 @@ def silent(tasks: Sequence[Task], kept: int) -> Iterator[Callable[[Done], None]]
     yield lambda _: None
 
 
-def test_a_run_in_a_worker_gives_the_bits_of_a_run_here() -> None:
+def test_a_run_in_a_worker_gives_the_bits_of_a_run_here(tmp_path: Path) -> None:
     task = team_task(short(24))
-    (done,) = run([task], 1)
+    (done,) = Cases(tmp_path).run([task], 1)
     here = team_run(**task.parameters)
     assert done.result is not None
     assert done.result["final_map_sha256"] == here["final_map_sha256"]
@@ -88,7 +87,8 @@ def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path: Path
     (concluded,) = computed([plan(wrong, dead, *good)], tmp_path, 1, silent)
     assert concluded.outcome.figures["means"] == [1.0, 5.0]
     assert "TypeError" in concluded.failed["wrong"]
-    assert concluded.failed["dead"] == "its process ended with exit status 3"
+    assert concluded.failed["dead"].startswith("its process died: ")
+    assert "EXIT(3)" in concluded.failed["dead"]
     assert "Traceback" in (tmp_path / FAILURES).read_text()
 
 
@@ -108,25 +108,23 @@ def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path: Path)
     assert concluded.outcome.figures["means"] == [1.0, 2.0]
 
 
-def test_a_result_of_another_program_does_not_count(tmp_path: Path) -> None:
-    store, task = Store(tmp_path), counted(1.0)
-    store.keep(task, {"rmse": 1.0}, 0.1)
-    assert store.found([task]) == {task.name: {"rmse": 1.0}}
-    line = json.loads(store.path.read_text())
-    store.path.write_text(json.dumps(line | {"program": "0" * 16}) + "\n")
-    assert store.found([task]) == {}
-
-
-def test_a_line_that_was_cut_off_is_passed_over_and_the_next_one_stands_alone(
-    tmp_path: Path,
+def test_a_result_of_another_program_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, first, second = Store(tmp_path), counted(1.0), counted(2.0)
-    store.keep(first, {"rmse": 1.0}, 0.1)
-    whole = store.path.read_bytes()
-    store.path.write_bytes(whole[:-9])
-    store = Store(tmp_path)
-    store.keep(second, {"rmse": 2.0}, 0.1)
-    assert store.found([first, second]) == {second.name: {"rmse": 2.0}}
+    (done,) = Cases(tmp_path).run([counted(1.0)], 1)
+    assert done.result == {"rmse": 1.0}
+    assert Cases(tmp_path).found(counted(1.0)) == {"rmse": 1.0}
+    assert Cases(tmp_path).found(counted(2.0)) is None
+    monkeypatch.setattr("sim.studies.experiments.task.program_of", lambda _: "0" * 16)
+    assert Cases(tmp_path).found(counted(1.0)) is None
+
+
+def test_a_result_that_was_cut_off_is_computed_again(tmp_path: Path) -> None:
+    list(Cases(tmp_path).run([counted(1.0), counted(2.0)], 1))
+    for kept in (tmp_path / FOLDER).rglob("output.pkl"):
+        kept.write_bytes(kept.read_bytes()[:-9])
+    (concluded,) = computed([plan(counted(1.0), counted(2.0))], tmp_path, 1, silent)
+    assert concluded.outcome.figures["means"] == [1.0, 2.0]
 
 
 def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> None:
@@ -149,11 +147,18 @@ def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
     assert not {name for name in sources if name.partition(".")[0] == "numpy"}
 
 
-def test_leaving_early_ends_the_processes() -> None:
-    runs = run([counted(1.0), team_task(load("large"))], 2)
+def test_leaving_early_ends_the_long_run_too(tmp_path: Path) -> None:
+    begun = time.monotonic()
+    slow = Task("subprocess:run", {"args": ["sleep", "40"]}, "slow")
+    runs = Cases(tmp_path).run([counted(1.0), slow], 2)
     assert next(runs).task == counted(1.0)
     runs.close()  # type: ignore[attr-defined] # a generator
-    assert active_children() == []
+    assert time.monotonic() - begun < 30.0
+
+
+def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path: Path) -> None:
+    with pytest.raises(SchedulerError, match="--scheduler"):
+        list(Cases(tmp_path).run([counted(1.0)], 1, "tcp://127.0.0.1:1"))
 
 
 def test_a_data_set_is_known_by_its_content(tmp_path: Path) -> None:

@@ -1,0 +1,138 @@
+"""Cases computed in parallel and kept on disk, by joblib: its workers, its memory.
+
+A case that fails or whose process dies loses itself only. With a scheduler the cases go to Dask's
+workers, on a cluster too (decision 0058).
+"""
+
+import traceback
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from joblib import Memory, Parallel, delayed, parallel_config
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+from sim.studies.experiments.task import Task
+
+FOLDER = "cases"
+"""Of the results, in the folder of an experiment."""
+IDLE_S = 5
+"""A worker without a case ends after this."""
+Kept = Callable[..., dict[str, Any]]
+
+
+class SchedulerError(ValueError):
+    """A scheduler that can not be used; the text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """A finished case: its result, or else the error in a line and the traceback."""
+
+    task: Task
+    result: dict[str, Any] | None
+    error: str = ""
+    details: str = ""
+
+
+class Cases:
+    """The results in a folder; one counts for a case of the same parameters and program."""
+
+    def __init__(self, folder: Path) -> None:
+        self._kept = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
+
+    def found(self, task: Task) -> dict[str, Any] | None:
+        """The result that is kept of a case; None where it is to be computed."""
+        arguments = _arguments(task)
+        if not self._kept.check_call_in_cache(**arguments):
+            return None
+        result: dict[str, Any] = self._kept(**arguments)
+        return result
+
+    def run(self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None) -> Iterator[Done]:
+        """Compute the cases, `jobs` at a time; each as it is done, in no fixed order.
+
+        Long cases begin first. Leaving the iterator early ends the workers. scheduler: the address
+        of a Dask scheduler whose workers see the folder; then as many at a time as it has workers.
+        """
+        waiting = {task.name: task for task in sorted(tasks, key=lambda task: -task.cost)}
+        with ExitStack() as stack:
+            for each in _backend(scheduler):
+                stack.enter_context(each)
+            finished = self._parallel(list(waiting.values()), jobs, scheduler)
+            try:
+                for done in finished:
+                    del waiting[done.task.name]
+                    yield done
+            except TerminatedWorkerError:  # one of those that are left: each by itself then
+                for task in waiting.values():
+                    yield self._alone(task)
+            finally:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # that cases are cancelled is what is asked
+                    finished.close()
+
+    def _parallel(
+        self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None
+    ) -> Generator[Done, None, None]:
+        # Of one job joblib would make a loop in this process, where a case that dies ends us.
+        workers = max(jobs, 2) if scheduler is None else -1
+        at_once = jobs if scheduler is None else "all"
+        parallel = Parallel(
+            workers, return_as="generator_unordered", pre_dispatch=at_once, batch_size=1
+        )
+        done: Generator[Done, None, None] = parallel(
+            delayed(_attempt)(self._kept, task) for task in tasks
+        )
+        return done
+
+    def _alone(self, task: Task) -> Done:
+        try:
+            (done,) = self._parallel([task], 1)
+        except TerminatedWorkerError as error:
+            return Done(task, None, f"its process died: {' '.join(str(error).split())}")
+        return done
+
+
+def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
+    """The workers: processes of this machine with one thread each, or those of a scheduler."""
+    if scheduler is None:
+        return [parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=IDLE_S)]
+    try:
+        from distributed import Client
+    except ImportError:
+        raise SchedulerError(
+            "--scheduler needs Dask: python -m pip install 'teamslam[cluster]'"
+        ) from None
+    try:
+        client = Client(scheduler, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise SchedulerError(f"--scheduler {scheduler}: no Dask scheduler there: {error}") from None
+    return [client, parallel_config("dask")]
+
+
+def _attempt(kept: Kept, task: Task) -> Done:
+    try:
+        return Done(task, kept(**_arguments(task)))
+    except Exception as error:  # whatever a case raises is that case's result
+        text = " ".join(str(error).split())
+        return Done(task, None, f"{type(error).__name__}: {text}", traceback.format_exc())
+
+
+def _arguments(task: Task) -> dict[str, Any]:
+    return {
+        "work": task.work,
+        "parameters": dict(task.parameters),
+        "program": task.program,
+        "local": dict(task.local),
+    }
+
+
+def _result(
+    work: str, parameters: dict[str, Any], program: str, local: dict[str, str]
+) -> dict[str, Any]:
+    """The result of a case. program: of the sources, so that those of another one do not count."""
+    return Task(work, parameters, "", local=local).run()
