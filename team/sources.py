@@ -1,16 +1,21 @@
 """Which of our sources a module depends on: what its results, or its compiled code, hang on."""
 
 import ast
+import re
 import sys
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
+_PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
+"""How a table names what is found by name (`team.registry`)."""
+
 
 def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
     """The text of a module and of every module of these packages that it imports, near or far.
 
-    They are found by their import statements, those inside functions too.
+    They are found by their import statements, those inside functions too, and by the places that
+    tables name.
     """
     found: dict[str, bytes] = {}
     waiting = [module]
@@ -29,13 +34,15 @@ def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
 
 @lru_cache
 def _imported(source: bytes) -> tuple[str, ...]:
-    """Modules that a source may import: `from a import b` may mean a.b."""
+    """Modules that a source may import: `from a import b` may mean a.b, a text `a.b:c` is of a.b."""
     names: list[str] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
             names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            names += _PLACE.findall(node.value)
     return tuple(names)
 
 
