@@ -34,7 +34,7 @@ def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
 
 @lru_cache
 def _imported(source: bytes) -> tuple[str, ...]:
-    """Modules that a source may import: `from a import b` may mean a.b, a text `a.b:c` is of a.b."""
+    """Modules that a source may use: `from a import b` may mean a.b, a text `a.b:c` means a.b."""
     names: list[str] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
