@@ -63,7 +63,35 @@ def test_every_file_and_name_that_a_page_names_is_there(page: Path) -> None:
     assert wrong(page.read_text()) == []
 
 
-def test_what_is_not_there_is_found() -> None:
+LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)")
+
+
+def dangling(page: Path) -> list[str]:
+    """Links to files or headings that are not there; what the site generates is not looked at."""
+    found = []
+    for target, anchor in LINK.findall(page.read_text()):
+        file = page.parent / target if target else page
+        if not file.is_relative_to(ROOT / "docs" / "generated") and (
+            not file.exists() or (anchor and anchor not in anchors(file))
+        ):
+            found.append(f"{target}#{anchor}" if anchor else target)
+    return found
+
+
+def anchors(page: Path) -> set[str]:
+    """The headings of a page as links spell them."""
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in names_of(page))
+    return {each.strip().replace(" ", "-") for each in plain}
+
+
+@pytest.mark.parametrize("page", PAGES + DECISIONS, ids=lambda page: page.name)
+def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
+    assert dangling(page) == []
+
+
+def test_what_is_not_there_is_found(tmp_path: Path) -> None:
+    (tmp_path / "page.md").write_text("# A heading\n[a](#a-heading) [b](#none) [c](gone.md)\n")
+    assert dangling(tmp_path / "page.md") == ["#none", "gone.md"]
     assert wrong("see `team/shell.py: Shell.run` and `team/nothing.py`") == ["team/nothing.py"]
     assert wrong("`team/shell.py: Shell.walk`") == ["team/shell.py: Shell.walk"]
     assert wrong("`docs/wire.md: Keys`, `team/wire/`") == []

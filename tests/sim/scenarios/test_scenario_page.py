@@ -88,7 +88,7 @@ def test_the_page_gives_each_field_a_unit_and_a_meaning(cls: type[msgspec.Struct
     assert [name for name, row in rows.items() if len(row) != 4 or not all(row)] == []
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/scenario.md"])
+@pytest.mark.parametrize("page", ["docs/your_own_world.md", "docs/scenario.md"])
 def test_the_scenario_that_a_page_shows_gives_three_robots_their_streams(
     page: str, tmp_path: Path
 ) -> None:
