@@ -122,15 +122,21 @@ CLI = typer.main.get_command(app)
 
 
 def unknown(line: str) -> str | None:
-    """What a command line of a page has that the program has not: a command, or an option."""
-    command: Any = CLI
+    """What a command line of a page has that the program has not: a command, or an option.
+
+    Three dots stand for any command of a group, or for arguments.
+    """
+    commands: list[Any] = [CLI]
     words = line.split()
-    while words and hasattr(command, "commands") and not words[0].startswith("-"):
-        word = words.pop(0)
-        if word not in command.commands:
+    while words and not words[0].startswith("-") and hasattr(commands[0], "commands"):
+        word, group = words.pop(0), commands[0].commands
+        if word not in {*group, "…"}:
             return f"no command {word!r} in: teamslam {line}"
-        command = command.commands[word]
-    options = {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
+        commands = [*group.values()] if word == "…" else [group[word]]
+    options = {
+        name for command in commands for each in command.params
+        for name in (*each.opts, *each.secondary_opts)
+    }  # fmt: skip
     extra = sorted(
         set(re.findall(r"(?<!\S)--?[a-z][\w-]*", " ".join(words))) - {*options, "--help"}
     )
@@ -141,11 +147,13 @@ def unknown(line: str) -> str | None:
 def test_every_command_and_option_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text()
     named = [" ".join(each.split()) for each in COMMAND.findall(text) + SPOKEN.findall(text)]
-    assert [why for each in named if (why := unknown(each.replace("…", "")))] == []
+    assert [why for each in named if (why := unknown(each))] == []
 
 
 def test_a_command_or_an_option_that_is_not_there_is_found() -> None:
     assert unknown("launch thesis --seed 2") is None
     assert unknown("log cut LOG --from 60 -o NEW") is None
+    assert unknown("experiment … --seeds 3") is None
+    assert unknown("experiment … --sedes 3") is not None
     assert unknown("fly me") == "no command 'fly' in: teamslam fly me"
     assert unknown("launch thesis --sed 2") == "no option --sed in: teamslam launch thesis --sed 2"
