@@ -54,7 +54,7 @@ def joined(endpoint: str, team: str, publishers: int, rng: random.Random) -> dic
     def say(count: int) -> None:
         for robot in robots:
             text = "x" * 1_500
-            message = m.Withdrawal(count, robot, "operator", text)
+            message = m.Withdrawal(stamp_ns=count, robot=robot, by="operator", reason=text)
             buses[robot].publish(Outgoing(ch.WITHDRAWAL, robot, message))
 
     def go_on() -> None:

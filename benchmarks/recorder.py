@@ -57,17 +57,25 @@ def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds:
                 time.sleep(wait)
             for robot in robots:
                 values = rng.uniform(1.0, 10.0, LANDMARKS)
-                head = (k * period_ns, robot, 1)
+                head = {"stamp_ns": k * period_ns, "robot": robot, "incarnation": 1}
                 for channel, message in (
-                    (ch.ODOMETRY, m.Odometry(*head, 2 * k, period_ns, 0.5, 0.1)),
+                    (
+                        ch.ODOMETRY,
+                        m.Odometry(
+                            **head, number=2 * k, duration_ns=period_ns, forward=0.5, yaw_rate=0.1
+                        ),
+                    ),
                     (
                         ch.OBSERVATIONS,
                         m.Observations(
-                            *head, 2 * k + 1, from_ids(range(LANDMARKS)), from_floats(values),
-                            from_floats(values / 10.0),
+                            **head,
+                            number=2 * k + 1,
+                            ids=from_ids(range(LANDMARKS)),
+                            ranges=from_floats(values),
+                            bearings=from_floats(values / 10.0),
                         ),
                     ),
-                ):  # fmt: skip
+                ):
                     bus.publish(Outgoing(channel, robot, message))
                     key = channel.key(robot)
                     counts[key] = counts.get(key, 0) + 1
@@ -177,7 +185,21 @@ def _no_map() -> m.FusedMap:
     """The message after which a recorder ends when nobody is left."""
     empty = from_floats([])
     return m.FusedMap(
-        0, "join", bytes(8), "", True, False, 0, (), (), True, from_ids([]), empty, empty, 0.0, 0
+        stamp_ns=0,
+        rule="join",
+        digest=bytes(8),
+        frame="",
+        final=True,
+        provisional=False,
+        exchange=0,
+        members=(),
+        missing=(),
+        joint=True,
+        ids=from_ids([]),
+        means=empty,
+        covariance=empty,
+        chi2=0.0,
+        dof=0,
     )
 
 

@@ -43,7 +43,15 @@ _HERE = [sys.executable, str(Path(__file__).resolve())]
 
 def observations(i: int) -> m.Observations:
     near = from_floats(np.linspace(1.0, 9.0, 5))
-    return m.Observations(i, "r1", 1, i, from_ids(range(5)), near, from_floats([0.1] * 5))
+    return m.Observations(
+        stamp_ns=i,
+        robot="r1",
+        incarnation=1,
+        number=i,
+        ids=from_ids(range(5)),
+        ranges=near,
+        bearings=from_floats([0.1] * 5),
+    )
 
 
 def entered(endpoint: str, folder: Path | None, node: str) -> ZenohBus:
@@ -68,7 +76,14 @@ def take(endpoint: str, folder: Path | None, count: int) -> None:
         while arrived < count:
             for sample in bus.receive(0.05):
                 if sample.key == ch.END.key():
-                    done = m.Progress(sample.stamp_ns, "robot/r1", "r1", 1, 0, 0)
+                    done = m.Progress(
+                        stamp_ns=sample.stamp_ns,
+                        node="robot/r1",
+                        robot="r1",
+                        incarnation=1,
+                        measurements=0,
+                        submaps=0,
+                    )
                     bus.publish(Outgoing(ch.ROBOT_PROGRESS, "r1", done))
                     continue
                 began = began or time.monotonic()
@@ -105,13 +120,13 @@ def link(folder: Path | None, count: int) -> tuple[float, float]:
 def ping(bus: ZenohBus, stamp_ns: int) -> float:
     """One message there and one back; sent again while the link is still coming up."""
     began = time.perf_counter()
-    bus.publish(Outgoing(ch.END, "", m.End(stamp_ns, ())))
+    bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=stamp_ns, streams=())))
     while True:
         back = bus.receive(1.0)
         if any(sample.stamp_ns == stamp_ns for sample in back):
             return time.perf_counter() - began
         if not back:
-            bus.publish(Outgoing(ch.END, "", m.End(stamp_ns, ())))
+            bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=stamp_ns, streams=())))
 
 
 class Sink:

@@ -36,23 +36,30 @@ def fused_message(
     """
     joint = joint and len(value.ids) <= JOINT_LANDMARKS
     fused = m.FusedMap(
-        stamp_ns,
-        config.fusion,
-        digest,
-        frame,
-        final,
-        False,
-        exchange,
-        members,
-        (),
-        joint,
-        from_ids(value.ids),
-        from_floats(value.means),
-        translate.covariance_bytes(value.covariance, joint=joint),
-        *cost,
-        reasons,
+        stamp_ns=stamp_ns,
+        rule=config.fusion,
+        digest=digest,
+        frame=frame,
+        final=final,
+        provisional=False,
+        exchange=exchange,
+        members=members,
+        missing=(),
+        joint=joint,
+        ids=from_ids(value.ids),
+        means=from_floats(value.means),
+        covariance=translate.covariance_bytes(value.covariance, joint=joint),
+        chi2=cost[0],
+        dof=cost[1],
+        reasons=reasons,
     )
     return receivable(fused)
+
+
+def version_entry(stream: tuple[str, int], sequence: int) -> m.VersionEntry:
+    """The entry of a version vector that says: all of (robot, incarnation) up to `sequence`."""
+    robot, incarnation = stream
+    return m.VersionEntry(robot=robot, incarnation=incarnation, sequence=sequence)
 
 
 def receivable(fused: m.FusedMap) -> m.FusedMap:

@@ -30,7 +30,9 @@ class Hearsay:
         self._said.setdefault(heard.withdrawn, {})[heard.robot] = heard
         if not self._believed(heard.withdrawn):
             return None
-        return m.Withdrawal(heard.stamp_ns, heard.withdrawn, heard.by, heard.reason)
+        return m.Withdrawal(
+            stamp_ns=heard.stamp_ns, robot=heard.withdrawn, by=heard.by, reason=heard.reason
+        )
 
     def _believed(self, robot: str) -> bool:
         witnesses = self._said[robot].keys()

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from central.fused import JOINT_LANDMARKS, receivable
+from central.fused import JOINT_LANDMARKS, receivable, version_entry
 from central.monitor import NOTHING, finding, miscalibrations
 from central.roll import Roll
 from central.rule import Inputs, Stream, Tail
@@ -169,7 +169,11 @@ class JoinRule(SubmapRule):
         self._announced |= found
         self.warnings += [f"{robot} withdrawn by central: {found[robot]}" for robot in new]
         return [
-            Outgoing(ch.WITHDRAWAL, robot, m.Withdrawal(now_ns, robot, "central", found[robot]))
+            Outgoing(
+                ch.WITHDRAWAL,
+                robot,
+                m.Withdrawal(stamp_ns=now_ns, robot=robot, by="central", reason=found[robot]),
+            )
             for robot in new
         ]
 
@@ -227,26 +231,35 @@ class JoinRule(SubmapRule):
         frame = fold.frame
         last_ns = fold.contributions[-1].end_ns if fold.contributions else 0
         return m.FusedMap(
-            last_ns,
-            "join",
-            digest,
-            "" if frame is None else f"{frame[0]}/{frame[1]}",
-            tail == "final",
-            tail == "provisional",
-            0,
-            tuple(m.VersionEntry(*s, n) for s, n in self._ticks.members(fold).items()),
-            self._set.missing(),
-            joint,
-            from_ids(ids),
-            from_floats(means),
-            covariance,
-            chi2,
-            round(dof),
-            self.reasons,
-            tuple(m.BiasEstimate(*b.stream, b.bias, b.value, b.sigma) for b in biases),
-            tuple(fold.joined[k] for k in sorted(fold.joined)),
-            self._ticks.withdrawn,
-            self.finding.figures.get("covariance_scale", 0.0),
+            stamp_ns=last_ns,
+            rule="join",
+            digest=digest,
+            frame="" if frame is None else f"{frame[0]}/{frame[1]}",
+            final=tail == "final",
+            provisional=tail == "provisional",
+            exchange=0,
+            members=tuple(version_entry(*each) for each in self._ticks.members(fold).items()),
+            missing=self._set.missing(),
+            joint=joint,
+            ids=from_ids(ids),
+            means=from_floats(means),
+            covariance=covariance,
+            chi2=chi2,
+            dof=round(dof),
+            reasons=self.reasons,
+            biases=tuple(
+                m.BiasEstimate(
+                    robot=b.stream[0],
+                    incarnation=b.stream[1],
+                    bias=b.bias,
+                    value=b.value,
+                    sigma=b.sigma,
+                )
+                for b in biases
+            ),
+            joined=tuple(fold.joined[k] for k in sorted(fold.joined)),
+            withdrawn=self._ticks.withdrawn,
+            covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
             heard=self._heard,
         )
 

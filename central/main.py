@@ -58,7 +58,7 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
-        self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(0))
+        self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
         self._shell.look_for_the_end()
         self._shell.begin()
         while self._shell.going:
@@ -117,7 +117,9 @@ class CentralShell:
             del self._since[node]
             why = f"lost for {self._patience_s:g} s, the centre's --patience"
             _LOG.warning("%s is given up: %s", node, why)
-            order = Outgoing(ch.GIVEN_UP, node, m.GivenUp(0, node, "central", why))
+            order = Outgoing(
+                ch.GIVEN_UP, node, m.GivenUp(stamp_ns=0, node=node, by="central", reason=why)
+            )
             self._shell.take([self._shell.sample_of(order)])
 
     def _awaited(self) -> tuple[str, ...]:
@@ -158,7 +160,7 @@ class CentralShell:
         """
         robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
         for robot in sorted(robots - self._greeted):
-            self._bus.request(ch.SENT, robot, m.SubmapsRequest(0, robot))
+            self._bus.request(ch.SENT, robot, m.SubmapsRequest(stamp_ns=0, robot=robot))
         self._greeted |= robots
         wanted = {(each.robot, each.incarnation): each for each in self.node.lacking()}
         firsts = {stream: each.first for stream, each in wanted.items()}

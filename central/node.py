@@ -171,4 +171,10 @@ class CentralNode:
         ]
         warnings = (*given_up, *self._rule.findings, *self.warnings[-3:])
         now_ns = self._roll.now_ns
-        return m.Status(now_ns, "central", state, figures | dict(self._rule.figures), warnings)
+        return m.Status(
+            stamp_ns=now_ns,
+            node="central",
+            state=state,
+            figures=figures | dict(self._rule.figures),
+            warnings=warnings,
+        )

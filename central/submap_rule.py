@@ -186,12 +186,21 @@ class SubmapRule(FusionRule):
                 sent[stream] = max(sent.get(stream, 0), each.submaps)
         here = {stream: self.count(stream) for stream in sent}
         return [
-            m.SubmapsRequest(roll.now_ns, *stream, here[stream])
+            m.SubmapsRequest(
+                stamp_ns=roll.now_ns, robot=stream[0], incarnation=stream[1], first=here[stream]
+            )
             for stream in sorted(sent)
             if here[stream] < sent[stream]
         ]
 
 
 def _credit(of: m.Submap | m.SightingFactor, count: int, now_ns: int) -> list[Outgoing]:
-    progress = m.Progress(now_ns, "central", of.robot, of.incarnation, 0, count)
+    progress = m.Progress(
+        stamp_ns=now_ns,
+        node="central",
+        robot=of.robot,
+        incarnation=of.incarnation,
+        measurements=0,
+        submaps=count,
+    )
     return [Outgoing(ch.CENTRAL_PROGRESS, of.robot, progress)]

@@ -108,7 +108,7 @@ class SubmapSet:
         for (robot, incarnation), found in sorted(self.streams.items()):
             first = self.count((robot, incarnation))
             if found and max(found) >= first:
-                gaps.append(VersionEntry(robot, incarnation, first))
+                gaps.append(VersionEntry(robot=robot, incarnation=incarnation, sequence=first))
         return tuple(gaps)
 
 

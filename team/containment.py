@@ -136,7 +136,17 @@ class Boundary:
         stamp_ns = min(max(sample.stamp_ns, -(2**62)), 2**62 - 1)
         name = type(error).__name__
         counter = max(sample.counter, -1)
-        fault = m.Fault(stamp_ns, self.name, key, counter, tag, name, text, place, digest)
+        fault = m.Fault(
+            stamp_ns=stamp_ns,
+            node=self.name,
+            origin=key,
+            count=counter,
+            message=tag,
+            error=name,
+            text=text,
+            place=place,
+            digest=digest,
+        )
         return Outgoing(ch.FAULT, self.name, fault)
 
     @property

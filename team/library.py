@@ -163,15 +163,15 @@ def fastslam_step(
     """
     taken = keyframe.calibrated(sensor)
     return propagated_and_updated(
-        particles,
-        taken.increment,
-        sensor,
-        taken.ids,
-        taken.ranges,
-        taken.bearings,
-        proposal,
-        resample_below,
-        generator,
+        particles=particles,
+        increment=taken.increment,
+        sensor=sensor,
+        ids=taken.ids,
+        ranges=taken.ranges,
+        bearings=taken.bearings,
+        proposal=proposal,
+        resample_below=resample_below,
+        generator=generator,
     )
 
 

@@ -218,7 +218,13 @@ class Shell:
     def _publish_status(self) -> None:
         status = self.contained("status", self.node.status)
         if status is None:
-            status = Status(0, self._name, "unknown", {}, ("it can not say how it is",))
+            status = Status(
+                stamp_ns=0,
+                node=self._name,
+                state="unknown",
+                figures={},
+                warnings=("it can not say how it is",),
+            )
         now = time.monotonic()
         elapsed = max(now - self._since, 1e-3)
         rates = {"messages_per_s": self._messages / elapsed, "bytes_per_s": self._bytes / elapsed}

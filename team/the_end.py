@@ -44,7 +44,9 @@ class TheEnd:
         try:
             # Before the question: its age is told as of the answer, which may take its time.
             life_s = time.monotonic() - self._began + max(self._before_s, 0.0)
-            replies = self._bus.ask(FINAL_KEPT, "", FinalMapRequest(0, self._node), FINAL_ASK_S)
+            replies = self._bus.ask(
+                FINAL_KEPT, "", FinalMapRequest(stamp_ns=0, node=self._node), FINAL_ASK_S
+            )
             kept = [decoded(reply, FinalMapReply) for reply in replies]
             return [_sample(k.final) for k in kept[:1] if k.missed or 1e-9 * k.age_ns <= life_s]
         except (BusError, WireError) as error:

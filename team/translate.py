@@ -34,7 +34,13 @@ def configured(
 ) -> m.Configuration:
     """The announcement of a configuration, with its digest."""
     text = msgspec.json.encode(configuration, order="deterministic")
-    return m.Configuration(stamp_ns, node, incarnation, digest_of(text), text.decode())
+    return m.Configuration(
+        stamp_ns=stamp_ns,
+        node=node,
+        incarnation=incarnation,
+        digest=digest_of(text),
+        configuration=text.decode(),
+    )
 
 
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
@@ -104,22 +110,22 @@ def submap_message(
 ) -> m.Submap:
     """A local map with the names of its inputs, how many sightings belong to it, what was gated."""
     return m.Submap(
-        span_ns[1],
-        robot,
-        incarnation,
-        sequence,
-        measurements[0],
-        measurements[1],
-        span_ns[0],
-        config,
-        from_ids(local.ids),
-        from_floats(local.mean),
-        from_floats(packed(local.covariance)),
-        from_stamps(local.node_stamps),
-        sightings,
-        local.biases,
-        from_floats(local.sensitivity),
-        gated,
+        stamp_ns=span_ns[1],
+        robot=robot,
+        incarnation=incarnation,
+        sequence=sequence,
+        first_measurement=measurements[0],
+        last_measurement=measurements[1],
+        start_ns=span_ns[0],
+        config=config,
+        ids=from_ids(local.ids),
+        mean=from_floats(local.mean),
+        covariance=from_floats(packed(local.covariance)),
+        nodes=from_stamps(local.node_stamps),
+        sightings=sightings,
+        biases=local.biases,
+        sensitivity=from_floats(local.sensitivity),
+        gated=gated,
     )
 
 
@@ -148,16 +154,16 @@ def sighting_message(
 ) -> m.SightingFactor:
     """A sighting with the names of its inputs."""
     return m.SightingFactor(
-        sighting.stamp_ns,
-        sighting.robot,
-        sighting.incarnation,
-        sighting.sequence,
-        config,
-        sighting.teammate,
-        float(sighting.measurement[0]),
-        float(sighting.measurement[1]),
-        from_floats(packed(sighting.covariance)),
-        measurements,
+        stamp_ns=sighting.stamp_ns,
+        robot=sighting.robot,
+        incarnation=sighting.incarnation,
+        sequence=sighting.sequence,
+        config=config,
+        teammate=sighting.teammate,
+        range=float(sighting.measurement[0]),
+        bearing=float(sighting.measurement[1]),
+        covariance=from_floats(packed(sighting.covariance)),
+        measurements=measurements,
     )
 
 
@@ -197,7 +203,13 @@ def pose_message(
     """A pose with its covariance, symmetric to the last bit."""
     symmetric = 0.5 * (covariance + covariance.T)
     return m.PoseEstimate(
-        stamp_ns, robot, incarnation, sequence, digest, from_floats(pose), from_floats(symmetric)
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        sequence=sequence,
+        map_digest=digest,
+        pose=from_floats(pose),
+        covariance=from_floats(symmetric),
     )
 
 
@@ -312,18 +324,23 @@ def prior_message(
 ) -> m.Prior:
     """The joint marginal of a robot's last fused end pose and the landmarks; of which set."""
     return m.Prior(
-        stamp_ns,
-        robot,
-        incarnation,
-        sequence,
-        digest,
-        from_ids(prior.ids),
-        from_floats(np.concatenate((prior.pose, prior.means.ravel()))),
-        joint_bytes(prior.covariance),
-        prior.shared.covariance_factor,
-        tuple(m.BiasEstimate(robot, incarnation, *each) for each in prior.shared.biases),
-        tuple(members),
-        heard,
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        sequence=sequence,
+        digest=digest,
+        ids=from_ids(prior.ids),
+        mean=from_floats(np.concatenate((prior.pose, prior.means.ravel()))),
+        covariance=joint_bytes(prior.covariance),
+        covariance_factor=prior.shared.covariance_factor,
+        biases=tuple(
+            m.BiasEstimate(
+                robot=robot, incarnation=incarnation, bias=bias, value=value, sigma=sigma
+            )
+            for bias, value, sigma in prior.shared.biases
+        ),
+        members=tuple(members),
+        heard=heard,
     )
 
 
@@ -349,13 +366,13 @@ def trajectory_message(
     """The smoothed end poses of a robot's submaps."""
     symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     return m.Trajectory(
-        stamp_ns,
-        robot,
-        incarnation,
-        digest,
-        from_stamps(pose_stamps),
-        from_floats(poses),
-        from_floats(symmetric),
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        digest=digest,
+        stamps=from_stamps(pose_stamps),
+        poses=from_floats(poses),
+        covariances=from_floats(symmetric),
     )
 
 

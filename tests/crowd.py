@@ -30,13 +30,32 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
         Outgoing(
             ch.TRUTH_LANDMARKS,
             "",
-            m.TruthLandmarks(0, from_ids(range(landmarks)), from_floats(places)),
+            m.TruthLandmarks(
+                stamp_ns=0, ids=from_ids(range(landmarks)), positions=from_floats(places)
+            ),
         )
     )
     for name in names:
-        yield sample(Outgoing(ch.ALIVE, f"robot/{name}", m.Liveliness(0, f"robot/{name}", True)))
         yield sample(
-            Outgoing(ch.START, name, m.InitialPose(0, name, 1, 0, from_floats([0, 0, 0]), b""))
+            Outgoing(
+                ch.ALIVE,
+                f"robot/{name}",
+                m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True),
+            )
+        )
+        yield sample(
+            Outgoing(
+                ch.START,
+                name,
+                m.InitialPose(
+                    stamp_ns=0,
+                    robot=name,
+                    incarnation=1,
+                    number=0,
+                    pose=from_floats([0, 0, 0]),
+                    covariance=b"",
+                ),
+            )
         )
     phase = rng.uniform(0.0, 2.0 * np.pi, robots)
     reach = rng.uniform(0.1, 0.45, robots) * size_m
@@ -51,8 +70,18 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
                 np.arctan2(1.3 * np.cos(1.3 * angle), -np.sin(angle)),
             ]
             said = np.array(true) + rng.normal(size=3) * [0.2, 0.3, 0.03]
-            truth = m.Truth(at, name, from_stamps([at]), from_floats(true))
-            pose = m.PoseEstimate(at, name, 1, 0, b"12345678", from_floats(said), P)
+            truth = m.Truth(
+                stamp_ns=at, robot=name, stamps=from_stamps([at]), poses=from_floats(true)
+            )
+            pose = m.PoseEstimate(
+                stamp_ns=at,
+                robot=name,
+                incarnation=1,
+                sequence=0,
+                map_digest=b"12345678",
+                pose=from_floats(said),
+                covariance=P,
+            )
             yield sample(Outgoing(ch.TRUTH, name, truth))
             yield sample(Outgoing(ch.TEAM_POSE, name, pose))
         if k % 25 == 24:
@@ -68,8 +97,21 @@ def _map(
     sigma = 0.1 + 0.4 * (1.0 - min(share, 1.0))
     blocks = np.tile([sigma**2, 0.3 * sigma**2, 0.6 * sigma**2], (count, 1))
     means = places[:count] + sigma * rng.normal(size=(count, 2))
-    members = (m.VersionEntry("r1", 1, 0),)
+    members = (m.VersionEntry(robot="r1", incarnation=1, sequence=0),)
     return m.FusedMap(
-        at, "join", bytes(8), "r1/1", final, not final, 0, members, (), False,
-        from_ids(range(count)), from_floats(means), from_floats(blocks), 0.0, 0,
-    )  # fmt: skip
+        stamp_ns=at,
+        rule="join",
+        digest=bytes(8),
+        frame="r1/1",
+        final=final,
+        provisional=not final,
+        exchange=0,
+        members=members,
+        missing=(),
+        joint=False,
+        ids=from_ids(range(count)),
+        means=from_floats(means),
+        covariance=from_floats(blocks),
+        chi2=0.0,
+        dof=0,
+    )

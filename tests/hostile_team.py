@@ -94,14 +94,30 @@ class Team:
     def start(self, robot: str, incarnation: int = 1) -> m.InitialPose:
         rng = self._rng
         if rng.random() < 0.5:
-            return m.InitialPose(0, robot, incarnation, 0, b"", b"")
+            return m.InitialPose(
+                stamp_ns=0, robot=robot, incarnation=incarnation, number=0, pose=b"", covariance=b""
+            )
         pose = np.append(numbers(rng, 2), rng.uniform(-3.0, 3.0))
         spread = b"" if rng.random() < 0.5 else from_floats(covariance(rng, 3))
-        exact = m.InitialPose(0, robot, incarnation, 0, from_floats(pose), spread)
+        exact = m.InitialPose(
+            stamp_ns=0,
+            robot=robot,
+            incarnation=incarnation,
+            number=0,
+            pose=from_floats(pose),
+            covariance=spread,
+        )
         return (
             exact
             if valid(exact)
-            else m.InitialPose(0, robot, incarnation, 0, from_floats(pose), b"")
+            else m.InitialPose(
+                stamp_ns=0,
+                robot=robot,
+                incarnation=incarnation,
+                number=0,
+                pose=from_floats(pose),
+                covariance=b"",
+            )
         )
 
     def submap(self, robot: str) -> m.Submap:
@@ -116,10 +132,23 @@ class Team:
         mean[2:poses:3] = np.clip(mean[2:poses:3], -3.1, 3.1)
         biases = ("bearing", "range_scale") if rng.random() < 0.2 else ()
         return m.Submap(
-            (k + 1) * 10 * S, robot, 1, k, k * 20 + (k > 0), k * 20 + 20, k * 10 * S, CONFIG,
-            from_ids(ids), from_floats(mean), packed(covariance(rng, n)), from_stamps(nodes),
-            0, biases, from_floats(numbers(rng, n * len(biases))), 0,
-        )  # fmt: skip
+            stamp_ns=(k + 1) * 10 * S,
+            robot=robot,
+            incarnation=1,
+            sequence=k,
+            first_measurement=k * 20 + (k > 0),
+            last_measurement=k * 20 + 20,
+            start_ns=k * 10 * S,
+            config=CONFIG,
+            ids=from_ids(ids),
+            mean=from_floats(mean),
+            covariance=packed(covariance(rng, n)),
+            nodes=from_stamps(nodes),
+            sightings=0,
+            biases=biases,
+            sensitivity=from_floats(numbers(rng, n * len(biases))),
+            gated=0,
+        )
 
     def grow(self) -> None:
         """One more submap of one robot, with the sightings from its nodes."""
@@ -129,11 +158,7 @@ class Team:
         stamps = np.frombuffer(made.nodes, "<i8")
         seen = [self._sighting(made, int(t)) for t in stamps if rng.random() < 0.7]
         seen = [each for each in seen if valid(each) is not None]
-        if self._add(
-            m.Submap(
-                *((seen and [*_fields(made)[:12], len(seen), *_fields(made)[13:]]) or _fields(made))
-            )
-        ):
+        if self._add(msgspec.structs.replace(made, sightings=len(seen)) if seen else made):
             self._next[robot] += 1
             for each in seen:
                 self._add(each)
@@ -143,22 +168,53 @@ class Team:
         teammate = str(rng.choice([r for r in ROBOTS if r != submap.robot]))
         distance = float(abs(numbers(rng, 1)[0])) or 1.0
         return m.SightingFactor(
-            stamp_ns, submap.robot, 1, submap.sequence, CONFIG, teammate, distance,
-            float(rng.uniform(-3.0, 3.0)), packed(covariance(rng, 2)), (stamp_ns // S,),
-        )  # fmt: skip
+            stamp_ns=stamp_ns,
+            robot=submap.robot,
+            incarnation=1,
+            sequence=submap.sequence,
+            config=CONFIG,
+            teammate=teammate,
+            range=distance,
+            bearing=float(rng.uniform(-3.0, 3.0)),
+            covariance=packed(covariance(rng, 2)),
+            measurements=(stamp_ns // S,),
+        )
 
     def ends(self) -> list[m.Message]:
         """The last words of the robots and of the world."""
         out: list[m.Message] = []
         for robot, count in self._next.items():
             now_ns = count * 10 * S
-            out.append(m.Progress(now_ns, f"robot/{robot}", robot, 1, 1000, count))
-            out.append(m.Done(now_ns, robot, 1, 1000, 500, count, ()))
-        return [*out, m.End(10**12, tuple(m.StreamEnd(robot, 1, 1000) for robot in ROBOTS))]
-
-
-def _fields(message: m.Message) -> list[object]:
-    return [getattr(message, name) for name in message.__struct_fields__]
+            out.append(
+                m.Progress(
+                    stamp_ns=now_ns,
+                    node=f"robot/{robot}",
+                    robot=robot,
+                    incarnation=1,
+                    measurements=1000,
+                    submaps=count,
+                )
+            )
+            out.append(
+                m.Done(
+                    stamp_ns=now_ns,
+                    robot=robot,
+                    incarnation=1,
+                    measurements=1000,
+                    steps=500,
+                    submaps=count,
+                    ledger=(),
+                )
+            )
+        return [
+            *out,
+            m.End(
+                stamp_ns=10**12,
+                streams=tuple(
+                    m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS
+                ),
+            ),
+        ]
 
 
 def centre_session(
@@ -168,7 +224,7 @@ def centre_session(
     centre = CentralNode(config or CentralConfig(), list(ROBOTS))
     out = centre.begin()
     for robot in ROBOTS:
-        out += centre.handle(m.Liveliness(0, f"robot/{robot}", True), 0)
+        out += centre.handle(m.Liveliness(stamp_ns=0, node=f"robot/{robot}", alive=True), 0)
     for message in messages:
         out += centre.handle(message, 0)
     for each in [*out, Outgoing(out[0].channel, "central", centre.status())]:
@@ -192,7 +248,15 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
             speed = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 1.0
             yaw = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 0.1
             end_ns = stamp_ns + duration_ns
-            yield m.Odometry(end_ns, robot, 1, counter, duration_ns, speed, yaw)
+            yield m.Odometry(
+                stamp_ns=end_ns,
+                robot=robot,
+                incarnation=1,
+                number=counter,
+                duration_ns=duration_ns,
+                forward=speed,
+                yaw_rate=yaw,
+            )
             if kind != 0:
                 now_ns = end_ns
         elif kind <= 10:
@@ -201,18 +265,31 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
             ranges = np.abs(numbers(rng, n))
             bearings = rng.uniform(-np.pi, np.pi, n) * (rng.random() < 0.8)
             yield m.Observations(
-                stamp_ns, robot, 1, counter, from_ids(ids), from_floats(ranges),
-                from_floats(bearings),
-            )  # fmt: skip
+                stamp_ns=stamp_ns,
+                robot=robot,
+                incarnation=1,
+                number=counter,
+                ids=from_ids(ids),
+                ranges=from_floats(ranges),
+                bearings=from_floats(bearings),
+            )
         else:
             names = tuple(str(x) for x in rng.choice(ROBOTS, int(rng.integers(0, 3))))
             yield m.Sightings(
-                stamp_ns, robot, 1, counter, names, from_floats(np.abs(numbers(rng, len(names)))),
-                from_floats(rng.uniform(-np.pi, np.pi, len(names))),
-            )  # fmt: skip
+                stamp_ns=stamp_ns,
+                robot=robot,
+                incarnation=1,
+                number=counter,
+                teammates=names,
+                ranges=from_floats(np.abs(numbers(rng, len(names)))),
+                bearings=from_floats(rng.uniform(-np.pi, np.pi, len(names))),
+            )
         if rng.random() < 0.05:
             yield prior(rng, robot)
-    yield m.End(now_ns, (m.StreamEnd(robot, 1, counter + 1),))
+    yield m.End(
+        stamp_ns=now_ns,
+        streams=(m.StreamEnd(robot=robot, incarnation=1, measurements=counter + 1),),
+    )
 
 
 def prior(rng: np.random.Generator, robot: str) -> m.Prior:
@@ -221,9 +298,15 @@ def prior(rng: np.random.Generator, robot: str) -> m.Prior:
     n = 3 + 2 * len(ids)
     sequence = int(rng.integers(-1, 4))
     return m.Prior(
-        sequence * 10 * S, robot, 1, sequence, CONFIG, from_ids(ids), from_floats(numbers(rng, n)),
-        packed(covariance(rng, n)),
-    )  # fmt: skip
+        stamp_ns=sequence * 10 * S,
+        robot=robot,
+        incarnation=1,
+        sequence=sequence,
+        digest=CONFIG,
+        ids=from_ids(ids),
+        mean=from_floats(numbers(rng, n)),
+        covariance=packed(covariance(rng, n)),
+    )
 
 
 def robot_session(
@@ -233,7 +316,12 @@ def robot_session(
     node = RobotNode(config)
     out = node.begin()
     if config.estimator == "localisation":
-        out += node.handle(m.KnownMap(0, from_ids([1, 2, 3]), from_floats([5, 0, 0, 6, -4, 3])), 0)
+        out += node.handle(
+            m.KnownMap(
+                stamp_ns=0, ids=from_ids([1, 2, 3]), positions=from_floats([5, 0, 0, 6, -4, 3])
+            ),
+            0,
+        )
     taken = 0
     for message in messages:
         found = valid(message)
@@ -243,7 +331,17 @@ def robot_session(
         out += node.handle(found, 0)
         answers = [each.message for each in out if isinstance(each.message, m.Submap)]
         if answers:
-            out += node.handle(m.Progress(0, "central", node.robot, 1, 0, len(answers)), 0)
+            out += node.handle(
+                m.Progress(
+                    stamp_ns=0,
+                    node="central",
+                    robot=node.robot,
+                    incarnation=1,
+                    measurements=0,
+                    submaps=len(answers),
+                ),
+                0,
+            )
     for each in [*out, Outgoing(out[0].channel, "", node.status())]:
         decoded(encoded(each.message), type(each.message))
     return node, out

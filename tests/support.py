@@ -103,23 +103,31 @@ def packed(matrix: np.ndarray) -> bytes:
 
 
 def odometry(i: int, robot: str = "alpha") -> m.Odometry:
-    return m.Odometry(i * 1_000_000, robot, 0, i, 1_000_000, 0.5, 0.1)
+    return m.Odometry(
+        stamp_ns=i * 1_000_000,
+        robot=robot,
+        incarnation=0,
+        number=i,
+        duration_ns=1_000_000,
+        forward=0.5,
+        yaw_rate=0.1,
+    )
 
 
 def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
     n = 3 + 2 * landmarks
     return m.Submap(
-        (i + 1) * 1_000_000,
-        robot,
-        0,
-        i,
-        10 * i,
-        10 * i + 9,
-        i * 1_000_000,
-        b"configur",
-        from_ids(range(landmarks)),
-        from_floats(np.arange(n) / 8.0),
-        packed(spd(n)),
+        stamp_ns=(i + 1) * 1_000_000,
+        robot=robot,
+        incarnation=0,
+        sequence=i,
+        first_measurement=10 * i,
+        last_measurement=10 * i + 9,
+        start_ns=i * 1_000_000,
+        config=b"configur",
+        ids=from_ids(range(landmarks)),
+        mean=from_floats(np.arange(n) / 8.0),
+        covariance=packed(spd(n)),
     )
 
 
@@ -135,55 +143,218 @@ def examples() -> Iterator[m.Message]:
     two, three = from_ids([4, 7]), from_floats([1.0, -0.5, 0.25])
     means, blocks = from_floats([1.0, 2.0, 3.0, 4.0]), from_floats([2.0, 0.5, 1.0] * 2)
     digest = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
-    member = m.VersionEntry("alpha", 1, 5)
-    yield m.InitialPose(0, "alpha", 1, 0, three, from_floats(spd(3)))
-    yield m.Odometry(1_000, "alpha", 1, 2, 100_000_000, 0.25, -0.125)
-    yield m.Observations(2_000, "alpha", 1, 3, two, from_floats([2.0, 3.5]), from_floats([0.5, -1]))
-    yield m.Sightings(3_000, "alpha", 1, 4, ("bravo",), from_floats([6.0]), from_floats([-3.0]))
-    yield m.Truth(4_000, "alpha", from_stamps([0, 4_000]), from_floats(range(6)))
-    yield m.TruthLandmarks(-5, two, means)
-    yield m.KnownMap(-5, two, means)
-    yield m.Configuration(0, "robot/alpha", 1, digest, '{"seed": 7}')
-    yield m.Submap(
-        9_000, "alpha", 1, 5, 10, 19, 8_000, digest, two, from_floats(range(10)), packed(spd(10)),
-        from_stamps([8_500]), 1, ("bearing", "range_scale"), from_floats(np.arange(20) / 16.0),
-        3,
-    )  # fmt: skip
-    yield m.SightingFactor(
-        8_500, "alpha", 1, 5, digest, "bravo", 6.0, -3.0, packed(spd(2)), (12, 14)
+    member = m.VersionEntry(robot="alpha", incarnation=1, sequence=5)
+    yield m.InitialPose(
+        stamp_ns=0,
+        robot="alpha",
+        incarnation=1,
+        number=0,
+        pose=three,
+        covariance=from_floats(spd(3)),
     )
-    yield m.Withdrawal(9_000, "alpha", "operator", "its wheel is flat")
-    yield m.WithdrawalHeard(9_000, "alpha", "bravo", "operator", "its wheel is flat")
-    yield m.MapEstimate(9_000, "alpha", 1, 5, 0, False, two, means, blocks)
-    yield m.PoseEstimate(9_000, "alpha", 1, 5, digest, three, from_floats(spd(3)))
-    yield m.ParticleCloud(9_000, "alpha", from_floats(range(6)), from_floats([0.25, 0.75]))
-    yield m.Innovation(9_000, "alpha", 1, 5, 20.5, 22)
+    yield m.Odometry(
+        stamp_ns=1_000,
+        robot="alpha",
+        incarnation=1,
+        number=2,
+        duration_ns=100_000_000,
+        forward=0.25,
+        yaw_rate=-0.125,
+    )
+    yield m.Observations(
+        stamp_ns=2_000,
+        robot="alpha",
+        incarnation=1,
+        number=3,
+        ids=two,
+        ranges=from_floats([2.0, 3.5]),
+        bearings=from_floats([0.5, -1]),
+    )
+    yield m.Sightings(
+        stamp_ns=3_000,
+        robot="alpha",
+        incarnation=1,
+        number=4,
+        teammates=("bravo",),
+        ranges=from_floats([6.0]),
+        bearings=from_floats([-3.0]),
+    )
+    yield m.Truth(
+        stamp_ns=4_000, robot="alpha", stamps=from_stamps([0, 4_000]), poses=from_floats(range(6))
+    )
+    yield m.TruthLandmarks(stamp_ns=-5, ids=two, positions=means)
+    yield m.KnownMap(stamp_ns=-5, ids=two, positions=means)
+    yield m.Configuration(
+        stamp_ns=0, node="robot/alpha", incarnation=1, digest=digest, configuration='{"seed": 7}'
+    )
+    yield m.Submap(
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        sequence=5,
+        first_measurement=10,
+        last_measurement=19,
+        start_ns=8_000,
+        config=digest,
+        ids=two,
+        mean=from_floats(range(10)),
+        covariance=packed(spd(10)),
+        nodes=from_stamps([8_500]),
+        sightings=1,
+        biases=("bearing", "range_scale"),
+        sensitivity=from_floats(np.arange(20) / 16.0),
+        gated=3,
+    )
+    yield m.SightingFactor(
+        stamp_ns=8_500,
+        robot="alpha",
+        incarnation=1,
+        sequence=5,
+        config=digest,
+        teammate="bravo",
+        range=6.0,
+        bearing=-3.0,
+        covariance=packed(spd(2)),
+        measurements=(12, 14),
+    )
+    yield m.Withdrawal(stamp_ns=9_000, robot="alpha", by="operator", reason="its wheel is flat")
+    yield m.WithdrawalHeard(
+        stamp_ns=9_000, robot="alpha", withdrawn="bravo", by="operator", reason="its wheel is flat"
+    )
+    yield m.MapEstimate(
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        sequence=5,
+        exchange=0,
+        joint=False,
+        ids=two,
+        means=means,
+        covariance=blocks,
+    )
+    yield m.PoseEstimate(
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        sequence=5,
+        map_digest=digest,
+        pose=three,
+        covariance=from_floats(spd(3)),
+    )
+    yield m.ParticleCloud(
+        stamp_ns=9_000,
+        robot="alpha",
+        poses=from_floats(range(6)),
+        weights=from_floats([0.25, 0.75]),
+    )
+    yield m.Innovation(
+        stamp_ns=9_000, robot="alpha", incarnation=1, sequence=5, squared=20.5, dof=22
+    )
     yield m.FusedMap(
-        9_000, "join", digest, "alpha/1", True, False, 0,
-        (member,), (m.VersionEntry("bravo", 0, 2),),
-        True, two, means, packed(spd(4)), 12.5, 14, ("bravo: 1 shared landmark, 2 needed",),
-        (m.BiasEstimate("alpha", 1, "bearing", 0.25, 0.125),), ("charlie joined: 5 landmarks",),
-        ("charlie",), 1.25, (), 9,
-    )  # fmt: skip
+        stamp_ns=9_000,
+        rule="join",
+        digest=digest,
+        frame="alpha/1",
+        final=True,
+        provisional=False,
+        exchange=0,
+        members=(member,),
+        missing=(m.VersionEntry(robot="bravo", incarnation=0, sequence=2),),
+        joint=True,
+        ids=two,
+        means=means,
+        covariance=packed(spd(4)),
+        chi2=12.5,
+        dof=14,
+        reasons=("bravo: 1 shared landmark, 2 needed",),
+        biases=(
+            m.BiasEstimate(robot="alpha", incarnation=1, bias="bearing", value=0.25, sigma=0.125),
+        ),
+        joined=("charlie joined: 5 landmarks",),
+        withdrawn=("charlie",),
+        covariance_scale=1.25,
+        lost=(),
+        heard=9,
+    )
     yield m.Prior(
-        9_000, "alpha", 1, 5, digest, two, from_floats(range(7)), packed(spd(7)),
-        2.5, (m.BiasEstimate("alpha", 1, "range_scale", 0.25, 0.125),), (member,), 9,
-    )  # fmt: skip
-    yield m.Trajectory(9_000, "alpha", 1, digest, from_stamps([9_000]), three, from_floats(spd(3)))
-    yield m.Progress(9_000, "central", "alpha", 1, 128, 6)
-    yield m.Rendezvous(9_000, "alpha", 1, ("bravo",), 3, 12.5)
-    yield m.Done(9_000, "alpha", 1, 200, 99, 20, (m.Disposition("in a submap", 200),), 7)
-    yield m.End(9_000, (m.StreamEnd("alpha", 1, 200),), ("gap of 3 s",))
-    yield m.Status(9_000, "recorder", "recording", {"messages": 12.0}, ("slow disk",))
-    yield m.GivenUp(9_000, "robot/alpha", "operator", "it fell into the water")
-    yield m.FinalMapRequest(0, "robot/alpha")
-    yield m.FinalMapReply(0, 5_000_000_000, b"\x91\xc0", True)
-    yield m.OrdersRequest(0)
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        sequence=5,
+        digest=digest,
+        ids=two,
+        mean=from_floats(range(7)),
+        covariance=packed(spd(7)),
+        covariance_factor=2.5,
+        biases=(
+            m.BiasEstimate(
+                robot="alpha", incarnation=1, bias="range_scale", value=0.25, sigma=0.125
+            ),
+        ),
+        members=(member,),
+        heard=9,
+    )
+    yield m.Trajectory(
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        digest=digest,
+        stamps=from_stamps([9_000]),
+        poses=three,
+        covariances=from_floats(spd(3)),
+    )
+    yield m.Progress(
+        stamp_ns=9_000, node="central", robot="alpha", incarnation=1, measurements=128, submaps=6
+    )
+    yield m.Rendezvous(
+        stamp_ns=9_000, robot="alpha", incarnation=1, teammates=("bravo",), submaps=3, waited_s=12.5
+    )
+    yield m.Done(
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        measurements=200,
+        steps=99,
+        submaps=20,
+        ledger=(m.Disposition(disposition="in a submap", measurements=200),),
+        last_map=7,
+    )
+    yield m.End(
+        stamp_ns=9_000,
+        streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=200),),
+        notes=("gap of 3 s",),
+    )
+    yield m.Status(
+        stamp_ns=9_000,
+        node="recorder",
+        state="recording",
+        figures={"messages": 12.0},
+        warnings=("slow disk",),
+    )
+    yield m.GivenUp(
+        stamp_ns=9_000, node="robot/alpha", by="operator", reason="it fell into the water"
+    )
+    yield m.FinalMapRequest(stamp_ns=0, node="robot/alpha")
+    yield m.FinalMapReply(stamp_ns=0, age_ns=5_000_000_000, final=b"\x91\xc0", missed=True)
+    yield m.OrdersRequest(stamp_ns=0)
     yield m.Fault(
-        9_000, "central", "robot/alpha/submap", 7, "submap/1", "ValueError", "no frame",
-        "central.node:CentralNode.handle:58", b"\x01\x02\x03\x04\x05\x06\x07\x08",
-    )  # fmt: skip
-    yield m.Liveliness(0, "robot/alpha", True)
-    yield m.Tally(9_000, "robot/alpha", 10**18, ("robot/alpha/submap",), (6,))
-    yield m.MeasurementsRequest(0, "alpha", 1, 5, -1)
-    yield m.SubmapsRequest(0, "alpha")
+        stamp_ns=9_000,
+        node="central",
+        origin="robot/alpha/submap",
+        count=7,
+        message="submap/1",
+        error="ValueError",
+        text="no frame",
+        place="central.node:CentralNode.handle:58",
+        digest=b"\x01\x02\x03\x04\x05\x06\x07\x08",
+    )
+    yield m.Liveliness(stamp_ns=0, node="robot/alpha", alive=True)
+    yield m.Tally(
+        stamp_ns=9_000,
+        node="robot/alpha",
+        since_ns=10**18,
+        keys=("robot/alpha/submap",),
+        counts=(6,),
+    )
+    yield m.MeasurementsRequest(stamp_ns=0, robot="alpha", incarnation=1, first=5, last=-1)
+    yield m.SubmapsRequest(stamp_ns=0, robot="alpha")

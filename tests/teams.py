@@ -102,7 +102,17 @@ def stream(
         np.zeros(len(met_at)),
     )
     start = StartPose(np.array([0.0, y, 0.0]), None) if known else None
-    return robot_stream(robot, 0, start, intervals, seen, met, ("r9",), ends, poses)
+    return robot_stream(
+        robot=robot,
+        start_ns=0,
+        start=start,
+        intervals=intervals,
+        observations=seen,
+        sightings=met,
+        teammates=("r9",),
+        truth_ns=ends,
+        truth=poses,
+    )
 
 
 def world_of(*streams: RobotStream) -> WorldStreams:
@@ -112,7 +122,13 @@ def world_of(*streams: RobotStream) -> WorldStreams:
 
 def published(each: RobotStream) -> list[m.Measurement]:
     """The measurements of one stream as the world publishes them."""
-    world = WorldNode(world_of(each), frozenset(), m.Configuration(0, "world", 0, bytes(8), "{}"))
+    world = WorldNode(
+        world_of(each),
+        frozenset(),
+        m.Configuration(
+            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
+        ),
+    )
     out: list[Outgoing] = []
     while not world.ended:
         out += world.publish(0.0)
@@ -126,8 +142,12 @@ def driven(
     out = [o for measurement in measurements for o in node.handle(measurement, 0)]
     if end:
         last = measurements[-1]
-        ends = (m.StreamEnd(node.robot, last.incarnation, last.number + 1),)
-        out += node.handle(m.End(last.stamp_ns, ends), 0)
+        ends = (
+            m.StreamEnd(
+                robot=node.robot, incarnation=last.incarnation, measurements=last.number + 1
+            ),
+        )
+        out += node.handle(m.End(stamp_ns=last.stamp_ns, streams=ends), 0)
     return out
 
 
@@ -158,7 +178,9 @@ class Team:
     def __post_init__(self) -> None:
         names = [c.id for c in self.configs]
         rule = msgspec.structs.replace(self.central, fusion=self.configs[0].fusion)
-        announced = m.Configuration(0, "world", 0, bytes(8), "{}")
+        announced = m.Configuration(
+            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
+        )
         self.world = WorldNode(
             self.streams,
             expected_nodes(names, recorder=False),
@@ -177,7 +199,9 @@ class Team:
         for to in self.nodes:
             if to != node and (to in ("world", "central") or node == "central"):
                 key = ch.ALIVE.key(node)
-                self.queues.setdefault((to, key), deque()).append(m.Liveliness(0, node, alive))
+                self.queues.setdefault((to, key), deque()).append(
+                    m.Liveliness(stamp_ns=0, node=node, alive=alive)
+                )
 
     def send(self, source: str, out: Sequence[Outgoing]) -> None:
         for o in out:
@@ -204,11 +228,13 @@ class Team:
         """The process is there again: it takes over the submaps that the centre has."""
         name, node = ch.robot_node(robot.id), RobotNode(robot, self.exchange)
         self.nodes[name] = self.robots[robot.id] = node
-        request = encoded(m.SubmapsRequest(0, robot.id))
+        request = encoded(m.SubmapsRequest(stamp_ns=0, robot=robot.id))
         kept = [decoded(reply) for reply in self.centre.answer_submaps(request)]
         if kept:
             node.take_over(kept)
-        self.queues[(name, "central/alive")] = deque([m.Liveliness(0, "central", True)])
+        self.queues[(name, "central/alive")] = deque(
+            [m.Liveliness(stamp_ns=0, node="central", alive=True)]
+        )
         latest = [
             self.sent[c.key()][-1:] for c in (ch.KNOWN_MAP, ch.END, ch.FUSED_MAP, ch.FINAL_MAP)
         ]
@@ -237,7 +263,11 @@ class Team:
             wanted = node.wanted()
             if wanted is None and not node.finished and not node._inbox.waiting:
                 wanted = m.MeasurementsRequest(
-                    0, node.robot, node.incarnation, node.next_measurement, -1
+                    stamp_ns=0,
+                    robot=node.robot,
+                    incarnation=node.incarnation,
+                    first=node.next_measurement,
+                    last=-1,
                 )
             if wanted is None:
                 continue

@@ -127,7 +127,7 @@ def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_i
     assert credit[-1].submaps == done.submaps > 5, "nobody waits for what was set aside"
     final = final_map(samples)
     assert {x.robot: x.sequence for x in final.members}["r1"] == 0
-    assert m.VersionEntry("r1", done.incarnation, 1) in final.missing
+    assert m.VersionEntry(robot="r1", incarnation=done.incarnation, sequence=1) in final.missing
 
 
 def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(
@@ -200,7 +200,7 @@ def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
 def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew() -> None:
     network = MemoryNetwork()
     centre, viewer = MemoryBus(network), MemoryBus(network)
-    start = m.InitialPose(0, "r1", 1, 0, b"", b"")
+    start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
     centre.answer(ch.SUBMAPS, "", lambda _: [encoded(start)])
     centre.answer(ch.MEASUREMENTS, "r1", lambda _: [encoded(submap(0))])
     for channel in (ch.FAULT, ch.ROBOT_CONFIG):
@@ -223,7 +223,7 @@ def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(
     shell = CentralShell(MemoryBus(network), CENTRE, ["r1"], threading.Event())
     token = Sample(
         ch.ALIVE.key("robot/" + "a" * 25_000),
-        encoded(m.Liveliness(0, "robot/" + "a" * 25_000, True)),
+        encoded(m.Liveliness(stamp_ns=0, node="robot/" + "a" * 25_000, alive=True)),
         0, 0, 0,
     )  # fmt: skip
     shell._shell.take(shell._patient([token]))
@@ -244,7 +244,7 @@ def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody() -> None:
     shell.answer(ch.SUBMAPS, "", answer)
     asker = MemoryBus(network)
     with pytest.raises(RuntimeError, match="the answer failed: IndexError"):
-        asker.ask(ch.SUBMAPS, "", m.SubmapsRequest(0, "r1"), 1.0)
+        asker.ask(ch.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="r1"), 1.0)
     assert shell.boundary.faults == 1
 
 

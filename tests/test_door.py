@@ -22,7 +22,12 @@ HUGE = 2**62
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
 SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
-END = m.End(0, tuple(m.StreamEnd(n, 1, len(s)) for n, s in STREAMS.items()))
+END = m.End(
+    stamp_ns=0,
+    streams=tuple(
+        m.StreamEnd(robot=n, incarnation=1, measurements=len(s)) for n, s in STREAMS.items()
+    ),
+)
 FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
 
 
@@ -37,20 +42,35 @@ def given(
 
 
 def progress(robot: str, measurements: int, submaps: int, stamp_s: float = 12.0) -> m.Progress:
-    return m.Progress(round(stamp_s * 1e9), f"robot/{robot}", robot, 1, measurements, submaps)
+    return m.Progress(
+        stamp_ns=round(stamp_s * 1e9),
+        node=f"robot/{robot}",
+        robot=robot,
+        incarnation=1,
+        measurements=measurements,
+        submaps=submaps,
+    )
 
 
 def run() -> list[tuple[ch.Channel, str, m.Message]]:
     """All that a centre hears of a team, in one possible order."""
     said: list[tuple[ch.Channel, str, m.Message]] = []
     for name, submaps in SUBMAPS.items():
-        here = m.Liveliness(0, f"robot/{name}", True)
+        here = m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True)
         count = len(MEASUREMENTS[name])
         said += [(ch.ALIVE, f"robot/{name}", here), (ch.START, name, MEASUREMENTS[name][0])]
         said += [(ch.SUBMAP, name, submap) for submap in submaps]
         said.append((ch.ROBOT_PROGRESS, name, progress(name, count, len(submaps))))
     for name, submaps in SUBMAPS.items():
-        done = m.Done(12 * 10**9, name, 1, len(MEASUREMENTS[name]), 12, len(submaps), ())
+        done = m.Done(
+            stamp_ns=12 * 10**9,
+            robot=name,
+            incarnation=1,
+            measurements=len(MEASUREMENTS[name]),
+            steps=12,
+            submaps=len(submaps),
+            ledger=(),
+        )
         said.append((ch.ROBOT_DONE, name, done))
     return [*said, (ch.END, "", END)]
 
@@ -58,19 +78,71 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
 STRANGE = msgspec.structs.replace(SUBMAPS["r1"][0], robot="r9")
 ATTACKS = [
     (ch.SUBMAP, "r9", STRANGE, "of r9, not in this team"),
-    (ch.START, "r1", m.InitialPose(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
-    (ch.ROBOT_DONE, "r1", m.Done(0, "r1", HUGE, 0, 0, 0, ()), f"of incarnation {HUGE}"),
-    (ch.ROBOT_DONE, "r1", m.Done(0, "r1", 1, 5, 0, HUGE, ()), f"counts to {HUGE}"),
+    (
+        ch.START,
+        "r1",
+        m.InitialPose(stamp_ns=0, robot="r1", incarnation=HUGE, number=0, pose=b"", covariance=b""),
+        f"of incarnation {HUGE}",
+    ),
+    (
+        ch.ROBOT_DONE,
+        "r1",
+        m.Done(
+            stamp_ns=0, robot="r1", incarnation=HUGE, measurements=0, steps=0, submaps=0, ledger=()
+        ),
+        f"of incarnation {HUGE}",
+    ),
+    (
+        ch.ROBOT_DONE,
+        "r1",
+        m.Done(
+            stamp_ns=0, robot="r1", incarnation=1, measurements=5, steps=0, submaps=HUGE, ledger=()
+        ),
+        f"counts to {HUGE}",
+    ),
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, HUGE), f"counts to {HUGE}"),
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, 1, 4e9), "days after its stream began"),
     (ch.ROBOT_PROGRESS, "r1", progress("r2", 5, 1), "a message of 'r2' on the key"),
-    (ch.ROBOT_PROGRESS, "r1", m.Progress(0, "central", "r1", 1, 5, 1), "a message of 'central'"),
-    (ch.END, "", m.End(0, ()), "an end that does not know of r1, r2"),
-    (ch.END, "", m.End(0, tuple(m.StreamEnd(n, 1, 3) for n in STREAMS)), "ends with measurement 3"),
-    (ch.END, "", m.End(0, (*END.streams, m.StreamEnd("r9", 1, 3))), "of r9, not in this team"),
-    (ch.ORDER, "r1", m.Withdrawal(0, "r1", "central", "so"), "a message of 'central' on the key"),
-    (ch.ORDER, "r9", m.Withdrawal(0, "r9", "operator", "so"), "of r9, not in this team"),
-]  # fmt: skip
+    (
+        ch.ROBOT_PROGRESS,
+        "r1",
+        m.Progress(
+            stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=5, submaps=1
+        ),
+        "a message of 'central'",
+    ),
+    (ch.END, "", m.End(stamp_ns=0, streams=()), "an end that does not know of r1, r2"),
+    (
+        ch.END,
+        "",
+        m.End(
+            stamp_ns=0,
+            streams=tuple(m.StreamEnd(robot=n, incarnation=1, measurements=3) for n in STREAMS),
+        ),
+        "ends with measurement 3",
+    ),
+    (
+        ch.END,
+        "",
+        m.End(
+            stamp_ns=0,
+            streams=(*END.streams, m.StreamEnd(robot="r9", incarnation=1, measurements=3)),
+        ),
+        "of r9, not in this team",
+    ),
+    (
+        ch.ORDER,
+        "r1",
+        m.Withdrawal(stamp_ns=0, robot="r1", by="central", reason="so"),
+        "a message of 'central' on the key",
+    ),
+    (
+        ch.ORDER,
+        "r9",
+        m.Withdrawal(stamp_ns=0, robot="r9", by="operator", reason="so"),
+        "of r9, not in this team",
+    ),
+]
 
 
 def centre() -> tuple[Boundary, CentralNode]:
@@ -111,15 +183,33 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
     out = given(boundary, node, *measurements[:8])
     odometry = next(each for each in MEASUREMENTS["r1"][8:] if isinstance(each, m.Odometry))
     far = msgspec.structs.replace(odometry, stamp_ns=odometry.stamp_ns + 2 * LATE_NS)
-    acknowledged = m.Progress(0, "central", "r1", 1, 0, 10**6)
+    acknowledged = m.Progress(
+        stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=0, submaps=10**6
+    )
     attacks = [
-        (ch.START, m.InitialPose(0, "r1", HUGE, 0, b"", b""), f"of incarnation {HUGE}"),
-        (ch.START, m.InitialPose(0, "r1", 100, 0, b"", b""), "of incarnation 100, while 1 is in"),
+        (
+            ch.START,
+            m.InitialPose(
+                stamp_ns=0, robot="r1", incarnation=HUGE, number=0, pose=b"", covariance=b""
+            ),
+            f"of incarnation {HUGE}",
+        ),
+        (
+            ch.START,
+            m.InitialPose(
+                stamp_ns=0, robot="r1", incarnation=100, number=0, pose=b"", covariance=b""
+            ),
+            "of incarnation 100, while 1 is in",
+        ),
         (ch.ODOMETRY, msgspec.structs.replace(odometry, number=HUGE), f"counts to {HUGE}"),
         (ch.ODOMETRY, far, "days after its stream began"),
         (ch.CENTRAL_PROGRESS, acknowledged, "acknowledges 1000000 submaps of"),
-        (ch.END, m.End(0, ()), "an end that does not know of r1"),
-        (ch.END, m.End(0, (m.StreamEnd("r1", 1, 2),)), "ends with measurement 2 of r1"),
+        (ch.END, m.End(stamp_ns=0, streams=()), "an end that does not know of r1"),
+        (
+            ch.END,
+            m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=2),)),
+            "ends with measurement 2 of r1",
+        ),
     ]
     for count, (channel, message, why) in enumerate(attacks, 1):
         out += given(boundary, node, (channel, "r1", message))
@@ -143,7 +233,14 @@ def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own() 
     for channel, name, message, why in (
         (ch.ROBOT_PROGRESS, "r1", progress("r1", 10**6, 1), "consumed 1000000 of"),
         (ch.ROBOT_PROGRESS, "r9", progress("r9", 1, 1), "of r9, not in this team"),
-        (ch.RECORDER_PROGRESS, "r1", m.Progress(0, "recorder", "r1", 7, 1, 1), "incarnation 7"),
+        (
+            ch.RECORDER_PROGRESS,
+            "r1",
+            m.Progress(
+                stamp_ns=0, node="recorder", robot="r1", incarnation=7, measurements=1, submaps=1
+            ),
+            "incarnation 7",
+        ),
         (ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, final=True), "before the end"),
     ):
         before = boundary.refused
@@ -160,5 +257,31 @@ def test_what_a_team_can_say_is_refused_in_no_order(order: int) -> None:
     door = Door(["r1", "r2"])
     said = [message for _, _, message in run()]
     assert [door.refusal(message) for message in said[::order]] == [None] * len(said)
-    assert door.refusal(m.Done(0, "r1", MOST_LIVES, MOST_COUNT, 0, 0, ())) is None
-    assert door.refusal(m.Done(0, "r1", MOST_LIVES + 1, 0, 0, 0, ())) is not None
+    assert (
+        door.refusal(
+            m.Done(
+                stamp_ns=0,
+                robot="r1",
+                incarnation=MOST_LIVES,
+                measurements=MOST_COUNT,
+                steps=0,
+                submaps=0,
+                ledger=(),
+            )
+        )
+        is None
+    )
+    assert (
+        door.refusal(
+            m.Done(
+                stamp_ns=0,
+                robot="r1",
+                incarnation=MOST_LIVES + 1,
+                measurements=0,
+                steps=0,
+                submaps=0,
+                ledger=(),
+            )
+        )
+        is not None
+    )

@@ -150,9 +150,22 @@ def test_a_rule_with_feedback_breaks_law_1_and_this_can_be_seen():
 def _answer(estimate, shift):
     means = translate.landmarks_of(estimate)[1]
     return m.FusedMap(
-        0, "kalman", bytes(8), "", False, False, estimate.exchange, (), (), True, estimate.ids,
-        (means + shift).tobytes(), estimate.covariance, 0.0, 0,
-    )  # fmt: skip
+        stamp_ns=0,
+        rule="kalman",
+        digest=bytes(8),
+        frame="",
+        final=False,
+        provisional=False,
+        exchange=estimate.exchange,
+        members=(),
+        missing=(),
+        joint=True,
+        ids=estimate.ids,
+        means=(means + shift).tobytes(),
+        covariance=estimate.covariance,
+        chi2=0.0,
+        dof=0,
+    )
 
 
 # Law 2.
@@ -202,8 +215,13 @@ MESSAGES = [
         for o in driven(RobotNode(config(each.robot, pose_s=1e6)), published(each))
         if o.channel in (ch.SUBMAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
     ),
-    m.End(12_000_000_000, tuple(m.StreamEnd(x.robot, 1, len(x)) for x in PAIR.streams)),
-    *(m.Liveliness(0, ch.robot_node(x.robot), True) for x in PAIR.streams),
+    m.End(
+        stamp_ns=12_000_000_000,
+        streams=tuple(
+            m.StreamEnd(robot=x.robot, incarnation=1, measurements=len(x)) for x in PAIR.streams
+        ),
+    ),
+    *(m.Liveliness(stamp_ns=0, node=ch.robot_node(x.robot), alive=True) for x in PAIR.streams),
 ]
 
 
@@ -228,7 +246,7 @@ def test_the_centre_gives_the_same_map_for_any_order_duplicates_and_delays(order
 def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_map():
     node, out = CentralNode(CENTRE, ["r1", "r2"]), []
     late = [x for x in MESSAGES if isinstance(x, m.Submap) and x.robot == "r2"]
-    lost = m.Liveliness(0, "robot/r2", False)
+    lost = m.Liveliness(stamp_ns=0, node="robot/r2", alive=False)
     first = [x for x in MESSAGES if getattr(x, "robot", "r1") != "r2" and not isinstance(x, m.End)]
     first.sort(key=lambda x: not isinstance(x, m.Liveliness))
     for message in [*first[:2], lost, *first[2:]]:
@@ -237,7 +255,12 @@ def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_ma
     assert [member.robot for member in closed.members] == ["r1"]
     assert not closed.provisional
     rest = [x for x in MESSAGES if x not in first and x not in late]
-    for message in [late[0], m.Liveliness(0, "robot/r2", True), *rest, *late[1:]]:
+    for message in [
+        late[0],
+        m.Liveliness(stamp_ns=0, node="robot/r2", alive=True),
+        *rest,
+        *late[1:],
+    ]:
         out += node.handle(message, 0)
     (final,) = of(out, ch.FINAL_MAP)
     assert encoded(final) == expected_final()
@@ -369,7 +392,12 @@ def played(seed, estimator, fusion):
         if rng.random() < 0.5:
             team.resume(team.robots[victim].config)
         else:
-            order = m.GivenUp(0, ch.robot_node(victim), "operator", "it fell into the water")
+            order = m.GivenUp(
+                stamp_ns=0,
+                node=ch.robot_node(victim),
+                by="operator",
+                reason="it fell into the water",
+            )
             team.send("operator", [Outgoing(ch.GIVEN_UP, order.node, order)])
     team.run()
     return team

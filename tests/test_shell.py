@@ -25,7 +25,13 @@ class Waiting:
         return []
 
     def status(self) -> m.Status:
-        return m.Status(0, "world", self.state, {}, ("waiting for robot/r2",))
+        return m.Status(
+            stamp_ns=0,
+            node="world",
+            state=self.state,
+            figures={},
+            warnings=("waiting for robot/r2",),
+        )
 
 
 def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(

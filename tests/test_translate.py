@@ -53,7 +53,16 @@ def test_pose_nodes_and_sightings_survive_the_wire_bit_for_bit():
     local = LocalMap(
         np.array([4], np.uint32), rng.normal(size=11), correlated(np.ones(11), rng), nodes
     )
-    message = translate.submap_message("r1", 2, 5, (1, 9), (1_000, 2_000), b"settings", local, 1)
+    message = translate.submap_message(
+        robot="r1",
+        incarnation=2,
+        sequence=5,
+        measurements=(1, 9),
+        span_ns=(1_000, 2_000),
+        config=b"settings",
+        local=local,
+        sightings=1,
+    )
     there = over_the_wire(message)
     found = translate.local_map_of(there)
     assert there.sightings == 1
@@ -86,21 +95,40 @@ def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
 @pytest.mark.parametrize("covariance", [None, np.diag([0.25, 0.5, 0.125])])
 def test_a_start_is_known_exactly_or_with_a_covariance(covariance):
     spread = b"" if covariance is None else from_floats(covariance)
-    start = translate.start_of(m.InitialPose(0, "r1", 1, 0, from_floats([1.0, 2.0, 3.0]), spread))
+    start = translate.start_of(
+        m.InitialPose(
+            stamp_ns=0,
+            robot="r1",
+            incarnation=1,
+            number=0,
+            pose=from_floats([1.0, 2.0, 3.0]),
+            covariance=spread,
+        )
+    )
     np.testing.assert_array_equal(start.pose, [1.0, 2.0, 3.0])
     np.testing.assert_equal(start.covariance, covariance)
     assert start.stream == ("r1", 1)
 
 
 def test_an_unknown_start_is_none():
-    unknown = m.InitialPose(0, "r1", 1, 0, b"", b"")
+    unknown = m.InitialPose(
+        stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b""
+    )
     assert translate.start_of(unknown) is None
     assert translate.pose_of(unknown) == (None, None)
 
 
 def estimate(covariance, *, joint):
     return m.MapEstimate(
-        0, "r1", 1, 0, 0, joint, from_ids([3, 9]), from_floats(np.arange(4.0)), covariance
+        stamp_ns=0,
+        robot="r1",
+        incarnation=1,
+        sequence=0,
+        exchange=0,
+        joint=joint,
+        ids=from_ids([3, 9]),
+        means=from_floats(np.arange(4.0)),
+        covariance=covariance,
     )
 
 
@@ -169,7 +197,13 @@ def test_every_field_of_a_configuration_changes_its_digest():
 
 def test_a_scan_is_in_the_machines_byte_order_and_writable_by_nobody_elses_hand():
     message = m.Observations(
-        0, "r1", 1, 1, from_ids([4, 2]), from_floats([1.5, 2.5]), from_floats([0.5, -0.5])
+        stamp_ns=0,
+        robot="r1",
+        incarnation=1,
+        number=1,
+        ids=from_ids([4, 2]),
+        ranges=from_floats([1.5, 2.5]),
+        bearings=from_floats([0.5, -0.5]),
     )
     ids, ranges, bearings = translate.scan_of(message)
     assert (ids.tolist(), ranges.tolist(), bearings.tolist()) == ([4, 2], [1.5, 2.5], [0.5, -0.5])

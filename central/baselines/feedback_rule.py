@@ -99,7 +99,10 @@ class FeedbackRule:
         value, refused = fused_totally(
             RULES[self._config.fusion], values, self._config.bounds.coordinate_m
         )
-        members = tuple(m.VersionEntry(x.robot, x.incarnation, x.sequence) for x in maps)
+        members = tuple(
+            m.VersionEntry(robot=x.robot, incarnation=x.incarnation, sequence=x.sequence)
+            for x in maps
+        )
         payload = b"".join(x.ids + x.means + x.covariance for x in maps)
         previous = b"" if self._fused is None else self._fused.digest
         stamp_ns = max(x.stamp_ns for x in maps)

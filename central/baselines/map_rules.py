@@ -206,7 +206,9 @@ def _name(estimate: m.MapEstimate) -> tuple[int, int]:
 
 
 def _member(estimate: m.MapEstimate) -> m.VersionEntry:
-    return m.VersionEntry(estimate.robot, estimate.incarnation, estimate.sequence)
+    return m.VersionEntry(
+        robot=estimate.robot, incarnation=estimate.incarnation, sequence=estimate.sequence
+    )
 
 
 def _payload(estimate: m.MapEstimate) -> bytes:

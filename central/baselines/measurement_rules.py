@@ -140,7 +140,10 @@ class MeasurementRule(FusionRule):
             name: translate.pose_of(placed[name]) if self._is_placed(placed[name]) else (None, None)
             for name in self._robots
         }
-        self._members = {n: m.VersionEntry(n, placed[n].incarnation, 0) for n in self._robots}
+        self._members = {
+            n: m.VersionEntry(robot=n, incarnation=placed[n].incarnation, sequence=0)
+            for n in self._robots
+        }
         self._start(
             {
                 name: (np.zeros(3) if pose is None else pose, covariance)
@@ -171,7 +174,9 @@ class MeasurementRule(FusionRule):
         self._now_ns = step[-1].stamp_ns
         for each in step:
             incarnation = self._members[each.robot].incarnation
-            self._members[each.robot] = m.VersionEntry(each.robot, incarnation, each.number)
+            self._members[each.robot] = m.VersionEntry(
+                robot=each.robot, incarnation=incarnation, sequence=each.number
+            )
         return self._take(step, turns)
 
     def _pose_is_due(self, each: RobotKeyframe) -> bool:

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from central.config import CentralConfig
-from central.fused import fused_message
+from central.fused import fused_message, version_entry
 from central.roll import Roll
 from central.rule import Inputs, Stream, Tail
 from central.submap_rule import SubmapRule
@@ -123,7 +123,7 @@ class SvdJoinRule(SubmapRule):
             self._config,
             translate.digest_of(self._config_digest, *(joined[s].digest for s in sorted(joined))),
             fused,
-            tuple(m.VersionEntry(*stream, joined[stream].count - 1) for stream in sorted(joined)),
+            tuple(version_entry(stream, joined[stream].count - 1) for stream in sorted(joined)),
             stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
             final=final,
             frame=f"{first[0]}/{first[1]}",

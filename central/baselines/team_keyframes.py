@@ -120,7 +120,11 @@ class TeamKeyframes:
         """The last counters of the streams."""
         for name, stream in self._streams.items():
             mine = [s for s in end.streams if s.robot == name]
-            stream.end = mine[0] if mine else m.StreamEnd(name, stream.inbox.incarnation, 0)
+            stream.end = (
+                mine[0]
+                if mine
+                else m.StreamEnd(robot=name, incarnation=stream.inbox.incarnation, measurements=0)
+            )
 
     @property
     def starts(self) -> dict[str, tuple[RobotConfig, m.InitialPose]] | None:
@@ -164,5 +168,10 @@ class TeamKeyframes:
         for name, stream in self._streams.items():
             missing = stream.inbox.missing(stream.end)
             if missing is not None and not stream.broken:
-                found.append(m.MeasurementsRequest(now_ns, name, *missing))
+                incarnation, first, last = missing
+                found.append(
+                    m.MeasurementsRequest(
+                        stamp_ns=now_ns, robot=name, incarnation=incarnation, first=first, last=last
+                    )
+                )
         return found

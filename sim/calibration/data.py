@@ -110,16 +110,16 @@ def references(
     """The references of the robots that have a path and odometry."""
     return [
         Reference(
-            f"{label} {stream.robot}",
-            stream.intervals,
-            stream.landmark_detections,
-            paths[stream.robot],
-            gap_ns,
-            landmarks,
-            stream.teammate_detections,
-            stream.teammates,
-            paths,
-            stream.robot in turning_first,
+            name=f"{label} {stream.robot}",
+            intervals=stream.intervals,
+            seen=stream.landmark_detections,
+            path=paths[stream.robot],
+            gap_ns=gap_ns,
+            landmarks=landmarks,
+            sighted=stream.teammate_detections,
+            names=stream.teammates,
+            teammates=paths,
+            turns_first=stream.robot in turning_first,
         )
         for stream in world.streams
         if stream.robot in paths and len(stream.intervals.end_ns)

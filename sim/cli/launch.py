@@ -122,7 +122,15 @@ def launch(
     _prepare(resolved)
     door = listen if keys is None else over_tls(listen)
     plan = Plan(
-        resolved, folder, log, pace, door, views, end_silent, keys and keys.resolve(), insecure
+        scenario=resolved,
+        folder=folder,
+        log=log,
+        speed=pace,
+        listen=door,
+        views=views,
+        end_silent_s=end_silent,
+        keys=keys and keys.resolve(),
+        insecure=insecure,
     )
     page = (
         shown_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)

@@ -75,18 +75,18 @@ def rerun(
     any change, as they would have run with every message arriving at once.
     """
     changes = Changes(
-        tuple(without or ()),
-        fusion,
-        estimator,
-        particles,
-        _positive(window, "--window"),
-        seed,
-        _probability(loss),
-        delay,
-        None if no_centre is None else _span(no_centre, "--no-centre"),
-        tuple(_partition(each) for each in partition or ()),
-        unsafe_feedback,
-        _noise(noise or []),
+        without=tuple(without or ()),
+        fusion=fusion,
+        estimator=estimator,
+        particles=particles,
+        window_s=_positive(window, "--window"),
+        seed=seed,
+        loss=_probability(loss),
+        delay_s=delay,
+        no_centre=None if no_centre is None else _span(no_centre, "--no-centre"),
+        partitions=tuple(_partition(each) for each in partition or ()),
+        unsafe_feedback=unsafe_feedback,
+        noise=_noise(noise or []),
     )
     if not verify:
         _compare(log, changes, json_file, output)

@@ -109,17 +109,17 @@ def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: 
     met = log.measurements.where(log.measurements.subjects <= last_robot)
     index = (met.subjects[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
     return robot_stream(
-        log.robot,
-        log.start_ns,
-        _start(world, log),
-        log.intervals,
-        grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings),
-        grouped(met.stamps_ns, index, met.ranges, met.bearings),
-        robots,
-        log.truth_ns if len(log.truth) else None,
-        log.truth if len(log.truth) else None,
-        (*log.notes, *_truth_notes(log)),
-        clocks[log.robot],
+        robot=log.robot,
+        start_ns=log.start_ns,
+        start=_start(world, log),
+        intervals=log.intervals,
+        observations=grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings),
+        sightings=grouped(met.stamps_ns, index, met.ranges, met.bearings),
+        teammates=robots,
+        truth_ns=log.truth_ns if len(log.truth) else None,
+        truth=log.truth if len(log.truth) else None,
+        notes=(*log.notes, *_truth_notes(log)),
+        clock_offset_ns=clocks[log.robot],
     )
 
 

@@ -96,8 +96,10 @@ class Conditions:
         for robot, cut in self._cuts(robots):
             node = ch.robot_node(robot)
             if cut.end_ns - cut.begin_ns > PATIENCE_NS:
-                link.say(cut.begin_ns + PATIENCE_NS, m.Liveliness(0, node, False))
-                link.say(cut.end_ns, m.Liveliness(0, node, True))
+                link.say(
+                    cut.begin_ns + PATIENCE_NS, m.Liveliness(stamp_ns=0, node=node, alive=False)
+                )
+                link.say(cut.end_ns, m.Liveliness(stamp_ns=0, node=node, alive=True))
         return link
 
     def to_robot(self, robot: str) -> Link:
@@ -107,8 +109,8 @@ class Conditions:
             return Link()
         link = Link(lambda sample, now_ns: _behind(cuts, now_ns, sample, _FROM_CENTRE))
         for cut in cuts:
-            link.say(cut.begin_ns, m.Liveliness(0, "central", False))
-            link.say(cut.end_ns, m.Liveliness(0, "central", True))
+            link.say(cut.begin_ns, m.Liveliness(stamp_ns=0, node="central", alive=False))
+            link.say(cut.end_ns, m.Liveliness(stamp_ns=0, node="central", alive=True))
         return link
 
     def _cuts(self, robots: Sequence[str]) -> list[tuple[str, Partition]]:

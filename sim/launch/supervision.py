@@ -88,7 +88,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     watch.given_up.append(service.name)
     watch.failures.append(f"{failure(ended)}; {deaths}")
     node = node_of(service.name)
-    order = m.GivenUp(0, node, "launch", f"{ended.how}; {deaths}")
+    order = m.GivenUp(stamp_ns=0, node=node, by="launch", reason=f"{ended.how}; {deaths}")
     if service.name not in _WITHOUT_IT_NO_MAP:
         bus.publish(Outgoing(ch.GIVEN_UP, node, order))
 

@@ -26,7 +26,7 @@ def withdraw(bus: Bus, robot: str, reason: str, patience_s: float) -> m.FusedMap
     bus.watch_alive()
     robots: set[str] = set()
     _await_team(bus, robot, robots)
-    order = m.Withdrawal(0, robot, "operator", reason)
+    order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=reason)
     bus.publish(Outgoing(ch.ORDER, robot, order))
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
@@ -50,7 +50,9 @@ def give_up(bus: Bus, robot: str, reason: str, patience_s: float) -> None:
     bus.watch_alive()
     _await_team(bus, robot, set())
     node = ch.robot_node(robot)
-    bus.publish(Outgoing(ch.GIVEN_UP, node, m.GivenUp(0, node, "operator", reason)))
+    bus.publish(
+        Outgoing(ch.GIVEN_UP, node, m.GivenUp(stamp_ns=0, node=node, by="operator", reason=reason))
+    )
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         for sample in bus.receive(LOOK_S):

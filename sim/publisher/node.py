@@ -58,41 +58,61 @@ class _Source:
         robot, incarnation, measurement = self.stream.robot, self.incarnation, index - self.base
         stamp_ns = int(self.stream.stamps_ns[index])
         if measurement == 0 and incarnation > FIRST_INCARNATION:
-            return m.InitialPose(stamp_ns, robot, incarnation, 0, b"", b"")
+            return m.InitialPose(
+                stamp_ns=stamp_ns,
+                robot=robot,
+                incarnation=incarnation,
+                number=0,
+                pose=b"",
+                covariance=b"",
+            )
         kind = self.stream.kinds[index]
         if kind == s.ODOMETRY:
             o = self.stream.odometry(index)
             stamp_ns -= self.stream.clock_offset_ns
             return m.Odometry(
-                stamp_ns, robot, incarnation, measurement, o.duration_ns, o.forward, o.yaw_rate
+                stamp_ns=stamp_ns,
+                robot=robot,
+                incarnation=incarnation,
+                number=measurement,
+                duration_ns=o.duration_ns,
+                forward=o.forward,
+                yaw_rate=o.yaw_rate,
             )
         if kind == s.OBSERVATIONS:
             z = self.stream.observations(index)
             return m.Observations(
-                stamp_ns,
-                robot,
-                incarnation,
-                measurement,
-                from_ids(z.ids),
-                from_floats(z.ranges),
-                from_floats(z.bearings),
+                stamp_ns=stamp_ns,
+                robot=robot,
+                incarnation=incarnation,
+                number=measurement,
+                ids=from_ids(z.ids),
+                ranges=from_floats(z.ranges),
+                bearings=from_floats(z.bearings),
             )
         if kind == s.SIGHTINGS:
             t = self.stream.sightings(index)
             return m.Sightings(
-                stamp_ns,
-                robot,
-                incarnation,
-                measurement,
-                t.teammates,
-                from_floats(t.ranges),
-                from_floats(t.bearings),
+                stamp_ns=stamp_ns,
+                robot=robot,
+                incarnation=incarnation,
+                number=measurement,
+                teammates=t.teammates,
+                ranges=from_floats(t.ranges),
+                bearings=from_floats(t.bearings),
             )
         start = self.stream.start
         pose = b"" if start is None else from_floats(start.pose)
         known = start is not None and start.covariance is not None
         covariance = from_floats(start.covariance) if start is not None and known else b""
-        return m.InitialPose(stamp_ns, robot, incarnation, measurement, pose, covariance)
+        return m.InitialPose(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=incarnation,
+            number=measurement,
+            pose=pose,
+            covariance=covariance,
+        )
 
 
 _CHANNEL_OF_KIND = {
@@ -172,13 +192,13 @@ class WorldNode:
         if self.streams.landmarks is not None:
             order = np.argsort(self.streams.landmark_ids)
             truth = m.TruthLandmarks(
-                self._first_ns,
-                from_ids(self.streams.landmark_ids[order]),
-                from_floats(self.streams.landmarks[order]),
+                stamp_ns=self._first_ns,
+                ids=from_ids(self.streams.landmark_ids[order]),
+                positions=from_floats(self.streams.landmarks[order]),
             )
             out.append(Outgoing(ch.TRUTH_LANDMARKS, "", truth))
             if self.tells_map:
-                told = m.KnownMap(self._first_ns, truth.ids, truth.positions)
+                told = m.KnownMap(stamp_ns=self._first_ns, ids=truth.ids, positions=truth.positions)
                 out.append(Outgoing(ch.KNOWN_MAP, "", told))
         return out
 
@@ -375,19 +395,22 @@ class WorldNode:
             return []
         source.truth_sent = end
         truth = m.Truth(
-            int(stream.truth_ns[end - 1]),
-            stream.robot,
-            from_stamps(stream.truth_ns[begin:end]),
-            from_floats(stream.truth[begin:end]),
+            stamp_ns=int(stream.truth_ns[end - 1]),
+            robot=stream.robot,
+            stamps=from_stamps(stream.truth_ns[begin:end]),
+            poses=from_floats(stream.truth[begin:end]),
         )
         return [Outgoing(ch.TRUTH, stream.robot, truth)]
 
     def _end(self) -> m.End:
-        ends = tuple(m.StreamEnd(n, x.incarnation, x.counter) for n, x in self._sources.items())
+        ends = tuple(
+            m.StreamEnd(robot=n, incarnation=x.incarnation, measurements=x.counter)
+            for n, x in self._sources.items()
+        )
         notes = [*self.streams.notes]
         for name, source in self._sources.items():
             notes += [f"{name}: {note}" for note in source.stream.notes]
-        return m.End(self.now_ns, ends, tuple(notes))
+        return m.End(stamp_ns=self.now_ns, streams=ends, notes=tuple(notes))
 
     def measurements(self, request: bytes) -> Iterable[bytes]:
         """The answer to `MeasurementsRequest`: the published measurements asked for, ANSWER at
@@ -432,11 +455,11 @@ class WorldNode:
                 f"{who} holds the team up: it has got no further for {self._clock_s - since:.0f} s",
             )
         return m.Status(
-            self.now_ns,
-            "world",
-            "ended" if self.ended else state,
-            figures,
-            (*self.configurations.mismatches, *warnings),
+            stamp_ns=self.now_ns,
+            node="world",
+            state="ended" if self.ended else state,
+            figures=figures,
+            warnings=(*self.configurations.mismatches, *warnings),
         )
 
 

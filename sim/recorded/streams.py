@@ -77,15 +77,15 @@ def _stream(
     times = [stamps(each.stamps, "stamps") for each in truth]
     poses = [floats(each.poses, "poses").reshape(-1, 3) for each in truth]
     return robot_stream(
-        robot,
-        measurements[0].stamp_ns,
-        None if pose is None else StartPose(pose, covariance),
-        intervals,
-        _detections(seen, [ids(each.ids, "ids") for each in seen]),
-        _detections(sighted, [_indices(each, robots) for each in sighted]),
-        robots,
-        np.concatenate(times) if times else None,
-        np.concatenate(poses) if poses else None,
+        robot=robot,
+        start_ns=measurements[0].stamp_ns,
+        start=None if pose is None else StartPose(pose, covariance),
+        intervals=intervals,
+        observations=_detections(seen, [ids(each.ids, "ids") for each in seen]),
+        sightings=_detections(sighted, [_indices(each, robots) for each in sighted]),
+        teammates=robots,
+        truth_ns=np.concatenate(times) if times else None,
+        truth=np.concatenate(poses) if poses else None,
     )
 
 

@@ -80,7 +80,9 @@ class RecordedWorld:
                     f"the estimator {scenario.estimator} needs a map of the landmarks, "
                     "and the log has none"
                 )
-            told = m.KnownMap(truth[0].stamp_ns, truth[0].ids, truth[0].positions)
+            told = m.KnownMap(
+                stamp_ns=truth[0].stamp_ns, ids=truth[0].ids, positions=truth[0].positions
+            )
             self._said.append(Outgoing(ch.KNOWN_MAP, "", told))
         self._said.insert(
             0, Outgoing(ch.WORLD_CONFIG, "", translate.configured("world", 0, 0, scenario))
@@ -102,7 +104,11 @@ class RecordedWorld:
         if not self._waiting:
             self._ended = True
             self.now_ns = self.last_ns
-            out.append(Outgoing(ch.END, "", m.End(self.last_ns, self._end, self._notes)))
+            out.append(
+                Outgoing(
+                    ch.END, "", m.End(stamp_ns=self.last_ns, streams=self._end, notes=self._notes)
+                )
+            )
         return out or self.publish(clock_s)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
@@ -124,5 +130,5 @@ def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...
         counts[robot, incarnation] += 1
     last: dict[str, m.StreamEnd] = {}
     for (robot, incarnation), count in sorted(counts.items()):
-        last[robot] = m.StreamEnd(robot, incarnation, count)
+        last[robot] = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
     return tuple(last.values())

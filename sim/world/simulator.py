@@ -160,15 +160,15 @@ def _stream(
     unknown = starts_unknown(world, robot.id)
     start = None if unknown else StartPose(drive.poses[0].copy(), None)
     return robot_stream(
-        robot.id,
-        int(stamps_ns[0]),
-        start,
-        _odometry(robot, drive, stamps_ns, seed),
-        _observations(world, robot, drive, landmarks, stamps_ns, seed),
-        _sightings(world, robots, drives, index, stamps_ns[1:], seed),
-        [other.id for other in robots],
-        stamps_ns,
-        drive.poses,
+        robot=robot.id,
+        start_ns=int(stamps_ns[0]),
+        start=start,
+        intervals=_odometry(robot, drive, stamps_ns, seed),
+        observations=_observations(world, robot, drive, landmarks, stamps_ns, seed),
+        sightings=_sightings(world, robots, drives, index, stamps_ns[1:], seed),
+        teammates=[other.id for other in robots],
+        truth_ns=stamps_ns,
+        truth=drive.poses,
         clock_offset_ns=_clock_ns(robot),
     )
 

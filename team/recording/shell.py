@@ -114,7 +114,12 @@ class RecordLoop:
             before = self._reported.get((robot, incarnation), (0, 0))
             if measurements - before[0] >= every or submaps > before[1]:
                 progress = Progress(
-                    self._newest_ns, NODE, robot, incarnation, measurements, submaps
+                    stamp_ns=self._newest_ns,
+                    node=NODE,
+                    robot=robot,
+                    incarnation=incarnation,
+                    measurements=measurements,
+                    submaps=submaps,
                 )
                 self._bus.publish(Outgoing(RECORDER_PROGRESS, robot, progress))
                 self._reported[robot, incarnation] = (measurements, submaps)
@@ -171,12 +176,21 @@ class RecordLoop:
             _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
             if kind == "measurements":
                 wanted = MeasurementsRequest(
-                    self._newest_ns, robot, incarnation, first, last, only=True
+                    stamp_ns=self._newest_ns,
+                    robot=robot,
+                    incarnation=incarnation,
+                    first=first,
+                    last=last,
+                    only=True,
                 )
                 self._bus.request(MEASUREMENTS, robot, wanted)
             else:
                 self._bus.request(
-                    SENT, robot, SubmapsRequest(self._newest_ns, robot, incarnation, first)
+                    SENT,
+                    robot,
+                    SubmapsRequest(
+                        stamp_ns=self._newest_ns, robot=robot, incarnation=incarnation, first=first
+                    ),
                 )
 
     @property
@@ -209,7 +223,7 @@ class RecordLoop:
             return replace(sample, stamp_ns=self._newest_ns)
         (self._alive.add if came else self._alive.discard)(node)
         self._missing.discard(node)
-        message = Liveliness(self._newest_ns, node, came)
+        message = Liveliness(stamp_ns=self._newest_ns, node=node, alive=came)
         return replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
     def look(self, end: TheEnd) -> None:
@@ -228,7 +242,13 @@ class RecordLoop:
         absent = tuple(f"{node} has not appeared yet" for node in sorted(self._missing))
         lacking = tuple(f"{MISSING}{what}" for what in self.lacking) if last else ()
         state = "done" if last else "recording"
-        status = Status(self._newest_ns, NODE, state, figures, (*failure, *absent, *lacking))
+        status = Status(
+            stamp_ns=self._newest_ns,
+            node=NODE,
+            state=state,
+            figures=figures,
+            warnings=(*failure, *absent, *lacking),
+        )
         self._bus.publish(Outgoing(STATUS, NODE, status))
         self._write([_own(STATUS.key(NODE), status, self._statuses)])
         self._statuses += 1

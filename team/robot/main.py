@@ -96,7 +96,7 @@ class RobotShell:
 
     def _resume(self) -> bool:
         """Take over the submaps of an earlier life that the centre has; False if there are none."""
-        wanted = m.SubmapsRequest(0, self.node.robot)
+        wanted = m.SubmapsRequest(stamp_ns=0, robot=self.node.robot)
         try:
             replies = self._bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
         except BusError as error:  # a centre that does not answer: the same submaps once more
@@ -124,7 +124,13 @@ class RobotShell:
         while True:
             first = self.node.next_measurement
             replies = self._ask(
-                m.MeasurementsRequest(0, self.node.robot, self.node.incarnation, first, -1)
+                m.MeasurementsRequest(
+                    stamp_ns=0,
+                    robot=self.node.robot,
+                    incarnation=self.node.incarnation,
+                    first=first,
+                    last=-1,
+                )
             )
             if not replies or self.node.next_measurement == first:
                 return

@@ -150,8 +150,15 @@ class RobotNode:
     def wanted(self) -> m.MeasurementsRequest | None:
         """The measurements that are missing and must be asked for at their source."""
         missing = self._inbox.missing(self._end)
-        return (
-            None if missing is None else m.MeasurementsRequest(self._now_ns, self.robot, *missing)
+        if missing is None:
+            return None
+        incarnation, first, last = missing
+        return m.MeasurementsRequest(
+            stamp_ns=self._now_ns,
+            robot=self.robot,
+            incarnation=incarnation,
+            first=first,
+            last=last,
         )
 
     def begin(self) -> list[Outgoing]:
@@ -290,7 +297,9 @@ class RobotNode:
         doubt = (self._team_map.doubt,) if self._team_map.doubt else ()
         warnings = (*waiting, *doubt, *self._unexpected(nis), *self.warnings[-3:])
         told = {name: value for name, value in figures.items() if abs(value) <= 1e300}
-        return m.Status(self._now_ns, node, state, told, warnings)
+        return m.Status(
+            stamp_ns=self._now_ns, node=node, state=state, figures=told, warnings=warnings
+        )
 
     def _unexpected(self, nis: Innovation) -> tuple[str, ...]:
         """Says that measurements lie far from their predictions, and what to configure then."""
@@ -601,7 +610,13 @@ class RobotNode:
         if order.robot in self._withdrawn:
             return []
         self._withdrawn.add(order.robot)
-        heard = m.WithdrawalHeard(order.stamp_ns, self.robot, order.robot, order.by, order.reason)
+        heard = m.WithdrawalHeard(
+            stamp_ns=order.stamp_ns,
+            robot=self.robot,
+            withdrawn=order.robot,
+            by=order.by,
+            reason=order.reason,
+        )
         return [Outgoing(ch.WITHDRAWALS_HEARD, self.robot, heard)]
 
     def _release(self, seen: tuple[str, ...]) -> list[Outgoing]:
@@ -611,7 +626,14 @@ class RobotNode:
         if not self._held.waits or not (submaps or set(seen) - self._held.greeted):
             return []
         self._held.greeted.update(seen)
-        told = m.Rendezvous(self._now_ns, self.robot, self._incarnation, seen, submaps, waited_s)
+        told = m.Rendezvous(
+            stamp_ns=self._now_ns,
+            robot=self.robot,
+            incarnation=self._incarnation,
+            teammates=seen,
+            submaps=submaps,
+            waited_s=waited_s,
+        )
         out = [Outgoing(ch.RENDEZVOUS, self.robot, told), *self._held.released()]
         self._sent.note(out)
         return [*out, self._progress()]
@@ -695,12 +717,12 @@ class RobotNode:
             ch.ROBOT_PROGRESS,
             self.robot,
             m.Progress(
-                self._passed_ns if self._held.since_ns is None else self._held.since_ns,
-                ch.robot_node(self.robot),
-                self.robot,
-                self._incarnation,
-                max(self._consumed, self._pace.credited),
-                self.submaps,
+                stamp_ns=self._passed_ns if self._held.since_ns is None else self._held.since_ns,
+                node=ch.robot_node(self.robot),
+                robot=self.robot,
+                incarnation=self._incarnation,
+                measurements=max(self._consumed, self._pace.credited),
+                submaps=self.submaps,
             ),
         )
 
@@ -743,7 +765,11 @@ class RobotNode:
     def _take_end(self, end: m.End) -> None:
         self._world_end = end = later_end(end, self._world_end)
         mine = [s for s in end.streams if s.robot == self.robot]
-        self._end = mine[0] if mine else m.StreamEnd(self.robot, self.incarnation, 0)
+        self._end = (
+            mine[0]
+            if mine
+            else m.StreamEnd(robot=self.robot, incarnation=self.incarnation, measurements=0)
+        )
 
     def _close_incarnation(self) -> list[Outgoing]:
         driven, uncovered = self._estimator.finish()
@@ -783,12 +809,16 @@ class RobotNode:
 
     def _incarnation_done(self) -> m.Done:
         return m.Done(
-            self._now_ns,
-            self.robot,
-            self._incarnation,
-            self._consumed,
-            self._steps,
-            self.submaps,
-            tuple(m.Disposition(k, n) for k, n in sorted(self._ledger.items()) if n),
-            self._last_map,
+            stamp_ns=self._now_ns,
+            robot=self.robot,
+            incarnation=self._incarnation,
+            measurements=self._consumed,
+            steps=self._steps,
+            submaps=self.submaps,
+            ledger=tuple(
+                m.Disposition(disposition=k, measurements=n)
+                for k, n in sorted(self._ledger.items())
+                if n
+            ),
+            last_map=self._last_map,
         )

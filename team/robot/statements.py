@@ -30,15 +30,15 @@ class Speaker:
     def submap(self, closed: ClosedWindow) -> Outgoing:
         """The window's Gaussian with the names of its inputs."""
         message = translate.submap_message(
-            self.robot,
-            self.incarnation,
-            closed.sequence,
-            (closed.first_measurement, closed.last_measurement),
-            (closed.start_ns, closed.end_ns),
-            self.config,
-            closed.local,
-            len(closed.sightings),
-            closed.gated,
+            robot=self.robot,
+            incarnation=self.incarnation,
+            sequence=closed.sequence,
+            measurements=(closed.first_measurement, closed.last_measurement),
+            span_ns=(closed.start_ns, closed.end_ns),
+            config=self.config,
+            local=closed.local,
+            sightings=len(closed.sightings),
+            gated=closed.gated,
         )
         return Outgoing(ch.SUBMAP, self.robot, message)
 
@@ -61,12 +61,19 @@ class Speaker:
         if cloud is None:
             return []
         poses, weights = (from_floats(x) for x in cloud)
-        message = m.ParticleCloud(stamp_ns, self.robot, poses, weights)
+        message = m.ParticleCloud(stamp_ns=stamp_ns, robot=self.robot, poses=poses, weights=weights)
         return [Outgoing(ch.PARTICLES, self.robot, message)]
 
     def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
         """How well the measurements of a window, or since the last of these, were predicted."""
-        message = m.Innovation(stamp_ns, self.robot, self.incarnation, sequence, *found)
+        message = m.Innovation(
+            stamp_ns=stamp_ns,
+            robot=self.robot,
+            incarnation=self.incarnation,
+            sequence=sequence,
+            squared=found.squared,
+            dof=found.dof,
+        )
         return Outgoing(ch.INNOVATION, self.robot, message)
 
     def own_map(
@@ -83,15 +90,15 @@ class Speaker:
         """
         joint = kind == "joint"
         message = m.MapEstimate(
-            stamp_ns,
-            self.robot,
-            self.incarnation,
-            sequence,
-            exchange,
-            joint,
-            from_ids(landmarks.ids),
-            from_floats(landmarks.means),
-            translate.covariance_bytes(landmarks.covariance, joint=joint),
+            stamp_ns=stamp_ns,
+            robot=self.robot,
+            incarnation=self.incarnation,
+            sequence=sequence,
+            exchange=exchange,
+            joint=joint,
+            ids=from_ids(landmarks.ids),
+            means=from_floats(landmarks.means),
+            covariance=translate.covariance_bytes(landmarks.covariance, joint=joint),
         )
         return Outgoing(ch.OWN_MAP, self.robot, translate.receivable(message)[0])
 

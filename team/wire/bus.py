@@ -310,7 +310,9 @@ class MemoryBus:
         return node in self._network.alive
 
     def _token(self, node: str, *, alive: bool) -> None:
-        sample = Sample(ALIVE.key(node), encoded(Liveliness(0, node, alive)), 0, 0, 0)
+        sample = Sample(
+            ALIVE.key(node), encoded(Liveliness(stamp_ns=0, node=node, alive=alive)), 0, 0, 0
+        )
         if alive:
             self._network.alive[node] = (self, sample)
         else:

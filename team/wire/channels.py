@@ -65,105 +65,105 @@ class Channel:
         return None if match is None else match.groupdict().get("name", "")
 
 
-START = Channel("start", "source/{robot}/start", m.InitialPose, "once per incarnation", "all", True, False,
-                "measurement 0: the initial pose, if known")  # fmt: skip
-ODOMETRY = Channel("odometry", "source/{robot}/odometry", m.Odometry, "8-100 Hz", "stream", True,
-                   False, "one odometry interval")  # fmt: skip
-OBSERVATIONS = Channel("observations", "source/{robot}/observations", m.Observations, "1-30 Hz",
-                       "stream", True, False, "landmarks seen")  # fmt: skip
-SIGHTINGS = Channel("sightings", "source/{robot}/sightings", m.Sightings, "0-10 Hz", "stream", True,
-                    False, "teammates seen")  # fmt: skip
+START = Channel(name="start", template="source/{robot}/start", message=m.InitialPose, rate="once per incarnation", delivery="all", recorded=True, recomputable=False,
+                meaning="measurement 0: the initial pose, if known")  # fmt: skip
+ODOMETRY = Channel(name="odometry", template="source/{robot}/odometry", message=m.Odometry, rate="8-100 Hz", delivery="stream", recorded=True,
+                   recomputable=False, meaning="one odometry interval")  # fmt: skip
+OBSERVATIONS = Channel(name="observations", template="source/{robot}/observations", message=m.Observations, rate="1-30 Hz",
+                       delivery="stream", recorded=True, recomputable=False, meaning="landmarks seen")  # fmt: skip
+SIGHTINGS = Channel(name="sightings", template="source/{robot}/sightings", message=m.Sightings, rate="0-10 Hz", delivery="stream", recorded=True,
+                    recomputable=False, meaning="teammates seen")  # fmt: skip
 SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)
 
-TRUTH = Channel("truth", "truth/{robot}", m.Truth, "1 Hz, batched", "all", True, False,
-                "true poses; the evaluator's only")  # fmt: skip
-TRUTH_LANDMARKS = Channel("truth_landmarks", "truth_landmarks", m.TruthLandmarks, "once", "latest",
-                          True, False, "true landmarks; the evaluator's only")  # fmt: skip
+TRUTH = Channel(name="truth", template="truth/{robot}", message=m.Truth, rate="1 Hz, batched", delivery="all", recorded=True, recomputable=False,
+                meaning="true poses; the evaluator's only")  # fmt: skip
+TRUTH_LANDMARKS = Channel(name="truth_landmarks", template="truth_landmarks", message=m.TruthLandmarks, rate="once", delivery="latest",
+                          recorded=True, recomputable=False, meaning="true landmarks; the evaluator's only")  # fmt: skip
 
-ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configuration, "once per incarnation",
-                       "latest", True, False, "the robot's configuration")  # fmt: skip
-SUBMAP = Channel("submap", "robot/{robot}/submap", m.Submap, "one per window", "all", True, True,
-                 "what the rule `join` consumes")  # fmt: skip
-SIGHTING_FACTOR = Channel("sighting_factor", "robot/{robot}/sighting_factor", m.SightingFactor,
-                          "0-1 per teammate and node", "all", True, True,
-                          "a teammate seen from a pose node; what the rule `join` consumes")  # fmt: skip
-RENDEZVOUS = Channel("rendezvous", "robot/{robot}/rendezvous", m.Rendezvous,
-                     "0-1 per window and meeting", "all", True, False,
-                     "held submaps are sent, since a teammate is seen; who is seen sends too")  # fmt: skip
-OWN_MAP = Channel("own_map", "robot/{robot}/own/map", m.MapEstimate, "one per window or exchange",
-                  "latest", True, True,
-                  "running landmark means and covariances; consumed by rules with feedback")  # fmt: skip
-OWN_POSE = Channel("own_pose", "robot/{robot}/own/pose", m.PoseEstimate, "one per keyframe", "latest",
-                   True, True, "running pose from own measurements alone")  # fmt: skip
-TEAM_POSE = Channel("team_pose", "robot/{robot}/team/pose", m.PoseEstimate, "one per keyframe",
-                    "latest", True, True, "pose given the fused map; never an input of fusion")  # fmt: skip
-PARTICLES = Channel("particles", "robot/{robot}/particles", m.ParticleCloud, "one per window",
-                    "latest", True, True, "thinned cloud, for viewers")  # fmt: skip
-INNOVATION = Channel("innovation", "robot/{robot}/innovation", m.Innovation, "one per window", "latest",
-                     True, True, "how well a window's measurements were predicted (NIS)")  # fmt: skip
-ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 measurements",
-                         "latest", True, False, "credit for the world")  # fmt: skip
-ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per incarnation", "latest", True,
-                     True, "all measurements consumed, last submap sent")  # fmt: skip
+ROBOT_CONFIG = Channel(name="robot_config", template="robot/{robot}/config", message=m.Configuration, rate="once per incarnation",
+                       delivery="latest", recorded=True, recomputable=False, meaning="the robot's configuration")  # fmt: skip
+SUBMAP = Channel(name="submap", template="robot/{robot}/submap", message=m.Submap, rate="one per window", delivery="all", recorded=True, recomputable=True,
+                 meaning="what the rule `join` consumes")  # fmt: skip
+SIGHTING_FACTOR = Channel(name="sighting_factor", template="robot/{robot}/sighting_factor", message=m.SightingFactor,
+                          rate="0-1 per teammate and node", delivery="all", recorded=True, recomputable=True,
+                          meaning="a teammate seen from a pose node; what the rule `join` consumes")  # fmt: skip
+RENDEZVOUS = Channel(name="rendezvous", template="robot/{robot}/rendezvous", message=m.Rendezvous,
+                     rate="0-1 per window and meeting", delivery="all", recorded=True, recomputable=False,
+                     meaning="held submaps are sent, since a teammate is seen; who is seen sends too")  # fmt: skip
+OWN_MAP = Channel(name="own_map", template="robot/{robot}/own/map", message=m.MapEstimate, rate="one per window or exchange",
+                  delivery="latest", recorded=True, recomputable=True,
+                  meaning="running landmark means and covariances; consumed by rules with feedback")  # fmt: skip
+OWN_POSE = Channel(name="own_pose", template="robot/{robot}/own/pose", message=m.PoseEstimate, rate="one per keyframe", delivery="latest",
+                   recorded=True, recomputable=True, meaning="running pose from own measurements alone")  # fmt: skip
+TEAM_POSE = Channel(name="team_pose", template="robot/{robot}/team/pose", message=m.PoseEstimate, rate="one per keyframe",
+                    delivery="latest", recorded=True, recomputable=True, meaning="pose given the fused map; never an input of fusion")  # fmt: skip
+PARTICLES = Channel(name="particles", template="robot/{robot}/particles", message=m.ParticleCloud, rate="one per window",
+                    delivery="latest", recorded=True, recomputable=True, meaning="thinned cloud, for viewers")  # fmt: skip
+INNOVATION = Channel(name="innovation", template="robot/{robot}/innovation", message=m.Innovation, rate="one per window", delivery="latest",
+                     recorded=True, recomputable=True, meaning="how well a window's measurements were predicted (NIS)")  # fmt: skip
+ROBOT_PROGRESS = Channel(name="robot_progress", template="robot/{robot}/progress", message=m.Progress, rate="every 64 measurements",
+                         delivery="latest", recorded=True, recomputable=False, meaning="credit for the world")  # fmt: skip
+ROBOT_DONE = Channel(name="robot_done", template="robot/{robot}/done", message=m.Done, rate="once per incarnation", delivery="latest", recorded=True,
+                     recomputable=True, meaning="all measurements consumed, last submap sent")  # fmt: skip
 
-CENTRAL_CONFIG = Channel("central_config", "central/config", m.Configuration, "once", "latest", True,
-                         False, "the centre's configuration")  # fmt: skip
-FUSED_MAP = Channel("fused_map", "central/map", m.FusedMap, "one per broadcast", "latest", True,
-                    True, "the team's map")  # fmt: skip
-PRIOR = Channel("prior", "central/prior/{robot}", m.Prior, "one per broadcast", "latest", True,
-                True, "the joint marginal that a robot needs")  # fmt: skip
-ORDER = Channel("order", "operator/withdrawal/{robot}", m.Withdrawal, "once", "all", True, False,
-                "an operator's order: the team goes on without the robot")  # fmt: skip
-WITHDRAWAL = Channel("withdrawal", "central/withdrawal/{robot}", m.Withdrawal, "once", "all", True, False,
-                     "the team goes on without the robot; every order that the centre follows")  # fmt: skip
-WITHDRAWALS_HEARD = Channel("withdrawals_heard", "robot/{robot}/withdrawals", m.WithdrawalHeard,
-                            "once per order", "all", True, False,
-                            "an order that the robot has heard, for a centre that is started again")  # fmt: skip
-GIVEN_UP = Channel("given_up", "operator/given_up/{node}", m.GivenUp, "once", "all", True, False,
-                   "an order: nobody waits for the node any more")  # fmt: skip
-FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", True, True,
-                    "the team's map with its joint covariance")  # fmt: skip
-TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per incarnation",
-                     "all", True, True, "smoothed end poses of the submaps, or of all keyframes")  # fmt: skip
-CENTRAL_POSE = Channel("central_pose", "central/pose/{robot}", m.PoseEstimate, "one per keyframe or broadcast",
-                       "latest", True, True, "running pose by a rule on raw measurements")  # fmt: skip
-CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress,
-                           "one per submap", "latest", True, False, "credit for the robots")  # fmt: skip
+CENTRAL_CONFIG = Channel(name="central_config", template="central/config", message=m.Configuration, rate="once", delivery="latest", recorded=True,
+                         recomputable=False, meaning="the centre's configuration")  # fmt: skip
+FUSED_MAP = Channel(name="fused_map", template="central/map", message=m.FusedMap, rate="one per broadcast", delivery="latest", recorded=True,
+                    recomputable=True, meaning="the team's map")  # fmt: skip
+PRIOR = Channel(name="prior", template="central/prior/{robot}", message=m.Prior, rate="one per broadcast", delivery="latest", recorded=True,
+                recomputable=True, meaning="the joint marginal that a robot needs")  # fmt: skip
+ORDER = Channel(name="order", template="operator/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
+                meaning="an operator's order: the team goes on without the robot")  # fmt: skip
+WITHDRAWAL = Channel(name="withdrawal", template="central/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
+                     meaning="the team goes on without the robot; every order that the centre follows")  # fmt: skip
+WITHDRAWALS_HEARD = Channel(name="withdrawals_heard", template="robot/{robot}/withdrawals", message=m.WithdrawalHeard,
+                            rate="once per order", delivery="all", recorded=True, recomputable=False,
+                            meaning="an order that the robot has heard, for a centre that is started again")  # fmt: skip
+GIVEN_UP = Channel(name="given_up", template="operator/given_up/{node}", message=m.GivenUp, rate="once", delivery="all", recorded=True, recomputable=False,
+                   meaning="an order: nobody waits for the node any more")  # fmt: skip
+FINAL_MAP = Channel(name="final_map", template="central/final", message=m.FusedMap, rate="once", delivery="latest", recorded=True, recomputable=True,
+                    meaning="the team's map with its joint covariance")  # fmt: skip
+TRAJECTORY = Channel(name="trajectory", template="central/trajectory/{robot}", message=m.Trajectory, rate="once per incarnation",
+                     delivery="all", recorded=True, recomputable=True, meaning="smoothed end poses of the submaps, or of all keyframes")  # fmt: skip
+CENTRAL_POSE = Channel(name="central_pose", template="central/pose/{robot}", message=m.PoseEstimate, rate="one per keyframe or broadcast",
+                       delivery="latest", recorded=True, recomputable=True, meaning="running pose by a rule on raw measurements")  # fmt: skip
+CENTRAL_PROGRESS = Channel(name="central_progress", template="central/progress/{robot}", message=m.Progress,
+                           rate="one per submap", delivery="latest", recorded=True, recomputable=False, meaning="credit for the robots")  # fmt: skip
 
-WORLD_CONFIG = Channel("world_config", "world/config", m.Configuration, "once", "latest", True, False,
-                       "the scenario")  # fmt: skip
-KNOWN_MAP = Channel("known_map", "world/known_map", m.KnownMap, "once", "latest", True, False,
-                    "the map that robots are told that only localise themselves")  # fmt: skip
-END = Channel("end", "world/end", m.End, "once", "latest", True, False,
-              "everything is published; the last counters")  # fmt: skip
-RECORDER_PROGRESS = Channel("recorder_progress", "recorder/progress/{robot}", m.Progress,
-                            "every 256 measurements", "latest", False, False,
-                            "credit for the world")  # fmt: skip
-STATUS = Channel("status", "{node}/status", m.Status, "1 Hz", "latest", True, False,
-                 "what a node is doing, for people")  # fmt: skip
-FAULT = Channel("fault", "{node}/fault", m.Fault, "when a handling raises", "all", True, False,
-                "a message that a node could not handle and set aside")  # fmt: skip
-ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", True, False,
-                "liveliness token; its changes are logged as messages")  # fmt: skip
+WORLD_CONFIG = Channel(name="world_config", template="world/config", message=m.Configuration, rate="once", delivery="latest", recorded=True, recomputable=False,
+                       meaning="the scenario")  # fmt: skip
+KNOWN_MAP = Channel(name="known_map", template="world/known_map", message=m.KnownMap, rate="once", delivery="latest", recorded=True, recomputable=False,
+                    meaning="the map that robots are told that only localise themselves")  # fmt: skip
+END = Channel(name="end", template="world/end", message=m.End, rate="once", delivery="latest", recorded=True, recomputable=False,
+              meaning="everything is published; the last counters")  # fmt: skip
+RECORDER_PROGRESS = Channel(name="recorder_progress", template="recorder/progress/{robot}", message=m.Progress,
+                            rate="every 256 measurements", delivery="latest", recorded=False, recomputable=False,
+                            meaning="credit for the world")  # fmt: skip
+STATUS = Channel(name="status", template="{node}/status", message=m.Status, rate="1 Hz", delivery="latest", recorded=True, recomputable=False,
+                 meaning="what a node is doing, for people")  # fmt: skip
+FAULT = Channel(name="fault", template="{node}/fault", message=m.Fault, rate="when a handling raises", delivery="all", recorded=True, recomputable=False,
+                meaning="a message that a node could not handle and set aside")  # fmt: skip
+ALIVE = Channel(name="alive", template="{node}/alive", message=m.Liveliness, rate="on change", delivery="latest", recorded=True, recomputable=False,
+                meaning="liveliness token; its changes are logged as messages")  # fmt: skip
 
-TALLY = Channel("tally", "{node}/tally", m.Tally, "once, at its end", "latest", True, False,
-                "how many messages the node's process has published on each key")  # fmt: skip
+TALLY = Channel(name="tally", template="{node}/tally", message=m.Tally, rate="once, at its end", delivery="latest", recorded=True, recomputable=False,
+                meaning="how many messages the node's process has published on each key")  # fmt: skip
 
-MEASUREMENTS = Channel("readings", "source/{robot}/readings", m.MeasurementsRequest, "query", "stream", False,
-                   False, "a query; the replies are the measurements")  # fmt: skip
-SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsRequest, "query", "stream", False, False,
-                  "a query; the replies are the starts, submaps and sightings in the centre's set")  # fmt: skip
-SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsRequest, "query", "stream", False, False,
-               "a query; the replies are the starts, submaps and sightings that the robot has sent")  # fmt: skip
+MEASUREMENTS = Channel(name="readings", template="source/{robot}/readings", message=m.MeasurementsRequest, rate="query", delivery="stream", recorded=False,
+                   recomputable=False, meaning="a query; the replies are the measurements")  # fmt: skip
+SUBMAPS = Channel(name="submaps", template="central/submaps", message=m.SubmapsRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+                  meaning="a query; the replies are the starts, submaps and sightings in the centre's set")  # fmt: skip
+SENT = Channel(name="sent", template="robot/{robot}/submaps", message=m.SubmapsRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+               meaning="a query; the replies are the starts, submaps and sightings that the robot has sent")  # fmt: skip
 
-FINAL_KEPT = Channel("final_kept", "router/final", m.FinalMapRequest, "query", "stream", False, False,
-                     "a query; the reply is the final map, when the centre has left, too")  # fmt: skip
+FINAL_KEPT = Channel(name="final_kept", template="router/final", message=m.FinalMapRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+                     meaning="a query; the reply is the final map, when the centre has left, too")  # fmt: skip
 
-ORDERS_KEPT = Channel("orders_kept", "router/orders", m.OrdersRequest, "query", "stream", False, False,
-                      "a query; the replies are the orders `given_up` that hold, when who gave them has left, too")  # fmt: skip
+ORDERS_KEPT = Channel(name="orders_kept", template="router/orders", message=m.OrdersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+                      meaning="a query; the replies are the orders `given_up` that hold, when who gave them has left, too")  # fmt: skip
 
-VIEW = Channel("view", "view/{view}", m.Message, "about 1 Hz of team time", "latest", True, False,
-               "what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
+VIEW = Channel(name="view", template="view/{view}", message=m.Message, rate="about 1 Hz of team time", delivery="latest", recorded=True, recomputable=False,
+               meaning="what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
 QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT)

@@ -66,4 +66,6 @@ class Kept:
             missed = node in self._owed
             self._owed.discard(node)
             since_s, final = self._final
-            return FinalMapReply(0, round(1e9 * (now_s - since_s)), final, missed)
+            return FinalMapReply(
+                stamp_ns=0, age_ns=round(1e9 * (now_s - since_s)), final=final, missed=missed
+            )

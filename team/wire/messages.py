@@ -41,7 +41,7 @@ Real = Annotated[float, Meta(ge=-1e300, le=1e300)]
 """A finite number: the bounds reject NaN and the infinities."""
 
 
-class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
+class Message(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """What every message has: the team time that it is about."""
 
     stamp_ns: StampNs
@@ -50,7 +50,7 @@ class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
         """Raise ValueError where the arrays do not fit together; nothing to check here."""
 
 
-class Measurement(Message, frozen=True, array_like=True, gc=False):
+class Measurement(Message, frozen=True, kw_only=True, array_like=True, gc=False):
     """What every measurement of a sensor stream has: robot, incarnation and the robot's measurement
     counter.
     """
@@ -60,7 +60,7 @@ class Measurement(Message, frozen=True, array_like=True, gc=False):
     number: Count
 
 
-class InitialPose(Measurement, frozen=True, array_like=True, gc=False, tag="start/1"):
+class InitialPose(Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="start/1"):
     """Measurement 0 of an incarnation: the start pose in the team's frame, if it is known.
 
     pose: 3 floats (x, y, theta), or empty when unknown. covariance: 3 × 3 floats, row by row; empty
@@ -78,7 +78,7 @@ class InitialPose(Measurement, frozen=True, array_like=True, gc=False, tag="star
             check_covariance(self.covariance, 3, "covariance")
 
 
-class Odometry(Measurement, frozen=True, array_like=True, gc=False, tag="odometry/1"):
+class Odometry(Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="odometry/1"):
     """One odometry interval that ends at stamp_ns: mean forward speed and yaw rate over it."""
 
     duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
@@ -86,7 +86,9 @@ class Odometry(Measurement, frozen=True, array_like=True, gc=False, tag="odometr
     yaw_rate: Real
 
 
-class Observations(Measurement, frozen=True, array_like=True, gc=False, tag="observations/1"):
+class Observations(
+    Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="observations/1"
+):
     """Range [m] and bearing [rad] of landmarks with known identities, seen at stamp_ns."""
 
     ids: Ids
@@ -101,7 +103,9 @@ class Observations(Measurement, frozen=True, array_like=True, gc=False, tag="obs
         check_angles(self.bearings, "bearings", n)
 
 
-class Sightings(Measurement, frozen=True, array_like=True, gc=False, tag="sightings/1"):
+class Sightings(
+    Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="sightings/1"
+):
     """Range [m] and bearing [rad] of teammates, seen at stamp_ns."""
 
     teammates: tuple[Name, ...]
@@ -115,7 +119,7 @@ class Sightings(Measurement, frozen=True, array_like=True, gc=False, tag="sighti
         check_angles(self.bearings, "bearings", len(self.teammates))
 
 
-class Truth(Message, frozen=True, array_like=True, gc=False, tag="truth/1"):
+class Truth(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="truth/1"):
     """True poses of a robot, for the evaluator only: T stamps and T × 3 floats (x, y, theta)."""
 
     robot: Name
@@ -126,7 +130,9 @@ class Truth(Message, frozen=True, array_like=True, gc=False, tag="truth/1"):
         check_finite(self.poses, "poses", 3 * len(stamps(self.stamps, "stamps")))
 
 
-class TruthLandmarks(Message, frozen=True, array_like=True, gc=False, tag="truth_landmarks/1"):
+class TruthLandmarks(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="truth_landmarks/1"
+):
     """True landmark positions, for the evaluator only: L ids and L × 2 floats."""
 
     ids: Ids
@@ -137,7 +143,7 @@ class TruthLandmarks(Message, frozen=True, array_like=True, gc=False, tag="truth
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
 
 
-class KnownMap(Message, frozen=True, array_like=True, gc=False, tag="known_map/1"):
+class KnownMap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="known_map/1"):
     """A map that robots are told (`localisation`): L ids, L × 2 floats in the team's frame."""
 
     ids: Ids
@@ -148,7 +154,9 @@ class KnownMap(Message, frozen=True, array_like=True, gc=False, tag="known_map/1
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
 
 
-class Configuration(Message, frozen=True, array_like=True, gc=False, tag="configured/1"):
+class Configuration(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="configured/1"
+):
     """A node's configuration (JSON), announced once; `digest` is its 8-byte name elsewhere."""
 
     node: Text
@@ -157,7 +165,7 @@ class Configuration(Message, frozen=True, array_like=True, gc=False, tag="config
     configuration: Text
 
 
-class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
+class Submap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="submap/1"):
     """One window's Gaussian, the only input of the rule `join`; stamp_ns is its end pose's stamp.
 
     It names its inputs: the measurements first_measurement … last_measurement of (robot,
@@ -204,7 +212,9 @@ class Submap(Message, frozen=True, array_like=True, gc=False, tag="submap/1"):
             raise ValueError("out of bounds: the interval of measurements or of time is empty")
 
 
-class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sighting_factor/1"):
+class SightingFactor(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="sighting_factor/1"
+):
     """A teammate seen from a pose node of submap (robot, incarnation, sequence); stamp_ns is the
     node's.
 
@@ -233,7 +243,7 @@ class SightingFactor(Message, frozen=True, array_like=True, gc=False, tag="sight
             raise ValueError("out of bounds: a robot sees itself")
 
 
-class Withdrawal(Message, frozen=True, array_like=True, gc=False, tag="withdrawal/1"):
+class Withdrawal(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="withdrawal/1"):
     """The team goes on without a robot: the map is that of the set without its submaps, and without
     the sightings by it or of it. A member of the set like a submap: there is no way back.
 
@@ -245,7 +255,9 @@ class Withdrawal(Message, frozen=True, array_like=True, gc=False, tag="withdrawa
     reason: Text
 
 
-class WithdrawalHeard(Message, frozen=True, array_like=True, gc=False, tag="withdrawal_heard/1"):
+class WithdrawalHeard(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="withdrawal_heard/1"
+):
     """A robot has heard that the team goes on without `withdrawn`, and keeps the order for a centre
     that is started again. Hearsay, which a centre weighs (`central.hearsay`).
 
@@ -258,7 +270,7 @@ class WithdrawalHeard(Message, frozen=True, array_like=True, gc=False, tag="with
     reason: Text
 
 
-class GivenUp(Message, frozen=True, array_like=True, gc=False, tag="given_up/1"):
+class GivenUp(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="given_up/1"):
     """Nobody waits for a node any more: what has come of a robot is in the map, what has not is
     missing, and the final map names it as lost.
 
@@ -270,7 +282,7 @@ class GivenUp(Message, frozen=True, array_like=True, gc=False, tag="given_up/1")
     reason: Text
 
 
-class MapEstimate(Message, frozen=True, array_like=True, gc=False, tag="map/1"):
+class MapEstimate(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="map/1"):
     """A robot's own running map in the team's frame: landmark means and covariances.
 
     exchange: counts the maps that a rule with feedback exchanged (lockstep), 0 under `join`.
@@ -291,7 +303,7 @@ class MapEstimate(Message, frozen=True, array_like=True, gc=False, tag="map/1"):
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
 
 
-class PoseEstimate(Message, frozen=True, array_like=True, gc=False, tag="pose/1"):
+class PoseEstimate(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="pose/1"):
     """A robot's pose in the team's frame at stamp_ns, with its 3 × 3 covariance.
 
     `map_digest` names the fused map that went into it (8 zero bytes: none), `sequence` the submap
@@ -310,7 +322,9 @@ class PoseEstimate(Message, frozen=True, array_like=True, gc=False, tag="pose/1"
         check_covariance(self.covariance, 3, "covariance")
 
 
-class ParticleCloud(Message, frozen=True, array_like=True, gc=False, tag="particles/1"):
+class ParticleCloud(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="particles/1"
+):
     """A thinned particle cloud in the team's frame, for viewers: P × 3 poses and P weights."""
 
     robot: Name
@@ -322,7 +336,7 @@ class ParticleCloud(Message, frozen=True, array_like=True, gc=False, tag="partic
         check_finite(self.weights, "weights")
 
 
-class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovation/1"):
+class Innovation(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="innovation/1"):
     """Σ νᵀ S⁻¹ ν of a window's measurements against their prediction; χ² where the models are
     right.
 
@@ -339,7 +353,7 @@ class Innovation(Message, frozen=True, array_like=True, gc=False, tag="innovatio
     dof: Count
 
 
-class VersionEntry(msgspec.Struct, frozen=True, array_like=True):
+class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """One entry of a version vector: all submaps of (robot, incarnation) up to `sequence` are in.
 
     Of a rule on whole maps it is the robot's map of that sequence, of one on raw measurements the
@@ -351,7 +365,7 @@ class VersionEntry(msgspec.Struct, frozen=True, array_like=True):
     sequence: int
 
 
-class BiasEstimate(msgspec.Struct, frozen=True, array_like=True):
+class BiasEstimate(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """What the map says of an error that the submaps of (robot, incarnation) share, ± one sigma."""
 
     robot: Name
@@ -361,7 +375,7 @@ class BiasEstimate(msgspec.Struct, frozen=True, array_like=True):
     sigma: Real
 
 
-class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1"):
+class FusedMap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="fused_map/1"):
     """The team's map: landmark means and covariances, its set and its frame.
 
     members: the version vector of its set, ordered; missing: submaps known to be in a gap of it, as
@@ -408,7 +422,7 @@ class FusedMap(Message, frozen=True, array_like=True, gc=False, tag="fused_map/1
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
 
 
-class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
+class Prior(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="prior/1"):
     """For one robot: the joint marginal of its last fused end pose and the landmarks.
 
     The set is named by digest; `sequence` is the robot's last submap in it (−1: none; the pose is
@@ -437,7 +451,7 @@ class Prior(Message, frozen=True, array_like=True, gc=False, tag="prior/1"):
         check_packed_covariance(self.covariance, n, "covariance")
 
 
-class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajectory/1"):
+class Trajectory(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="trajectory/1"):
     """A robot's smoothed poses in the final map: K stamps, K × 3 poses, K × 9 floats.
 
     Under `join` those of its submaps' ends, under `batch` those of its keyframes.
@@ -458,7 +472,7 @@ class Trajectory(Message, frozen=True, array_like=True, gc=False, tag="trajector
             check_covariance(self.covariances[72 * i : 72 * (i + 1)], 3, "covariances")
 
 
-class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"):
+class Progress(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="progress/1"):
     """How far a node is: per (robot, incarnation) the count of measurements it is done with, and of
     submaps.
 
@@ -474,7 +488,7 @@ class Progress(Message, frozen=True, array_like=True, gc=False, tag="progress/1"
     submaps: Count
 
 
-class Rendezvous(Message, frozen=True, array_like=True, gc=False, tag="rendezvous/1"):
+class Rendezvous(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="rendezvous/1"):
     """A robot that holds its submaps back sends them: submaps of them, the oldest since waited_s.
 
     teammates: whom it sees, so that they send too; empty for one that was seen, or is home.
@@ -487,7 +501,7 @@ class Rendezvous(Message, frozen=True, array_like=True, gc=False, tag="rendezvou
     waited_s: Annotated[float, Meta(ge=0.0, le=1e12)]
 
 
-class Disposition(msgspec.Struct, frozen=True, array_like=True):
+class Disposition(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """How many measurements of a robot ended in one way: in a submap, rejected for a reason,
     lost…
     """
@@ -496,7 +510,7 @@ class Disposition(msgspec.Struct, frozen=True, array_like=True):
     measurements: Count
 
 
-class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
+class Done(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="done/1"):
     """A robot has consumed every measurement of its stream and sent its last submap.
 
     last_map: the sequence of its last own map, where the rule consumes own maps; −1: none.
@@ -511,7 +525,7 @@ class Done(Message, frozen=True, array_like=True, gc=False, tag="done/1"):
     last_map: int = -1
 
 
-class StreamEnd(msgspec.Struct, frozen=True, array_like=True):
+class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """The last counters of one robot's stream: its measurements are numbered 0 … measurements −
     1.
     """
@@ -521,14 +535,14 @@ class StreamEnd(msgspec.Struct, frozen=True, array_like=True):
     measurements: Count
 
 
-class End(Message, frozen=True, array_like=True, gc=False, tag="end/1"):
+class End(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="end/1"):
     """The world has published everything; its last counters."""
 
     streams: tuple[StreamEnd, ...]
     notes: tuple[Text, ...] = ()
 
 
-class Status(Message, frozen=True, array_like=True, gc=False, tag="status/1"):
+class Status(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="status/1"):
     """What a node is doing, for people: a state word, figures by name, warnings in words."""
 
     node: Text
@@ -537,7 +551,7 @@ class Status(Message, frozen=True, array_like=True, gc=False, tag="status/1"):
     warnings: tuple[Text, ...] = ()
 
 
-class Fault(Message, frozen=True, array_like=True, gc=False, tag="fault/1"):
+class Fault(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="fault/1"):
     """A node could not handle a message and set it aside; stamp_ns is the message's.
 
     origin: its key, the query's for a reply, the duty's name if there was no message. count: its
@@ -556,14 +570,14 @@ class Fault(Message, frozen=True, array_like=True, gc=False, tag="fault/1"):
     digest: Digest
 
 
-class Liveliness(Message, frozen=True, array_like=True, gc=False, tag="liveliness/1"):
+class Liveliness(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="liveliness/1"):
     """A node's liveliness token appeared or went; a recorded input of whoever reacted to it."""
 
     node: Text
     alive: bool
 
 
-class Tally(Message, frozen=True, array_like=True, gc=False, tag="tally/1"):
+class Tally(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="tally/1"):
     """What a process has published of each key, said at its end: what is not in a log is missing.
 
     since_ns: its wall clock at the beginning [ns since 1970]; what it published is not older.
@@ -579,7 +593,9 @@ class Tally(Message, frozen=True, array_like=True, gc=False, tag="tally/1"):
             raise ValueError(f"{len(self.counts)} counts of {len(self.keys)} keys")
 
 
-class MeasurementsRequest(Message, frozen=True, array_like=True, gc=False, tag="readings_wanted/1"):
+class MeasurementsRequest(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="readings_wanted/1"
+):
     """A query to a source: measurements first … last of (robot, incarnation); last −1: all there
     are.
 
@@ -593,7 +609,9 @@ class MeasurementsRequest(Message, frozen=True, array_like=True, gc=False, tag="
     only: bool = False
 
 
-class SubmapsRequest(Message, frozen=True, array_like=True, gc=False, tag="submaps_wanted/1"):
+class SubmapsRequest(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="submaps_wanted/1"
+):
     """A query for the submaps of one robot: to the centre for those in its set, or to the robot.
 
     incarnation: whose alone; 0: of every incarnation. first: of that incarnation, those from this
@@ -605,13 +623,17 @@ class SubmapsRequest(Message, frozen=True, array_like=True, gc=False, tag="subma
     first: Count = 0
 
 
-class FinalMapRequest(Message, frozen=True, array_like=True, gc=False, tag="final_wanted/1"):
+class FinalMapRequest(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="final_wanted/1"
+):
     """A query to the router: the team's final map, if there is one already. node: who asks."""
 
     node: Text = ""
 
 
-class FinalMapReply(Message, frozen=True, array_like=True, gc=False, tag="final_kept/1"):
+class FinalMapReply(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="final_kept/1"
+):
     """The router's answer: the payload of the newest final map, and how long ago it came [ns].
 
     missed: a process of the node that asks was in that run and went without a last word.
@@ -622,7 +644,9 @@ class FinalMapReply(Message, frozen=True, array_like=True, gc=False, tag="final_
     missed: bool = False
 
 
-class OrdersRequest(Message, frozen=True, array_like=True, gc=False, tag="orders_wanted/1"):
+class OrdersRequest(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="orders_wanted/1"
+):
     """A query to the router: the orders that hold in this run, from operators who have left."""
 
 

@@ -53,12 +53,12 @@ def further(new: m.Progress, held: m.Progress | None) -> m.Progress:
     if new.incarnation < held.incarnation:
         return held
     return m.Progress(
-        max(new.stamp_ns, held.stamp_ns),
-        new.node,
-        new.robot,
-        new.incarnation,
-        max(new.measurements, held.measurements),
-        max(new.submaps, held.submaps),
+        stamp_ns=max(new.stamp_ns, held.stamp_ns),
+        node=new.node,
+        robot=new.robot,
+        incarnation=new.incarnation,
+        measurements=max(new.measurements, held.measurements),
+        submaps=max(new.submaps, held.submaps),
     )
 
 
@@ -75,4 +75,4 @@ def later_end(new: m.End, held: m.End | None) -> m.End:
         ):
             streams[each.robot] = each
     ordered = tuple(streams[robot] for robot in sorted(streams))
-    return m.End(max(new.stamp_ns, held.stamp_ns), ordered, new.notes)
+    return m.End(stamp_ns=max(new.stamp_ns, held.stamp_ns), streams=ordered, notes=new.notes)

@@ -192,7 +192,13 @@ class ZenohBus:
             node = next(iter(self._tokens))
             counts = dict(sorted(self._published.items()))
             keys = tuple(counts)
-            tally = Tally(self._newest_ns, node, self._since_ns, keys, tuple(counts.values()))
+            tally = Tally(
+                stamp_ns=self._newest_ns,
+                node=node,
+                since_ns=self._since_ns,
+                keys=keys,
+                counts=tuple(counts.values()),
+            )
             self.publish(Outgoing(TALLY, node, tally))
 
     def publish(self, out: Outgoing) -> int:
@@ -329,7 +335,7 @@ class ZenohBus:
                 node = ALIVE.owner(str(item.sample.key_expr).removeprefix(self._prefix))
                 if node is not None and node not in self._tokens:
                     alive = item.sample.kind == zenoh.SampleKind.PUT
-                    payload = encoded(Liveliness(0, node, alive))
+                    payload = encoded(Liveliness(stamp_ns=0, node=node, alive=alive))
                     samples.append(Sample(ALIVE.key(node), payload, 0, time.time_ns(), 0))
             case _Heartbeat():
                 self._arrivals_of(item.key, item.publisher, item.newest).know(item.newest)

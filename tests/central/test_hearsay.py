@@ -11,7 +11,9 @@ TEAM = ("r1", "r2", "r3", "r4")
 
 
 def heard(robot: str, withdrawn: str = "r2") -> m.WithdrawalHeard:
-    return m.WithdrawalHeard(7, robot, withdrawn, "operator", "a flat wheel")
+    return m.WithdrawalHeard(
+        stamp_ns=7, robot=robot, withdrawn=withdrawn, by="operator", reason="a flat wheel"
+    )
 
 
 def centre(robots: tuple[str, ...] = TEAM) -> CentralNode:
@@ -29,7 +31,9 @@ def test_what_more_than_half_of_the_others_heard_is_followed_once_and_told_on() 
     assert withdrawn(node, heard("r1")) == [], "the same robot twice is one witness"
     (told,) = node.handle(heard("r3"), 0)
     assert told.key == "central/withdrawal/r2"
-    assert told.message == m.Withdrawal(7, "r2", "operator", "a flat wheel")
+    assert told.message == m.Withdrawal(
+        stamp_ns=7, robot="r2", by="operator", reason="a flat wheel"
+    )
     assert withdrawn(node, heard("r4")) == []
     assert node.warnings == ["r2 withdrawn by operator: a flat wheel"]
 
@@ -45,7 +49,9 @@ def test_one_robot_alone_withdraws_no_teammate_and_the_remedy_is_named(
         "r1 heard that r2 is withdrawn, too few to be believed: if it is, order it again by "
         "`teamslam withdraw r2`"
     )
-    assert withdrawn(node, m.Withdrawal(8, "r2", "operator", "a flat wheel")) == ["r2"]
+    assert withdrawn(
+        node, m.Withdrawal(stamp_ns=8, robot="r2", by="operator", reason="a flat wheel")
+    ) == ["r2"]
     assert "too few" not in " ".join(node.status().warnings)
 
 
@@ -61,5 +67,5 @@ def test_a_robot_is_believed_about_itself() -> None:
 
 def test_an_operators_order_is_told_on_so_that_who_joins_later_hears_of_it() -> None:
     node = centre()
-    order = m.Withdrawal(3, "r2", "operator", "a flat wheel")
+    order = m.Withdrawal(stamp_ns=3, robot="r2", by="operator", reason="a flat wheel")
     assert withdrawn(node, order, order) == ["r2"]

@@ -70,7 +70,10 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
     assert [each.stamp_ns // 10**9 for each in maps] == [3, 9, 15]
     for each in maps:
         last = each.stamp_ns // 3_000_000_000 - 1
-        assert each.members == (m.VersionEntry("r1", 1, last), m.VersionEntry("r2", 1, last))
+        assert each.members == (
+            m.VersionEntry(robot="r1", incarnation=1, sequence=last),
+            m.VersionEntry(robot="r2", incarnation=1, sequence=last),
+        )
         assert (each.final, each.provisional, each.frame) == (False, False, "r1/1")
     assert {p.digest for p in priors} == {each.digest for each in maps}
     assert len({each.digest for each in maps}) == 3
@@ -90,7 +93,11 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
             assert bool(said) == (name == "r2"), "r1's waits for r2's, nothing is said twice"
             maps += said
     assert [each.members for each in maps] == [
-        (m.VersionEntry("r1", 1, k), m.VersionEntry("r2", 1, k)) for k in range(3)
+        (
+            m.VersionEntry(robot="r1", incarnation=1, sequence=k),
+            m.VersionEntry(robot="r2", incarnation=1, sequence=k),
+        )
+        for k in range(3)
     ]
     assert not any(each.provisional for each in maps)
     for submap in ALL:
@@ -117,7 +124,7 @@ def test_no_map_has_less_than_the_one_before_it():
         now = {(each.robot, each.incarnation): each.sequence for each in after.members}
         assert all(now[each.robot, each.incarnation] >= each.sequence for each in before.members)
     assert not maps[-1].provisional
-    withdrawal = m.Withdrawal(END_NS, "r1", "operator", "a test")
+    withdrawal = m.Withdrawal(stamp_ns=END_NS, robot="r1", by="operator", reason="a test")
     found.take_withdrawal(withdrawal)
     (last,) = of(found.conclude(END_NS), ch.FINAL_MAP)
     assert {each.robot for each in last.members} == {"r2"}
@@ -133,7 +140,7 @@ def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_on
     late_ns = SUBMAPS["r1"][0].stamp_ns + 18_000_000_000
     (fused,) = of(found.broadcasts(float("-inf"), late_ns), ch.FUSED_MAP)
     assert fused.provisional
-    assert fused.members == (m.VersionEntry("r1", 1, 4),)
+    assert fused.members == (m.VersionEntry(robot="r1", incarnation=1, sequence=4),)
     assert found.broadcasts(float("-inf"), late_ns + 1) == []
     assert encoded(final(_completed(found))) == encoded(final(whole())), "it leaves no trace"
 
@@ -156,8 +163,11 @@ def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
                 found.take_submap(submap)
     assert found.count(("r2", 1)) == 2
     fused = final(found)
-    assert fused.missing == (m.VersionEntry("r2", 1, 2),)
-    assert fused.members == (m.VersionEntry("r1", 1, 4), m.VersionEntry("r2", 1, 1))
+    assert fused.missing == (m.VersionEntry(robot="r2", incarnation=1, sequence=2),)
+    assert fused.members == (
+        m.VersionEntry(robot="r1", incarnation=1, sequence=4),
+        m.VersionEntry(robot="r2", incarnation=1, sequence=1),
+    )
 
 
 def test_a_refused_submap_changes_no_bit_and_says_why():
@@ -184,7 +194,7 @@ def test_nobody_need_wait_for_what_was_refused_and_what_follows_it():
     assert found.take_submap(SUBMAPS["r1"][2]) == 3
     assert found.count(("r1", 1)) == 3
     assert sequences(found, "r1") == [0]
-    assert final(found).members == (m.VersionEntry("r1", 1, 0),)
+    assert final(found).members == (m.VersionEntry(robot="r1", incarnation=1, sequence=0),)
     assert found.take_submap(SUBMAPS["r1"][1]) == 3, "the right one may still come"
     assert sequences(found, "r1") == [0, 1, 2]
 

@@ -15,19 +15,39 @@ CONFIG = CentralConfig(tick_s=3.0, broadcast_s=3.0)
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
 STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
-END = m.End(0, tuple(m.StreamEnd(n, 1, len(s)) for n, s in STREAMS.items()))
+END = m.End(
+    stamp_ns=0,
+    streams=tuple(
+        m.StreamEnd(robot=n, incarnation=1, measurements=len(s)) for n, s in STREAMS.items()
+    ),
+)
 
 
 def alive(name, *, here=True):
-    return m.Liveliness(0, f"robot/{name}", here)
+    return m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=here)
 
 
 def progress(name, stamp_s, submaps, incarnation=1):
-    return m.Progress(round(stamp_s * 1e9), f"robot/{name}", name, incarnation, 0, submaps)
+    return m.Progress(
+        stamp_ns=round(stamp_s * 1e9),
+        node=f"robot/{name}",
+        robot=name,
+        incarnation=incarnation,
+        measurements=0,
+        submaps=submaps,
+    )
 
 
 def done(name, submaps=4, incarnation=1):
-    return m.Done(12_000_000_000, name, incarnation, 31, 12, submaps, ())
+    return m.Done(
+        stamp_ns=12_000_000_000,
+        robot=name,
+        incarnation=incarnation,
+        measurements=31,
+        steps=12,
+        submaps=submaps,
+        ledger=(),
+    )
 
 
 class Centre:
@@ -76,7 +96,10 @@ def test_a_tick_closes_when_every_live_robot_has_passed_it():
     (fused,) = centre.maps
     assert (fused.provisional, fused.members) == (
         False,
-        (m.VersionEntry("r1", 1, 0), m.VersionEntry("r2", 1, 0)),
+        (
+            m.VersionEntry(robot="r1", incarnation=1, sequence=0),
+            m.VersionEntry(robot="r2", incarnation=1, sequence=0),
+        ),
     )
 
 
@@ -84,7 +107,7 @@ def test_a_robot_that_is_lost_is_not_waited_for():
     centre = joined()
     centre.hears(SUBMAPS["r1"][0], progress("r1", 3, 1))
     centre.hears(alive("r2", here=False))
-    assert centre.maps[0].members == (m.VersionEntry("r1", 1, 0),)
+    assert centre.maps[0].members == (m.VersionEntry(robot="r1", incarnation=1, sequence=0),)
     centre.hears(alive("r2"), SUBMAPS["r1"][1], progress("r1", 6, 2))
     assert len(centre.maps) == 1, "come back, it is waited for again"
 
@@ -95,7 +118,7 @@ def test_submaps_that_are_announced_but_not_here_hold_the_watermark():
     centre.hears(progress("r1", 9, 3), SUBMAPS["r1"][0], SUBMAPS["r1"][2])
     assert centre.maps == []
     centre.hears(SUBMAPS["r1"][1])
-    assert centre.maps[0].members == (m.VersionEntry("r1", 1, 2),)
+    assert centre.maps[0].members == (m.VersionEntry(robot="r1", incarnation=1, sequence=2),)
 
 
 def test_a_submap_is_acknowledged_after_the_map_that_it_gave():
@@ -140,7 +163,10 @@ def test_the_final_map_comes_once_when_everybody_is_done_and_everything_is_here(
         assert centre.node.finished
         assert centre.node.final == centre.final
         centre.hears(*messages, alive("r1", here=False))
-        assert centre.final.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 3))
+        assert centre.final.members == (
+            m.VersionEntry(robot="r1", incarnation=1, sequence=3),
+            m.VersionEntry(robot="r2", incarnation=1, sequence=3),
+        )
 
 
 def test_a_robot_that_was_never_there_is_waited_for():
@@ -150,7 +176,9 @@ def test_a_robot_that_was_never_there_is_waited_for():
 
 
 def given_up(robot):
-    return m.GivenUp(0, f"robot/{robot}", "operator", "it fell into the water")
+    return m.GivenUp(
+        stamp_ns=0, node=f"robot/{robot}", by="operator", reason="it fell into the water"
+    )
 
 
 def test_a_robot_that_is_lost_at_the_end_is_waited_for_until_it_is_given_up():
@@ -159,7 +187,10 @@ def test_a_robot_that_is_lost_at_the_end_is_waited_for_until_it_is_given_up():
     assert not centre.node.finished
     assert centre.node.awaited == ["r2"]
     centre.hears(given_up("r2"))
-    assert centre.final.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 1))
+    assert centre.final.members == (
+        m.VersionEntry(robot="r1", incarnation=1, sequence=3),
+        m.VersionEntry(robot="r2", incarnation=1, sequence=1),
+    )
     assert (centre.final.lost, centre.final.provisional) == (("r2",), True)
     assert "r2 is given up" in centre.node.status().warnings[0]
 
@@ -181,7 +212,11 @@ def test_a_robot_that_is_given_up_and_brings_all_before_the_end_is_not_lost():
 
 def test_a_robot_that_was_withdrawn_and_has_left_is_not_waited_for_and_not_lost():
     centre = joined()
-    centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"][:2], m.Withdrawal(0, "r2", "operator", "flat"))
+    centre.hears(
+        *SUBMAPS["r1"],
+        *SUBMAPS["r2"][:2],
+        m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="flat"),
+    )
     centre.hears(done("r1"), END)
     assert not centre.node.finished, "it is there, and may still say what it did"
     centre.hears(alive("r2", here=False))
@@ -202,7 +237,7 @@ def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_is_waited_for_
     centre.hears(alive("r2", here=False))
     assert not centre.node.finished
     centre.hears(given_up("r2"))
-    assert centre.final.missing == (m.VersionEntry("r2", 1, 1),)
+    assert centre.final.missing == (m.VersionEntry(robot="r2", incarnation=1, sequence=1),)
     assert centre.final.lost == ("r2",)
 
 
@@ -213,18 +248,23 @@ def test_a_refused_submap_does_not_hold_up_the_team():
     acknowledged = [o.message.submaps for o in out if o.channel is ch.CENTRAL_PROGRESS]
     assert acknowledged == [1, 2, 3, 4], "the robot has its credit"
     centre.hears(*SUBMAPS["r1"], done("r1"), done("r2"), END)
-    assert centre.final.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 0))
+    assert centre.final.members == (
+        m.VersionEntry(robot="r1", incarnation=1, sequence=3),
+        m.VersionEntry(robot="r2", incarnation=1, sequence=0),
+    )
     assert centre.node.status().figures["refused"] == 1.0
     assert "overlap" in centre.node.warnings[0]
 
 
 def test_the_last_word_of_an_earlier_incarnation_is_not_the_last():
     centre = joined()
-    end = msgspec.structs.replace(END, streams=(END.streams[0], m.StreamEnd("r2", 2, 9)))
+    end = msgspec.structs.replace(
+        END, streams=(END.streams[0], m.StreamEnd(robot="r2", incarnation=2, measurements=9))
+    )
     centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), end, done("r2"))
     assert not centre.node.finished
     second = [msgspec.structs.replace(x, incarnation=2) for x in SUBMAPS["r2"][:2]]
-    start = m.InitialPose(0, "r2", 2, 0, b"", b"")
+    start = m.InitialPose(stamp_ns=0, robot="r2", incarnation=2, number=0, pose=b"", covariance=b"")
     centre.hears(start, *second, done("r2", 2, incarnation=2))
     assert centre.node.finished
     again = joined()
@@ -241,7 +281,7 @@ def test_the_submaps_of_a_robot_are_given_to_its_next_life():
     centre.hears(SUBMAPS["r1"][0], SUBMAPS["r1"][1], SUBMAPS["r1"][3])
 
     def answer(robot):
-        request = encoded(m.SubmapsRequest(0, robot))
+        request = encoded(m.SubmapsRequest(stamp_ns=0, robot=robot))
         return [decoded(reply) for reply in centre.node.answer_submaps(request)]
 
     assert answer("r1") == [STARTS["r1"], *SUBMAPS["r1"][:2]]
@@ -252,14 +292,29 @@ def test_the_submaps_of_a_robot_are_given_to_its_next_life():
 
 def test_what_is_not_of_the_team_changes_nothing():
     centre = joined()
-    assert centre.hears(progress("r9", 3, 1), done("r9"), m.Liveliness(0, "recorder", True)) == []
+    assert (
+        centre.hears(
+            progress("r9", 3, 1), done("r9"), m.Liveliness(stamp_ns=0, node="recorder", alive=True)
+        )
+        == []
+    )
 
 
 FEEDBACK = CentralConfig(fusion="kalman-per-axis")
 
 
 def estimate(robot, number):
-    return m.MapEstimate(number, robot, 1, number, number, False, b"", b"", b"")
+    return m.MapEstimate(
+        stamp_ns=number,
+        robot=robot,
+        incarnation=1,
+        sequence=number,
+        exchange=number,
+        joint=False,
+        ids=b"",
+        means=b"",
+        covariance=b"",
+    )
 
 
 def exchanges(centre):

@@ -41,7 +41,9 @@ def test_a_gap_holds_back_the_chain_and_is_listed(here):
     assert found.count(("alpha", 0)) == first
     assert found.chain(("alpha", 0)) == CHAIN[:first]
     behind = any(i > first for i in here)
-    assert found.missing() == ((m.VersionEntry("alpha", 0, first),) if behind else ())
+    assert found.missing() == (
+        (m.VersionEntry(robot="alpha", incarnation=0, sequence=first),) if behind else ()
+    )
 
 
 def changed(i, **fields):
@@ -83,7 +85,16 @@ def test_another_incarnation_is_another_stream():
 def sighting(i, stamp=1, teammate="bravo", measurements=(3,)):
     stamp_ns = i * 1_000_000 + stamp
     return m.SightingFactor(
-        stamp_ns, "alpha", 0, i, b"configur", teammate, 2.0, 0.5, packed(spd(2)), measurements
+        stamp_ns=stamp_ns,
+        robot="alpha",
+        incarnation=0,
+        sequence=i,
+        config=b"configur",
+        teammate=teammate,
+        range=2.0,
+        bearing=0.5,
+        covariance=packed(spd(2)),
+        measurements=measurements,
     )
 
 
@@ -115,7 +126,7 @@ def test_a_submap_counts_when_its_sightings_are_here_in_any_order(order, cut):
 
 def test_an_incomplete_submap_is_what_its_stream_waits_for():
     found = put(CHAIN[0], changed(1, sightings=1))
-    assert found.missing() == (m.VersionEntry("alpha", 0, 1),)
+    assert found.missing() == (m.VersionEntry(robot="alpha", incarnation=0, sequence=1),)
     assert found.chain(("alpha", 0)) == CHAIN[:1]
 
 

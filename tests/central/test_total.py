@@ -30,18 +30,31 @@ def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fiel
         mean = np.concatenate([[10.0, 0.0, 0.1], np.zeros(3 * len(nodes)), np.ravel(places)])
     begins = sequence * 10 * S
     return m.Submap(
-        begins + 10 * S, robot, 1, sequence, sequence * 20 + (sequence > 0), sequence * 20 + 20,
-        begins, CONFIG, from_ids(np.array(ids, np.uint32)), from_floats(mean),
-        packed(np.eye(n) * 0.01 if P is None else P), from_stamps(np.array(nodes, np.int64)),
+        stamp_ns=begins + 10 * S,
+        robot=robot,
+        incarnation=1,
+        sequence=sequence,
+        first_measurement=sequence * 20 + (sequence > 0),
+        last_measurement=sequence * 20 + 20,
+        start_ns=begins,
+        config=CONFIG,
+        ids=from_ids(np.array(ids, np.uint32)),
+        mean=from_floats(mean),
+        covariance=packed(np.eye(n) * 0.01 if P is None else P),
+        nodes=from_stamps(np.array(nodes, np.int64)),
         **fields,
-    )  # fmt: skip
+    )
 
 
 def start(robot, pose=(0.0, 0.0, 0.0), spread=None):
     return m.InitialPose(
-        0, robot, 1, 0, b"" if pose is None else from_floats(pose),
-        b"" if spread is None else from_floats(spread),
-    )  # fmt: skip
+        stamp_ns=0,
+        robot=robot,
+        incarnation=1,
+        number=0,
+        pose=b"" if pose is None else from_floats(pose),
+        covariance=b"" if spread is None else from_floats(spread),
+    )
 
 
 def good(robot, count=4, **known):
@@ -50,7 +63,16 @@ def good(robot, count=4, **known):
 
 def sighting(by, of, stamp_ns, spread):
     return m.SightingFactor(
-        stamp_ns, by, 1, stamp_ns // (10 * S), CONFIG, of, 3.0, 0.5, packed(spread), (5,)
+        stamp_ns=stamp_ns,
+        robot=by,
+        incarnation=1,
+        sequence=stamp_ns // (10 * S),
+        config=CONFIG,
+        teammate=of,
+        range=3.0,
+        bearing=0.5,
+        covariance=packed(spread),
+        measurements=(5,),
     )
 
 
@@ -63,9 +85,35 @@ def concluded(messages, config=None):
     ends = []
     for robot, submaps in count.items():
         now_ns = submaps * 10 * S
-        ends.append(m.Progress(now_ns, f"robot/{robot}", robot, 1, 1000, submaps))
-        ends.append(m.Done(now_ns, robot, 1, 1000, 500, submaps, ()))
-    ends.append(m.End(10**12, tuple(m.StreamEnd(robot, 1, 1000) for robot in ROBOTS)))
+        ends.append(
+            m.Progress(
+                stamp_ns=now_ns,
+                node=f"robot/{robot}",
+                robot=robot,
+                incarnation=1,
+                measurements=1000,
+                submaps=submaps,
+            )
+        )
+        ends.append(
+            m.Done(
+                stamp_ns=now_ns,
+                robot=robot,
+                incarnation=1,
+                measurements=1000,
+                steps=500,
+                submaps=submaps,
+                ledger=(),
+            )
+        )
+    ends.append(
+        m.End(
+            stamp_ns=10**12,
+            streams=tuple(
+                m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS
+            ),
+        )
+    )
     taken = [decoded(encoded(each), type(each)) for each in [*messages, *ends]]
     centre, _ = centre_session(taken, config)
     assert centre.final is not None
@@ -132,7 +180,9 @@ def test_what_is_refused_leaves_the_map_of_the_others_as_it_is():
     alone = concluded(good("r2"))
     beside = concluded([start("r1"), submap("r1", mean=FAR), *good("r2")])
     assert (beside.ids, beside.means) == (alone.ids, alone.means)
-    assert m.VersionEntry("r1", 1, 0) in beside.members, "the set that the map names has it"
+    assert m.VersionEntry(robot="r1", incarnation=1, sequence=0) in beside.members, (
+        "the set that the map names has it"
+    )
 
 
 def test_behind_a_refused_submap_the_chain_has_ended_and_it_is_said():
@@ -221,19 +271,52 @@ def test_rules_on_whole_maps_fuse_what_they_can(fusion: FusionRule, seed: int):
             ids = np.unique(rng.integers(1, 6, 4)).astype(np.uint32)
             n = 2 * len(ids)
             made = m.MapEstimate(
-                exchange * S, robot, 1, exchange, exchange, True, from_ids(ids),
-                from_floats(numbers(rng, n)), packed(covariance(rng, n)),
-            )  # fmt: skip
+                stamp_ns=exchange * S,
+                robot=robot,
+                incarnation=1,
+                sequence=exchange,
+                exchange=exchange,
+                joint=True,
+                ids=from_ids(ids),
+                means=from_floats(numbers(rng, n)),
+                covariance=packed(covariance(rng, n)),
+            )
             tame = m.MapEstimate(
-                exchange * S, robot, 1, exchange, exchange, True, from_ids(ids),
-                from_floats(np.zeros(n)), packed(np.eye(n)),
-            )  # fmt: skip
+                stamp_ns=exchange * S,
+                robot=robot,
+                incarnation=1,
+                sequence=exchange,
+                exchange=exchange,
+                joint=True,
+                ids=from_ids(ids),
+                means=from_floats(np.zeros(n)),
+                covariance=packed(np.eye(n)),
+            )
             try:
                 messages.append(decoded(encoded(made), m.MapEstimate))
             except ValueError:
                 messages.append(tame)
-    messages += [m.Done(2 * S, robot, 1, 1000, 500, 0, (), 2) for robot in ROBOTS]
-    messages.append(m.End(10**12, tuple(m.StreamEnd(robot, 1, 1000) for robot in ROBOTS)))
+    messages += [
+        m.Done(
+            stamp_ns=2 * S,
+            robot=robot,
+            incarnation=1,
+            measurements=1000,
+            steps=500,
+            submaps=0,
+            ledger=(),
+            last_map=2,
+        )
+        for robot in ROBOTS
+    ]
+    messages.append(
+        m.End(
+            stamp_ns=10**12,
+            streams=tuple(
+                m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS
+            ),
+        )
+    )
     centre, _ = centre_session(messages, CentralConfig(fusion=fusion))
     assert centre.final is not None
 
@@ -248,7 +331,7 @@ class HostileTeam(RuleBasedStateMachine):
         self.unsent: list[m.Message] = []
         self.centre = CentralNode(CentralConfig(), list(ROBOTS))
         for robot in ROBOTS:
-            self.centre.handle(m.Liveliness(0, f"robot/{robot}", True), 0)
+            self.centre.handle(m.Liveliness(stamp_ns=0, node=f"robot/{robot}", alive=True), 0)
         for each in self.team.messages:
             self.hear(each)
 
@@ -278,11 +361,20 @@ class HostileTeam(RuleBasedStateMachine):
     @rule(robot=st.sampled_from(ROBOTS), submaps=st.integers(0, 8))
     def reports(self, robot, submaps):
         now_ns = submaps * 10 * S
-        self.hear(m.Progress(now_ns, f"robot/{robot}", robot, 1, 1000, submaps))
+        self.hear(
+            m.Progress(
+                stamp_ns=now_ns,
+                node=f"robot/{robot}",
+                robot=robot,
+                incarnation=1,
+                measurements=1000,
+                submaps=submaps,
+            )
+        )
 
     @rule()
     def is_withdrawn(self):
-        self.hear(m.Withdrawal(0, "r3", "operator", "a test"))
+        self.hear(m.Withdrawal(stamp_ns=0, robot="r3", by="operator", reason="a test"))
 
     @invariant()
     def says_what_every_receiver_takes(self):

@@ -148,7 +148,9 @@ def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> JoinRu
 
 def test_a_map_names_who_was_withdrawn_in_its_digest_too() -> None:
     samples = team_run()
-    orders = [m.Withdrawal(k, "r3", "operator", f"reason {k}") for k in range(2)]
+    orders = [
+        m.Withdrawal(stamp_ns=k, robot="r3", by="operator", reason=f"reason {k}") for k in range(2)
+    ]
     plain, once, twice = (rule_with(samples, *orders[:k]) for k in range(3))
     maps = [rule.conclude(0)[-1].message for rule in (plain, once, twice)]
     assert [fused.withdrawn for fused in maps] == [(), ("r3",), ("r3",)]
@@ -365,6 +367,8 @@ def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
                 if isinstance(message, m.Submap)
                 else message
             )
-    rule.take_withdrawal(m.Withdrawal(0, "r1", "operator", "it fell into the pool"))
+    rule.take_withdrawal(
+        m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="it fell into the pool")
+    )
     fused = rule.conclude(0)[-1].message
     assert (fused.ids, fused.members, fused.withdrawn) == (b"", (), ("r1",))

@@ -29,28 +29,60 @@ from tests.support import examples, odometry, submap, wait_until
 HUGE = 2**62
 FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
 ATTACKS = {
-    "ends the run": (ch.END, "", m.End(0, ())),
+    "ends the run": (ch.END, "", m.End(stamp_ns=0, streams=())),
     "forges the final map": (ch.FINAL_MAP, "", FINAL),
-    "begins one that nobody reaches": (ch.START, "r1", m.InitialPose(0, "r1", HUGE, 0, b"", b"")),
-    "says that another is done": (ch.ROBOT_DONE, "r1", m.Done(0, "r1", HUGE, 0, 0, 0, ())),
-    "frees another's credit": (
-        ch.ROBOT_PROGRESS, "r1", m.Progress(0, "robot/r1", "r1", 1, HUGE, HUGE),
+    "begins one that nobody reaches": (
+        ch.START,
+        "r1",
+        m.InitialPose(stamp_ns=0, robot="r1", incarnation=HUGE, number=0, pose=b"", covariance=b""),
     ),
-    "orders a withdrawal": (ch.ORDER, "r1", m.Withdrawal(0, "r1", "operator", "so")),
-    "tells that the centre withdrew": (ch.WITHDRAWAL, "r1", m.Withdrawal(0, "r1", "central", "so")),
+    "says that another is done": (
+        ch.ROBOT_DONE,
+        "r1",
+        m.Done(
+            stamp_ns=0, robot="r1", incarnation=HUGE, measurements=0, steps=0, submaps=0, ledger=()
+        ),
+    ),
+    "frees another's credit": (
+        ch.ROBOT_PROGRESS,
+        "r1",
+        m.Progress(
+            stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=HUGE, submaps=HUGE
+        ),
+    ),
+    "orders a withdrawal": (
+        ch.ORDER,
+        "r1",
+        m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="so"),
+    ),
+    "tells that the centre withdrew": (
+        ch.WITHDRAWAL,
+        "r1",
+        m.Withdrawal(stamp_ns=0, robot="r1", by="central", reason="so"),
+    ),
     "lets another repeat it": (
-        ch.WITHDRAWALS_HEARD, "r1", m.WithdrawalHeard(0, "r1", "r1", "operator", "so"),
+        ch.WITHDRAWALS_HEARD,
+        "r1",
+        m.WithdrawalHeard(stamp_ns=0, robot="r1", withdrawn="r1", by="operator", reason="so"),
     ),
     "brings a robot of its own": (ch.SUBMAP, "r9", submap(0, "r9")),
     "replaces a measurement": (ch.ODOMETRY, "r1", odometry(0, "r1")),
     "replaces a teammate's submap": (ch.SUBMAP, "r1", submap(0, "r1")),
     "takes the recorder's place": (
-        ch.RECORDER_PROGRESS, "r1", m.Progress(0, "recorder", "r1", 1, HUGE, HUGE),
+        ch.RECORDER_PROGRESS,
+        "r1",
+        m.Progress(
+            stamp_ns=0, node="recorder", robot="r1", incarnation=1, measurements=HUGE, submaps=HUGE
+        ),
     ),
     "gives the truth": (ch.TRUTH, "r1", next(e for e in examples() if isinstance(e, m.Truth))),
-}  # fmt: skip
+}
 """What r2 says that is not its own to say."""
-OWN = Outgoing(ch.ROBOT_PROGRESS, "r2", m.Progress(7, "robot/r2", "r2", 1, 1, 1))
+OWN = Outgoing(
+    ch.ROBOT_PROGRESS,
+    "r2",
+    m.Progress(stamp_ns=7, node="robot/r2", robot="r2", incarnation=1, measurements=1, submaps=1),
+)
 
 
 @contextmanager
@@ -93,7 +125,11 @@ def test_a_robot_that_was_taken_over_says_nothing_for_others(
         victim, robot = enter("recorder"), enter("robot-r2")
         for channel in {channel for channel, _, _ in ATTACKS.values()} | {ch.ROBOT_PROGRESS}:
             victim.subscribe(channel)
-        probe = Outgoing(ch.STATUS, "robot/r2", m.Status(0, "robot/r2", "mapping", {}))
+        probe = Outgoing(
+            ch.STATUS,
+            "robot/r2",
+            m.Status(stamp_ns=0, node="robot/r2", state="mapping", figures={}),
+        )
         victim.subscribe(ch.STATUS)
 
         def there() -> bool:
@@ -120,7 +156,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
     keys: Folders, *, locked: bool
 ) -> None:
     forged = [encoded(odometry(5, "r1"))]
-    wanted = m.MeasurementsRequest(0, "r1", 1, 0, -1)
+    wanted = m.MeasurementsRequest(stamp_ns=0, robot="r1", incarnation=1, first=0, last=-1)
     with door(keys if locked else None) as enter:
         robot, attacker = enter("robot-r1"), enter("robot-r2")
         attacker.answer(ch.MEASUREMENTS, "r1", lambda _: forged)
@@ -136,7 +172,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
         serving.start()
         try:
             found = answers(robot, ch.MEASUREMENTS, "r1", wanted)
-            found += answers(robot, ch.SUBMAPS, "", m.SubmapsRequest(0, "r1"))
+            found += answers(robot, ch.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="r1"))
         finally:
             over.set()
             serving.join()
@@ -180,7 +216,7 @@ def test_no_estimator_hears_the_truth(keys: Folders) -> None:
             bus.subscribe(ch.END)
         world.publish(truth)
         wait_until(lambda: recorder.receive(0.05), what="the truth at the recorder")
-        world.publish(Outgoing(ch.END, "", m.End(0, ())))
+        world.publish(Outgoing(ch.END, "", m.End(stamp_ns=0, streams=())))
         assert arriving(robot, "world/end") == []
 
 

@@ -92,15 +92,74 @@ def far_counters(path: Path) -> Path:
     far = 2**60
     joint = from_floats([0.0] * 5)
     submap = m.Submap(
-        9, "alpha", 1, 0, 0, far, 1, DIGEST, from_ids([1]), joint, packed(spd(5))
-    )  # fmt: skip
+        stamp_ns=9,
+        robot="alpha",
+        incarnation=1,
+        sequence=0,
+        first_measurement=0,
+        last_measurement=far,
+        start_ns=1,
+        config=DIGEST,
+        ids=from_ids([1]),
+        mean=joint,
+        covariance=packed(spd(5)),
+    )
     told: list[tuple[ch.Channel, str, m.Message]] = [
-        (ch.START, "alpha", m.InitialPose(0, "alpha", 1, 0, b"", b"")),
-        (ch.ODOMETRY, "alpha", m.Odometry(5, "alpha", 1, 1, 5, 0.5, 0.1)),
-        (ch.ODOMETRY, "alpha", m.Odometry(2**61, "alpha", 1, far, 5, 0.5, 0.1)),
+        (
+            ch.START,
+            "alpha",
+            m.InitialPose(
+                stamp_ns=0, robot="alpha", incarnation=1, number=0, pose=b"", covariance=b""
+            ),
+        ),
+        (
+            ch.ODOMETRY,
+            "alpha",
+            m.Odometry(
+                stamp_ns=5,
+                robot="alpha",
+                incarnation=1,
+                number=1,
+                duration_ns=5,
+                forward=0.5,
+                yaw_rate=0.1,
+            ),
+        ),
+        (
+            ch.ODOMETRY,
+            "alpha",
+            m.Odometry(
+                stamp_ns=2**61,
+                robot="alpha",
+                incarnation=1,
+                number=far,
+                duration_ns=5,
+                forward=0.5,
+                yaw_rate=0.1,
+            ),
+        ),
         (ch.SUBMAP, "alpha", submap),
-        (ch.ROBOT_DONE, "alpha", m.Done(9, "alpha", 1, far, far, 1, ())),
-        (ch.END, "", m.End(2**61, (m.StreamEnd("alpha", 1, far),))),
+        (
+            ch.ROBOT_DONE,
+            "alpha",
+            m.Done(
+                stamp_ns=9,
+                robot="alpha",
+                incarnation=1,
+                measurements=far,
+                steps=far,
+                submaps=1,
+                ledger=(),
+            ),
+        ),
+        (
+            ch.END,
+            "",
+            m.End(
+                stamp_ns=2**61,
+                streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=far),),
+            ),
+        ),
     ]
     return log_of(path, records_of([(c, n, encoded(message)) for c, n, message in told]))
 

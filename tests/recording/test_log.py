@@ -95,7 +95,19 @@ def test_any_bytes_are_kept_as_they_came(
 
 def test_a_stamp_before_zero_comes_back_as_it_was(path: Path) -> None:
     samples = [
-        sample(c.ODOMETRY, "alpha", m.Odometry(stamp, "alpha", 0, 0, 0, 0.0, 0.0))
+        sample(
+            c.ODOMETRY,
+            "alpha",
+            m.Odometry(
+                stamp_ns=stamp,
+                robot="alpha",
+                incarnation=0,
+                number=0,
+                duration_ns=0,
+                forward=0.0,
+                yaw_rate=0.0,
+            ),
+        )
         for stamp in (-(2**62), -5, 0, 5)
     ]
     log = recorded(path, samples[::-1])

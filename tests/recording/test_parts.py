@@ -163,7 +163,15 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
     limit(-1)
     assert logged(path, c.OWN_POSE) < said, "what was written reads"
     room = True
-    world.publish(Outgoing(c.END, "", m.End(0, (m.StreamEnd("alpha", 0, said),))))
+    world.publish(
+        Outgoing(
+            c.END,
+            "",
+            m.End(
+                stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=0, measurements=said),)
+            ),
+        )
+    )
     for now_s in (1e9, 2e9, 3e9):
         loop.mend(now_s)
         loop.take(bus.receive())

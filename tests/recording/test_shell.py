@@ -67,13 +67,25 @@ def test_a_new_incarnation_counts_from_zero(path: Path) -> None:
     with Recorder(path, "t", {}) as recorder:
         loop = RecordLoop(bus, recorder, ())
         for incarnation, measurement in ((0, 0), (0, 1), (3, 0)):
-            message = m.Odometry(7, "alpha", incarnation, measurement, 0, 0.0, 0.0)
+            message = m.Odometry(
+                stamp_ns=7,
+                robot="alpha",
+                incarnation=incarnation,
+                number=measurement,
+                duration_ns=0,
+                forward=0.0,
+                yaw_rate=0.0,
+            )
             world.publish(Outgoing(c.ODOMETRY, "alpha", message))
         loop.take(bus.receive())
         loop.take([])
     assert messages_of(world.receive(), c.RECORDER_PROGRESS) == [
-        m.Progress(7, "recorder", "alpha", 0, 2, 0),
-        m.Progress(7, "recorder", "alpha", 3, 1, 0),
+        m.Progress(
+            stamp_ns=7, node="recorder", robot="alpha", incarnation=0, measurements=2, submaps=0
+        ),
+        m.Progress(
+            stamp_ns=7, node="recorder", robot="alpha", incarnation=3, measurements=1, submaps=0
+        ),
     ]
 
 
@@ -151,8 +163,8 @@ def test_a_recording_ends_with_the_final_map_and_the_last_token(path: Path, endp
         one.message for one in published if one.channel is c.ODOMETRY
     ]
     assert messages_of(list(log.samples()), c.ALIVE) == [
-        m.Liveliness(0, "robot/alpha", True),
-        m.Liveliness(999_000_000, "robot/alpha", False),
+        m.Liveliness(stamp_ns=0, node="robot/alpha", alive=True),
+        m.Liveliness(stamp_ns=999_000_000, node="robot/alpha", alive=False),
     ]
     assert messages_of(list(log.samples()), c.STATUS)[:-1] == statuses != []
     assert statuses[0].warnings == ("central has not appeared yet",)
@@ -186,7 +198,10 @@ class Team:
 
     def ends(self, until: Callable[[], bool]) -> None:
         """The end of a run: what is left is asked for while the source is there."""
-        end = m.End(0, (m.StreamEnd("alpha", 0, len(self.published)),))
+        end = m.End(
+            stamp_ns=0,
+            streams=(m.StreamEnd(robot="alpha", incarnation=0, measurements=len(self.published)),),
+        )
         self.bus.publish(Outgoing(c.END, "", end))
         self.bus.publish(Outgoing(c.FINAL_MAP, "", FINAL))
 
@@ -246,7 +261,15 @@ def test_what_nobody_has_any_more_is_named(path: Path) -> None:
     def saying(_: m.Status) -> None:
         for i in (0, 1, 4):
             world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
-        world.publish(Outgoing(c.END, "", m.End(0, (m.StreamEnd("alpha", 0, 7),))))
+        world.publish(
+            Outgoing(
+                c.END,
+                "",
+                m.End(
+                    stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=0, measurements=7),)
+                ),
+            )
+        )
         stop.set()
 
     record(bus, Recorder(path, "t", {}), on_status=saying, stop=stop)
@@ -280,7 +303,9 @@ def flows(source: ZenohBus, path: Path) -> None:
     wait_until(heard)
 
 
-PROBE = m.Sightings(0, "probe", 0, 0, (), b"", b"")
+PROBE = m.Sightings(
+    stamp_ns=0, robot="probe", incarnation=0, number=0, teammates=(), ranges=b"", bearings=b""
+)
 
 
 def test_a_recording_ends_when_asked(path: Path) -> None:

@@ -44,11 +44,30 @@ def sampled(channel: c.Channel, name: str, message: m.Message, counter: int) -> 
 def drive(robot: str, seconds: int) -> list[Sample]:
     """A configuration at zero, ten odometry measurements a second and a submap each second."""
     out = [
-        sampled(c.ROBOT_CONFIG, robot, m.Configuration(0, f"robot/{robot}", 1, bytes(8), "{}"), 0)
+        sampled(
+            c.ROBOT_CONFIG,
+            robot,
+            m.Configuration(
+                stamp_ns=0,
+                node=f"robot/{robot}",
+                incarnation=1,
+                digest=bytes(8),
+                configuration="{}",
+            ),
+            0,
+        )
     ]
     for i in range(10 * seconds):
         stamp = 100 * SECOND + i * SECOND // 10
-        measurement = m.Odometry(stamp, robot, 1, i, SECOND // 10, 0.5, 0.1)
+        measurement = m.Odometry(
+            stamp_ns=stamp,
+            robot=robot,
+            incarnation=1,
+            number=i,
+            duration_ns=SECOND // 10,
+            forward=0.5,
+            yaw_rate=0.1,
+        )
         out.append(sampled(c.ODOMETRY, robot, measurement, i))
         if i % 10 == 9:
             times = {"stamp_ns": stamp, "start_ns": stamp - SECOND}
@@ -106,7 +125,10 @@ def test_a_publisher_that_starts_again_has_lost_nothing(path: Path) -> None:
 
 
 def test_a_publisher_that_starts_again_unheard_is_told(path: Path) -> None:
-    said = [sampled(c.STATUS, "central", m.Status(0, "central", "", {}), k) for k in range(3)]
+    said = [
+        sampled(c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k)
+        for k in range(3)
+    ]
     again = [replace(s, wall_ns=s.wall_ns + 10**9) for s in said[2:]]
     assert found(recorded(path, said + again)) == ["central/status: 2 messages missing: 0–1"]
 
@@ -114,10 +136,27 @@ def test_a_publisher_that_starts_again_unheard_is_told(path: Path) -> None:
 def test_what_a_stream_is_known_to_have_and_the_log_has_not_is_named(path: Path) -> None:
     """Nothing behind the last message shows that there was more, but the words of others do."""
     said = drive("alpha", 1)
-    said.append(sampled(c.END, "", m.End(0, (m.StreamEnd("alpha", 1, 12),)), 0))
-    done = m.Done(0, "alpha", 0, 0, 0, 3, ())
+    said.append(
+        sampled(
+            c.END,
+            "",
+            m.End(
+                stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=12),)
+            ),
+            0,
+        )
+    )
+    done = m.Done(
+        stamp_ns=0, robot="alpha", incarnation=0, measurements=0, steps=0, submaps=3, ledger=()
+    )
     said.append(sampled(c.ROBOT_DONE, "alpha", done, 0))
-    tally = m.Tally(0, "robot/alpha", 10**18, ("robot/alpha/done", "robot/alpha/team/pose"), (1, 4))
+    tally = m.Tally(
+        stamp_ns=0,
+        node="robot/alpha",
+        since_ns=10**18,
+        keys=("robot/alpha/done", "robot/alpha/team/pose"),
+        counts=(1, 4),
+    )
     said.append(replace(sampled(c.TALLY, "robot/alpha", tally, 0), wall_ns=10**18 + 100))
     assert found(recorded(path, said)) == [
         "robot/alpha/team/pose: 4 messages missing: 0–3",
@@ -129,8 +168,20 @@ def test_what_a_stream_is_known_to_have_and_the_log_has_not_is_named(path: Path)
 def test_a_log_without_the_end_of_the_streams_says_so(path: Path, tmp_path: Path) -> None:
     """Whoever has heard of the end shows that there was one."""
     said = drive("alpha", 1)
-    done = sampled(c.ROBOT_DONE, "alpha", m.Done(0, "alpha", 1, 10, 2, 0, ()), 0)
-    end = sampled(c.END, "", m.End(0, (m.StreamEnd("alpha", 1, 10),)), 0)
+    done = sampled(
+        c.ROBOT_DONE,
+        "alpha",
+        m.Done(
+            stamp_ns=0, robot="alpha", incarnation=1, measurements=10, steps=2, submaps=0, ledger=()
+        ),
+        0,
+    )
+    end = sampled(
+        c.END,
+        "",
+        m.End(stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=10),)),
+        0,
+    )
     lacking = "world/end: missing: how many measurements there were is not known"
     assert found(recorded(path, [*said, done])) == [lacking]
     assert found(recorded(tmp_path / "whole.mcap", [*said, done, end])) == []
@@ -141,12 +192,12 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
     """A killed robot's second life says what it has published; of the first nobody knows."""
 
     def status(counter: int, wall_s: int) -> Sample:
-        said = m.Status(counter * 10**9, "robot/alpha", "mapping", {})
+        said = m.Status(stamp_ns=counter * 10**9, node="robot/alpha", state="mapping", figures={})
         return replace(sampled(c.STATUS, "robot/alpha", said, counter), wall_ns=wall_s * 10**9)
 
     def tally(node: str, since_s: int, until_s: int, count: int) -> Sample:
         keys = (f"{node}/status",)
-        said = m.Tally(0, node, since_s * 10**9, keys, (count,))
+        said = m.Tally(stamp_ns=0, node=node, since_ns=since_s * 10**9, keys=keys, counts=(count,))
         return replace(sampled(c.TALLY, node, said, 0), wall_ns=until_s * 10**9)
 
     first = [status(k, 10 + k) for k in range(3)]
@@ -160,8 +211,15 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
 
 
 def test_views_that_are_missing_can_be_drawn_again(path: Path) -> None:
-    views = [replace(sampled(c.STATUS, "central", m.Status(0, "central", "", {}), k),
-                     key="view/log") for k in (0, 2)]  # fmt: skip
+    views = [
+        replace(
+            sampled(
+                c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k
+            ),
+            key="view/log",
+        )
+        for k in (0, 2)
+    ]
     (named,) = found(recorded(path, views))
     assert named == (
         "view/log: 1 message missing: 1; `teamslam view LOG --export NEW` draws all views again"
@@ -177,23 +235,52 @@ def test_what_was_asked_for_later_is_not_held_against_the_counters(path: Path) -
 
 
 def test_a_measurement_that_is_there_twice_and_not_the_same_is_named(path: Path) -> None:
-    other = sampled(c.ODOMETRY, "alpha", m.Odometry(100 * SECOND, "alpha", 1, 3, 1, 0.5, 0.5), 10)
+    other = sampled(
+        c.ODOMETRY,
+        "alpha",
+        m.Odometry(
+            stamp_ns=100 * SECOND,
+            robot="alpha",
+            incarnation=1,
+            number=3,
+            duration_ns=1,
+            forward=0.5,
+            yaw_rate=0.5,
+        ),
+        10,
+    )
     assert found(recorded(path, [*drive("alpha", 1), other])) == [
         "source/alpha: 1 measurements of incarnation 1 there twice, and not the same"
     ]
 
 
 def test_what_the_recorder_knows_that_it_lacks_is_found(path: Path) -> None:
-    last = m.Status(0, "recorder", "done", {}, ("missing: robot/alpha/team/pose: 7",))
+    last = m.Status(
+        stamp_ns=0,
+        node="recorder",
+        state="done",
+        figures={},
+        warnings=("missing: robot/alpha/team/pose: 7",),
+    )
     said = [*drive("alpha", 1), sampled(c.STATUS, "recorder", last, 0)]
     assert found(recorded(path, said)) == ["recorder: missing: robot/alpha/team/pose: 7"]
 
 
 def test_what_no_publisher_counts_is_not_held_against_its_counters(path: Path) -> None:
-    alive = [sampled(c.ALIVE, "central", m.Liveliness(0, "central", up), 0) for up in (True, False)]
-    own = sampled(c.STATUS, "recorder", m.Status(0, "recorder", "recording", {}), 4)
+    alive = [
+        sampled(c.ALIVE, "central", m.Liveliness(stamp_ns=0, node="central", alive=up), 0)
+        for up in (True, False)
+    ]
+    own = sampled(
+        c.STATUS,
+        "recorder",
+        m.Status(stamp_ns=0, node="recorder", state="recording", figures={}),
+        4,
+    )
     assert found(recorded(path, [*alive, own])) == []
-    other = sampled(c.STATUS, "central", m.Status(0, "central", "waiting", {}), 4)
+    other = sampled(
+        c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="waiting", figures={}), 4
+    )
     assert found(recorded(path.with_name("b.mcap"), [other])) == [
         "central/status: 4 messages missing: 0–3"
     ]
@@ -468,7 +555,13 @@ def test_numbers_read_back_from_csv_are_the_same(
     folder = tmp_path_factory.mktemp("csv")
     ids, ranges, bearings = ([row[i] for row in seen] for i in range(3))
     message = m.Observations(
-        5, "alpha", 1, 9, from_ids(ids), from_floats(ranges), from_floats(bearings)
+        stamp_ns=5,
+        robot="alpha",
+        incarnation=1,
+        number=9,
+        ids=from_ids(ids),
+        ranges=from_floats(ranges),
+        bearings=from_floats(bearings),
     )
     log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
     export_csv(log, folder / "out")

@@ -93,7 +93,15 @@ def _whole_of(measurements):
 
 def test_a_window_does_not_depend_on_what_was_read_before_it():
     other = [
-        m.Odometry(r.stamp_ns, r.robot, r.incarnation, r.number, r.duration_ns, 2 * r.forward, 0.5)
+        m.Odometry(
+            stamp_ns=r.stamp_ns,
+            robot=r.robot,
+            incarnation=r.incarnation,
+            number=r.number,
+            duration_ns=r.duration_ns,
+            forward=2 * r.forward,
+            yaw_rate=0.5,
+        )
         if isinstance(r, m.Odometry) and r.stamp_ns <= 3_000_000_000
         else r
         for r in MEASUREMENTS

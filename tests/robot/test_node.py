@@ -23,8 +23,11 @@ from tests.teams import config, driven, of, published, stream
 
 STREAM = stream("r1", 12, off_ns=300_000_000)
 MEASUREMENTS = published(STREAM)
-END = m.End(12_000_000_000, (m.StreamEnd("r1", 1, len(MEASUREMENTS)),))
-CENTRE = m.Liveliness(0, "central", True)
+END = m.End(
+    stamp_ns=12_000_000_000,
+    streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=len(MEASUREMENTS)),),
+)
+CENTRE = m.Liveliness(stamp_ns=0, node="central", alive=True)
 
 
 def payloads(out, channel=ch.SUBMAP):
@@ -37,16 +40,35 @@ LONELY = payloads(driven(RobotNode(config()), MEASUREMENTS))
 def prior(sequence=0, incarnation=1, scale=1.0, at=0.0, ids=(1, 2)):
     n = 3 + 2 * len(ids)
     return m.Prior(
-        0, "r1", incarnation, sequence, b"whatever", from_ids(ids),
-        from_floats(np.full(n, at)), packed(scale * spd(n)),
-    )  # fmt: skip
+        stamp_ns=0,
+        robot="r1",
+        incarnation=incarnation,
+        sequence=sequence,
+        digest=b"whatever",
+        ids=from_ids(ids),
+        mean=from_floats(np.full(n, at)),
+        covariance=packed(scale * spd(n)),
+    )
 
 
 def fused(ids=(1, 2), at=0.0, *, final=False, exchange=0):
     return m.FusedMap(
-        0, "join", b"whatever", "r1/1", final, False, exchange, (), (), True, from_ids(ids),
-        from_floats(np.full(2 * len(ids), at)), packed(spd(2 * len(ids))), 0.0, 0,
-    )  # fmt: skip
+        stamp_ns=0,
+        rule="join",
+        digest=b"whatever",
+        frame="r1/1",
+        final=final,
+        provisional=False,
+        exchange=exchange,
+        members=(),
+        missing=(),
+        joint=True,
+        ids=from_ids(ids),
+        means=from_floats(np.full(2 * len(ids), at)),
+        covariance=packed(spd(2 * len(ids))),
+        chi2=0.0,
+        dof=0,
+    )
 
 
 garbage = st.one_of(
@@ -60,8 +82,13 @@ garbage = st.one_of(
     ),
     st.builds(fused, st.sampled_from([(), (1, 2), (77,)]), st.floats(-1e9, 1e9)),
     st.just(CENTRE),
-    st.just(m.Liveliness(0, "central", False)),
-    st.builds(lambda n: m.Progress(0, "central", "r1", 1, 0, n), st.integers(0, 100)),
+    st.just(m.Liveliness(stamp_ns=0, node="central", alive=False)),
+    st.builds(
+        lambda n: m.Progress(
+            stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=0, submaps=n
+        ),
+        st.integers(0, 100),
+    ),
 )
 
 
@@ -74,7 +101,7 @@ def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections
         for at, message in interjections:
             out += node.handle(message, 0) if at == i else []
     out += node.handle(END, 0)
-    out += node.handle(m.Liveliness(0, "central", False), 0)
+    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
     assert payloads(out) == LONELY
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
@@ -95,8 +122,12 @@ def test_the_prior_does_change_the_team_pose():
 def test_an_older_prior_does_not_replace_the_one_that_is_held():
     """Closed and provisional broadcasts alternate: the closed one has fewer of everyone's."""
     poses = []
-    newer = msgspec.structs.replace(prior(2, at=3.0), members=(m.VersionEntry("r1", 1, 2),))
-    older = msgspec.structs.replace(prior(1), members=(m.VersionEntry("r1", 1, 1),))
+    newer = msgspec.structs.replace(
+        prior(2, at=3.0), members=(m.VersionEntry(robot="r1", incarnation=1, sequence=2),)
+    )
+    older = msgspec.structs.replace(
+        prior(1), members=(m.VersionEntry(robot="r1", incarnation=1, sequence=1),)
+    )
     for after in ((), (older,), (newer,), (older, newer, older)):
         node = RobotNode(config())
         out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
@@ -153,8 +184,11 @@ def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
     front_end = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
     fusion = {"hybrid": "join", "hybrid-thesis": "kalman-per-axis"}.get(estimator, "alone")
     node = RobotNode(config(front_end=front_end, estimator=estimator, fusion=fusion))
-    node.handle(m.Liveliness(0, "central", False), 0)
-    node.handle(m.KnownMap(0, from_ids([1, 2]), from_floats([5.0, 3.0, 9.0, -2.0])), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
+    node.handle(
+        m.KnownMap(stamp_ns=0, ids=from_ids([1, 2]), positions=from_floats([5.0, 3.0, 9.0, -2.0])),
+        0,
+    )
     out = driven(node, measurements)
     (done,) = of(out, ch.ROBOT_DONE)
     assert done.measurements == len(measurements)
@@ -263,13 +297,23 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
     node.handle(CENTRE, 0)
     out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
     assert len(of(out, ch.SUBMAP)) == 2
-    out += node.handle(m.Progress(0, "central", "r1", 7, 0, 9), 0)
+    out += node.handle(
+        m.Progress(
+            stamp_ns=0, node="central", robot="r1", incarnation=7, measurements=0, submaps=9
+        ),
+        0,
+    )
     assert len(of(out, ch.SUBMAP)) == 2, "credit of another incarnation is none"
-    out += node.handle(m.Progress(0, "central", "r1", 1, 0, 1), 0)
+    out += node.handle(
+        m.Progress(
+            stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=0, submaps=1
+        ),
+        0,
+    )
     assert len(of(out, ch.SUBMAP)) == 3
-    out += node.handle(m.Liveliness(0, "robot/r2", False), 0)
+    out += node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False), 0)
     assert len(of(out, ch.SUBMAP)) == 3, "another node's token is not the centre's"
-    out += node.handle(m.Liveliness(0, "central", False), 0)
+    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
     assert payloads(out) == LONELY
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
@@ -278,7 +322,9 @@ def test_missing_measurements_are_asked_for():
     node = RobotNode(config())
     assert node.wanted() is None
     node.handle(MEASUREMENTS[3], 0)
-    assert node.wanted() == m.MeasurementsRequest(0, "r1", 1, 0, 2), "the very first ones too"
+    assert node.wanted() == m.MeasurementsRequest(
+        stamp_ns=0, robot="r1", incarnation=1, first=0, last=2
+    ), "the very first ones too"
     for measurement in MEASUREMENTS[:3]:
         node.handle(measurement, 0)
     assert node.wanted() is None
@@ -308,10 +354,12 @@ def test_a_new_incarnation_closes_the_old_one_under_its_own_name():
     second = [
         msgspec.structs.replace(r, incarnation=2, number=r.number - 15) for r in MEASUREMENTS[15:]
     ]
-    second[0] = m.InitialPose(second[0].stamp_ns, "r1", 2, 0, b"", b"")
+    second[0] = m.InitialPose(
+        stamp_ns=second[0].stamp_ns, robot="r1", incarnation=2, number=0, pose=b"", covariance=b""
+    )
     out += [o for r in second for o in node.handle(r, 0)]
-    ends = (m.StreamEnd("r1", 2, len(second)),)
-    out += node.handle(m.End(0, ends), 0)
+    ends = (m.StreamEnd(robot="r1", incarnation=2, measurements=len(second)),)
+    out += node.handle(m.End(stamp_ns=0, streams=ends), 0)
     submaps = of(out, ch.SUBMAP)
     names = [(s.incarnation, s.sequence) for s in submaps]
     assert names == [(1, 0), (1, 1), *((2, k) for k in range(len(names) - 2))]
@@ -357,7 +405,7 @@ def test_waiting_for_an_exchange_a_robot_reports_what_it_has_received(monkeypatc
 def test_under_feedback_the_last_map_is_sent_whether_or_not_an_exchange_is_due():
     for estimator, fusion in (("hybrid", "kalman"), ("hybrid-thesis", "kalman-per-axis")):
         node = RobotNode(config(estimator=estimator, fusion=fusion, exchange_s=1e6))
-        node.handle(m.Liveliness(0, "central", False), 0)
+        node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
         maps = of(driven(node, MEASUREMENTS), ch.OWN_MAP)
         assert len(maps) == 2
         assert maps[-1].stamp_ns > maps[0].stamp_ns
@@ -367,7 +415,7 @@ def test_under_feedback_a_lost_centre_is_not_waited_for():
     node = feedback()
     out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
     assert not of(out, ch.ROBOT_DONE)
-    out += node.handle(m.Liveliness(0, "central", False), 0)
+    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
 
@@ -446,8 +494,14 @@ def test_measurements_far_from_their_predictions_are_said_with_what_to_configure
 def test_an_order_to_withdraw_a_robot_is_repeated_once_for_a_centre_that_comes_later(exchange):
     node = RobotNode(config(), exchange)
     assert {ch.ORDER, ch.WITHDRAWAL} <= set(node.overhears)
-    orders = [m.Withdrawal(0, name, "operator", "a flat wheel") for name in ("r2", "r3", "r2")]
-    heard = [m.WithdrawalHeard(0, "r1", o.robot, o.by, o.reason) for o in orders]
+    orders = [
+        m.Withdrawal(stamp_ns=0, robot=name, by="operator", reason="a flat wheel")
+        for name in ("r2", "r3", "r2")
+    ]
+    heard = [
+        m.WithdrawalHeard(stamp_ns=0, robot="r1", withdrawn=o.robot, by=o.by, reason=o.reason)
+        for o in orders
+    ]
     assert [of(node.handle(order, 0), ch.WITHDRAWALS_HEARD) for order in orders] == [
         [heard[0]], [heard[1]], [],
     ]  # fmt: skip
@@ -465,17 +519,19 @@ def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
         sent += node.handle(measurement, 0)
 
     def answer(**wanted):
-        request = encoded(m.SubmapsRequest(0, "r1", **wanted))
+        request = encoded(m.SubmapsRequest(stamp_ns=0, robot="r1", **wanted))
         return [decoded(reply) for reply in node.answer_submaps(request)]
 
     assert answer() == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)]
     assert answer(incarnation=1, first=2) == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)[2:]]
     assert answer(incarnation=2) == []
-    assert node.answer_submaps(encoded(m.SubmapsRequest(0, "r2"))) == []
+    assert node.answer_submaps(encoded(m.SubmapsRequest(stamp_ns=0, robot="r2"))) == []
 
 
 def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
     node = RobotNode(config(), "rendezvous")
     for measurement in MEASUREMENTS:
         node.handle(measurement, 0)
-    assert node.answer_submaps(encoded(m.SubmapsRequest(0, "r1"))) == [encoded(MEASUREMENTS[0])]
+    assert node.answer_submaps(encoded(m.SubmapsRequest(stamp_ns=0, robot="r1"))) == [
+        encoded(MEASUREMENTS[0])
+    ]

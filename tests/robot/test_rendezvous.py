@@ -72,7 +72,14 @@ def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else() -> None:
     for teammates, count in (((CONFIG.id,), 1), (("r9",), 0)):
         node = RobotNode(CONFIG, "rendezvous")
         driven(node, MEASUREMENTS[:first], end=False)
-        seen = m.Rendezvous(MEASUREMENTS[first].stamp_ns, "r2", 1, teammates, 0, 0.0)
+        seen = m.Rendezvous(
+            stamp_ns=MEASUREMENTS[first].stamp_ns,
+            robot="r2",
+            incarnation=1,
+            teammates=teammates,
+            submaps=0,
+            waited_s=0.0,
+        )
         out = node.handle(seen, 0)
         assert (len(of(out, ch.SUBMAP)) > 0) == (len(of(out, ch.RENDEZVOUS)) == 1) == bool(count)
         if count:

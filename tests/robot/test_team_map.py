@@ -19,7 +19,14 @@ LOCALS = [each.local for each in team(1, robots=1, submaps=6).submaps]
 
 def prior(sequence: int) -> m.Prior:
     return m.Prior(
-        0, "r0", 0, sequence, b"", from_ids((1, 2)), from_floats([0.0] * 7), packed(spd(7))
+        stamp_ns=0,
+        robot="r0",
+        incarnation=0,
+        sequence=sequence,
+        digest=b"",
+        ids=from_ids((1, 2)),
+        mean=from_floats([0.0] * 7),
+        covariance=packed(spd(7)),
     )
 
 

@@ -57,16 +57,45 @@ def drive(
     steps: int, odd: dict[int, m.Message] | None = None, *, sees: bool = True
 ) -> list[m.Message]:
     """A circle at 1 m/s, three landmarks each second; `odd`: what comes in place of a second's."""
-    out: list[m.Message] = [m.InitialPose(0, "r1", 1, 0, from_floats([0.0, 0.0, 0.0]), b"")]
+    out: list[m.Message] = [
+        m.InitialPose(
+            stamp_ns=0,
+            robot="r1",
+            incarnation=1,
+            number=0,
+            pose=from_floats([0.0, 0.0, 0.0]),
+            covariance=b"",
+        )
+    ]
     for k in range(1, steps + 1):
-        own = m.Odometry(k * S, "r1", 1, 2 * k, S, 1.0, 0.1)
+        own = m.Odometry(
+            stamp_ns=k * S,
+            robot="r1",
+            incarnation=1,
+            number=2 * k,
+            duration_ns=S,
+            forward=1.0,
+            yaw_rate=0.1,
+        )
         scan = [(i, float(np.hypot(*p)), 0.3 * i - 1.0) for i, p in LANDMARKS.items()]
         seen, ranges, bearings = zip(*scan, strict=True) if sees else ((), (), ())
         look = m.Observations(
-            k * S, "r1", 1, 2 * k - 1, from_ids(seen), from_floats(ranges), from_floats(bearings)
+            stamp_ns=k * S,
+            robot="r1",
+            incarnation=1,
+            number=2 * k - 1,
+            ids=from_ids(seen),
+            ranges=from_floats(ranges),
+            bearings=from_floats(bearings),
         )
         out += [look, (odd or {}).get(k) or own]
-    return [*out, m.End(steps * S, (m.StreamEnd("r1", 1, 2 * steps + 1),))]
+    return [
+        *out,
+        m.End(
+            stamp_ns=steps * S,
+            streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=2 * steps + 1),),
+        ),
+    ]
 
 
 def lived(messages, **fields) -> tuple[RobotNode, list[m.Submap], Counter[str]]:
@@ -80,7 +109,15 @@ def lived(messages, **fields) -> tuple[RobotNode, list[m.Submap], Counter[str]]:
 
 @pytest.mark.parametrize("speed", [1e3, 1e7, 1e300])
 def test_an_interval_that_is_too_fast_is_rejected_and_the_robot_drives_on(speed):
-    glitch = m.Odometry(15 * S, "r1", 1, 30, S, speed, 0.0)
+    glitch = m.Odometry(
+        stamp_ns=15 * S,
+        robot="r1",
+        incarnation=1,
+        number=30,
+        duration_ns=S,
+        forward=speed,
+        yaw_rate=0.0,
+    )
     _, submaps, ledger = lived(drive(40, {15: glitch}, sees=False))
     assert ledger[Rejection.SPEED.disposition] == 1
     _, good, _ = lived(drive(40, sees=False))
@@ -92,9 +129,33 @@ def test_an_interval_that_is_too_fast_is_rejected_and_the_robot_drives_on(speed)
 
 def test_time_that_stands_goes_back_or_leaps_is_rejected():
     odd = {
-        12: m.Odometry(11 * S, "r1", 1, 24, S, 1.0, 0.1),
-        14: m.Odometry(3 * S, "r1", 1, 28, S, 1.0, 0.1),
-        16: m.Odometry(16 * S + 10**18, "r1", 1, 32, S, 1.0, 0.1),
+        12: m.Odometry(
+            stamp_ns=11 * S,
+            robot="r1",
+            incarnation=1,
+            number=24,
+            duration_ns=S,
+            forward=1.0,
+            yaw_rate=0.1,
+        ),
+        14: m.Odometry(
+            stamp_ns=3 * S,
+            robot="r1",
+            incarnation=1,
+            number=28,
+            duration_ns=S,
+            forward=1.0,
+            yaw_rate=0.1,
+        ),
+        16: m.Odometry(
+            stamp_ns=16 * S + 10**18,
+            robot="r1",
+            incarnation=1,
+            number=32,
+            duration_ns=S,
+            forward=1.0,
+            yaw_rate=0.1,
+        ),
     }
     _, submaps, ledger = lived(drive(40, odd))
     assert ledger[Rejection.OLDER.disposition] == 2
@@ -104,14 +165,33 @@ def test_time_that_stands_goes_back_or_leaps_is_rejected():
 
 def test_a_clock_that_has_truly_leapt_is_followed_from_the_second_interval_on():
     away = 10**18
-    odd = {k: m.Odometry(k * S + away, "r1", 1, 2 * k, S, 1.0, 0.1) for k in range(21, 41)}
+    odd = {
+        k: m.Odometry(
+            stamp_ns=k * S + away,
+            robot="r1",
+            incarnation=1,
+            number=2 * k,
+            duration_ns=S,
+            forward=1.0,
+            yaw_rate=0.1,
+        )
+        for k in range(21, 41)
+    }
     _, submaps, ledger = lived(drive(40, odd))
     assert ledger[Rejection.TIME.disposition] == 1
     assert submaps[-1].stamp_ns == 40 * S + away
 
 
 def test_a_range_beyond_the_bounds_is_not_taken():
-    far = m.Observations(5 * S, "r1", 1, 9, from_ids([1]), from_floats([9e5]), from_floats([0.0]))
+    far = m.Observations(
+        stamp_ns=5 * S,
+        robot="r1",
+        incarnation=1,
+        number=9,
+        ids=from_ids([1]),
+        ranges=from_floats([9e5]),
+        bearings=from_floats([0.0]),
+    )
     messages = [far if getattr(x, "number", None) == 9 else x for x in drive(20)]
     _, _, ledger = lived(messages, bounds=Bounds(extent_m=1e4))
     assert ledger[Rejection.RANGE.disposition] == 1
@@ -126,9 +206,14 @@ def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bo
             seen = np.arange(1, n + 1) + 60 * k
             ranges = np.linspace(1.0, 50.0, n)
             each = m.Observations(
-                each.stamp_ns, "r1", 1, k, from_ids(seen), from_floats(ranges),
-                from_floats(np.linspace(-3.0, 3.0, n)),
-            )  # fmt: skip
+                stamp_ns=each.stamp_ns,
+                robot="r1",
+                incarnation=1,
+                number=k,
+                ids=from_ids(seen),
+                ranges=from_floats(ranges),
+                bearings=from_floats(np.linspace(-3.0, 3.0, n)),
+            )
         messages.append(each)
     bounds = Bounds(submap_landmarks=200)
     _, submaps, _ = lived(messages, bounds=bounds)

@@ -66,9 +66,22 @@ def final_map(
     """A final map of the rule `join`."""
     content = translate.covariance_bytes(covariance, joint=joint)
     message = m.FusedMap(
-        STEPS * 10**9, "join", bytes(8), "r1/1", True, False, 0, (), (), joint,
-        from_ids(ids), from_floats(means), content, 30.0, 20,
-    )  # fmt: skip
+        stamp_ns=STEPS * 10**9,
+        rule="join",
+        digest=bytes(8),
+        frame="r1/1",
+        final=True,
+        provisional=False,
+        exchange=0,
+        members=(),
+        missing=(),
+        joint=joint,
+        ids=from_ids(ids),
+        means=from_floats(means),
+        covariance=content,
+        chi2=30.0,
+        dof=20,
+    )
     return Outgoing(ch.FINAL_MAP, "", message)
 
 
@@ -86,7 +99,19 @@ def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoin
     ends = streams(of).streams[0].intervals.end_ns.tolist()
     unit = from_floats(np.eye(3))
     return [
-        Outgoing(channel, "r1", m.PoseEstimate(t, "r1", 1, 0, bytes(8), from_floats(p), unit))
+        Outgoing(
+            channel,
+            "r1",
+            m.PoseEstimate(
+                stamp_ns=t,
+                robot="r1",
+                incarnation=1,
+                sequence=0,
+                map_digest=bytes(8),
+                pose=from_floats(p),
+                covariance=unit,
+            ),
+        )
         for t, p in zip(ends, poses, strict=True)
     ]
 

@@ -8,7 +8,15 @@ from team.wire import messages as m
 
 
 def measurement(number, incarnation=0):
-    return m.Odometry(number * 1_000, "r1", incarnation, number, 1_000, 1.0, 0.0)
+    return m.Odometry(
+        stamp_ns=number * 1_000,
+        robot="r1",
+        incarnation=incarnation,
+        number=number,
+        duration_ns=1_000,
+        forward=1.0,
+        yaw_rate=0.0,
+    )
 
 
 def names(taken):

@@ -95,7 +95,7 @@ def test_a_node_channel_hears_nodes_of_any_depth(joined: Joined) -> None:
     source, sink = joined(), joined()
     sink.subscribe(c.STATUS)
     for node in ("central", "robot/alpha"):
-        send(source, (c.STATUS, node, m.Status(0, node, "running", {})))
+        send(source, (c.STATUS, node, m.Status(stamp_ns=0, node=node, state="running", figures={})))
     assert {sample.key for sample in received(sink, 2)} == {"central/status", "robot/alpha/status"}
 
 
@@ -119,7 +119,16 @@ def test_a_late_joiner_gets_every_message_of_an_all_channel(joined: Joined) -> N
 def test_a_late_joiner_gets_the_newest_message_of_a_latest_channel(joined: Joined) -> None:
     source = joined()
     for i in range(5):
-        send(source, (c.WORLD_CONFIG, "", m.Configuration(i, "world", 0, b"configur", "{}")))
+        send(
+            source,
+            (
+                c.WORLD_CONFIG,
+                "",
+                m.Configuration(
+                    stamp_ns=i, node="world", incarnation=0, digest=b"configur", configuration="{}"
+                ),
+            ),
+        )
     late = joined()
     late.subscribe(c.WORLD_CONFIG)
     assert [sample.counter for sample in received(late, 1)] == [4]
@@ -140,7 +149,9 @@ def test_order_holds_across_keys_and_deliveries(joined: Joined) -> None:
         sink.subscribe(channel, "alpha")
     until_heard(source, sink)
     for i in range(300):
-        progress = m.Progress(i, "robot/alpha", "alpha", 0, i, 0)
+        progress = m.Progress(
+            stamp_ns=i, node="robot/alpha", robot="alpha", incarnation=0, measurements=i, submaps=0
+        )
         send(
             source,
             (c.ODOMETRY, "alpha", odometry(i)),
@@ -170,19 +181,19 @@ def test_a_question_gets_all_its_answers_in_order(joined: Joined) -> None:
         return [encoded(submap(i, wanted.robot)) for i in range(300)]
 
     centre.answer(c.SUBMAPS, "", answer)
-    got = asked(robot, centre, c.SUBMAPS, "", m.SubmapsRequest(0, "bravo"))
+    got = asked(robot, centre, c.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="bravo"))
     assert got == [encoded(submap(i, "bravo")) for i in range(300)]
 
 
 def test_one_answer_can_serve_every_name(joined: Joined) -> None:
     world, robot = joined(), joined()
     world.answer(c.MEASUREMENTS, "*", lambda request: [request])
-    wanted = m.MeasurementsRequest(0, "bravo", 0, 1, 2)
+    wanted = m.MeasurementsRequest(stamp_ns=0, robot="bravo", incarnation=0, first=1, last=2)
     assert asked(robot, world, c.MEASUREMENTS, "bravo", wanted) == [encoded(wanted)]
 
 
 def test_a_question_that_nobody_answers_has_no_answers(joined: Joined) -> None:
-    assert joined().ask(c.SUBMAPS, "", m.SubmapsRequest(0, "alpha"), 5.0) == []
+    assert joined().ask(c.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="alpha"), 5.0) == []
 
 
 def test_an_answer_that_fails_is_told_to_the_asker(joined: Joined) -> None:
@@ -193,7 +204,7 @@ def test_an_answer_that_fails_is_told_to_the_asker(joined: Joined) -> None:
 
     centre.answer(c.SUBMAPS, "", answer)
     with pytest.raises(BusError, match="central/submaps: no such robot"):
-        asked(robot, centre, c.SUBMAPS, "", m.SubmapsRequest(0, "nobody"))
+        asked(robot, centre, c.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="nobody"))
 
 
 def asked(
@@ -228,9 +239,9 @@ def test_tokens_are_seen_as_they_appear_and_go_and_never_ones_own(joined: Joined
     late.close()
     seen += [opened(sample)[2] for sample in received(watcher, 1)]
     assert seen == [
-        m.Liveliness(0, "world", True),
-        m.Liveliness(0, "robot/alpha", True),
-        m.Liveliness(0, "robot/alpha", False),
+        m.Liveliness(stamp_ns=0, node="world", alive=True),
+        m.Liveliness(stamp_ns=0, node="robot/alpha", alive=True),
+        m.Liveliness(stamp_ns=0, node="robot/alpha", alive=False),
     ]
 
 
@@ -252,7 +263,7 @@ def test_replies_to_a_request_come_with_what_arrives(joined: Joined) -> None:
 
     def all_here() -> bool:
         if not arrived:  # the answerer's declaration may still be on its way
-            centre.request(c.SENT, "alpha", m.SubmapsRequest(0, "alpha"))
+            centre.request(c.SENT, "alpha", m.SubmapsRequest(stamp_ns=0, robot="alpha"))
         robot.receive(0.02)
         arrived.extend(centre.receive(0.02))
         return len(arrived) >= 30

@@ -55,7 +55,9 @@ def test_appended_fields_are_ignored(tag: str) -> None:
 
 
 def test_a_last_word_from_before_the_last_map_has_none() -> None:
-    done = m.Done(0, "alpha", 1, 2, 1, 1, ())
+    done = m.Done(
+        stamp_ns=0, robot="alpha", incarnation=1, measurements=2, steps=1, submaps=1, ledger=()
+    )
     assert decoded(msgpack.packb(fields_of(done)[:-1])) == done
     assert done.last_map == -1
 
@@ -106,7 +108,15 @@ def test_odometry_comes_back_as_it_went(
     forward: float,
     rate: float,
 ) -> None:
-    message = m.Odometry(stamp, robot, incarnation, measurement, duration, forward, rate)
+    message = m.Odometry(
+        stamp_ns=stamp,
+        robot=robot,
+        incarnation=incarnation,
+        number=measurement,
+        duration_ns=duration,
+        forward=forward,
+        yaw_rate=rate,
+    )
     assert decoded(encoded(message), m.Odometry) == message
 
 
@@ -121,7 +131,13 @@ def test_odometry_comes_back_as_it_went(
 def test_observations_come_back_as_they_went(seen: list[tuple[int, float, float]]) -> None:
     ids, ranges, bearings = zip(*seen, strict=True) if seen else ((), (), ())
     message = m.Observations(
-        5, "alpha", 0, 1, from_ids(ids), from_floats(ranges), from_floats(bearings)
+        stamp_ns=5,
+        robot="alpha",
+        incarnation=0,
+        number=1,
+        ids=from_ids(ids),
+        ranges=from_floats(ranges),
+        bearings=from_floats(bearings),
     )
     assert decoded(encoded(message), m.Observations) == message
 
@@ -132,9 +148,18 @@ def test_submaps_come_back_as_they_went(ids: set[int], seed: int) -> None:
     n = 3 + 2 * len(ids)
     root = np.random.default_rng(seed).normal(size=(n, n))
     message = m.Submap(
-        20, "alpha", 0, 1, 2, 3, 10, b"configur",
-        from_ids(sorted(ids)), from_floats(root[0]), packed(root @ root.T + np.eye(n)),
-    )  # fmt: skip
+        stamp_ns=20,
+        robot="alpha",
+        incarnation=0,
+        sequence=1,
+        first_measurement=2,
+        last_measurement=3,
+        start_ns=10,
+        config=b"configur",
+        ids=from_ids(sorted(ids)),
+        mean=from_floats(root[0]),
+        covariance=packed(root @ root.T + np.eye(n)),
+    )
     assert decoded(encoded(message), m.Submap) == message
 
 
@@ -147,7 +172,9 @@ def test_submaps_come_back_as_they_went(ids: set[int], seed: int) -> None:
 def test_statuses_come_back_as_they_went(
     state: str, figures: dict[str, float], warnings: list[str]
 ) -> None:
-    message = m.Status(0, "central", state, figures, tuple(warnings))
+    message = m.Status(
+        stamp_ns=0, node="central", state=state, figures=figures, warnings=tuple(warnings)
+    )
     assert decoded(encoded(message), m.Status) == message
 
 

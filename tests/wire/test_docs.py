@@ -122,9 +122,17 @@ def test_the_pages_program_reads_a_submap_from_a_live_team() -> None:
 
 
 def test_the_pages_example_bytes_are_those_of_the_code() -> None:
-    assert encoded(m.Odometry(1_000, "alpha", 1, 2, 100_000_000, 0.25, -0.125)).hex(" ") in (
-        PAGE.read_text().replace("\n", " ")
-    )
+    assert encoded(
+        m.Odometry(
+            stamp_ns=1_000,
+            robot="alpha",
+            incarnation=1,
+            number=2,
+            duration_ns=100_000_000,
+            forward=0.25,
+            yaw_rate=-0.125,
+        )
+    ).hex(" ") in (PAGE.read_text().replace("\n", " "))
 
 
 if __name__ == "__main__":

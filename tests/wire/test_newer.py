@@ -14,7 +14,10 @@ vectors = st.dictionaries(st.sampled_from(["r1", "r2", "r3"]), st.integers(0, 3)
 
 
 def members(vector: dict[str, int]) -> tuple[m.VersionEntry, ...]:
-    return tuple(m.VersionEntry(robot, 1, vector[robot]) for robot in sorted(vector))
+    return tuple(
+        m.VersionEntry(robot=robot, incarnation=1, sequence=vector[robot])
+        for robot in sorted(vector)
+    )
 
 
 def prior(vector: dict[str, int], heard: int = 0, incarnation: int = 1) -> m.Prior:
@@ -59,7 +62,14 @@ def test_a_later_life_of_the_stream_and_a_settled_map_of_the_same_set_are_newer(
 
 
 def progress(stamp_ns: int, incarnation: int, measurements: int, submaps: int) -> m.Progress:
-    return m.Progress(stamp_ns, "robot/r1", "r1", incarnation, measurements, submaps)
+    return m.Progress(
+        stamp_ns=stamp_ns,
+        node="robot/r1",
+        robot="r1",
+        incarnation=incarnation,
+        measurements=measurements,
+        submaps=submaps,
+    )
 
 
 counters = st.builds(progress, st.integers(0, 3), st.integers(1, 2), st.integers(0, 3),
@@ -81,7 +91,19 @@ def test_progress_never_goes_back(said: list[m.Progress]) -> None:
 
 
 def test_an_older_end_does_not_take_measurements_back() -> None:
-    first = m.End(1, (m.StreamEnd("r1", 1, 90), m.StreamEnd("r2", 1, 40)))
-    later = m.End(2, (m.StreamEnd("r1", 2, 10), m.StreamEnd("r2", 1, 50)))
+    first = m.End(
+        stamp_ns=1,
+        streams=(
+            m.StreamEnd(robot="r1", incarnation=1, measurements=90),
+            m.StreamEnd(robot="r2", incarnation=1, measurements=40),
+        ),
+    )
+    later = m.End(
+        stamp_ns=2,
+        streams=(
+            m.StreamEnd(robot="r1", incarnation=2, measurements=10),
+            m.StreamEnd(robot="r2", incarnation=1, measurements=50),
+        ),
+    )
     assert later_end(first, later).streams == later.streams
     assert later_end(later, first).streams == later.streams

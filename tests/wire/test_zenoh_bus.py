@@ -45,7 +45,13 @@ def flowing(source: ZenohBus, sink: ZenohBus, *channels: c.Channel) -> None:
 
 
 def progress(i: int) -> Outgoing:
-    return Outgoing(c.ROBOT_PROGRESS, "alpha", m.Progress(i, "robot/alpha", "alpha", 0, i, 0))
+    return Outgoing(
+        c.ROBOT_PROGRESS,
+        "alpha",
+        m.Progress(
+            stamp_ns=i, node="robot/alpha", robot="alpha", incarnation=0, measurements=i, submaps=0
+        ),
+    )
 
 
 MORE = 34
@@ -128,7 +134,21 @@ def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None
     ):
         flowing(source, sink, c.FINAL_MAP, c.ROBOT_DONE)
         link.cut()
-        source.publish(Outgoing(c.ROBOT_DONE, "alpha", m.Done(0, "alpha", 0, 9, 9, 1, ())))
+        source.publish(
+            Outgoing(
+                c.ROBOT_DONE,
+                "alpha",
+                m.Done(
+                    stamp_ns=0,
+                    robot="alpha",
+                    incarnation=0,
+                    measurements=9,
+                    steps=9,
+                    submaps=1,
+                    ledger=(),
+                ),
+            )
+        )
         link.mend()
         assert [sample.key for sample in received(sink, 1)] == ["robot/alpha/done"]
 
@@ -141,9 +161,13 @@ def test_a_killed_process_loses_its_token(endpoint: str) -> None:
     )
     with ZenohBus("t", endpoint) as watcher, python(program) as child:
         watcher.watch_alive()
-        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(0, "robot/alpha", True)
+        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(
+            stamp_ns=0, node="robot/alpha", alive=True
+        )
         child.kill()
-        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(0, "robot/alpha", False)
+        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(
+            stamp_ns=0, node="robot/alpha", alive=False
+        )
 
 
 def python(program: str) -> subprocess.Popen[str]:
@@ -219,7 +243,7 @@ def test_an_answer_that_never_comes_is_an_error(endpoint: str) -> None:
 
         def timed_out() -> bool:
             try:
-                asker.ask(c.SUBMAPS, "", m.SubmapsRequest(0, "alpha"), 0.2)
+                asker.ask(c.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="alpha"), 0.2)
             except BusError as error:
                 return "team/t/central/submaps" in str(error)
             return False  # its declaration is still on its way
@@ -349,10 +373,12 @@ def test_who_was_killed_in_a_run_and_begins_after_its_end_is_told_once(
 
 
 def test_an_order_outlives_the_operator_and_ends_with_the_team(endpoint: str) -> None:
-    order = m.GivenUp(0, "robot/alpha", "operator", "it fell into the water")
+    order = m.GivenUp(
+        stamp_ns=0, node="robot/alpha", by="operator", reason="it fell into the water"
+    )
 
     def asked(bus: ZenohBus) -> list[m.Message]:
-        bus.request(c.ORDERS_KEPT, "", m.OrdersRequest(0))
+        bus.request(c.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
         end = time.monotonic() + 1.0
         while time.monotonic() < end:
             if found := bus.receive(0.1):

@@ -124,14 +124,14 @@ def map_errors(
     difference = means - truth
     motion = rigid_alignment(truth, means)
     return MapErrors(
-        count,
-        rms(np.hypot(difference[:, 0], difference[:, 1])),
-        None if motion is None else distance_rmse(moved(motion, means), truth),
-        motion,
-        nees(difference.ravel(), covariance) / (2 * count),
-        chi2_interval(2 * count, BAND, 1),
-        None if motion is None else _shape_errors(means, covariance, truth, motion),
-        _covered(difference, covariance),
+        count=count,
+        rmse_m=rms(np.hypot(difference[:, 0], difference[:, 1])),
+        aligned_rmse_m=None if motion is None else distance_rmse(moved(motion, means), truth),
+        truth_from_map=motion,
+        nees_per_dof=nees(difference.ravel(), covariance) / (2 * count),
+        band=chi2_interval(2 * count, BAND, 1),
+        shape=None if motion is None else _shape_errors(means, covariance, truth, motion),
+        coverage=_covered(difference, covariance),
     )
 
 

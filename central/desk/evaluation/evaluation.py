@@ -151,16 +151,16 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     end = log.sound(log.last(ch.END))
     faults = log.faults()
     return Evaluation(
-        scenario,
-        fused,
-        robots,
-        positions,
-        {key: log.traffic[key] for key in sorted(log.traffic)},
-        (*(end.notes if isinstance(end, m.End) else ()), *_lost(fused), *_set_aside(faults)),
-        log.unsound,
-        _by_robot(log, "joint_cost_per_dof."),
-        len(faults),
-        _by_robot(log, "covariance_scale."),
+        scenario=scenario,
+        map=fused,
+        robots=robots,
+        true_landmarks=positions,
+        channels={key: log.traffic[key] for key in sorted(log.traffic)},
+        notes=(*(end.notes if isinstance(end, m.End) else ()), *_lost(fused), *_set_aside(faults)),
+        unsound=log.unsound,
+        cost_by_robot=_by_robot(log, "joint_cost_per_dof."),
+        faults=len(faults),
+        scale_by_robot=_by_robot(log, "covariance_scale."),
     )
 
 
@@ -378,19 +378,23 @@ def _robot_result(
     aligned, alignment = _aligned(log, fused)
     map_motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
     return RobotResult(
-        used,
-        uplink_bytes,
-        log.truth,
-        log.smoothed,
-        smoothed,
-        log.online,
-        pose_errors(log.online, log.online_covariances, log.truth),
-        log.online_channel,
-        float(smoothed.nees[-1]) / 3.0 if smoothed is not None and ends_known else None,
-        aligned,
-        alignment,
-        None if map_motion is None else _moved_rmse(map_motion, log.online, log.truth),
-        own_map,
+        consumption=used,
+        uplink_bytes=uplink_bytes,
+        truth=log.truth,
+        smoothed_path=log.smoothed,
+        smoothed=smoothed,
+        online_path=log.online,
+        online=pose_errors(log.online, log.online_covariances, log.truth),
+        online_channel=log.online_channel,
+        final_pose_nees_per_dof=float(smoothed.nees[-1]) / 3.0
+        if smoothed is not None and ends_known
+        else None,
+        aligned_rmse_m=aligned,
+        alignment=alignment,
+        online_aligned_rmse_m=None
+        if map_motion is None
+        else _moved_rmse(map_motion, log.online, log.truth),
+        own_map=own_map,
     )
 
 

@@ -245,18 +245,18 @@ def history(samples: Iterable[Sample]) -> History:
     if span == _NO_SPAN:
         span = (min(map(min, stamps), default=0), max(map(max, stamps), default=0))
     return History(
-        span[0],
-        span[1],
-        {robot: _innovations(of) for robot, of in sorted(found.innovations.items())},
-        found.map_nees.series,
-        found.map_cost.series,
-        {robot: column.series for robot, column in sorted(found.robot_cost.items())},
-        {robot: _latencies(of) for robot, of in sorted(found.latencies.items())},
-        {
+        start_ns=span[0],
+        end_ns=span[1],
+        innovations={robot: _innovations(of) for robot, of in sorted(found.innovations.items())},
+        map_nees=found.map_nees.series,
+        map_cost=found.map_cost.series,
+        robot_cost={robot: column.series for robot, column in sorted(found.robot_cost.items())},
+        latencies={robot: _latencies(of) for robot, of in sorted(found.latencies.items())},
+        traffic={
             key: Traffic(series.stamps_ns, series.values.astype(np.int64))
             for key, series in ((k, found.traffic[k].series) for k in sorted(found.traffic))
         },
-        tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
+        events=tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
     )
 
 

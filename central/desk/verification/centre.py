@@ -93,6 +93,9 @@ class _LogInputs:
         for stream in sorted(log.measurements):
             measurements = log.measurements[stream]
             yield from (measurements[counter] for counter in sorted(measurements))
-        ends = tuple(m.StreamEnd(*stream, count) for stream, count in log.published.items())
+        ends = tuple(
+            m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
+            for (robot, incarnation), count in log.published.items()
+        )
         if ends:
-            yield m.End(0, ends)
+            yield m.End(stamp_ns=0, streams=ends)

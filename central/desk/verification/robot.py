@@ -154,8 +154,8 @@ def _life(
             yield from node.given(measurements[counter])
             counter += 1
         if counter == last and until is not None:
-            end = m.StreamEnd(start.robot, start.incarnation, until)
-            yield from node.given(m.End(0, (end,)))
+            end = m.StreamEnd(robot=start.robot, incarnation=start.incarnation, measurements=until)
+            yield from node.given(m.End(stamp_ns=0, streams=(end,)))
         behind = (s.last_measurement + 1 for s in chain if counter <= s.last_measurement < last)
         following = next((b for b in behind if b in measurements), None)
         if counter >= last or following is None:
@@ -177,15 +177,21 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
         for counter in sorted(log.measurements[(robot, incarnation)])
     ]
     if any(isinstance(d, m.Done) and d.robot == robot for d in log.of(ch.ROBOT_DONE)):
-        end = m.StreamEnd(robot, incarnations[-1], len(log.measurements[(robot, incarnations[-1])]))
-        inputs.append(m.End(0, (end,)))
+        end = m.StreamEnd(
+            robot=robot,
+            incarnation=incarnations[-1],
+            measurements=len(log.measurements[(robot, incarnations[-1])]),
+        )
+        inputs.append(m.End(stamp_ns=0, streams=(end,)))
     inputs.reverse()
     while inputs:
         out = node.given(inputs.pop())
         yield from out
         for each in out:
             if isinstance(each.message, m.MapEstimate):
-                centre = m.Liveliness(0, "central", each.message.exchange in fused)
+                centre = m.Liveliness(
+                    stamp_ns=0, node="central", alive=each.message.exchange in fused
+                )
                 inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
 
 
@@ -200,7 +206,7 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     node = RetoldRobot(config, digest, {})
     if log.known_map is not None:
         node.given(log.known_map)
-    node.given(m.Liveliness(0, "central", False))
+    node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
     measurements = log.measurements.get((robot, incarnation), {})
     done = max((d.measurements for d in _dones(log, robot, incarnation)), default=None)
     said: dict[int, str] = {}
@@ -216,8 +222,8 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
         else:
             said[counter] = next(iter(took), "lost")
     if said and done is not None:
-        end = m.StreamEnd(robot, incarnation, len(said))
-        for reason, count in node.took(m.End(0, (end,))).items():
+        end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(said))
+        for reason, count in node.took(m.End(stamp_ns=0, streams=(end,))).items():
             kind = m.Sightings if reason == Rejection.NO_NODE.disposition else m.Observations
             taken = [n for n in said if isinstance(measurements[n], kind)]
             taken = [n for n in taken if not said[n].startswith("rejected")]

@@ -34,7 +34,9 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     while not (viewing.node.finished or final is not None or stop.is_set()):
         if time.monotonic() >= due:
             due = time.monotonic() + STATUS_S
-            status = Status(0, NODE, "viewing", {"messages": float(published)})
+            status = Status(
+                stamp_ns=0, node=NODE, state="viewing", figures={"messages": float(published)}
+            )
             bus.publish(Outgoing(ch.STATUS, NODE, status))
         for sample in (*bus.receive(WAIT_S), *end.missed()):
             if ch.ALIVE.owner(sample.key) == NODE:

@@ -67,7 +67,18 @@ def looks_of(chains: Sequence[Chain]) -> list[Look]:
                 key = _ERRORS + len(looks)
                 before, then_ns = last.get(landmark, (None, stamp_ns))
                 gap_s = 1e-9 * (stamp_ns - then_ns)
-                looks.append(Look(key, c, i, landmark, float(r), float(b), before, gap_s))
+                looks.append(
+                    Look(
+                        key=key,
+                        chain=c,
+                        pose=i,
+                        landmark=landmark,
+                        distance=float(r),
+                        bearing=float(b),
+                        before=before,
+                        gap_s=gap_s,
+                    )
+                )
                 last[landmark] = key, stamp_ns
     return looks
 

@@ -130,14 +130,14 @@ def _chain(
         nothing = np.empty(0, np.uint32)
         keyframes.append(Keyframe(last_ns, rest, nothing, none, none))
     return Chain(
-        config,
-        incarnation,
-        start[0],
-        start[1],
-        np.array([first_ns, *(e.stamp_ns for e in keyframes)]),
-        tuple(e.increment for e in keyframes),
-        tuple(Scan(e.ids, e.ranges, e.bearings) for e in keyframes),
-        () if grid is None else grid.sightings(),
+        config=config,
+        incarnation=incarnation,
+        start=start[0],
+        start_covariance=start[1],
+        stamps_ns=np.array([first_ns, *(e.stamp_ns for e in keyframes)]),
+        increments=tuple(e.increment for e in keyframes),
+        scans=tuple(Scan(e.ids, e.ranges, e.bearings) for e in keyframes),
+        sightings=() if grid is None else grid.sightings(),
     )
 
 

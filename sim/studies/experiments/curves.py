@@ -122,17 +122,17 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
         seen.bearings[:rows],
     )  # fmt: skip
     return robot_stream(
-        stream.robot,
-        int(stream.stamps_ns[0]),
-        stream.start,
-        stream.intervals,
-        late,
-        stream.teammate_detections,
-        stream.teammates,
-        stream.truth_ns,
-        stream.truth,
-        stream.notes,
-        stream.clock_offset_ns,
+        robot=stream.robot,
+        start_ns=int(stream.stamps_ns[0]),
+        start=stream.start,
+        intervals=stream.intervals,
+        observations=late,
+        sightings=stream.teammate_detections,
+        teammates=stream.teammates,
+        truth_ns=stream.truth_ns,
+        truth=stream.truth,
+        notes=stream.notes,
+        clock_offset_ns=stream.clock_offset_ns,
     )
 
 

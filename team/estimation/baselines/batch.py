@@ -205,7 +205,16 @@ def begun(starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | No
         Measurements(none, none, nothing, nothing, np.empty((0, 3))),
     )
     ids = np.empty(0, np.uint32)
-    return Batch(tuple(starts), factors, mean, order, np.empty((0, 2)), ids, none, robust_c)
+    return Batch(
+        robots=tuple(starts),
+        factors=factors,
+        poses=mean,
+        pose_robot=order,
+        landmarks=np.empty((0, 2)),
+        ids=ids,
+        age=none,
+        robust_c=robust_c,
+    )
 
 
 def _start_information(pose: Pose, covariance: Matrix | None) -> Matrix:

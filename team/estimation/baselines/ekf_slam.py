@@ -84,7 +84,14 @@ def innovation(
 ) -> Innovation:
     """Of the measurements that `stepped` would take; of landmarks that are known already."""
     return joint_innovation(
-        state.ids, state.mean, state.covariance, increment, sensor, ids, ranges, bearings
+        landmarks=state.ids,
+        mean=state.mean,
+        covariance=state.covariance,
+        increment=increment,
+        sensor=sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
     )
 
 

@@ -46,14 +46,14 @@ def begun(
     """The poses exactly known; an uncertain one is a first turn by Increment(0, covariance)."""
     none = fastslam.at_poses(np.zeros((particles, 3)))
     return JointFastSlam(
-        tuple(poses),
-        np.stack([np.tile(pose, (particles, 1)) for pose in poses.values()]),
-        none.log_weights,
-        none.ids,
-        none.means,
-        none.covariances,
-        proposal,
-        resample_below,
+        robots=tuple(poses),
+        poses=np.stack([np.tile(pose, (particles, 1)) for pose in poses.values()]),
+        log_weights=none.log_weights,
+        ids=none.ids,
+        means=none.means,
+        covariances=none.covariances,
+        proposal=proposal,
+        resample_below=resample_below,
     )
 
 

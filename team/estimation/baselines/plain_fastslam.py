@@ -52,15 +52,15 @@ def stepped(
     (`propagated_and_updated`).
     """
     particles, _ = fastslam.propagated_and_updated(
-        state.particles,
-        increment,
-        sensor,
-        ids,
-        ranges,
-        bearings,
-        state.proposal,
-        state.resample_below,
-        generator,
+        particles=state.particles,
+        increment=increment,
+        sensor=sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        proposal=state.proposal,
+        resample_below=state.resample_below,
+        generator=generator,
     )
     return replace(state, particles=particles)
 

@@ -78,15 +78,15 @@ def noise_of(sensor: Sensor) -> Noise:
 def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
     """A window at its start: every particle exactly at zero, no landmark, no measurement."""
     return Window(
-        front_end,
-        sensor,
-        fastslam.at_poses(np.zeros((front_end.particles, 3))),
-        np.empty((0, front_end.particles, 3)),
-        np.empty(0, np.int64),
-        np.empty(0, np.uint32),
-        np.empty((0, 2)),
-        NO_NODES,
-        NO_NODES,
+        front_end=front_end,
+        sensor=sensor,
+        particles=fastslam.at_poses(np.zeros((front_end.particles, 3))),
+        paths=np.empty((0, front_end.particles, 3)),
+        keyframes=np.empty(0, np.int64),
+        ids=np.empty(0, np.uint32),
+        measurements=np.empty((0, 2)),
+        node_stamps=NO_NODES,
+        node_keyframes=NO_NODES,
     )
 
 
@@ -109,15 +109,15 @@ def advanced(
     with suppress(NotACovarianceError):  # then it is not known how well they were predicted
         expected = innovation(window.particles, increment, window.sensor, ids, ranges, bearings)
     particles, info = fastslam.propagated_and_updated(
-        window.particles,
-        increment,
-        window.sensor,
-        ids,
-        ranges,
-        bearings,
-        window.front_end.proposal,
-        window.front_end.resample_below,
-        generator,
+        particles=window.particles,
+        increment=increment,
+        sensor=window.sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        proposal=window.front_end.proposal,
+        resample_below=window.front_end.resample_below,
+        generator=generator,
     )
     paths = window.paths if info.parents is None else window.paths[:, info.parents]
     keyframe = np.full(len(ids), len(paths))

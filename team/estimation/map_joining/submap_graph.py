@@ -99,18 +99,24 @@ class Graph:
         """The submaps in flat arrays, for the kernels."""
         submaps = [each.contribution for each in self.submaps]
         return Factors(
-            np.concatenate([np.zeros(0, np.int64), *(each.nodes for each in self.submaps)]),
-            _starts([len(each.nodes) for each in self.submaps]),
-            np.concatenate([np.zeros(0), *(each.local.mean for each in submaps)]),
-            _starts([len(each.local.mean) for each in submaps]),
-            np.concatenate([np.zeros(0), *(each.information.ravel() for each in submaps)]),
-            _starts([each.information.size for each in submaps]),
-            np.concatenate([np.zeros(0), *(each.sensitivity.ravel() for each in self.submaps)]),
-            _starts([each.sensitivity.size for each in self.submaps]),
-            np.concatenate([np.zeros((0, 3)), *(_blocks(each.local) for each in submaps)]),
-            _starts([len(each.local.ids) for each in submaps]),
-            np.array([b == "range_scale" for each in self.submaps for b in each.biases], np.bool_),
-            _starts([len(each.biases) for each in self.submaps]),
+            member=np.concatenate([np.zeros(0, np.int64), *(each.nodes for each in self.submaps)]),
+            member_start=_starts([len(each.nodes) for each in self.submaps]),
+            mean=np.concatenate([np.zeros(0), *(each.local.mean for each in submaps)]),
+            mean_start=_starts([len(each.local.mean) for each in submaps]),
+            information=np.concatenate(
+                [np.zeros(0), *(each.information.ravel() for each in submaps)]
+            ),
+            information_start=_starts([each.information.size for each in submaps]),
+            sensitivity=np.concatenate(
+                [np.zeros(0), *(each.sensitivity.ravel() for each in self.submaps)]
+            ),
+            sensitivity_start=_starts([each.sensitivity.size for each in self.submaps]),
+            block=np.concatenate([np.zeros((0, 3)), *(_blocks(each.local) for each in submaps)]),
+            block_start=_starts([len(each.local.ids) for each in submaps]),
+            of_range=np.array(
+                [b == "range_scale" for each in self.submaps for b in each.biases], np.bool_
+            ),
+            row_start=_starts([len(each.biases) for each in self.submaps]),
         )
 
     @cached_property
@@ -186,7 +192,17 @@ class Graph:
         return f"landmark {ids[0]}"
 
 
-EMPTY_GRAPH = Graph({}, {}, {}, {}, np.zeros(1, np.int64), np.zeros(0, np.bool_), (), (), ())
+EMPTY_GRAPH = Graph(
+    streams={},
+    landmarks={},
+    poses={},
+    biases={},
+    offset=np.zeros(1, np.int64),
+    fixed=np.zeros(0, np.bool_),
+    submaps=(),
+    sightings=(),
+    priors=(),
+)
 
 
 def _blocks(local: LocalMap) -> Float[np.ndarray, "L 3"]:
@@ -282,16 +298,16 @@ def extended(
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
         submaps.append(Joined(contribution, nodes, common))
     grown = Graph(
-        growth.streams,
-        growth.landmarks,
-        growth.poses,
-        growth.biases,
-        _continued(graph.offset, [len(value) for value in growth.values]),
-        np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
-        tuple(submaps),
-        graph.sightings,
-        tuple(priors),
-        growth.common,
+        streams=growth.streams,
+        landmarks=growth.landmarks,
+        poses=growth.poses,
+        biases=growth.biases,
+        offset=_continued(graph.offset, [len(value) for value in growth.values]),
+        fixed=np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
+        submaps=tuple(submaps),
+        sightings=graph.sightings,
+        priors=tuple(priors),
+        common=growth.common,
     )
     return grown, np.concatenate([state, *growth.values])
 
@@ -359,16 +375,19 @@ def merged(
         if len(prior.mean) == 1 and prior.node not in common
     )
     graph = Graph(
-        {**main.streams, **streams},
-        {**landmarks, **main.landmarks},
-        {**main.poses, **poses},
-        {**main.biases, **biases},
-        _continued(main.offset, [len(value) for value in values]),
-        np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
-        (*main.submaps, *(each._replace(nodes=node_of[each.nodes]) for each in other.submaps)),
-        (*main.sightings, *sightings),
-        (*main.priors, *priors),
-        {**of_team, **main.common},
+        streams={**main.streams, **streams},
+        landmarks={**landmarks, **main.landmarks},
+        poses={**main.poses, **poses},
+        biases={**main.biases, **biases},
+        offset=_continued(main.offset, [len(value) for value in values]),
+        fixed=np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
+        submaps=(
+            *main.submaps,
+            *(each._replace(nodes=node_of[each.nodes]) for each in other.submaps),
+        ),
+        sightings=(*main.sightings, *sightings),
+        priors=(*main.priors, *priors),
+        common={**of_team, **main.common},
     )
     return graph, np.concatenate([state, *values])
 

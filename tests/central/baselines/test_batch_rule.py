@@ -67,9 +67,23 @@ def heard(configs, **options):
         out += node.handle(translate.configured(ch.robot_node(name), 0, 0, told), 0)
         for measurement in MEASUREMENTS[name]:
             out += node.handle(measurement, 0)
-        out += node.handle(m.Done(0, name, 1, len(MEASUREMENTS[name]), 0, 0, ()), 0)
-    ends = tuple(m.StreamEnd(name, 1, len(each)) for name, each in MEASUREMENTS.items())
-    return node, out + node.handle(m.End(0, ends), 0)
+        out += node.handle(
+            m.Done(
+                stamp_ns=0,
+                robot=name,
+                incarnation=1,
+                measurements=len(MEASUREMENTS[name]),
+                steps=0,
+                submaps=0,
+                ledger=(),
+            ),
+            0,
+        )
+    ends = tuple(
+        m.StreamEnd(robot=name, incarnation=1, measurements=len(each))
+        for name, each in MEASUREMENTS.items()
+    )
+    return node, out + node.handle(m.End(stamp_ns=0, streams=ends), 0)
 
 
 def pose_times(out, name):

@@ -25,7 +25,15 @@ def rule(name="kalman"):
 def estimate(robot, number, at=0.0):
     means = from_floats([at, 1.0, 2.0, 3.0])
     return m.MapEstimate(
-        1000 * number, robot, 1, number, number, True, from_ids([1, 2]), means, packed(spd(4))
+        stamp_ns=1000 * number,
+        robot=robot,
+        incarnation=1,
+        sequence=number,
+        exchange=number,
+        joint=True,
+        ids=from_ids([1, 2]),
+        means=means,
+        covariance=packed(spd(4)),
     )
 
 

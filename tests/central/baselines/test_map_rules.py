@@ -18,12 +18,25 @@ from team.wire.codec import encoded
 from tests.support import packed, spd
 from tests.teams import of
 
-END = m.End(0, (m.StreamEnd("r1", 1, 9), m.StreamEnd("r2", 1, 9)))
-ALIVE = [m.Liveliness(0, f"robot/{name}", True) for name in ("r1", "r2")]
+END = m.End(
+    stamp_ns=0,
+    streams=(
+        m.StreamEnd(robot="r1", incarnation=1, measurements=9),
+        m.StreamEnd(robot="r2", incarnation=1, measurements=9),
+    ),
+)
+ALIVE = [m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True) for name in ("r1", "r2")]
 
 
 def start(robot, *, known=True):
-    return m.InitialPose(0, robot, 1, 0, from_floats(np.zeros(3)) if known else b"", b"")
+    return m.InitialPose(
+        stamp_ns=0,
+        robot=robot,
+        incarnation=1,
+        number=0,
+        pose=from_floats(np.zeros(3)) if known else b"",
+        covariance=b"",
+    )
 
 
 def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
@@ -31,11 +44,30 @@ def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
     content = packed(spd(n)) if joint else from_floats([2.0, 0.5, 1.0] * len(ids))
     means = from_floats(at + np.arange(n))
     stamp_ns = sequence * 10**9
-    return m.MapEstimate(stamp_ns, robot, 1, sequence, 0, joint, from_ids(ids), means, content)
+    return m.MapEstimate(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=1,
+        sequence=sequence,
+        exchange=0,
+        joint=joint,
+        ids=from_ids(ids),
+        means=means,
+        covariance=content,
+    )
 
 
 def done(robot, last_map):
-    return m.Done(9, robot, 1, 9, 3, 0, (), last_map)
+    return m.Done(
+        stamp_ns=9,
+        robot=robot,
+        incarnation=1,
+        measurements=9,
+        steps=3,
+        submaps=0,
+        ledger=(),
+        last_map=last_map,
+    )
 
 
 def value(message):
@@ -73,7 +105,10 @@ def test_the_final_map_is_kalmans_of_the_last_maps_in_whatever_order_they_come(o
     np.testing.assert_array_equal(translate.landmarks_of(node.final)[1], expected.means)
     covariance = translate.landmark_covariance_of(node.final)
     np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12)
-    assert node.final.members == (m.VersionEntry("r1", 1, 4), m.VersionEntry("r2", 1, 6))
+    assert node.final.members == (
+        m.VersionEntry(robot="r1", incarnation=1, sequence=4),
+        m.VersionEntry(robot="r2", incarnation=1, sequence=6),
+    )
     assert encoded(node.final) == encoded(heard("latest", TEAM)[0].final)
 
 
@@ -91,24 +126,36 @@ def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
     messages = [x for x in TEAM if x != LAST[1] and x != done("r2", 6)]
     node, _ = heard(rule, messages)
     assert not node.finished
-    node.handle(m.Liveliness(0, "robot/r2", False), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False), 0)
     assert not node.finished
-    node.handle(m.GivenUp(0, "robot/r2", "operator", "it fell into the water"), 0)
+    node.handle(
+        m.GivenUp(stamp_ns=0, node="robot/r2", by="operator", reason="it fell into the water"), 0
+    )
     assert (node.final.lost, node.final.provisional) == (("r2",), True)
-    assert node.final.members[1] == m.VersionEntry("r2", 1, 3)
+    assert node.final.members[1] == m.VersionEntry(robot="r2", incarnation=1, sequence=3)
 
 
 def test_a_map_in_a_frame_of_its_own_is_left_out_and_named():
     free = [start("r2", known=False) if x == start("r2") else x for x in TEAM]
     node, _ = heard("latest", free)
-    assert node.final.members == (m.VersionEntry("r1", 1, 4),)
+    assert node.final.members == (m.VersionEntry(robot="r1", incarnation=1, sequence=4),)
     assert node.final.means == LAST[0].means
     assert node.final.reasons == ("r2: its start pose is not known",)
 
 
 def test_a_broadcast_comes_when_it_is_due_and_something_is_new():
     maps = [estimate("r1", k) for k in range(1, 8)]
-    again = [maps[-1], m.Progress(60 * 10**9, "robot/r1", "r1", 1, 5, 0)]
+    again = [
+        maps[-1],
+        m.Progress(
+            stamp_ns=60 * 10**9,
+            node="robot/r1",
+            robot="r1",
+            incarnation=1,
+            measurements=5,
+            submaps=0,
+        ),
+    ]
     _, out = heard("latest", [start("r1"), *maps, *again], broadcast_s=3.0)
     said = [x.stamp_ns // 10**9 for x in of(out, ch.FUSED_MAP)]
     assert said == [1, 4, 7]
@@ -118,7 +165,7 @@ def test_a_broadcast_comes_when_it_is_due_and_something_is_new():
 @pytest.mark.parametrize("joint", [True, False])
 def test_alone_the_map_of_one_robot_is_the_final_one(joint):
     last = estimate("r1", 5, at=2.0, joint=joint)
-    end = m.End(0, (m.StreamEnd("r1", 1, 9),))
+    end = m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=9),))
     node, _ = heard("alone", [estimate("r1", 4), last, done("r1", 5), end], robots=["r1"])
     assert (node.final.means, node.final.covariance) == (last.means, last.covariance)
     assert (node.final.joint, node.final.reasons) == (joint, ())

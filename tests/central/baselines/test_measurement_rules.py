@@ -26,7 +26,12 @@ RULES = ["joint-fastslam", "batch"]
 STREAMS = {"r1": stream("r1", 9), "r2": stream("r2", 7, y=1.0)}
 CONFIGS = {name: config(name) for name in STREAMS}
 MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
-LAST_WORDS = [m.Done(0, name, 1, len(each), 0, 0, ()) for name, each in MEASUREMENTS.items()]
+LAST_WORDS = [
+    m.Done(
+        stamp_ns=0, robot=name, incarnation=1, measurements=len(each), steps=0, submaps=0, ledger=()
+    )
+    for name, each in MEASUREMENTS.items()
+]
 
 
 def announced(name):
@@ -35,7 +40,11 @@ def announced(name):
 
 def end(measurements=MEASUREMENTS):
     return m.End(
-        0, tuple(m.StreamEnd(n, r[-1].incarnation, len(r)) for n, r in measurements.items())
+        stamp_ns=0,
+        streams=tuple(
+            m.StreamEnd(robot=n, incarnation=r[-1].incarnation, measurements=len(r))
+            for n, r in measurements.items()
+        ),
     )
 
 
@@ -134,7 +143,11 @@ def test_it_waits_for_every_robots_models_start_and_last_measurement(fusion):
 @pytest.mark.parametrize("fusion", RULES)
 def test_missing_measurements_are_asked_for(fusion):
     node, _ = heard(fusion, (x for x in everything() if x not in MEASUREMENTS["r1"][4:6]))
-    assert node.wanted() == [m.MeasurementsRequest(node.status().stamp_ns, "r1", 1, 4, 5)]
+    assert node.wanted() == [
+        m.MeasurementsRequest(
+            stamp_ns=node.status().stamp_ns, robot="r1", incarnation=1, first=4, last=5
+        )
+    ]
     for measurement in MEASUREMENTS["r1"][4:6]:
         node.handle(measurement, 0)
     assert node.finished
@@ -157,13 +170,30 @@ def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
 @pytest.mark.parametrize("fusion", RULES)
 def test_a_stream_that_begins_anew_ends_there(fusion):
     later = [msgspec.structs.replace(x, incarnation=2) for x in MEASUREMENTS["r2"]]
-    later[0] = m.InitialPose(later[0].stamp_ns, "r2", 2, 0, b"", b"")
+    later[0] = m.InitialPose(
+        stamp_ns=later[0].stamp_ns, robot="r2", incarnation=2, number=0, pose=b"", covariance=b""
+    )
     whole = {"r1": MEASUREMENTS["r1"], "r2": [*MEASUREMENTS["r2"][:8], *later]}
     ends = m.End(
-        0, (m.StreamEnd("r1", 1, len(MEASUREMENTS["r1"])), m.StreamEnd("r2", 2, len(later)))
+        stamp_ns=0,
+        streams=(
+            m.StreamEnd(robot="r1", incarnation=1, measurements=len(MEASUREMENTS["r1"])),
+            m.StreamEnd(robot="r2", incarnation=2, measurements=len(later)),
+        ),
     )
     messages = [x for x in everything(whole) if not isinstance(x, m.End | m.Done)]
-    dones = [LAST_WORDS[0], m.Done(0, "r2", 2, len(later), 0, 0, ())]
+    dones = [
+        LAST_WORDS[0],
+        m.Done(
+            stamp_ns=0,
+            robot="r2",
+            incarnation=2,
+            measurements=len(later),
+            steps=0,
+            submaps=0,
+            ledger=(),
+        ),
+    ]
     node, _ = heard(fusion, [*messages, *dones, ends])
     assert node.finished
     assert node.final.reasons == ("r2: its stream began anew",)

@@ -23,14 +23,30 @@ from tests.teams import of, published, stream, submaps_of
 STREAMS = {"r1": stream("r1", 12), "r2": stream("r2", 10, y=1.0)}
 SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
 STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
-END = m.End(0, tuple(m.StreamEnd(n, 1, len(s)) for n, s in STREAMS.items()))
+END = m.End(
+    stamp_ns=0,
+    streams=tuple(
+        m.StreamEnd(robot=n, incarnation=1, measurements=len(s)) for n, s in STREAMS.items()
+    ),
+)
 RULES = ["svd-join", "svd-join-spherical"]
 
 
 def messages(submaps=SUBMAPS, starts=STARTS):
     return [
         *(x for name in submaps for x in (starts[name], *submaps[name])),
-        *(m.Done(0, name, 1, 1, 1, len(each), ()) for name, each in submaps.items()),
+        *(
+            m.Done(
+                stamp_ns=0,
+                robot=name,
+                incarnation=1,
+                measurements=1,
+                steps=1,
+                submaps=len(each),
+                ledger=(),
+            )
+            for name, each in submaps.items()
+        ),
         END,
     ]
 
@@ -61,7 +77,10 @@ def test_the_final_map_is_downs_exchange_of_the_robots_own_joined_maps(rule):
     covariance = translate.landmark_covariance_of(found)
     np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12, atol=1e-15)
     assert found.frame == "r1/1"
-    assert found.members == (m.VersionEntry("r1", 1, 3), m.VersionEntry("r2", 1, 3))
+    assert found.members == (
+        m.VersionEntry(robot="r1", incarnation=1, sequence=3),
+        m.VersionEntry(robot="r2", incarnation=1, sequence=3),
+    )
     assert len(of(out, ch.FUSED_MAP)) >= 2
     credit: list[Outgoing] = [o for o in out if o.channel is ch.CENTRAL_PROGRESS]
     assert len(credit) == 8, "every submap is acknowledged"

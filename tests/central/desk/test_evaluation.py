@@ -42,15 +42,36 @@ def stamps(*seconds: float) -> np.ndarray:
 
 
 def done(measurements: int, ledger: tuple[tuple[str, int], ...]) -> Outgoing:
-    entries = tuple(m.Disposition(name, count) for name, count in ledger)
-    return Outgoing(ch.ROBOT_DONE, "r1", m.Done(9, "r1", 1, measurements, 20, 2, entries))
+    entries = tuple(m.Disposition(disposition=name, measurements=count) for name, count in ledger)
+    return Outgoing(
+        ch.ROBOT_DONE,
+        "r1",
+        m.Done(
+            stamp_ns=9,
+            robot="r1",
+            incarnation=1,
+            measurements=measurements,
+            steps=20,
+            submaps=2,
+            ledger=entries,
+        ),
+    )
 
 
 def submap(sequence: int, first: int, last: int) -> Outgoing:
     message = m.Submap(
-        sequence + 1, "r1", 1, sequence, first, last, 0, bytes(8),
-        from_ids([]), from_floats(np.zeros(3)), joint_bytes(np.eye(3)),
-    )  # fmt: skip
+        stamp_ns=sequence + 1,
+        robot="r1",
+        incarnation=1,
+        sequence=sequence,
+        first_measurement=first,
+        last_measurement=last,
+        start_ns=0,
+        config=bytes(8),
+        ids=from_ids([]),
+        mean=from_floats(np.zeros(3)),
+        covariance=joint_bytes(np.eye(3)),
+    )
     return Outgoing(ch.SUBMAP, "r1", message)
 
 
@@ -206,9 +227,16 @@ def own_map(shift: float, of: Scenario) -> Outgoing:
     world = streams(of)
     n = len(world.landmark_ids)
     estimate = m.MapEstimate(
-        9, "r1", 1, 7, 0, True, from_ids(world.landmark_ids), from_floats(world.landmarks + shift),
-        joint_bytes(0.01 * np.eye(2 * n)),
-    )  # fmt: skip
+        stamp_ns=9,
+        robot="r1",
+        incarnation=1,
+        sequence=7,
+        exchange=0,
+        joint=True,
+        ids=from_ids(world.landmark_ids),
+        means=from_floats(world.landmarks + shift),
+        covariance=joint_bytes(0.01 * np.eye(2 * n)),
+    )
     return Outgoing(ch.OWN_MAP, "r1", estimate)
 
 

@@ -14,7 +14,7 @@ def told(*messages: m.Message) -> list[tuple[str, str]]:
 
 
 def alive(there: bool, node: str = "robot/r1") -> m.Liveliness:
-    return m.Liveliness(0, node, there)
+    return m.Liveliness(stamp_ns=0, node=node, alive=there)
 
 
 def test_a_robot_joins_is_lost_and_comes_back() -> None:
@@ -26,7 +26,9 @@ def test_a_robot_joins_is_lost_and_comes_back() -> None:
 
 
 def test_a_robot_that_is_done_leaves() -> None:
-    done = m.Done(0, "r1", 1, 1200, 5, 4, ())
+    done = m.Done(
+        stamp_ns=0, robot="r1", incarnation=1, measurements=1200, steps=5, submaps=4, ledger=()
+    )
     assert told(alive(True), done, done, alive(False))[1:] == [
         ("done", "r1 used all its 1,200 measurements, 4 submaps"),
         ("left", "r1 left"),
@@ -40,10 +42,26 @@ def fused(
     final: bool = False,
 ) -> m.FusedMap:
     return m.FusedMap(
-        0, "join", bytes(8), "r1/1", final, False, 0,
-        tuple(m.VersionEntry(robot, 1, 0) for robot in robots), (), False, b"", b"", b"", 0.0, 0,
-        reasons, (), (), withdrawn,
-    )  # fmt: skip
+        stamp_ns=0,
+        rule="join",
+        digest=bytes(8),
+        frame="r1/1",
+        final=final,
+        provisional=False,
+        exchange=0,
+        members=tuple(m.VersionEntry(robot=robot, incarnation=1, sequence=0) for robot in robots),
+        missing=(),
+        joint=False,
+        ids=b"",
+        means=b"",
+        covariance=b"",
+        chi2=0.0,
+        dof=0,
+        reasons=reasons,
+        biases=(),
+        joined=(),
+        withdrawn=withdrawn,
+    )
 
 
 def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once() -> None:
@@ -60,14 +78,20 @@ def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once() -> N
 
 
 def test_a_withdrawal_is_told_once_with_its_reason() -> None:
-    said = m.Withdrawal(3, "r2", "central", "its wheels slip")
+    said = m.Withdrawal(stamp_ns=3, robot="r2", by="central", reason="its wheels slip")
     assert told(fused(["r1", "r2"]), said, said, fused(["r1"]))[2:] == [
         ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
     ]
 
 
 def status(refused: int, *warnings: str) -> m.Status:
-    return m.Status(0, "central", "joining", {"refused": float(refused)}, warnings)
+    return m.Status(
+        stamp_ns=0,
+        node="central",
+        state="joining",
+        figures={"refused": float(refused)},
+        warnings=warnings,
+    )
 
 
 def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_is_one() -> None:
@@ -86,8 +110,13 @@ def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_
 
 
 def test_another_incarnation_and_another_life_of_a_process_are_events() -> None:
-    first, again = (m.InitialPose(9, "r1", n, 0, b"", b"") for n in (1, 2))
-    configured = m.Configuration(0, "robot/r1", 0, bytes(8), "{}")
+    first, again = (
+        m.InitialPose(stamp_ns=9, robot="r1", incarnation=n, number=0, pose=b"", covariance=b"")
+        for n in (1, 2)
+    )
+    configured = m.Configuration(
+        stamp_ns=0, node="robot/r1", incarnation=0, digest=bytes(8), configuration="{}"
+    )
     assert told(first, first, again, again) == [
         ("restarted", "the stream of r1 begins anew, incarnation 2")
     ]
@@ -97,7 +126,7 @@ def test_another_incarnation_and_another_life_of_a_process_are_events() -> None:
 
 
 def test_the_end_of_the_world_and_its_notes_are_told_once() -> None:
-    end = m.End(9, (), ("a row was repaired",))
+    end = m.End(stamp_ns=9, streams=(), notes=("a row was repaired",))
     assert told(end, end, fused([], final=True), alive(True, "recorder")) == [
         ("warning", "a row was repaired"),
         ("done", "the world has ended"),

@@ -62,7 +62,23 @@ def test_the_cost_and_the_nees_are_those_of_each_map(run: History, log: list[Sam
 
 
 def measurement(k: int, wall_ms: int) -> Sample:
-    (sample,) = samples([Outgoing(ch.ODOMETRY, "r1", m.Odometry(k * MS, "r1", 0, k, MS, 0.5, 0.1))])
+    (sample,) = samples(
+        [
+            Outgoing(
+                ch.ODOMETRY,
+                "r1",
+                m.Odometry(
+                    stamp_ns=k * MS,
+                    robot="r1",
+                    incarnation=0,
+                    number=k,
+                    duration_ns=MS,
+                    forward=0.5,
+                    yaw_rate=0.1,
+                ),
+            )
+        ]
+    )
     return dataclasses.replace(sample, wall_ns=wall_ms * MS)
 
 
@@ -71,12 +87,29 @@ def at(outgoing: Outgoing, wall_ms: int) -> Sample:
 
 
 def fused(stamp_ns: int, last: int, **fields: object) -> Outgoing:
-    values = {"members": (m.VersionEntry("r1", 0, last),), "reasons": (), "final": False} | fields
+    values = {
+        "members": (m.VersionEntry(robot="r1", incarnation=0, sequence=last),),
+        "reasons": (),
+        "final": False,
+    } | fields
     message = m.FusedMap(
-        stamp_ns, "join", bytes(8), "r1/0", values["final"], False, 0, values["members"], (),
-        False, from_ids([1]), from_floats([0.0, 0.0]), from_floats([1.0, 0.0, 1.0]), 3.0, 2,
-        values["reasons"],
-    )  # fmt: skip
+        stamp_ns=stamp_ns,
+        rule="join",
+        digest=bytes(8),
+        frame="r1/0",
+        final=values["final"],
+        provisional=False,
+        exchange=0,
+        members=values["members"],
+        missing=(),
+        joint=False,
+        ids=from_ids([1]),
+        means=from_floats([0.0, 0.0]),
+        covariance=from_floats([1.0, 0.0, 1.0]),
+        chi2=3.0,
+        dof=2,
+        reasons=values["reasons"],
+    )
     return Outgoing(ch.FUSED_MAP, "", message)
 
 
@@ -94,7 +127,23 @@ def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
     log = [measurement(k, 10 * k) for k in range(12, 20)]
     log += [at(Outgoing(ch.SUBMAP, "r1", submap(k, "r1")), 400) for k in range(2)]
     assert "r1" not in history([*log, at(fused(9, 1), 450)]).latencies
-    absurd = samples([Outgoing(ch.ODOMETRY, "r1", m.Odometry(5, "r1", 0, 2**60, MS, 0.5, 0.1))])
+    absurd = samples(
+        [
+            Outgoing(
+                ch.ODOMETRY,
+                "r1",
+                m.Odometry(
+                    stamp_ns=5,
+                    robot="r1",
+                    incarnation=0,
+                    number=2**60,
+                    duration_ns=MS,
+                    forward=0.5,
+                    yaw_rate=0.1,
+                ),
+            )
+        ]
+    )
     assert history([*log, *absurd]).end_ns == 19 * MS
 
 

@@ -113,7 +113,10 @@ def test_a_measurement_that_was_changed_and_sent_again_is_named(
 
 def test_a_robots_false_word_is_named(samples: list[Sample], tmp_path: Path) -> None:
     def lie(done: m.Message) -> m.Message:
-        ledger = tuple(m.Disposition(d.disposition, d.measurements + 1) for d in done.ledger)
+        ledger = tuple(
+            m.Disposition(disposition=d.disposition, measurements=d.measurements + 1)
+            for d in done.ledger
+        )
         return msgspec.structs.replace(done, ledger=ledger) if done.robot == "r2" else done
 
     offenders = ledger_of(changed(samples, ch.ROBOT_DONE, lie), tmp_path).offenders

@@ -178,9 +178,22 @@ def test_no_robot_hears_a_view(node):
 def test_the_blocks_of_a_joint_covariance_are_those_of_the_whole_matrix():
     P = spd(6)
     joint = m.FusedMap(
-        0, "join", bytes(8), "r1/1", False, False, 0, (), (), True,
-        from_ids([1, 2, 3]), from_floats(range(6)), translate.joint_bytes(P), 0.0, 0,
-    )  # fmt: skip
+        stamp_ns=0,
+        rule="join",
+        digest=bytes(8),
+        frame="r1/1",
+        final=False,
+        provisional=False,
+        exchange=0,
+        members=(),
+        missing=(),
+        joint=True,
+        ids=from_ids([1, 2, 3]),
+        means=from_floats(range(6)),
+        covariance=translate.joint_bytes(P),
+        chi2=0.0,
+        dof=0,
+    )
     blocks = msgspec.structs.replace(
         joint, joint=False, covariance=translate.block_bytes(translate.blocks_of(P))
     )
@@ -220,12 +233,25 @@ def test_a_long_path_keeps_its_ends_and_few_points():
 
 def pose(at_s: float, x: float, robot: str = "r1", sigma: float = 0.5) -> m.PoseEstimate:
     P = from_floats(sigma**2 * np.eye(3))
-    return m.PoseEstimate(round(at_s * S), robot, 1, 0, bytes(8), from_floats([x, 0, 0]), P)
+    return m.PoseEstimate(
+        stamp_ns=round(at_s * S),
+        robot=robot,
+        incarnation=1,
+        sequence=0,
+        map_digest=bytes(8),
+        pose=from_floats([x, 0, 0]),
+        covariance=P,
+    )
 
 
 def truth(times: list[float], robot: str = "r1") -> m.Truth:
     poses = from_floats(np.column_stack([times, np.zeros((len(times), 2))]))
-    return m.Truth(round(times[-1] * S), robot, from_stamps([round(t * S) for t in times]), poses)
+    return m.Truth(
+        stamp_ns=round(times[-1] * S),
+        robot=robot,
+        stamps=from_stamps([round(t * S) for t in times]),
+        poses=poses,
+    )
 
 
 @pytest.mark.parametrize("truth_first", [True, False])
@@ -258,9 +284,22 @@ def test_truth_that_is_far_ahead_is_kept_for_the_estimates():
 
 def test_a_maps_nees_is_of_each_landmark():
     fused = m.FusedMap(
-        0, "join", bytes(8), "r1/1", False, False, 0, (), (), False, from_ids([4, 7]),
-        from_floats([1.0, 0.0, 5.0, 5.0]), from_floats([0.25, 0.0, 1.0] * 2), 0.0, 0,
-    )  # fmt: skip
+        stamp_ns=0,
+        rule="join",
+        digest=bytes(8),
+        frame="r1/1",
+        final=False,
+        provisional=False,
+        exchange=0,
+        members=(),
+        missing=(),
+        joint=False,
+        ids=from_ids([4, 7]),
+        means=from_floats([1.0, 0.0, 5.0, 5.0]),
+        covariance=from_floats([0.25, 0.0, 1.0] * 2),
+        chi2=0.0,
+        dof=0,
+    )
     fit = TrueLandmarks(np.array([4], np.uint32), np.zeros((1, 2))).fit(fused)
     assert fit is not None
     assert (fit.landmarks, fit.rmse_m, fit.nees_per_dof) == (1, 1.0, 2.0)
@@ -284,7 +323,7 @@ def test_the_view_waits_for_the_slowest_robot_at_work():
     assert robots_at(shown(node, *ready)) == [0]
     assert robots_at(shown(node, *[(ch.OWN_POSE, pose(t, t)) for t in range(1, 9)])) == []
     assert robots_at(shown(node, (ch.OWN_POSE, pose(3, 3, "r2")))) == [1, 2, 3]
-    lost = (ch.ALIVE, m.Liveliness(0, "robot/r2", False))
+    lost = (ch.ALIVE, m.Liveliness(stamp_ns=0, node="robot/r2", alive=False))
     assert robots_at(shown(node, lost)) == [4, 5, 6, 7, 8]
 
 

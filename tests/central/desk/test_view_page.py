@@ -121,7 +121,7 @@ def test_the_page_is_told_who_joined_and_the_end(frames):
 
 
 def test_an_event_is_at_the_time_of_what_it_is_about(samples, tmp_path):
-    ended = m.End(SECONDS * 10**9, ())
+    ended = m.End(stamp_ns=SECONDS * 10**9, streams=())
     early = [*samples[:8], Sample(ch.END.key(), encoded(ended), ended.stamp_ns, 0, 0), *samples[8:]]
     with Recorder(tmp_path / "early.mcap", "crowd", {}) as recorder:
         recorder.write(early)

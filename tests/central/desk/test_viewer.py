@@ -25,7 +25,11 @@ def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(
     final = msgspec.structs.replace(FINAL, final=True, lost=lost)
     network = MemoryNetwork()
     router = MemoryBus(network)
-    router.answer(ch.FINAL_KEPT, "", lambda _: [encoded(m.FinalMapReply(0, 0, encoded(final)))])
+    router.answer(
+        ch.FINAL_KEPT,
+        "",
+        lambda _: [encoded(m.FinalMapReply(stamp_ns=0, age_ns=0, final=encoded(final)))],
+    )
     stop = threading.Event()
     timer = threading.Timer(20.0, stop.set)
     timer.start()

@@ -111,15 +111,15 @@ def filtered(motions, keyframes, count, proposal, resample_below=0.5, seed=0):
     for motion, measurements in zip(motions, keyframes, strict=True):
         z = np.array([measurement for _, measurement in measurements])
         particles, info = fastslam.propagated_and_updated(
-            particles,
-            motion,
-            SENSOR,
-            IDS[[k for k, _ in measurements]],
-            z[:, 0].copy(),
-            z[:, 1].copy(),
-            proposal,
-            resample_below,
-            rng,
+            particles=particles,
+            increment=motion,
+            sensor=SENSOR,
+            ids=IDS[[k for k, _ in measurements]],
+            ranges=z[:, 0].copy(),
+            bearings=z[:, 1].copy(),
+            proposal=proposal,
+            resample_below=resample_below,
+            generator=rng,
         )
         log_evidence += info.log_evidence
         infos.append(info)
@@ -173,15 +173,15 @@ def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
     shift = np.array([[0.1, -0.2], [0.1, 0.2], [-0.2, 0.1]])
     z = np.array([observed(truth, k) for k in range(3)]) + shift * [1.0, 0.01]
     after, info = fastslam.propagated_and_updated(
-        known,
-        Increment(MOTION.mean, root @ root.T),
-        SENSOR,
-        IDS,
-        z[:, 0].copy(),
-        z[:, 1].copy(),
-        "fastslam2",
-        0.5,
-        rng,
+        particles=known,
+        increment=Increment(MOTION.mean, root @ root.T),
+        sensor=SENSOR,
+        ids=IDS,
+        ranges=z[:, 0].copy(),
+        bearings=z[:, 1].copy(),
+        proposal="fastslam2",
+        resample_below=0.5,
+        generator=rng,
     )
     assert info.effective_sample_size > (1.0 - 3e-5) * count
     assert np.std(after.poses[:, 2]) < 0.5 * np.linalg.norm(root[2])

@@ -28,7 +28,7 @@ from tests.teams import LANDMARKS, config, driven, of, published, stream
 STREAM = stream("r1", 12)
 MEASUREMENTS = published(STREAM)
 KNOWN = KnownMap(np.arange(1, len(LANDMARKS) + 1, dtype=np.uint32), LANDMARKS)
-TOLD = m.KnownMap(0, from_ids(KNOWN.ids), from_floats(KNOWN.landmarks))
+TOLD = m.KnownMap(stamp_ns=0, ids=from_ids(KNOWN.ids), positions=from_floats(KNOWN.landmarks))
 ALL = sorted({estimator for estimator, _ in PAIRS})
 WHOLE = sorted({*MAPPERS, *LOCALISERS} - {"hybrid", "hybrid-thesis"})
 UNKNOWN = InitialPose(None, None)

@@ -67,7 +67,17 @@ def driven(
     stamps = np.arange(n + 1, dtype=np.int64) * (SECOND // 10)
     path = Path(stamps, np.stack([x, y, on_circle(heading)], axis=1))
     intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
-    return Reference(f"r{seed}", intervals, NOTHING, path, SECOND, SEEN, NOTHING, (), {})
+    return Reference(
+        name=f"r{seed}",
+        intervals=intervals,
+        seen=NOTHING,
+        path=path,
+        gap_ns=SECOND,
+        landmarks=SEEN,
+        sighted=NOTHING,
+        names=(),
+        teammates={},
+    )
 
 
 def seeing(seed: int) -> Reference:
@@ -101,9 +111,16 @@ def seeing(seed: int) -> Reference:
     intervals = Intervals(ends[1:], np.diff(ends), np.zeros(1), np.zeros(1))
     landmarks = {i: place * (0.5 + 0.25 * i) for i, place in SEEN.items()}
     return Reference(
-        f"r{seed}", intervals, seen, Path(ends, np.zeros((2, 3))), int(ends[1]), landmarks,
-        NOTHING, (), {},
-    )  # fmt: skip
+        name=f"r{seed}",
+        intervals=intervals,
+        seen=seen,
+        path=Path(ends, np.zeros((2, 3))),
+        gap_ns=int(ends[1]),
+        landmarks=landmarks,
+        sighted=NOTHING,
+        names=(),
+        teammates={},
+    )
 
 
 def by_name(figures: tuple[Figure, ...]) -> dict[str, Figure]:
@@ -232,7 +249,16 @@ def spinning(seed: int, *, turns_first: bool) -> Reference:
     intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
     name = f"r{seed}"
     return Reference(
-        name, intervals, NOTHING, path, SECOND, SEEN, NOTHING, (), {}, turns_first=turns_first
+        name=name,
+        intervals=intervals,
+        seen=NOTHING,
+        path=path,
+        gap_ns=SECOND,
+        landmarks=SEEN,
+        sighted=NOTHING,
+        names=(),
+        teammates={},
+        turns_first=turns_first,
     )
 
 

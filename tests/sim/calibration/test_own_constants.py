@@ -45,7 +45,17 @@ def looking(
     intervals = Intervals(np.array([last]), np.array([last]), np.zeros(1), np.zeros(1))
     path = Path(np.array([0, last]), np.zeros((2, 3)))
     label = f"{world} {robot}"
-    return Reference(label, intervals, seen, path, last, PLACES, NOTHING, (), {})
+    return Reference(
+        name=label,
+        intervals=intervals,
+        seen=seen,
+        path=path,
+        gap_ns=last,
+        landmarks=PLACES,
+        sighted=NOTHING,
+        names=(),
+        teammates={},
+    )
 
 
 def team(cameras: dict[str, tuple[float, float, float]], *, depth: bool = True) -> list[Reference]:

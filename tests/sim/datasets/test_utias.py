@@ -150,7 +150,11 @@ def test_a_robots_clock_offset_orders_its_measurements_and_leaves_its_stamps(fol
     (late,) = read(folder, 1, odometry_delay_s=0.5).streams
     assert np.array_equal(stream.stamps_ns, late.stamps_ns)
     node = WorldNode(
-        utias(world, robots), frozenset(), m.Configuration(0, "world", 0, bytes(8), "{}")
+        utias(world, robots),
+        frozenset(),
+        m.Configuration(
+            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
+        ),
     )
     sent = [o.message for o in node.publish(0.0) if isinstance(o.message, m.Odometry)]
     assert sent[0].stamp_ns == late.intervals.end_ns[0] - 400_000_000

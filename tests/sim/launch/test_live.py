@@ -13,7 +13,7 @@ from team.wire.arrays import from_floats, from_ids
 
 
 def status(node: str, state: str, **figures: float) -> m.Status:
-    return m.Status(0, node, state, figures, ())
+    return m.Status(stamp_ns=0, node=node, state=state, figures=figures, warnings=())
 
 
 def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
@@ -48,9 +48,22 @@ def told(robots: int, *, truth: bool) -> Watch:
         if truth:
             watch.errors._robot(f"r{k}").tally.take(np.array([3.0, 9.0]), 3)
     watch.fused = m.FusedMap(
-        0, "join", bytes(8), "r1/1", False, False, 0, (), (), False, from_ids([1, 2]),
-        from_floats([0.0] * 4), from_floats([1.0, 0.0, 1.0] * 2), 1.0, 1,
-    )  # fmt: skip
+        stamp_ns=0,
+        rule="join",
+        digest=bytes(8),
+        frame="r1/1",
+        final=False,
+        provisional=False,
+        exchange=0,
+        members=(),
+        missing=(),
+        joint=False,
+        ids=from_ids([1, 2]),
+        means=from_floats([0.0] * 4),
+        covariance=from_floats([1.0, 0.0, 1.0] * 2),
+        chi2=1.0,
+        dof=1,
+    )
     if truth:
         watch.errors.landmarks.take(np.array([1.0, 2.0]), 2)
     return watch
@@ -92,13 +105,25 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.Mo
     monkeypatch.setattr(live, "PATIENCE_S", -1.0)
     watch = Watch(robots=2)
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
-    watch.statuses["recorder"] = m.Status(0, "recorder", "recording", {}, missing)
-    late = m.Status(0, "robot/r1", "waiting", {}, ("no measurements of this team yet",))
+    watch.statuses["recorder"] = m.Status(
+        stamp_ns=0, node="recorder", state="recording", figures={}, warnings=missing
+    )
+    late = m.Status(
+        stamp_ns=0,
+        node="robot/r1",
+        state="waiting",
+        figures={},
+        warnings=("no measurements of this team yet",),
+    )
     watch.statuses["robot/r1"] = late
     assert live._warnings(watch) == [f"recorder: {'; '.join(missing)}"]
-    watch.statuses["world"] = m.Status(0, "world", "waiting", {}, ("waiting for robot/r2",))
+    watch.statuses["world"] = m.Status(
+        stamp_ns=0, node="world", state="waiting", figures={}, warnings=("waiting for robot/r2",)
+    )
     assert live._warnings(watch) == ["world: waiting for robot/r2"]
-    watch.statuses["world"] = m.Status(0, "world", "publishing", {}, ())
+    watch.statuses["world"] = m.Status(
+        stamp_ns=0, node="world", state="publishing", figures={}, warnings=()
+    )
     assert "robot/r1: no measurements of this team yet" in live._warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
     assert live._warnings(watch)[0] == "robot-r2 (pid 7) was killed"
@@ -112,7 +137,9 @@ def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.Monk
     watch.statuses["world"] = status("world", "publishing", measurements=1.0, of=2.0)
     for cost in ("8.8", "9.1", "9.4"):
         warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
-        watch.statuses["central"] = m.Status(0, "central", "joining", {}, (warning,))
+        watch.statuses["central"] = m.Status(
+            stamp_ns=0, node="central", state="joining", figures={}, warnings=(warning,)
+        )
         lines.show(watch)
     assert "submap 20" not in out.getvalue()  # it could be taken back
     monkeypatch.setattr(live, "SETTLED_S", 0.0)
@@ -127,10 +154,16 @@ def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one()
     lines = live._Lines(Console(file=out, width=100))
     watch = Watch(robots=1, began=-1e9)
     watch.statuses["world"] = status("world", "waiting")
-    watch.statuses["world"] = m.Status(0, "world", "waiting", {}, ("waiting for robot/r2",))
+    watch.statuses["world"] = m.Status(
+        stamp_ns=0, node="world", state="waiting", figures={}, warnings=("waiting for robot/r2",)
+    )
     lines.show(watch)
-    watch.statuses["world"] = m.Status(0, "world", "ended", {}, ())
-    watch.statuses["central"] = m.Status(0, "central", "joining", {}, ("two maps disagree",))
+    watch.statuses["world"] = m.Status(
+        stamp_ns=0, node="world", state="ended", figures={}, warnings=()
+    )
+    watch.statuses["central"] = m.Status(
+        stamp_ns=0, node="central", state="joining", figures={}, warnings=("two maps disagree",)
+    )
     lines.show(watch)
     assert "waiting for" not in out.getvalue()
     lines.end()

@@ -19,13 +19,21 @@ COVARIANCE = np.array([[0.09, 0.01, 0.0], [0.01, 0.04, 0.005], [0.0, 0.005, 0.01
 
 def pose(at_s: float, xyt: np.ndarray) -> m.PoseEstimate:
     return m.PoseEstimate(
-        round(at_s * SECOND), "r1", 1, 0, bytes(8), from_floats(xyt), from_floats(COVARIANCE)
+        stamp_ns=round(at_s * SECOND),
+        robot="r1",
+        incarnation=1,
+        sequence=0,
+        map_digest=bytes(8),
+        pose=from_floats(xyt),
+        covariance=from_floats(COVARIANCE),
     )
 
 
 def truth(seconds: list[float], poses: np.ndarray) -> m.Truth:
     stamps = [round(s * SECOND) for s in seconds]
-    return m.Truth(stamps[-1], "r1", from_stamps(stamps), from_floats(poses))
+    return m.Truth(
+        stamp_ns=stamps[-1], robot="r1", stamps=from_stamps(stamps), poses=from_floats(poses)
+    )
 
 
 def line(seconds: list[float]) -> np.ndarray:
@@ -91,15 +99,31 @@ def test_only_one_pose_in_a_second_is_decoded() -> None:
 def test_the_map_is_judged_by_landmark_and_the_newest_counts(joint: bool) -> None:
     errors, ids = LiveErrors(), [2, 5, 7]
     positions = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 6.0]])
-    errors.take(ch.TRUTH_LANDMARKS, m.TruthLandmarks(0, from_ids(ids), from_floats(positions)))
+    errors.take(
+        ch.TRUTH_LANDMARKS,
+        m.TruthLandmarks(stamp_ns=0, ids=from_ids(ids), positions=from_floats(positions)),
+    )
     root = np.random.default_rng(3).normal(size=(6, 6)) * 0.1
     P = root @ root.T + 0.01 * np.eye(6)
     content = translate.covariance_bytes(P, joint=joint)
     for deviation in (np.array([5.0, 5.0]), np.array([0.1, -0.2])):
         fused = m.FusedMap(
-            9, "join", bytes(8), "r1/1", False, False, 0, (), (), joint,
-            from_ids(ids), from_floats(positions + deviation), content, 3.0, 2,
-        )  # fmt: skip
+            stamp_ns=9,
+            rule="join",
+            digest=bytes(8),
+            frame="r1/1",
+            final=False,
+            provisional=False,
+            exchange=0,
+            members=(),
+            missing=(),
+            joint=joint,
+            ids=from_ids(ids),
+            means=from_floats(positions + deviation),
+            covariance=content,
+            chi2=3.0,
+            dof=2,
+        )
         errors.take(ch.FUSED_MAP, fused)
     blocks = [P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)]
     expected = [deviation @ np.linalg.solve(block, deviation) for block in blocks]
@@ -111,7 +135,9 @@ def test_a_watch_without_truth_has_the_robots_own_figures_only() -> None:
     bus, others = (MemoryBus(network := MemoryNetwork()), MemoryBus(network))
     for channel in (ch.STATUS, *LiveErrors.listens):
         bus.subscribe(channel)
-    status = m.Status(0, "robot/r1", "mapping", {"nis_per_dof": 1.02}, ())
+    status = m.Status(
+        stamp_ns=0, node="robot/r1", state="mapping", figures={"nis_per_dof": 1.02}, warnings=()
+    )
     others.publish(Outgoing(ch.STATUS, "robot/r1", status))
     others.publish(Outgoing(ch.TEAM_POSE, "r1", pose(1.0, np.zeros(3))))
     watch = Watch(robots=1)

@@ -22,10 +22,12 @@ def world() -> WorldNode:
     """A world that waits for two robots and a centre, which are all alive."""
     expected = expected_nodes(["r1", "r2"], recorder=False)
     configurations = Configurations(expected_configurations(SCENARIO))
-    announced = m.Configuration(0, "world", 0, bytes(8), "{}")
+    announced = m.Configuration(
+        stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
+    )
     node = WorldNode(STREAMS, expected, announced, configurations=configurations)
     for name in expected:
-        node.handle(m.Liveliness(0, name, True), 0)
+        node.handle(m.Liveliness(stamp_ns=0, node=name, alive=True), 0)
     return node
 
 
@@ -77,7 +79,11 @@ def test_a_robot_that_comes_later_with_another_configuration_is_a_warning() -> N
 
 def test_a_robot_that_is_not_in_the_scenario_is_named() -> None:
     configurations = Configurations(expected_configurations(SCENARIO))
-    configurations.take(m.Configuration(0, "robot/r9", 1, bytes(8), "{}"))
+    configurations.take(
+        m.Configuration(
+            stamp_ns=0, node="robot/r9", incarnation=1, digest=bytes(8), configuration="{}"
+        )
+    )
     (warning,) = configurations.mismatches
     assert warning.startswith("robot/r9 is not in the world's scenario, which has central, robot/r")
 

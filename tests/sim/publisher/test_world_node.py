@@ -15,7 +15,9 @@ from team.wire.arrays import floats, stamps
 from team.wire.codec import WireError, decoded, encoded
 from tests.teams import of, stream, world_of
 
-SCENARIO = m.Configuration(0, "world", 0, bytes(8), "{}")
+SCENARIO = m.Configuration(
+    stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
+)
 STREAMS = world_of(stream("r1", 12), stream("r2", 9, off_ns=300_000_000, beyond=2))
 
 
@@ -24,7 +26,7 @@ def world(streams=STREAMS, expected=frozenset(), **options):
 
 
 def alive(node, name, *, here=True):
-    node.handle(m.Liveliness(0, name, here), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node=name, alive=here), 0)
 
 
 def all_of(node, clock=0.0):
@@ -39,7 +41,9 @@ def measurements(out):
 
 
 def progress(robot, count, incarnation=1, node="robot"):
-    return m.Progress(0, node, robot, incarnation, count, 0)
+    return m.Progress(
+        stamp_ns=0, node=node, robot=robot, incarnation=incarnation, measurements=count, submaps=0
+    )
 
 
 def test_it_waits_for_everyone_and_says_for_whom():
@@ -208,7 +212,13 @@ def test_at_speed_max_only_credit_holds_it_back():
 
 def wanted(node, robot="r1", incarnation=1, first=0, last=-1):
     return list(
-        node.measurements(encoded(m.MeasurementsRequest(0, robot, incarnation, first, last)))
+        node.measurements(
+            encoded(
+                m.MeasurementsRequest(
+                    stamp_ns=0, robot=robot, incarnation=incarnation, first=first, last=last
+                )
+            )
+        )
     )
 
 
@@ -254,7 +264,7 @@ def test_who_asks_for_what_is_no_longer_kept_gets_a_new_incarnation_at_a_free_po
     assert isinstance(mine[0], m.InitialPose)
     assert (mine[0].pose, mine[0].covariance) == (b"", b"")
     (end,) = of(out, ch.END)
-    assert end.streams[0] == m.StreamEnd("r1", 2, len(mine))
+    assert end.streams[0] == m.StreamEnd(robot="r1", incarnation=2, measurements=len(mine))
     total = len(STREAMS.streams[0])
     assert len(before) + len(mine) - 1 == total, "the start takes the place of the last one sent"
 
@@ -265,7 +275,7 @@ def test_a_new_incarnation_after_the_end_has_its_own_end():
     wanted(node, first=0)
     out = node.publish(0.0)
     assert [type(o.message) for o in out] == [m.InitialPose, m.End]
-    assert out[-1].message.streams[0] == m.StreamEnd("r1", 2, 1)
+    assert out[-1].message.streams[0] == m.StreamEnd(robot="r1", incarnation=2, measurements=1)
     assert node.publish(0.0) == []
 
 
@@ -306,7 +316,21 @@ def test_without_truth_there_is_none():
 def test_it_is_finished_with_the_final_map():
     node = world()
     fused = m.FusedMap(
-        0, "join", bytes(8), "", False, False, 0, (), (), False, b"", b"", b"", 0.0, 0
+        stamp_ns=0,
+        rule="join",
+        digest=bytes(8),
+        frame="",
+        final=False,
+        provisional=False,
+        exchange=0,
+        members=(),
+        missing=(),
+        joint=False,
+        ids=b"",
+        means=b"",
+        covariance=b"",
+        chi2=0.0,
+        dof=0,
     )
     node.handle(fused, 0)
     assert not node.finished
@@ -336,7 +360,9 @@ def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
     least = {"r1": 7, "r2": 5}
     assert out[len(starts) :] == [r for r in before if r.number >= least[r.robot]]
     assert node.status().figures["measurements"] == len(before)
-    request = encoded(m.MeasurementsRequest(0, "r1", 1, 0, -1))
+    request = encoded(
+        m.MeasurementsRequest(stamp_ns=0, robot="r1", incarnation=1, first=0, last=-1)
+    )
     assert [decoded(reply).number for reply in node.measurements(request)] == list(range(26))
 
 
@@ -363,7 +389,17 @@ def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_eve
 
 def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot_is():
     node = world()
-    node.handle(m.Progress(5_000_000_000, "robot/r1", "r1", 3, 4, 0), 0)
+    node.handle(
+        m.Progress(
+            stamp_ns=5_000_000_000,
+            node="robot/r1",
+            robot="r1",
+            incarnation=3,
+            measurements=4,
+            submaps=0,
+        ),
+        0,
+    )
     out = [r for r in measurements(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
     assert {r.incarnation for r in out} == {4}
     assert [r.number for r in out] == list(range(len(out)))
@@ -374,5 +410,5 @@ def test_a_world_begins_without_a_node_that_is_given_up():
     node = world(expected=frozenset({"robot/r1", "recorder"}))
     alive(node, "robot/r1")
     assert node.publish(0.0) == []
-    node.handle(m.GivenUp(0, "recorder", "launch", "it died 5 times"), 0)
+    node.handle(m.GivenUp(stamp_ns=0, node="recorder", by="launch", reason="it died 5 times"), 0)
     assert measurements(node.publish(0.0))

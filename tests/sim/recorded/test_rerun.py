@@ -198,7 +198,13 @@ def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team
             team.resume(config("r1"))
             team.world.cache = cache
             first = team.robots["r1"].next_measurement
-            team.world.measurements(encoded(m.MeasurementsRequest(0, "r1", 0, first, -1)))
+            team.world.measurements(
+                encoded(
+                    m.MeasurementsRequest(
+                        stamp_ns=0, robot="r1", incarnation=0, first=first, last=-1
+                    )
+                )
+            )
             team.world.cache = None
         team.run()
     return team
@@ -303,7 +309,11 @@ def test_without_a_robot_the_map_is_that_of_a_team_that_never_had_it(
     alone = team_samples(thesis(STEPS, robots=1))  # there nobody is sighted: fewer measurements
     (one,), (other,) = (messages(each, ch.FINAL_MAP) for each in (run, alone))
     assert (one.means, one.covariance) == (other.means, other.covariance)
-    assert one.members == other.members == (m.VersionEntry("r1", 1, STEPS // 10 - 1),)
+    assert (
+        one.members
+        == other.members
+        == (m.VersionEntry(robot="r1", incarnation=1, sequence=STEPS // 10 - 1),)
+    )
 
 
 def test_another_rule_is_the_run_that_would_have_used_it(log: Log) -> None:

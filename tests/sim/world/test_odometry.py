@@ -174,7 +174,12 @@ def team_keyframes(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, b
     measurements = published(world.streams[0])
     for measurement in measurements:
         keyframes.put(measurement)
-    keyframes.end(m.End(0, (m.StreamEnd(robot.id, 1, len(measurements)),)))
+    keyframes.end(
+        m.End(
+            stamp_ns=0,
+            streams=(m.StreamEnd(robot=robot.id, incarnation=1, measurements=len(measurements)),),
+        )
+    )
     return [
         (each.stamp_ns, each.keyframe.increment.mean.tobytes(), each.keyframe.ranges.tobytes())
         for step in keyframes.steps()
