@@ -14,6 +14,7 @@ CENTRE = (
 JOIN = (
     "estimation/map_joining/test_joining.py",
     "estimation/map_joining/test_annealing.py",
+    "estimation/map_joining/test_damping.py",
     "estimation/map_joining/test_landmark_weights.py",
     "estimation/map_joining/test_sightings.py",
     "estimation/map_joining/test_alignment.py",
