@@ -1,9 +1,9 @@
 """The solution of a submap graph: Gauss-Newton, shortened or damped where the cost would rise.
 
-Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start or bias − prior‖², where ρ is the identity, or
-Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters with a wide
-scale that narrows with each iteration it has lived through, so a true loop closure is not taken for
-an outlier before the chain has bent.
+Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start − prior‖² + Σ ρ(bias − prior), where ρ is the
+identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters
+with a wide scale that narrows with each iteration it has lived through, so a true loop closure is
+not taken for an outlier before the chain has bent.
 
 With a robust loss each landmark of a submap has a weight of its own besides, so that a landmark
 that was mistaken for another does not break the robot's chain: beyond the gate g its χ² counts
@@ -203,6 +203,19 @@ class Island:
         """χ² of each prior on a start."""
         return np.array([_prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
 
+    @cached_property
+    def prior_weight(self) -> Float[np.ndarray, " priors"]:
+        """Robust weight of each prior: that of a bias as of a submap, of all else 1.
+
+        A sensor that was changed since its calibration is one robot's: its prior is an outlier, and
+        must not draw the others, by what they have in common, away from theirs.
+        """
+        if self.settings.robust_c is None:
+            return np.ones(len(self.graph.priors))
+        of_bias = np.array([len(prior.mean) == 1 for prior in self.graph.priors], dtype=np.bool_)
+        weight: Values = 1.0 / (1.0 + self.prior_chi2 / self.settings.robust_c**2)
+        return np.where(of_bias, weight, 1.0)
+
     def quadratic(self, state: Values) -> float:
         """The cost of another state with the weights of this one: what an iteration lowers.
 
@@ -212,7 +225,7 @@ class Island:
         factor, offset = self.settings.covariance_factor, self.graph.offset
         chi2 = float((self.weight * kernel.costs(state, offset, self.factors, factor)).sum())
         seen = float((self.sighting_weight * other.sighting_chi2).sum())
-        return chi2 + seen + float(other.prior_chi2.sum())
+        return chi2 + seen + float((self.prior_weight * other.prior_chi2).sum())
 
     @cached_property
     def cost(self) -> float:
@@ -221,12 +234,20 @@ class Island:
             chi2 = float(self.chi2.sum() + self.prior_chi2.sum())
             return chi2 + float(self.sighting_chi2.sum())
         scale = self.scale**2 * self.graph.dimensions
-        cost = float((scale * np.log1p(self.chi2 / scale)).sum() + self.prior_chi2.sum())
+        cost = float((scale * np.log1p(self.chi2 / scale)).sum()) + self._prior_cost
         own, gate = self._landmark_chi2_and_gate
         beyond = own > gate
         cost += float((gate[beyond] * np.log(own[beyond] / gate[beyond])).sum())
         scale = 2.0 * self.sighting_scale**2
         return cost + float((scale * np.log1p(self.sighting_chi2 / scale)).sum())
+
+    @property
+    def _prior_cost(self) -> float:
+        """Cauchy's loss of the biases' priors, χ² of the others."""
+        c2 = 1.0 if self.settings.robust_c is None else self.settings.robust_c**2
+        of_bias = self.prior_weight < 1.0
+        robust = float((c2 * np.log1p(self.prior_chi2[of_bias] / c2)).sum())
+        return robust + float(self.prior_chi2[~of_bias].sum())
 
     @cached_property
     def normal_equations(self) -> tuple[Values, Values]:
@@ -257,8 +278,9 @@ class Island:
         for k, prior in enumerate(graph.priors):
             slope, hessian, _ = _prior_terms(self, k)
             begin = graph.offset[prior.node]
-            gradient[begin : begin + len(slope)] += slope
-            pattern.diagonal_block(values, prior.node)[...] += hessian
+            weight = self.prior_weight[k]
+            gradient[begin : begin + len(slope)] += weight * slope
+            pattern.diagonal_block(values, prior.node)[...] += weight * hessian
         return values, gradient
 
     @cached_property

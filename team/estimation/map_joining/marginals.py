@@ -281,9 +281,11 @@ def _priors(island: Island) -> list[tuple[str, float, float]]:
     return [
         (
             robots[prior.node],
-            float(chi2),
+            float(weight * chi2),
             len(prior.mean)
-            - float(np.sum(prior.information * _own_marginal(island, prior.node)[1])),
+            - float(weight * np.sum(prior.information * _own_marginal(island, prior.node)[1])),
         )
-        for prior, chi2 in zip(island.graph.priors, island.prior_chi2, strict=True)
+        for prior, chi2, weight in zip(
+            island.graph.priors, island.prior_chi2, island.prior_weight, strict=True
+        )
     ]

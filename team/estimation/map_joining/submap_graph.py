@@ -30,7 +30,10 @@ NONE_IN_COMMON: Mapping[Bias, float] = MappingProxyType({})
 
 
 class Prior(NamedTuple):
-    """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹), never down-weighted."""
+    """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹).
+
+    A robust join weighs that of a bias, as a submap, by how far the state is from it.
+    """
 
     node: int
     mean: Float[np.ndarray, " k"]

@@ -313,3 +313,26 @@ def test_a_contribution_keeps_its_columns_over_the_wire():
     _, submaps, _ = camera_team(1, ("bearing",))
     assert all(isinstance(each, Contribution) for each in submaps)
     assert all(each.local.sensitivity.shape == (1, len(each.local.mean)) for each in submaps)
+
+
+def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_its_costs():
+    world, submaps, _ = biased_team(1)
+    options = JoinSettings(bias_sigma=SIGMA, robust_c=1.0)
+    island = fold_of(world, submaps, options).main
+    k = next(k for k, prior in enumerate(island.graph.priors) if len(prior.mean) == 1)
+    prior = island.graph.priors[k]
+    at, sigma = island.graph.offset[prior.node], prior.information[0, 0] ** -0.5
+
+    def shifted(by):
+        state = island.state.copy()
+        state[at] = prior.mean[0] + by
+        return replace(island, state=state)
+
+    assert shifted(10.0 * sigma).prior_weight[k] == pytest.approx(1.0 / 101.0)
+    plain = replace(shifted(10.0 * sigma), settings=replace(options, robust_c=None))
+    assert plain.prior_weight[k] == 1.0
+    h = 1e-4 * sigma
+    for by in (0.5 * sigma, 10.0 * sigma):
+        slope = (shifted(by + h)._prior_cost - shifted(by - h)._prior_cost) / (2.0 * h)
+        weighted = shifted(by).prior_weight[k] * prior.information[0, 0] * by
+        assert slope == pytest.approx(2.0 * weighted, rel=1e-5)

@@ -79,4 +79,6 @@ def test_a_scenario_with_a_learnt_factor_keeps_the_rest_of_the_centre(tmp_path):
     path.write_text(document, "utf-8")
     central = load(str(path)).central
     assert central.covariance_factor == float(f"{factor.value:.5g}")
-    assert msgspec.structs.replace(central, covariance_factor=1.9) == load("utias").central
+    before = load("utias").central
+    kept = msgspec.structs.replace(central, covariance_factor=before.covariance_factor)
+    assert kept == before

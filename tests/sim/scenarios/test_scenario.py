@@ -72,7 +72,13 @@ def test_the_utias_scenario_has_the_five_robots_of_the_rig() -> None:
     scenario = load("utias")
     assert [robot.id for robot in scenario.robots] == ["r1", "r2", "r3", "r4", "r5"]
     assert scenario.robots[4].motion.yaw_scale == 0.936
-    assert scenario.central.covariance_factor == 1.9
+    assert [r.sensor.range_scale for r in scenario.robots] == [
+        1.0149,
+        1.0539,
+        1.0134,
+        1.0166,
+        1.0066,
+    ]
 
 
 def test_estimator_rule_and_seed_are_said_once_and_handed_to_all(tmp_path: Path) -> None:
