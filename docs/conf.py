@@ -48,6 +48,7 @@ apidoc_modules = [
         "destination": f"generated/api/{package}",
         "separate_modules": False,
         "module_first": True,
+        "max_depth": 1,
         "automodule_options": {"members"},
         "exclude_patterns": [str(HERE.parent / left_out) for left_out in LEFT_OUT],
     }
