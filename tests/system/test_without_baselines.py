@@ -12,6 +12,8 @@ from tests.system.processes import Processes
 from tests.system.scenarios import short
 
 PACKAGES = ("team", "central", "sim")
+PATIENCE_S = 300.0
+"""Of one command: where no test before has compiled the kernels, the launch does."""
 REMOVABLE = (
     "team/estimation/baselines",
     "team/robot/baselines",
@@ -35,7 +37,7 @@ async def done(
     path = f"PYTHONPATH={sources}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     program = ["env", path, sys.executable, "-P", "-m", "sim"]
     process = await team.run(name, [*program, *(str(word) for word in words)])
-    assert await process.ended() == status, process.said()
+    assert await process.ended(PATIENCE_S) == status, process.said()
     return process.said()
 
 
