@@ -60,14 +60,14 @@ def stepped(
     corrected by the calibration.
     """
     after, _ = fastslam.stepped(
-        reset(state, ids, particles),
-        increment,
-        sensor,
-        ids,
-        ranges,
-        bearings,
-        "fastslam1",
-        generator,
+        particles=reset(state, ids, particles),
+        increment=increment,
+        sensor=sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        proposal="fastslam1",
+        generator=generator,
     )
     mean, P = moments(after.poses, np.exp(after.log_weights), after.means, after.covariances)
     columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)

@@ -60,7 +60,14 @@ def stepped(
     """
     known = len(state.particles.ids)
     drawn, _ = fastslam.stepped(
-        state.particles, increment, sensor, ids, ranges, bearings, "fastslam1", generator
+        particles=state.particles,
+        increment=increment,
+        sensor=sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        proposal="fastslam1",
+        generator=generator,
     )
     for slot in range(known, len(drawn.ids)):
         first = int(np.flatnonzero(ids == drawn.ids[slot])[0])

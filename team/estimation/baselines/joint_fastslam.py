@@ -80,14 +80,14 @@ def stepped(
     for turn in turns:
         index = state.robots.index(turn.robot)
         after, _ = fastslam.stepped(
-            _seen_by(state, index),
-            turn.increment,
-            turn.sensor,
-            turn.ids,
-            turn.ranges,
-            turn.bearings,
-            state.proposal,
-            generator,
+            particles=_seen_by(state, index),
+            increment=turn.increment,
+            sensor=turn.sensor,
+            ids=turn.ids,
+            ranges=turn.ranges,
+            bearings=turn.bearings,
+            proposal=state.proposal,
+            generator=generator,
         )
         poses = state.poses.copy()
         poses[index] = after.poses

@@ -100,7 +100,14 @@ def _thesis_stepped(
     increment, ids, ranges, bearings = step
     particles = config.front_end.particles
     return hybrid_thesis.stepped(
-        state, increment, config.sensor, ids, ranges, bearings, particles, generator
+        state=state,
+        increment=increment,
+        sensor=config.sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        particles=particles,
+        generator=generator,
     )
 
 

@@ -1,0 +1,112 @@
+"""The open window of a robot, total: a step that has no solution ends no run.
+
+Where the particles of a window have once had no solution, none of its measurements count: what is
+left of it is the motion that the odometry says.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from team.config import RobotConfig
+from team.estimation.gaussian import NotACovarianceError
+from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
+from team.estimation.hybrid_slam.outliers import OutlierGate
+from team.estimation.hybrid_slam.window import Window
+from team.estimation.models import Increment
+from team.estimation.plausible import submap_beyond
+from team.estimation.randomness import generator
+from team.estimation.submap import LocalMap
+
+
+class OpenWindow:
+    """The particles since the window's start, and the odometry's motion beside them.
+
+    A window's random numbers are keyed by (seed, robot, incarnation, sequence).
+    """
+
+    def __init__(self, config: RobotConfig, incarnation: int, sequence: int) -> None:
+        self._config = config
+        self._key = incarnation, sequence
+        self._gate = OutlierGate(config.sensor, config.front_end.garbage)
+        self._solvable = True
+        self.motion = Increment.identity()
+        self.last_keyframe_ns: int | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        config = self._config
+        self.particles = windows.opened(config.front_end, config.sensor)
+        self._generator = generator(config.seed, config.id, *self._key)
+
+    @property
+    def gated(self) -> int:
+        """Measurements that no others of the window confirmed."""
+        return self._gate.gated
+
+    def advance(self, keyframe: Keyframe) -> None:
+        """Particles move and weigh, once more: those measurements count that others agree with."""
+        self.motion = self.motion.then(keyframe.increment)
+        self.last_keyframe_ns = keyframe.stamp_ns
+        self._try(lambda: self._admit(keyframe))
+
+    def confirm(self) -> None:
+        """Where there may be outliers, the window once more with what all of it confirms."""
+        if self._gate.judges:
+            self._try(self._settle)
+
+    def move(self, rest: Increment, forward: np.ndarray) -> None:
+        """The motion after the last keyframe; forward: its shift by an error of the speed."""
+        if rest.mean.any() or rest.covariance.any():
+            self.motion = self.motion.then(rest)
+            self._try(lambda: self._go(rest, forward))
+
+    def solved(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
+        """The Gaussian that a step makes of the window; None where there is none."""
+        if not self._solvable:
+            return None
+        try:
+            with np.errstate(all="ignore"):
+                return step(self.particles)
+        except (NotACovarianceError, np.linalg.LinAlgError):
+            return None
+
+    def is_sensible(self, submap: LocalMap | None) -> bool:
+        """Whether a submap is there and within the bounds."""
+        return submap is not None and submap_beyond(submap, self._config.bounds) is None
+
+    def _admit(self, keyframe: Keyframe) -> None:
+        most = self._config.bounds.submap_landmarks
+        bounded = nearest_landmarks(keyframe, self.particles.particles.ids, most)
+        self._take(self._gate.admitted(bounded))
+
+    def _take(self, keyframe: Keyframe) -> None:
+        self.particles = windows.advanced(
+            self.particles,
+            keyframe.increment,
+            keyframe.ids,
+            keyframe.ranges,
+            keyframe.bearings,
+            self._generator,
+            keyframe.forward,
+        )
+        if keyframe.is_node:
+            self.particles = windows.marked(self.particles, keyframe.stamp_ns)
+
+    def _settle(self) -> None:
+        self._begin()
+        for keyframe in self._gate.settled():
+            self._take(keyframe)
+
+    def _go(self, rest: Increment, forward: np.ndarray) -> None:
+        self.particles = windows.moved(self.particles, rest, self._generator, forward)
+
+    def _try(self, step: Callable[[], None]) -> None:
+        """Take a step of the particles, unless one has failed."""
+        if self._solvable:
+            try:
+                with np.errstate(all="ignore"):
+                    step()
+            except (NotACovarianceError, np.linalg.LinAlgError):
+                self._solvable = False
