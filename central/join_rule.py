@@ -224,7 +224,7 @@ class JoinRule(SubmapRule):
         self.reasons = (
             *(fold.reasons[k] for k in sorted(fold.reasons)),
             *_worded(refusals(fold)),
-            *fold.doubts,
+            *fold.warnings,
             *self._unconfirmed(fold, shown),
             *miscalibrations(biases),
         )

@@ -7,7 +7,7 @@ from team.wire import messages as m
 from team.wire.newer import further, later_end
 
 Dealt = Callable[[m.Done], bool]
-"""Whether everything that a robot's last word speaks of has been dealt with."""
+"""True once all messages announced in a robot's `Done` have been dealt with."""
 
 
 @dataclass

@@ -82,7 +82,7 @@ class FusionRule(ABC):
         """The last messages, the final map behind all others."""
 
     def dealt(self, done: m.Done) -> bool:
-        """Whether everything that a robot's last word speaks of is here."""
+        """True once all messages announced in the robot's `Done` have arrived."""
         return True
 
     def complete(self, end: m.End) -> bool:

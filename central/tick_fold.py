@@ -27,8 +27,8 @@ from team.estimation.map_joining.joining import (
     InitialPoseFactor,
     JoinSettings,
     Sighting,
+    compacted,
     converged,
-    lean,
 )
 from team.estimation.map_joining.marginals import Agreement
 from team.estimation.map_joining.refusal import Tick, taken
@@ -196,7 +196,7 @@ class TickFold:
             tick, self._with_tick(self.fold, tick), 0 if before is None else before.tried
         )
         if before is not None:
-            before.fold = lean(before.fold)
+            before.fold = compacted(before.fold)
         self._taken.append(taken)
         asked = before is None or before.tick // self._period < tick // self._period
         if asked and len(taken.fold.contributions) >= GROWTH * taken.tried:

@@ -175,7 +175,7 @@ class LatestRule(_OwnMaps):
 
 
 class AloneRule(_OwnMaps):
-    """No fusion: the final map of a team of one is its robot's; of more robots it has nothing."""
+    """No fusion: publishes a final map for single-robot teams only."""
 
     listens = (ch.OWN_MAP,)
 

@@ -196,7 +196,7 @@ def tied(
     full: bool,
     sightings: Mapping[tuple[Stream, Stream], PointPairs] = NO_SIGHTINGS,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """The maps in the frame of the first, one by one: next who shares most with those that are in.
+    """Greedily aligns the map that has the most landmarks in common with those that are aligned.
 
     sightings: by two streams in their order, the robots' own places in both maps where they saw
     each other (`mutual_sighting`); they tie beside the common landmarks, not with `full`. Who

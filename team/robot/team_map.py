@@ -8,7 +8,7 @@ from team.estimation.map_joining.conditioning import (
     Posed,
     Shared,
     followed,
-    mostly,
+    is_majority,
     pose_now,
 )
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
@@ -42,7 +42,7 @@ class TeamMap:
         return posed
 
     def _doubt(self, given: Followed) -> str:
-        if mostly(self.refused, self.known):
+        if is_majority(self.refused, self.known):
             return (
                 f"the pose in the team's map is in doubt: {self.refused} of {self.known} landmarks "
                 "that are seen contradict the rest"

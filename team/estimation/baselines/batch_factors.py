@@ -92,7 +92,7 @@ def composed(a_from_b: Rows, b_from_c: Rows) -> Rows:
 
 
 @compiled
-def parted(a_from_b: Rows, a_from_c: Rows) -> Rows:
+def relative_poses(a_from_b: Rows, a_from_c: Rows) -> Rows:
     """b_from_c of each row."""
     found = np.empty_like(a_from_b)
     for k in range(len(found)):
@@ -160,14 +160,14 @@ def _adjoints_of_inverse(poses: Rows) -> Blocks:
 
 def start_residuals(starts: Starts, poses: Poses) -> tuple[Rows, Blocks]:
     """R and ∂r/∂ξ of the starts."""
-    residual = logarithms(parted(starts.mean, poses[starts.pose]))
+    residual = logarithms(relative_poses(starts.mean, poses[starts.pose]))
     return residual, inverse_right_jacobians(residual)
 
 
 def motion_residuals(motions: Motions, poses: Poses) -> Linear:
     """r, ∂r/∂ξ of the pose before and of the pose after."""
-    moved = parted(poses[motions.before], poses[motions.after])
-    residual = logarithms(parted(motions.mean, moved))
+    moved = relative_poses(poses[motions.before], poses[motions.after])
+    residual = logarithms(relative_poses(motions.mean, moved))
     after = inverse_right_jacobians(residual)
     return Linear(residual, -after @ _adjoints_of_inverse(moved), after)
 

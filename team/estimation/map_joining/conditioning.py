@@ -134,11 +134,13 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
         doubted, _, _ = settled(replace(island, settings=DOUBTING))
         beyond = _beyond_gate(doubted)
         refused = tuple(int(each.sum()) for each in beyond)
-        if not any(mostly(*pair) for pair in zip(refused, known, strict=True)):
+        if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
             kept = [_without(*pair) for pair in zip(submaps, beyond, strict=True)]
             island, _, _ = settled(_island(whole, kept, TRUSTING))
     cost, dof = float(island.chi2.sum()), _degrees(island)
-    disputed = cost > _most(dof) or any(mostly(*pair) for pair in zip(refused, known, strict=True))
+    disputed = cost > _most(dof) or any(
+        is_majority(*pair) for pair in zip(refused, known, strict=True)
+    )
     if disputed:
         island, _, _ = settled(_island(whole, submaps, DISPUTED))
     graph = island.graph
@@ -149,7 +151,7 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     return Followed(joint, known, refused, cost, dof, disputed)
 
 
-def mostly(refused: int, known: int) -> bool:
+def is_majority(refused: int, known: int) -> bool:
     """Whether so many of the known landmarks are refused that it is not they that are wrong."""
     return refused >= FEWEST and 2 * refused > known
 

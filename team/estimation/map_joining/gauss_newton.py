@@ -176,8 +176,8 @@ class Island:
     def counted_chi2(self) -> Float[np.ndarray, " F"]:
         """χ² of each submap with each landmark's share w χ² counted w times.
 
-        That is how the share of its numbers counts in `dimensions`: what is discounted says
-        nothing of whether the rest agrees.
+        In `dimensions` its numbers count by the same share: down-weighted terms are left out of
+        the agreement test.
         """
         factors, factor = self._discounted(self.landmark_weight**2), self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, factors, factor)
@@ -418,7 +418,7 @@ def settled(island: Island) -> tuple[Island, int, float]:
     return island, count, change
 
 
-def held(island: Island, unknown: int, by: float, iterations: int) -> Island:
+def solved_with_fixed(island: Island, unknown: int, by: float, iterations: int) -> Island:
     """One number of the state moved by so much, everything else solved for given that.
 
     With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose part

@@ -29,9 +29,9 @@ from team.estimation.map_joining.merging import Merge, ages, merge, sighted
 from team.estimation.map_joining.minima import (
     Minimum,
     Search,
-    doubts,
     searched,
     suspicious,
+    warnings,
     widened,
 )
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
@@ -47,9 +47,9 @@ __all__ = [
     "NotCanonicalError",
     "Sighting",
     "Stream",
+    "compacted",
     "converged",
     "folded",
-    "lean",
     "started",
 ]
 
@@ -98,10 +98,10 @@ class Fold:
     home:       island (a key of `islands`) of each stream.
     reasons:    why an island other than the main one is not merged, by its frame.
     joined:     how an island was merged into another one and how sure that is, by its old frame.
-    doubts:     of the full solution, what speaks for another minimum, in words.
+    warnings:   of the full solution, what speaks for another minimum, in words.
     waiting:    sightings whose pose nodes are not both in one island, in canonical order.
-    judged, looked: the submaps of two islands, or of one, when they were last searched for a place
-                or a minimum in vain; with it why the two were not merged.
+    judged, looked: number of submaps of two islands at their last failed merge attempt, with the
+                reason for the failure; of one island at its last failed search for a minimum.
     iterations, change: of the main island's last full solution: how many, the last step [m, rad].
     refused:    submaps that came and are not in the map, in canonical order, and why (`taken`).
     set_aside:  in words, what else was refused: initial poses, inter-robot measurements, and the
@@ -117,7 +117,7 @@ class Fold:
     iterations: int = 0
     change: float = 0.0
     joined: Mapping[Stream, str] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     judged: Mapping[tuple[Stream, Stream], tuple[int, str]] = field(default_factory=dict)
     looked: Mapping[Stream, int] = field(default_factory=dict)
     refused: Mapping[Key, str] = field(default_factory=dict)
@@ -210,7 +210,7 @@ def folded(
     return _with_merges(_looked(grown))
 
 
-def lean(fold: Fold) -> Fold:
+def compacted(fold: Fold) -> Fold:
     """The same fold without what can be computed again from it: a checkpoint to keep.
 
     It shares the submaps with the folds before and after it; its own are the state and the graph's
@@ -225,8 +225,8 @@ def lean(fold: Fold) -> Fold:
 def converged(fold: Fold, settings: JoinSettings) -> Fold:
     """The full solution of every island; `iterations` and `change` tell how it ended.
 
-    Wrong minima are looked for; what is found stands in `doubts`. An island that has no full
-    solution stays as the last tick has left it, and `doubts` says so.
+    Wrong minima are looked for; what is found stands in `warnings`. An island that has no full
+    solution stays as the last tick has left it, and `warnings` says so.
     """
     if fold.main_key is None:
         return fold
@@ -257,7 +257,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         islands={**merged.islands, main_key: last.best.island},
         iterations=last.best.iterations,
         change=last.best.change,
-        doubts=tuple(doubts(last)),
+        warnings=tuple(warnings(last)),
     )
 
 

@@ -21,7 +21,7 @@ from team.estimation.map_joining.alignment import Alignment, Shared
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island, is_solvable, joint_marginal
 from team.estimation.map_joining.island_ties import Tie, aligned_by, headings_that_fit, ties
 from team.estimation.map_joining.minima import Minimum, Search, minimum, searched
-from team.estimation.map_joining.submap_graph import merged, met
+from team.estimation.map_joining.submap_graph import encounter_of, merged
 
 WORTH_TELLING = 1.0
 """A search that gained less than this in χ² found the place that the first guess led to."""
@@ -49,7 +49,7 @@ def ages(count: int) -> Int64[np.ndarray, " count"]:
 
 def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[Sighting, ...]]:
     """The island with the sightings that it has both pose nodes of, and those that still wait."""
-    candidates = [(each, met(island.graph, each)) for each in waiting]
+    candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
     found = [between for _, between in candidates if between is not None]
     if not found:
         return island, tuple(waiting)

@@ -26,7 +26,7 @@ from team.estimation.map_joining.gauss_newton import (
     final_cost,
     settled,
 )
-from team.estimation.map_joining.nonlinearity import bends, ends, walks
+from team.estimation.map_joining.nonlinearity import ends, nonlinearity_warnings, profile
 from team.estimation.map_joining.relaxation import relaxed
 from team.estimation.sparse_cholesky import sparse_kernel
 
@@ -144,7 +144,7 @@ def widened(search: Search) -> Search:
     found = [search.best] if search.second is None else [search.best, search.second]
     for _, _, node in ends(best):
         with suppress(*UNSOLVABLE):  # of the walk itself
-            found += _minima(walked for walked, _ in walks(best, node))
+            found += _minima(walked for walked, _ in profile(best, node))
     found += _minima(_mirrored(best))
     wider = _lowest(found)
     return wider._replace(gained=search.gained + search.best.cost - wider.best.cost)
@@ -189,7 +189,7 @@ def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
 def _lowest(found: Sequence[Minimum]) -> Search:
     """Of minima of one graph, the first of them the one that would be taken without a search."""
     best = _at_rest(min(found, key=lambda each: each.cost))
-    others = [each for each in found if each.change < SETTLED_M and elsewhere(each, best)]
+    others = [each for each in found if each.change < SETTLED_M and is_another_minimum(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
     return Search(best, found[0].cost - best.cost, second)
 
@@ -224,7 +224,7 @@ def _at_rest(best: Minimum) -> Minimum:
     return best
 
 
-def elsewhere(one: Minimum, best: Minimum) -> bool:
+def is_another_minimum(one: Minimum, best: Minimum) -> bool:
     """Whether a minimum is another map, not one that the best one's covariance allows for.
 
     With the difference d of the states and the information A at the best one, A alone would raise
@@ -249,7 +249,7 @@ def _quadratic(island: Island, x: Values) -> float:
     return sparse_kernel.quadratic(values, *entries, island.graph.offset, x)
 
 
-def doubts(search: Search) -> list[str]:
+def warnings(search: Search) -> list[str]:
     """What a map's user must know of its minimum, in words; empty where it is the only one."""
     island, found = search.best.island, []
     dof = degrees_of_freedom(island)
@@ -274,7 +274,7 @@ def doubts(search: Search) -> list[str]:
         if sigma > limit
     ]
     with suppress(*UNSOLVABLE):  # a heading that can not be moved bends nothing
-        found += bends(island)
+        found += nonlinearity_warnings(island)
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)
         points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]

@@ -1,4 +1,4 @@
-"""Where a covariance does not say all: a pose in a curved valley of the cost.
+"""Where a pose covariance understates the uncertainty: a curved valley of the cost.
 
 One heading is moved away from its best value, everything else solved for given that: the profile of
 the cost (Bates & Watts 1988, chapter 6). For a quadratic cost its rise is the χ² by which the
@@ -15,7 +15,13 @@ from scipy.special import chdtri
 from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import information
 from team.estimation.geometry import compose, inverse, logarithm
-from team.estimation.map_joining.gauss_newton import FULL_AGE, Island, aged, held, joint_marginal
+from team.estimation.map_joining.gauss_newton import (
+    FULL_AGE,
+    Island,
+    aged,
+    joint_marginal,
+    solved_with_fixed,
+)
 
 STEPS = (1.0, 2.0, 3.0)
 """How far a heading is moved, in its standard deviations."""
@@ -41,7 +47,7 @@ class Bend(NamedTuple):
         return self.chi2 / max(self.rise, 1.0)
 
 
-def walks(island: Island, node: int) -> Iterator[tuple[Island, float]]:
+def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
     """The likely islands with the heading of a pose moved, and by how much their cost is higher.
 
     None where the heading is known too well for a bend.
@@ -55,7 +61,7 @@ def walks(island: Island, node: int) -> Iterator[tuple[Island, float]]:
         walked = island
         for before, after in zip((0.0, *STEPS), STEPS, strict=False):
             by = sign * (after - before) * sigma
-            walked = held(walked, int(island.graph.offset[node]) + 2, by, ITERATIONS)
+            walked = solved_with_fixed(walked, int(island.graph.offset[node]) + 2, by, ITERATIONS)
             rise = walked.cost - island.cost
             if not rise <= UNLIKELY:  # nor where the cost is no number
                 break
@@ -85,7 +91,7 @@ def bend(island: Island, node: int) -> Bend | None:
     metric = information(A @ covariance @ A.T, "a pose")
     at = int(island.graph.offset[node])
     found = []
-    for walked, rise in walks(island, node):
+    for walked, rise in profile(island, node):
         pose = walked.state[at : at + 3]
         eta = logarithm(compose(inverse(mean), pose))
         distance = float(np.hypot(*(pose - mean)[:2]))
@@ -94,8 +100,11 @@ def bend(island: Island, node: int) -> Bend | None:
     return None if worst is None or worst.ratio < BENT else worst
 
 
-def bends(island: Island) -> list[str]:
-    """In words, the bends of the first and the last pose of every stream without a given start."""
+def nonlinearity_warnings(island: Island) -> list[str]:
+    """Warns where the covariance of a first or last pose understates its uncertainty.
+
+    Asked of every stream without a given initial pose: profile cost against chi-square.
+    """
     said = []
     for stream, where, node in ends(island):
         found = bend(island, node)

@@ -64,7 +64,7 @@ class Joined(NamedTuple):
         return local.sensitivity[[local.biases.index(bias) for bias in self.biases]]
 
 
-class Met(NamedTuple):
+class Encounter(NamedTuple):
     """A sighting in the graph, between the pose nodes of the observer and of the teammate."""
 
     sighting: Sighting
@@ -93,7 +93,7 @@ class Graph:
     offset: Indices
     fixed: Bool[np.ndarray, " _"]
     submaps: tuple[Joined, ...]
-    sightings: tuple[Met, ...]
+    sightings: tuple[Encounter, ...]
     priors: tuple[Prior, ...]
     common: Mapping[Bias, int] = field(default_factory=dict)
 
@@ -127,8 +127,8 @@ class Graph:
         """The sightings in flat arrays, for the kernels; their entries follow the submaps'."""
         return Sightings(
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
-            np.array([met.sighting.measurement for met in self.sightings]).reshape(-1, 2),
-            np.array([met.sighting.information for met in self.sightings]).reshape(-1, 2, 2),
+            np.array([each.sighting.measurement for each in self.sightings]).reshape(-1, 2),
+            np.array([each.sighting.information for each in self.sightings]).reshape(-1, 2, 2),
             int((np.diff(self.factors.member_start) ** 2).sum()),
         )
 
@@ -324,11 +324,11 @@ def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
     return next((node for node in found if node is not None), None)
 
 
-def met(graph: Graph, sighting: Sighting) -> Met | None:
+def encounter_of(graph: Graph, sighting: Sighting) -> Encounter | None:
     """The sighting between its pose nodes; None while one of them is not in the graph."""
     observer = graph.poses.get((sighting.stream, sighting.stamp_ns))
     teammate = pose_node(graph, sighting.teammate, sighting.stamp_ns)
-    return None if observer is None or teammate is None else Met(sighting, observer, teammate)
+    return None if observer is None or teammate is None else Encounter(sighting, observer, teammate)
 
 
 def _continued(starts: Indices, lengths: Sequence[int]) -> Indices:
@@ -367,7 +367,7 @@ def merged(
     landmarks = {id_: int(node_of[node]) for id_, node in other.landmarks.items()}
     poses = {key: int(node_of[node]) for key, node in other.poses.items()}
     sightings = (
-        Met(each, int(node_of[observer]), int(node_of[teammate]))
+        Encounter(each, int(node_of[observer]), int(node_of[teammate]))
         for each, observer, teammate in other.sightings
     )
     biases = {key: int(node_of[node]) for key, node in other.biases.items()}

@@ -61,7 +61,7 @@ def test_the_functions_of_rows_are_those_of_single_poses(a, b):
     other = rows[[1, 0, 0]]
     for many, one in (
         (batch_factors.composed(rows, other), compose),
-        (batch_factors.parted(rows, other), between),
+        (batch_factors.relative_poses(rows, other), between),
     ):
         expected = [one(*each) for each in zip(rows, other, strict=True)]
         np.testing.assert_allclose(many, expected, atol=1e-12)

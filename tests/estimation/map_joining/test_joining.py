@@ -18,9 +18,9 @@ from team.estimation.map_joining.joining import (
     GapError,
     LateStartError,
     NotCanonicalError,
+    compacted,
     converged,
     folded,
-    lean,
     started,
 )
 from team.estimation.map_joining.marginals import (
@@ -158,10 +158,10 @@ def test_a_lean_fold_goes_on_to_the_same_bytes():
     world = team(2)
     before = joined(world.submaps[:8], world.starts)
     landmark_map(before)
-    on, lean_on = (folded(each, world.submaps[8:], EXACTLY) for each in (before, lean(before)))
+    on, lean_on = (folded(each, world.submaps[8:], EXACTLY) for each in (before, compacted(before)))
     assert on.main.state.tobytes() == lean_on.main.state.tobytes()
     assert landmark_map(on).covariance.tobytes() == landmark_map(lean_on).covariance.tobytes()
-    assert "posterior" not in vars(lean(before).main)
+    assert "posterior" not in vars(compacted(before).main)
 
 
 @pytest.mark.parametrize("seed", range(4))

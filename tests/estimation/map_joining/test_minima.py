@@ -13,10 +13,10 @@ from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
 from team.estimation.map_joining.minima import (
     Search,
-    doubts,
     minimum,
     searched,
     suspicious,
+    warnings,
     widened,
 )
 from team.estimation.map_joining.relaxation import relaxed
@@ -76,7 +76,7 @@ def test_a_search_leaves_the_wrong_minimum_that_gauss_newton_stays_in():
         search = searched([lost])
         assert search.best.cost < right + 0.1
         assert search.gained == pytest.approx(alone - search.best.cost)
-        assert doubts(search) == []
+        assert warnings(search) == []
     assert wrong >= 2, "the mutant without a search is often lost"
 
 
@@ -95,8 +95,8 @@ def test_a_cost_that_the_degrees_of_freedom_do_not_allow_is_said():
     clean, told = (
         converged(folded(fold, submaps, OPTIONS), OPTIONS) for submaps in (world.submaps, spoilt)
     )
-    assert clean.doubts == ()
-    (text,) = told.doubts
+    assert clean.warnings == ()
+    (text,) = told.warnings
     assert "the map does not fit its submaps: chi²" in text
     assert suspicious(told.main, told.main.cost)
 
@@ -119,7 +119,7 @@ def test_a_map_that_is_not_settled_is_said(monkeypatch):
     monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
     island = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
     hasty = replace(island, settings=replace(OPTIONS, max_iterations=1))
-    assert any("is not settled: after 1 iterations" in text for text in doubts(searched([hasty])))
+    assert any("is not settled: after 1 iterations" in text for text in warnings(searched([hasty])))
 
 
 def test_a_solution_that_is_stuck_is_told_from_one_that_has_converged(monkeypatch):
@@ -129,7 +129,7 @@ def test_a_solution_that_is_stuck_is_told_from_one_that_has_converged(monkeypatc
     stuck = minimum(lost)
     assert stuck.iterations < OPTIONS.max_iterations
     assert stuck.change > 1.0, "the mutant says 0"
-    assert any("is not settled" in text for text in doubts(Search(stuck, 0.0, None)))
+    assert any("is not settled" in text for text in warnings(Search(stuck, 0.0, None)))
 
 
 def test_what_has_not_settled_is_solved_on(monkeypatch):
@@ -149,7 +149,7 @@ def test_a_robot_whose_heading_no_landmark_gives_is_said(landmark_sigma, said):
     wide = np.diag([100.0, 100.0, 9.0])
     starts = [world.starts[0], replace(world.starts[1], covariance=wide)]
     island = joined_with(world.submaps, starts, (), OPTIONS).main
-    found = [text for text in doubts(searched([island])) if "is placed weakly" in text]
+    found = [text for text in warnings(searched([island])) if "is placed weakly" in text]
     assert [text.split(" is ")[0] for text in found] == ["r1 (incarnation 0)"] * said
 
 
@@ -157,14 +157,14 @@ def test_a_second_place_that_fits_as_well_is_found_and_said():
     search = searched(mirrored(30.0, OPTIONS))
     assert search.second is not None
     assert search.ambiguous
-    (text,) = doubts(search)
+    (text,) = warnings(search)
     assert "another map fits about as well" in text
 
 
 def test_a_place_that_the_measurements_exclude_is_no_second_place():
     search = searched(mirrored(0.02, OPTIONS))
     assert not search.ambiguous
-    assert doubts(search) == []
+    assert warnings(search) == []
 
 
 def hinged(apart, turn=0.1, sigma=0.8):
@@ -204,12 +204,12 @@ def test_a_chain_that_may_be_folded_to_the_other_side_is_said(apart):
     cosine = (apart**2 - 5.0**2 - 10.0**2) / (2.0 * 5.0 * 10.0)
     np.testing.assert_allclose(np.cos(turns), cosine, atol=0.1)
     assert turns[0] * turns[1] < 0.0
-    (text,) = converged(fold, OPTIONS).doubts
+    (text,) = converged(fold, OPTIONS).warnings
     assert "another map fits about as well" in text
 
 
 def test_a_chain_that_is_known_to_turn_left_is_not_said():
-    assert converged(hinged(13.0, turn=1.1, sigma=0.2), OPTIONS).doubts == ()
+    assert converged(hinged(13.0, turn=1.1, sigma=0.2), OPTIONS).warnings == ()
 
 
 def test_the_lower_one_of_two_sides_is_the_map():

@@ -5,10 +5,10 @@ import pytest
 
 from central.desk.evaluation.errors import Path, pose_errors
 from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.map_joining import nonlinearity as bends
-from team.estimation.map_joining.gauss_newton import JoinSettings, held, joint_marginal
+from team.estimation.map_joining import nonlinearity
+from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, solved_with_fixed
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
-from team.estimation.map_joining.minima import doubts, minimum, searched
+from team.estimation.map_joining.minima import minimum, searched, warnings
 from team.estimation.map_joining.nonlinearity import bend
 from team.estimation.submap import LocalMap
 from tests.estimation.submap_world import drawn, local_truth
@@ -50,7 +50,7 @@ def test_a_number_is_held_where_the_rest_has_the_least_cost():
     fold = latecomer(blind=10)
     island = minimum(fold.main).island
     at = int(island.graph.offset[start_node(fold)]) + 2
-    found = held(island, at, 0.3, 12)
+    found = solved_with_fixed(island, at, 0.3, 12)
     assert found.state[at] - island.state[at] == pytest.approx(0.3)
     gradient = found.normal_equations[1]
     assert abs(gradient[at]) > 0.1
@@ -63,9 +63,9 @@ def test_a_number_is_held_where_the_rest_has_the_least_cost():
 def test_the_start_of_a_robot_that_drove_long_without_a_landmark_is_said(seed):
     fold = latecomer(blind=14, seed=seed)
     found = bend(fold.main, start_node(fold))
-    assert found.ratio > bends.BENT
-    assert found.rise < bends.UNLIKELY
-    assert any("r1 (incarnation 0) may have started farther off" in text for text in fold.doubts)
+    assert found.ratio > nonlinearity.BENT
+    assert found.rise < nonlinearity.UNLIKELY
+    assert any("r1 (incarnation 0) may have started farther off" in text for text in fold.warnings)
 
 
 @pytest.mark.parametrize(("blind", "least", "most"), [(14, 4, 24), (1, 0, 0)])
@@ -85,8 +85,8 @@ def test_a_bent_ellipse_is_exceeded_and_another_one_is_not(blind, least, most):
 
 def test_a_robot_that_sees_landmarks_soon_is_not_said(monkeypatch):
     fold = latecomer(blind=1)
-    assert fold.doubts == ()
-    monkeypatch.setattr(bends, "STRAIGHT_RAD", 0.0)
+    assert fold.warnings == ()
+    monkeypatch.setattr(nonlinearity, "STRAIGHT_RAD", 0.0)
     assert bend(fold.main, start_node(fold)) is None, "nor is it bent"
 
 
@@ -99,4 +99,4 @@ def test_a_straight_valley_is_no_bend_however_wide():
     local = LocalMap(np.zeros(0, np.uint32), np.zeros(3), 1e-4 * np.eye(3))
     fold = folded(fold, [Contribution("r1", 0, 0, 2000, local)], OPTIONS)
     assert bend(fold.main, start_node(fold)) is None
-    assert not [text for text in doubts(searched([fold.main])) if "farther off" in text]
+    assert not [text for text in warnings(searched([fold.main])) if "farther off" in text]

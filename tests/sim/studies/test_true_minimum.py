@@ -106,7 +106,9 @@ def test_the_judge_owes_nothing_to_what_it_judges(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(f"team.estimation.map_joining.{place}", lambda island: (island, 1, 0.0))
     for place in ("gauss_newton.final_cost", "minima.final_cost"):
         monkeypatch.setattr(f"team.estimation.map_joining.{place}", lambda island: 0.0)
-    monkeypatch.setattr("team.estimation.map_joining.minima.elsewhere", lambda one, best: False)
+    monkeypatch.setattr(
+        "team.estimation.map_joining.minima.is_another_minimum", lambda one, best: False
+    )
     assert judged(island, landmarks, paths) == sound
     assert judged(wrong, landmarks, paths).wrong
 
