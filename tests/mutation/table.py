@@ -21,6 +21,11 @@ JOIN = (
     "estimation/map_joining/test_minima.py",
 )
 WINDOW = ("estimation/hybrid_slam/test_window.py", "estimation/hybrid_slam/test_pose_nodes.py")
+PIPELINE = (
+    "robot/test_hybrid.py",
+    "estimation/hybrid_slam/test_pose_grid.py",
+    "estimation/hybrid_slam/test_outliers.py",
+)
 
 MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "team/estimation/hybrid_slam/window.py": (
@@ -32,6 +37,8 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
         8,
         (*WINDOW, "estimation/hybrid_slam/test_correlated_measurements.py"),
     ),
+    "team/estimation/hybrid_slam/pipeline.py": (10, PIPELINE),
+    "team/estimation/hybrid_slam/open_window.py": (8, PIPELINE),
     "team/estimation/hybrid_slam/fastslam.py": (
         8,
         ("estimation/hybrid_slam/test_fastslam.py", *WINDOW),
@@ -128,6 +135,7 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "central/tick_fold.py": (12, CENTRE),
     "central/submap_set.py": (10, CENTRE),
     "central/join_rule.py": (14, CENTRE),
+    "central/submap_rule.py": (10, CENTRE),
     "central/monitor.py": (12, ("central/test_monitor.py", "central/test_withdrawal.py")),
     "central/withdrawal.py": (8, ("central/test_withdrawal.py", "central/test_monitor.py")),
     "central/roll.py": (8, ("central/test_node.py", "central/test_withdrawal.py")),
