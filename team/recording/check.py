@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from team.recording.counters import Counters, Told
+from team.recording.counters import Counters, TallyCount
 from team.recording.cut import CUT
 from team.recording.declared import declared, misdeclared
 from team.recording.inventory import Inventory
@@ -87,7 +87,7 @@ class _Evidence:
     part: bool
     inventory: Inventory = field(default_factory=Inventory)
     counters: dict[str, Counters] = field(default_factory=lambda: defaultdict(Counters))
-    tallies: dict[str, list[Told]] = field(default_factory=lambda: defaultdict(list))
+    tallies: dict[str, list[TallyCount]] = field(default_factory=lambda: defaultdict(list))
     last_words: LastWords = field(default_factory=LastWords)
     last_word: tuple[str, ...] = ()
     heard: set[ch.Channel] = field(default_factory=set)
@@ -111,7 +111,7 @@ class _Evidence:
         elif isinstance(message, m.Tally):
             self.last_words.take_tally(message, sample.wall_ns)
             for key, count in zip(message.keys, message.counts, strict=True):
-                self.tallies[key].append(Told(message.since_ns, sample.wall_ns, count))
+                self.tallies[key].append(TallyCount(message.since_ns, sample.wall_ns, count))
 
     def findings(self) -> Iterator[Finding]:
         """By key; of a part of a log only what is missing between two messages of a publisher."""

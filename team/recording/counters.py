@@ -16,7 +16,7 @@ from team.recording.inventory import intervals
 from team.wire.bus import NO_COUNTER, Sample
 
 
-class Told(NamedTuple):
+class TallyCount(NamedTuple):
     """A publisher's last word on a key: how many it published, between which wall clocks [ns]."""
 
     since_ns: int
@@ -40,7 +40,7 @@ class Counters:
         self._walls.append(min(sample.wall_ns, 2**63 - 1))
 
     def findings(
-        self, *, part: bool, numbered: bool = False, tallies: Sequence[Told] = ()
+        self, *, part: bool, numbered: bool = False, tallies: Sequence[TallyCount] = ()
     ) -> list[str]:
         """What is wrong, one line each; nothing of a sound key.
 

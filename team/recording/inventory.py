@@ -80,10 +80,10 @@ class Numbered:
 class Inventory:
     """The numbered streams of a log, sample by sample.
 
-    parted: the log has earlier parts, whose messages may come again.
+    has_earlier_parts: the log has earlier parts, whose messages may come again.
     """
 
-    parted: bool = False
+    has_earlier_parts: bool = False
     streams: dict[Stream, Numbered] = field(default_factory=dict)
     _earlier: set[int] = field(default_factory=set, init=False)
     _contents: set[int] = field(default_factory=set, init=False)
@@ -95,7 +95,7 @@ class Inventory:
 
     def news(self, sample: Sample) -> bool:
         """Note a sample; False where it is in the log already, or in an earlier part of it."""
-        if self.parted:
+        if self.has_earlier_parts:
             name = _name(sample)
             if name in self._earlier and sample.counter != NO_COUNTER:
                 return False

@@ -81,7 +81,7 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
 
 def inventory_of(parts: Sequence[Path]) -> Inventory:
     """What these parts have; what of them is damaged is not there."""
-    inventory = Inventory(parted=bool(parts))
+    inventory = Inventory(has_earlier_parts=bool(parts))
     for part in parts:
         log = _opened(part)
         for chunk in () if log is None else salvaged(log):

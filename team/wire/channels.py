@@ -89,7 +89,7 @@ SIGHTING_FACTOR = Channel(name="sighting_factor", template="robot/{robot}/sighti
                           meaning="a teammate seen from a pose node; what the rule `join` consumes")  # fmt: skip
 RENDEZVOUS = Channel(name="rendezvous", template="robot/{robot}/rendezvous", message=m.Rendezvous,
                      rate="0-1 per window and meeting", delivery="all", recorded=True, recomputable=False,
-                     meaning="held submaps are sent, since a teammate is seen; who is seen sends too")  # fmt: skip
+                     meaning="buffered submaps are released when a teammate is encountered; both robots transmit")  # fmt: skip
 OWN_MAP = Channel(name="own_map", template="robot/{robot}/own/map", message=m.MapEstimate, rate="one per window or exchange",
                   delivery="latest", recorded=True, recomputable=True,
                   meaning="running landmark means and covariances; consumed by rules with feedback")  # fmt: skip
@@ -133,7 +133,7 @@ CENTRAL_PROGRESS = Channel(name="central_progress", template="central/progress/{
 WORLD_CONFIG = Channel(name="world_config", template="world/config", message=m.Configuration, rate="once", delivery="latest", recorded=True, recomputable=False,
                        meaning="the scenario")  # fmt: skip
 KNOWN_MAP = Channel(name="known_map", template="world/known_map", message=m.KnownMap, rate="once", delivery="latest", recorded=True, recomputable=False,
-                    meaning="the map that robots are told that only localise themselves")  # fmt: skip
+                    meaning="prior map for localisation-only robots")  # fmt: skip
 END = Channel(name="end", template="world/end", message=m.End, rate="once", delivery="latest", recorded=True, recomputable=False,
               meaning="everything is published; the last counters")  # fmt: skip
 RECORDER_PROGRESS = Channel(name="recorder_progress", template="recorder/progress/{robot}", message=m.Progress,

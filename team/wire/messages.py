@@ -144,7 +144,7 @@ class TruthLandmarks(
 
 
 class KnownMap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="known_map/1"):
-    """A map that robots are told (`localisation`): L ids, L × 2 floats in the team's frame."""
+    """Prior map for localisation-only robots: L ids, L × 2 floats in the team's frame."""
 
     ids: Ids
     positions: Floats
@@ -489,9 +489,10 @@ class Progress(Message, frozen=True, kw_only=True, array_like=True, gc=False, ta
 
 
 class Rendezvous(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="rendezvous/1"):
-    """A robot that holds its submaps back sends them: submaps of them, the oldest since waited_s.
+    """Announces that `submaps` buffered submaps are released; the oldest waited `waited_s` seconds.
 
-    teammates: whom it sees, so that they send too; empty for one that was seen, or is home.
+    teammates: the robots that it sees, which release theirs on this message; empty where the robot
+    itself was seen, or its stream has ended.
     """
 
     robot: Name

@@ -463,19 +463,21 @@ def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
     assert figures["nis_dof"] == closed + sum(window.dof for window in rest)
 
 
-def outliers(readings, share):
+def outliers(measurements, share):
     """Some of the ranges and bearings have nothing to do with what is there."""
     rng, spoilt = np.random.default_rng(7), []
-    for reading in readings:
-        if isinstance(reading, m.Observations):
-            ranges, bearings = (floats(x, "z").copy() for x in (reading.ranges, reading.bearings))
+    for measurement in measurements:
+        if isinstance(measurement, m.Observations):
+            ranges, bearings = (
+                floats(x, "z").copy() for x in (measurement.ranges, measurement.bearings)
+            )
             bad = rng.random(len(ranges)) < share
             ranges[bad] = rng.uniform(1.0, 10.0, bad.sum())
             bearings[bad] = rng.uniform(-np.pi, np.pi, bad.sum())
-            reading = msgspec.structs.replace(
-                reading, ranges=from_floats(ranges), bearings=from_floats(bearings)
+            measurement = msgspec.structs.replace(
+                measurement, ranges=from_floats(ranges), bearings=from_floats(bearings)
             )
-        spoilt.append(reading)
+        spoilt.append(measurement)
     return spoilt
 
 
