@@ -16,7 +16,7 @@ FASTEST_TURN_RAD_S = 3.0
 """Between two poses of a path; more than both is a fault of resampled headings beside ±π."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Reference:
     """One robot's odometry and landmark measurements, and the poses and landmarks of reference.
 

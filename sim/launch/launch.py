@@ -39,7 +39,7 @@ class Outcome:
     given_up: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is to be launched."""
 

@@ -6,7 +6,7 @@ Span = tuple[float, float]
 """Begin and end in seconds since the log's first measurement."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Changes:
     """What is to be different; the measurements are the log's whatever is asked.
 

@@ -63,7 +63,7 @@ class PoseErrors:
         return coverage(self.nees, np.full(len(self.nees), 3.0), BAND)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MapErrors:
     """A map against the true positions of the same landmarks.
 

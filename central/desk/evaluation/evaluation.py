@@ -43,7 +43,7 @@ UPLINK = {
 """The channels of each name in `PAIRS`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MapResult:
     """The final map: L landmarks by id, their joint covariance (blocks only unless `joint`).
 
@@ -72,7 +72,7 @@ class MapResult:
     lost: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RobotResult:
     """One robot: its stream, what became of it, and its poses against the truth.
 
@@ -105,7 +105,7 @@ class RobotResult:
         return None if self.uplink_bytes is None or not steps else self.uplink_bytes / steps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """A run: its scenario (None: the log does not say), its map, its robots and its traffic.
 

@@ -73,7 +73,7 @@ class Traffic:
     sizes: Int64[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class History:
     """What happened in a run, by team time.
 

@@ -37,7 +37,7 @@ class Scan(NamedTuple):
     bearings: Float[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Chain:
     """One incarnation of a robot's stream: N + 1 poses, the first at the start.
 

@@ -330,9 +330,14 @@ def logged_often(world: WorldStreams, pieces: int) -> WorldStreams:
             ends, durations, np.repeat(each.forward, pieces), np.repeat(each.yaw_rate, pieces)
         )
         return robot_stream(
-            stream.robot, int(ends[0] - step[0]), stream.start, often, stream.landmark_detections,
-            stream.teammate_detections, stream.teammates,
-        )  # fmt: skip
+            robot=stream.robot,
+            start_ns=int(ends[0] - step[0]),
+            start=stream.start,
+            intervals=often,
+            observations=stream.landmark_detections,
+            sightings=stream.teammate_detections,
+            teammates=stream.teammates,
+        )
 
     return replace(world, streams=tuple(of(each) for each in world.streams))
 

@@ -30,13 +30,13 @@ def chain_of_one(motion: MotionModel) -> Chain:
     increment = increment_of(motion, 1.0, 1.0, 0.4)
     nothing = Scan(np.empty(0, np.uint32), np.empty(0), np.empty(0))
     return Chain(
-        RobotConfig("r1", motion),
-        1,
-        np.zeros(3),
-        None,
-        np.array([0, 10**9]),
-        (increment,),
-        (nothing,),
+        config=RobotConfig("r1", motion),
+        incarnation=1,
+        start=np.zeros(3),
+        start_covariance=None,
+        stamps_ns=np.array([0, 10**9]),
+        increments=(increment,),
+        scans=(nothing,),
     )
 
 

@@ -47,7 +47,13 @@ def standing(sensor: Sensor, robot: str = "r1", start: Pose | None = None) -> Ch
     ]
     stamps = np.arange(4) * 10**9
     return Chain(
-        config, 1, np.zeros(3) if start is None else start, None, stamps, (step,) * 3, tuple(scans)
+        config=config,
+        incarnation=1,
+        start=np.zeros(3) if start is None else start,
+        start_covariance=None,
+        stamps_ns=stamps,
+        increments=(step,) * 3,
+        scans=tuple(scans),
     )
 
 
