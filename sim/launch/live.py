@@ -75,12 +75,12 @@ class _Lines:
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
-        honesty = _honesty(watch)
+        consistency = _consistency(watch)
         self._print(
             watch,
             f"{_done(watch):4.0%}  team time {world.get('team_time_s', 0.0):.0f} s, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
-            f"{'; ' if honesty else ''}{honesty}",
+            f"{'; ' if consistency else ''}{consistency}",
         )
 
     def end(self) -> None:
@@ -208,11 +208,11 @@ def _map_lines(watch: Watch) -> list[str]:
         f"team map by {fused.rule}, {lag_s:.0f} s behind: {len(fused.ids) // 4} landmarks from "
         f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} maps sent"
     ]
-    honesty = _honesty(watch)
-    return [*lines, honesty] if honesty else lines
+    consistency = _consistency(watch)
+    return [*lines, consistency] if consistency else lines
 
 
-def _honesty(watch: Watch) -> str:
+def _consistency(watch: Watch) -> str:
     """The consistency monitor; against the truth NEES and coverage of the map's landmarks."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures

@@ -1,4 +1,4 @@
-"""How honest a team is while it runs: its poses and its map against the truth, as they come.
+"""How consistent a team is while it runs: its poses and its map against the truth, as they come.
 
 An evaluation like `central.desk.evaluation` of what has arrived so far; without a truth it stays
 empty.

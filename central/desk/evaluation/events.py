@@ -15,7 +15,12 @@ MOST = 2000
 FIRST = 1
 """The incarnation with which every stream begins."""
 _NUMBER = re.compile(r"\d+\.\d+")
-_AWAITED = ("waiting for ", "has not appeared yet", "no measurements of this team yet")
+_AWAITED = (
+    "waiting for ",
+    "has not appeared yet",
+    "no measurements of this team yet",
+    "no readings of this team yet",
+)
 """Nobody is there at once: that is no event."""
 
 

@@ -1,4 +1,4 @@
-"""A run over its team time: honesty, traffic, latency and events, from one pass over its log.
+"""A run over its team time: consistency, traffic, latency and events, from one pass over its log.
 
 `evaluation` says what a run was worth in the end; this is how it came to that. Nothing is kept of a
 message but the numbers that are shown: some tens of bytes a message.

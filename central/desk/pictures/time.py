@@ -1,4 +1,4 @@
-"""Pictures of a run over its team time: honesty, traffic, latency, events."""
+"""Pictures of a run over its team time: consistency, traffic, latency, events."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath

@@ -105,7 +105,7 @@ def _page(run: Run, pictures: Mapping[str, Path]) -> str:
     sections = [
         ("Map", [_image(pictures, "map", wide=False), *_own_maps(run)]),
         ("Robots", _robots(run, pictures)),
-        ("Honesty", _honesty(run, pictures)),
+        ("Consistency", _consistency(run, pictures)),
         ("Paths", _paths(run)),
         ("Measurements", _measurements(run)),
         ("Events", _events(run, pictures)),
@@ -147,7 +147,7 @@ def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     ]
 
 
-def _honesty(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     """Whether the covariances are true: with truth NEES and coverage, without it NIS and cost."""
     innovations, cost = run.history.innovations, run.evaluation.cost_by_robot
     scale = run.evaluation.scale_by_robot

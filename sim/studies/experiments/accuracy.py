@@ -1,4 +1,4 @@
-"""How accurate and how honest the team is, in every kind of world: all parts of it, one command."""
+"""How accurate and how consistent the team is, in every kind of world: all parts of it, one command."""
 
 from sim.studies.experiments import (
     accuracy_few,
@@ -35,5 +35,5 @@ def outcome(options: Options, results: Results) -> Outcome:
     """All parts' figures, tables and goals."""
     parts = [part.outcome(options, results) for part in PARTS]
     few = len(options.seeds) < ENOUGH_SEEDS
-    title = "accuracy and honesty of the fused map"
+    title = "accuracy and consistency of the fused map"
     return combined(title, [Outcome(title, {}, remarks=(_CHANCE,) if few else ()), *parts])

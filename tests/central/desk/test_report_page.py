@@ -53,7 +53,7 @@ def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Pat
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
     targets = set(re.findall(r'href="#(\w+)"', page))
     assert targets == set(re.findall(r'<h2 id="(\w+)"', page))
-    assert {"honesty", "latency", "events", "traffic"} <= targets
+    assert {"consistency", "latency", "events", "traffic"} <= targets
     assert '<meta name="viewport" content="width=device-width' in page
     figures = json.loads(paths[1].read_text("utf-8"))
     assert figures["landmarks"] == 8
@@ -86,7 +86,7 @@ def test_without_truth_there_are_the_monitor_and_nis(log: list[Sample], tmp_path
     blind = [s for s in log if not s.key.startswith("truth")]
     run = run_of(blind)
     page = page_of(run, tmp_path)
-    assert 'id="honesty"' in page
+    assert 'id="consistency"' in page
     assert 'id="paths"' not in page
     assert (tmp_path / "consistency.png").exists()
     assert not (tmp_path / "errors.png").exists()

@@ -1,4 +1,4 @@
-"""What a launch says of its team's honesty while it runs, against figures worked out apart."""
+"""What a launch says of its team's consistency while it runs, against figures worked out apart."""
 
 import numpy as np
 import pytest
