@@ -1,4 +1,4 @@
-"""How accurate and how consistent the team is, in every kind of world: all parts of it, one command."""
+"""How accurate and how consistent the team is in every kind of world: all parts, one command."""
 
 from sim.studies.experiments import (
     accuracy_few,
