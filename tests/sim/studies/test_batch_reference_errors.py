@@ -115,7 +115,7 @@ def test_the_derivatives_are_those_of_the_residuals() -> None:
     poses = [np.array([[0.1 * i, 0.2, 0.3 * i] for i in range(4)])]
     graph = profile_graph(gtsam, [chain], poses, LANDMARKS, None, BiasSigmas())
     values = add_errors(values_of(gtsam, poses, LANDMARKS), [chain])
-    values.update(bias_key(0), np.array([0.02, 0.03]))
+    values.update(bias_key(0), np.array([0.02, 0.01, 0.03]))
     for look in looks_of([chain]):
         values.update(look.key, np.array([0.7, -0.4]))
     linear = graph.linearize(values)
