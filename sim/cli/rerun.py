@@ -216,7 +216,8 @@ def _verify(path: Path, json_file: Path | None) -> None:
     if not log.complete:
         typer.echo(f"{path} is cut: its last messages may lack their inputs", err=True)
     if result.first is not None:
-        fail(f"the first difference: {result.first}", FAILED)
+        what = "the log lacks what is needed" if result.first.lacks else "the first difference"
+        fail(f"{what}: {result.first}", FAILED)
 
 
 def _print_verification(result: "Verification", elapsed_s: float) -> None:
@@ -224,10 +225,10 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     from rich.table import Table
 
     table = Table()
-    for heading in ("channel", "messages", "equal", "within tolerance", "different"):
+    for heading in ("channel", "messages", "equal", "within tolerance", "different", "inputs lost"):
         table.add_column(heading, justify="left" if heading == "channel" else "right")
     for row in result.channels:
-        cells = (row.messages, row.equal, row.close, row.different)
+        cells = (row.messages, row.equal, row.close, row.different, row.lacking)
         table.add_row(row.channel, *(f"{n:,}" for n in cells))
     console = Console()
     console.print(table)
@@ -243,9 +244,13 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     if result.unsound:
         console.print(f"{result.unsound} samples are no sound messages: left out", highlight=False)
     different = sum(row.different for row in result.channels)
-    verdict = "all equal" if not different else f"{different} different"
+    lacking = sum(row.lacking for row in result.channels)
+    whole = "all" if not lacking else "all others"
+    verdict = f"{whole} equal" if not different else f"{different} different"
     if not different and any(row.close for row in result.channels):
-        verdict = "all equal within the tolerance"
+        verdict = f"{whole} equal within the tolerance"
+    if lacking:
+        verdict += f", {lacking} can not be judged, since the log lacks what they were made of"
     console.print(
         f"{result.messages:,} messages from {result.measurements:,} measurements: {verdict}; "
         f"{elapsed_s:.1f} s for {result.span_s:.0f} s of team time, "

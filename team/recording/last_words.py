@@ -14,9 +14,6 @@ from team.wire import channels as ch
 from team.wire.bus import NO_COUNTER, Sample
 from team.wire.messages import Tally
 
-HEARTBEAT_S = 0.25
-"""What a process published longer before its end than this, its heartbeats have told of."""
-
 
 class _Spoke(NamedTuple):
     """A status: the publisher's wall clock [ns], its counter, the team time [ns]."""
@@ -57,8 +54,7 @@ class LastWords:
                 yield (
                     ch.TALLY.key(node),
                     f"no last word of the process that spoke until {last.stamp_ns * 1e-9:.1f} s: "
-                    f"it was killed or cut off, and what it said in its last {HEARTBEAT_S:g} s may "
-                    "be missing without a trace",
+                    "it was killed or cut off, and what it said after that may be missing",
                 )
 
 

@@ -137,8 +137,8 @@ KNOWN_MAP = Channel(name="known_map", template="world/known_map", message=m.Know
 END = Channel(name="end", template="world/end", message=m.End, rate="once", delivery="latest", recorded=True, recomputable=False,
               meaning="everything is published; the last counters")  # fmt: skip
 RECORDER_PROGRESS = Channel(name="recorder_progress", template="recorder/progress/{robot}", message=m.Progress,
-                            rate="every 256 measurements", delivery="latest", recorded=False, recomputable=False,
-                            meaning="credit for the world")  # fmt: skip
+                            rate="every 256 measurements, every submap", delivery="latest", recorded=False, recomputable=False,
+                            meaning="credit for the world, and that a robot may leave")  # fmt: skip
 STATUS = Channel(name="status", template="{node}/status", message=m.Status, rate="1 Hz", delivery="latest", recorded=True, recomputable=False,
                  meaning="what a node is doing, for people")  # fmt: skip
 FAULT = Channel(name="fault", template="{node}/fault", message=m.Fault, rate="when a handling raises", delivery="all", recorded=True, recomputable=False,

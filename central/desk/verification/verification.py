@@ -36,7 +36,10 @@ CHECKED = (
 
 @dataclass(frozen=True)
 class Difference:
-    """A recorded message that is not what its inputs give; `counter` is its publisher's."""
+    """A recorded message that is not what its inputs give; `counter` is its publisher's.
+
+    lacks: an input is not in the log, so that nothing can be said of the message.
+    """
 
     key: str
     stamp_ns: int
@@ -45,6 +48,7 @@ class Difference:
     field: str
     recorded: str
     recomputed: str
+    lacks: bool = False
 
     def __str__(self) -> str:
         return (
@@ -57,7 +61,8 @@ class Difference:
 class ChannelResult:
     """One channel: messages in the log, equal to the last bit, equal within the tolerance only.
 
-    first: the first that differs by more. Whatever is in neither count differs.
+    first: the first that differs by more, or that can not be judged where none does. lacking: how
+    many can not be judged, since an input is not in the log. Whatever is in no count differs.
     """
 
     channel: str
@@ -65,11 +70,12 @@ class ChannelResult:
     equal: int
     close: int
     first: Difference | None
+    lacking: int = 0
 
     @property
     def different(self) -> int:
         """Messages that are not what their inputs give."""
-        return self.messages - self.equal - self.close
+        return self.messages - self.equal - self.close - self.lacking
 
 
 @dataclass(frozen=True)
@@ -88,8 +94,9 @@ class Verification:
 
     @property
     def first(self) -> Difference | None:
-        """The first difference, causes before what follows from them."""
-        return next((c.first for c in self.channels if c.first is not None), None)
+        """The first difference, causes before what follows; without any, what lacks an input."""
+        found = [c.first for c in self.channels if c.first is not None]
+        return min(found, key=lambda each: each.lacks, default=None)
 
     @property
     def messages(self) -> int:
@@ -136,15 +143,18 @@ def _compared(
             close += 1
         else:
             differences.append(difference)
-    first = min(differences, key=lambda d: (d.stamp_ns, d.key), default=None)
-    return ChannelResult(name, len(said), equal, close, first)
+    first = min(differences, key=lambda d: (d.lacks, d.stamp_ns, d.key), default=None)
+    lacking = sum(d.lacks for d in differences)
+    return ChannelResult(name, len(said), equal, close, first, lacking)
 
 
 def _difference(
     said: Said, again: m.Message | None, log: Recorded, *, exact: bool
 ) -> Difference | None:
+    lacks = None if again is not None else _lacking(said.message, log)
     if again is None:
-        field, there, here = "the message", "there", _lacking(said.message, log)
+        none = "none" if lacks is None else f"{lacks}: none"
+        field, there, here = "the message", "there", none
     else:
         found = first_difference(said.message, again, exact=exact)
         if found is None:
@@ -154,8 +164,10 @@ def _difference(
         else:
             field, there, here = found.field, found.recorded, found.recomputed
     sample = said.sample
+    names = _names(said.message)
+    unknown = lacks is not None
     return Difference(
-        sample.key, sample.stamp_ns, sample.counter, _names(said.message), field, there, here
+        sample.key, sample.stamp_ns, sample.counter, names, field, there, here, unknown
     )
 
 
@@ -170,23 +182,31 @@ def _names(message: m.Message) -> str:
     return f"incarnation {incarnation}{named}"
 
 
-def _lacking(message: m.Message, log: Recorded) -> str:
-    """Why nothing came out for a message: an input that is not in the log, if that is it."""
+def _lacking(message: m.Message, log: Recorded) -> str | None:
+    """The input that is not in the log, in words; None where nothing that a message names lacks."""
     match message:
         case m.Submap():
             measurements = log.measurements.get((message.robot, message.incarnation), {})
             wanted = range(message.first_measurement, message.last_measurement + 1)
-            gone = next((str(n) for n in wanted if n not in measurements), None)
-            return (
-                "no such window" if gone is None else f"measurement {gone} is not in the log: none"
-            )
+            gone = next((n for n in wanted if n not in measurements), None)
+            return None if gone is None else f"measurement {gone} is not in the log"
         case m.PoseEstimate() if any(message.map_digest):
             priors = {p.digest for p in log.of(ch.PRIOR) if isinstance(p, m.Prior)}
-            known = message.map_digest in priors
-            return "none" if known else f"no prior {message.map_digest.hex()} in the log: none"
+            digest = message.map_digest
+            return None if digest in priors else f"no prior {digest.hex()} in the log"
         case m.Prior() | m.Trajectory():
-            return f"no map of the set {message.digest.hex()} gives one: none"
+            maps = (*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP))
+            digests = {each.digest for each in maps if isinstance(each, m.FusedMap)}
+            digest = message.digest
+            return None if digest in digests else f"no map {digest.hex()} in the log"
         case m.FusedMap():
-            return "not every submap or map that it names is in the log: none"
+            found = log.submaps()
+            for each in message.members:
+                there = found.get((each.robot, each.incarnation), {})
+                gone = next((k for k in range(each.sequence + 1) if k not in there), None)
+                if gone is not None:
+                    of = f"{each.robot}, incarnation {each.incarnation}"
+                    return f"submap {gone} of {of}, is not in the log"
+            return None
         case _:
-            return "none"
+            return None

@@ -158,6 +158,23 @@ def test_a_missing_measurement_is_named_and_the_windows_behind_it_come_out(
     assert counts(result)["submap"] == (12, 11)
     assert result.first is not None
     assert f"measurement {lost.number} is not in the log" in result.first.recomputed
+    assert result.first.lacks
+    assert [(c.channel, c.lacking) for c in result.channels if c.lacking] == [("submap", 1)]
+
+
+def test_what_was_made_of_a_map_that_is_lost_can_not_be_judged_and_all_else_is_equal(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    """A log that was filled late: the centre and the recorder were killed one after the other."""
+    (lost, *_) = messages(samples, ch.PRIOR, "r2")
+    poses = [x for x in messages(samples, ch.TEAM_POSE, "r2") if x.map_digest == lost.digest]
+    assert poses
+    cut = changed(samples, ch.PRIOR, lambda x: None if x == lost else x)
+    result = verify(written(tmp_path / "log.mcap", cut))
+    assert {c.channel: c.lacking for c in result.channels if c.lacking} == {"team_pose": len(poses)}
+    assert [c.channel for c in result.channels if c.different] == []
+    assert result.first is not None
+    assert f"no prior {lost.digest.hex()} in the log" in str(result.first)
 
 
 def test_on_another_platform_numbers_are_compared_within_a_tolerance(
