@@ -185,15 +185,12 @@ def _names(message: m.Message) -> str:
 def _lacking(message: m.Message, log: Recorded) -> str | None:
     """The input that is not in the log, in words; None where nothing that a message names lacks."""
     match message:
-        case m.Submap():
-            measurements = log.measurements.get((message.robot, message.incarnation), {})
-            wanted = range(message.first_measurement, message.last_measurement + 1)
-            gone = next((n for n in wanted if n not in measurements), None)
-            return None if gone is None else f"measurement {gone} is not in the log"
         case m.PoseEstimate() if any(message.map_digest):
-            priors = {p.digest for p in log.of(ch.PRIOR) if isinstance(p, m.Prior)}
+            own = (p for p in log.of(ch.PRIOR) if isinstance(p, m.Prior))
+            priors = {p.digest for p in own if p.robot == message.robot}
             digest = message.map_digest
-            return None if digest in priors else f"no prior {digest.hex()} in the log"
+            lost = None if digest in priors else f"no prior {digest.hex()} in the log"
+            return lost or _gap(log, message)
         case m.Prior() | m.Trajectory():
             maps = (*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP))
             digests = {each.digest for each in maps if isinstance(each, m.FusedMap)}
@@ -209,4 +206,18 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
                     return f"submap {gone} of {of}, is not in the log"
             return None
         case _:
-            return None
+            return _gap(log, message)
+
+
+def _gap(log: Recorded, message: m.Message) -> str | None:
+    """The first measurement of its stream that a message comes behind and the log has not."""
+    robot, incarnation = getattr(message, "robot", ""), getattr(message, "incarnation", None)
+    for stream in sorted(log.measurements):
+        if stream[0] != robot or incarnation not in {None, stream[1]}:
+            continue
+        there = log.measurements[stream]
+        lost = next((n for n in range(max(there)) if n not in there), None)
+        before = None if lost is None else there.get(lost - 1)
+        if lost is not None and (before is None or before.stamp_ns <= message.stamp_ns):
+            return f"measurement {lost} is not in the log"
+    return None
