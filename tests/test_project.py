@@ -257,6 +257,24 @@ def test_the_readme_names_the_commands_of_a_team() -> None:
     assert {"launch", "replay", "router", "world", "robot", "central", "record"} <= named
 
 
+def test_no_process_waits_for_what_it_does_not_use() -> None:
+    """The imports of the command line and of each node; a launch pays for them in every process."""
+    heavy = ("scipy", "scipy.stats", "scipy.optimize", "numba", "gtsam", "matplotlib", "foxglove")
+    code = "import sys; import {}; print(*(m for m in {!r} if m in sys.modules))"
+    takes = {
+        module: subprocess.run(
+            [sys.executable, "-c", code.format(module, heavy)],
+            capture_output=True, text=True, check=True, timeout=60,
+        ).stdout.split()
+        for module in ("sim.cli.main", "team.wire.zenoh_bus", "team.robot.main", "central.main")
+    }  # fmt: skip
+    computes = ["scipy", "numba"]
+    assert takes == {
+        "sim.cli.main": [], "team.wire.zenoh_bus": [],
+        "team.robot.main": computes, "central.main": computes,
+    }  # fmt: skip
+
+
 def always_true(node: ast.AST) -> bool:
     """`x is not y` where y is not None (np.True_ is not True), or an assert of what is no value."""
     if isinstance(node, ast.Assert):
