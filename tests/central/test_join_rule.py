@@ -89,7 +89,7 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
         for name, behind_ns in (("r1", 3_000_000_000), ("r2", 0)):
             submap = SUBMAPS[name][k]
             found.take_submap(submap)
-            said = of(found.advance(submap.stamp_ns - behind_ns, submap.stamp_ns), ch.FUSED_MAP)
+            said = of(found.broadcasts(submap.stamp_ns - behind_ns, submap.stamp_ns), ch.FUSED_MAP)
             assert bool(said) == (name == "r2"), "r1's waits for r2's, nothing is said twice"
             maps += said
     assert [each.members for each in maps] == [

@@ -96,7 +96,7 @@ def _absurd(evaluation: Evaluation) -> str:
     """The digits of a NEES of 1e18 say nothing to people; why it is so large does."""
     scenario = evaluation.scenario
     again = scenario is not None and scenario.fusion in _COUNT_AGAIN
-    why = " (rule counts measurements again)" if again else ""
+    why = " (measurements counted again)" if again else ""
     return f"> {ABSURD_NEES}: over-confident{why}"
 
 

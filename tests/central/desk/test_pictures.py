@@ -113,7 +113,7 @@ def test_a_star_is_explained_only_where_there_is_one(run: Evaluation) -> None:
     ("fusion", "said"),
     [
         ("join", "> 1000: over-confident"),
-        ("kalman", "> 1000: over-confident (rule counts measurements again)"),
+        ("kalman", "> 1000: over-confident (measurements counted again)"),
     ],
 )
 def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(

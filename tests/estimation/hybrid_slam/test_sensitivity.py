@@ -235,7 +235,7 @@ def test_biases_stay_when_islands_merge():
     assert len(fold.main.graph.priors) == len(fold.main.graph.biases) == 4
     graph = fold.main.graph
     assert {graph.name(node) for node in graph.biases.values()} == {
-        f"the bias {bias} of {robot} (keyframe 0)"
+        f"the bias {bias} of {robot} (incarnation 0)"
         for robot in ("r0", "r1")
         for bias in ("bearing", "range_scale")
     }

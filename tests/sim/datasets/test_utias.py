@@ -528,13 +528,13 @@ def test_of_a_real_set_every_row_is_a_measurement_or_in_a_note(
 ) -> None:
     world = real(number)
     counts = [int(note.split()[0]) for s in world.streams for note in s.notes if "drop" in note]
-    measurements = sum(
+    given = sum(
         len(stream.landmark_detections.ids) + len(stream.teammate_detections.ids)
         for stream in world.streams
     )
     intervals = sum(len(stream.intervals.end_ns) for stream in world.streams)
     last_rows = len(world.streams)  # the last row of a robot has no next one that ends it
-    assert intervals + last_rows + measurements + sum(counts) == odometry_rows + measurements
+    assert intervals + last_rows + given + sum(counts) == odometry_rows + measurements
     for landmark in world.landmark_ids.tolist():
         assert abs(np.median(range_errors(world, landmark))) < 0.25
     for stream in world.streams:
