@@ -34,7 +34,7 @@ CHECKED = (
 """Causes before what follows from them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Difference:
     """A recorded message that is not what its inputs give; `counter` is its publisher's.
 
@@ -167,7 +167,14 @@ def _difference(
     names = _names(said.message)
     unknown = lacks is not None
     return Difference(
-        sample.key, sample.stamp_ns, sample.counter, names, field, there, here, unknown
+        key=sample.key,
+        stamp_ns=sample.stamp_ns,
+        counter=sample.counter,
+        names=names,
+        field=field,
+        recorded=there,
+        recomputed=here,
+        lacks=unknown,
     )
 
 

@@ -33,14 +33,17 @@ def simulated() -> WorldStreams:
 
 
 def utias(path: Path) -> Scenario:
-    """The profile with few particles, for two robots whose odometry has the camera's clock."""
+    """The profile with few particles and the simulated robots' sensors and wheels and clock."""
     scenario = with_options(load("utias"), robots=2, dataset=path)
     assert isinstance(scenario.world, UtiasWorld)
     robots = tuple(
         msgspec.structs.replace(
-            robot, front_end=msgspec.structs.replace(robot.front_end, particles=20)
+            robot,
+            front_end=msgspec.structs.replace(robot.front_end, particles=20),
+            sensor=of.sensor,
+            motion=of.motion,
         )
-        for robot in scenario.robots
+        for robot, of in zip(scenario.robots, load("waypoints").robots, strict=False)
     )
     world = msgspec.structs.replace(scenario.world, odometry_delay_s=0.0)
     return msgspec.structs.replace(scenario, robots=robots, world=world)
