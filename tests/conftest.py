@@ -32,9 +32,19 @@ def pytest_runtest_setup() -> None:
 SYSTEM = "tests/system/"
 
 
+FIRST = (SYSTEM, "tests/recording/", "tests/keys/", "tests/wire/")
+"""The tests that start processes come first, theirs is the longest share; then tests that need few
+kernels, so that in a fresh clone the first launch compiles them while nobody else does the same.
+"""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The tests that start processes come first: theirs is the longest share."""
-    items.sort(key=lambda item: not item.nodeid.startswith(SYSTEM))
+    """Those of FIRST in its order, then the others in theirs."""
+
+    def rank(item: pytest.Item) -> int:
+        return next((k for k, at in enumerate(FIRST) if item.nodeid.startswith(at)), len(FIRST))
+
+    items.sort(key=rank)
 
 
 class Shares(LoadScopeScheduling):
