@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shutil
 import signal
 from pathlib import Path
@@ -147,10 +146,7 @@ async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that
     assert await launch.ended(120.0) == 0, launch.said()
     await team.none_left(0.0)
     assert f"world (pid {pid}) is stopped (SIGSTOP?) and has said nothing for" in launch.said()
-    restarts = json.loads((team.folder / "result.json").read_text())["restarts"]
-    assert "world" in restarts
-    for name in restarts:  # on a busy machine another one may be silent, too
-        assert re.search(rf"{name} \(pid \d+\) was silent \d+ s: ended", launch.said())
+    assert json.loads((team.folder / "result.json").read_text())["restarts"] == {"world": 1}
     samples = open_log(folder / "log.mcap").samples([ch.FINAL_MAP])
     assert final_map([(s.key, s.payload) for s in samples]) == map_in_memory(
         team.folder / "short.toml"
