@@ -9,6 +9,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
+from tests.support import fused_map
 
 S = 1_000_000_000
 
@@ -98,20 +99,12 @@ def _map(
     blocks = np.tile([sigma**2, 0.3 * sigma**2, 0.6 * sigma**2], (count, 1))
     means = places[:count] + sigma * rng.normal(size=(count, 2))
     members = (m.VersionEntry(robot="r1", incarnation=1, sequence=0),)
-    return m.FusedMap(
+    return fused_map(
         stamp_ns=at,
-        rule="join",
-        digest=bytes(8),
-        frame="r1/1",
         final=final,
         provisional=not final,
-        exchange=0,
         members=members,
-        missing=(),
-        joint=False,
         ids=from_ids(range(count)),
         means=from_floats(means),
         covariance=from_floats(blocks),
-        chi2=0.0,
-        dof=0,
     )

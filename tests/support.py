@@ -358,3 +358,27 @@ def examples() -> Iterator[m.Message]:
     )
     yield m.MeasurementsRequest(stamp_ns=0, robot="alpha", incarnation=1, first=5, last=-1)
     yield m.SubmapsRequest(stamp_ns=0, robot="alpha")
+
+
+def fused_map(**fields: object) -> m.FusedMap:
+    """An empty map of the rule `join` in r1's frame, with these fields in place of its own."""
+    return msgspec.structs.replace(_FUSED_MAP, **fields)
+
+
+_FUSED_MAP = m.FusedMap(
+    stamp_ns=0,
+    rule="join",
+    digest=bytes(8),
+    frame="r1/1",
+    final=False,
+    provisional=False,
+    exchange=0,
+    members=(),
+    missing=(),
+    joint=False,
+    ids=b"",
+    means=b"",
+    covariance=b"",
+    chi2=0.0,
+    dof=0,
+)

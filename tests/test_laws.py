@@ -30,7 +30,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, opened
 from team.wire.codec import encoded
-from tests.support import ROOT
+from tests.support import ROOT, fused_map
 from tests.teams import Team, config, driven, of, published, stream, world_of
 
 CENTRE = CentralConfig(tick_s=3.0, broadcast_s=3.0)
@@ -149,22 +149,14 @@ def test_a_rule_with_feedback_breaks_law_1_and_this_can_be_seen():
 
 def _answer(estimate, shift):
     means = translate.landmarks_of(estimate)[1]
-    return m.FusedMap(
-        stamp_ns=0,
+    return fused_map(
         rule="kalman",
-        digest=bytes(8),
         frame="",
-        final=False,
-        provisional=False,
         exchange=estimate.exchange,
-        members=(),
-        missing=(),
         joint=True,
         ids=estimate.ids,
         means=(means + shift).tobytes(),
         covariance=estimate.covariance,
-        chi2=0.0,
-        dof=0,
     )
 
 

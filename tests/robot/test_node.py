@@ -18,7 +18,7 @@ from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
-from tests.support import packed, spd
+from tests.support import fused_map, packed, spd
 from tests.teams import config, driven, of, published, stream
 
 STREAM = stream("r1", 12, off_ns=300_000_000)
@@ -52,22 +52,14 @@ def prior(sequence=0, incarnation=1, scale=1.0, at=0.0, ids=(1, 2)):
 
 
 def fused(ids=(1, 2), at=0.0, *, final=False, exchange=0):
-    return m.FusedMap(
-        stamp_ns=0,
-        rule="join",
+    return fused_map(
         digest=b"whatever",
-        frame="r1/1",
         final=final,
-        provisional=False,
         exchange=exchange,
-        members=(),
-        missing=(),
         joint=True,
         ids=from_ids(ids),
         means=from_floats(np.full(2 * len(ids), at)),
         covariance=packed(spd(2 * len(ids))),
-        chi2=0.0,
-        dof=0,
     )
 
 

@@ -18,6 +18,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import encoded
+from tests.support import fused_map
 
 STEPS = 20
 
@@ -65,16 +66,9 @@ def final_map(
 ) -> Outgoing:
     """A final map of the rule `join`."""
     content = translate.covariance_bytes(covariance, joint=joint)
-    message = m.FusedMap(
+    message = fused_map(
         stamp_ns=STEPS * 10**9,
-        rule="join",
-        digest=bytes(8),
-        frame="r1/1",
         final=True,
-        provisional=False,
-        exchange=0,
-        members=(),
-        missing=(),
         joint=joint,
         ids=from_ids(ids),
         means=from_floats(means),

@@ -6,6 +6,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from tests.sim.logs import samples
+from tests.support import fused_map
 
 
 def told(*messages: m.Message) -> list[tuple[str, str]]:
@@ -41,25 +42,10 @@ def fused(
     withdrawn: tuple[str, ...] = (),
     final: bool = False,
 ) -> m.FusedMap:
-    return m.FusedMap(
-        stamp_ns=0,
-        rule="join",
-        digest=bytes(8),
-        frame="r1/1",
+    return fused_map(
         final=final,
-        provisional=False,
-        exchange=0,
         members=tuple(m.VersionEntry(robot=robot, incarnation=1, sequence=0) for robot in robots),
-        missing=(),
-        joint=False,
-        ids=b"",
-        means=b"",
-        covariance=b"",
-        chi2=0.0,
-        dof=0,
         reasons=reasons,
-        biases=(),
-        joined=(),
         withdrawn=withdrawn,
     )
 

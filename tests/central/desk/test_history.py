@@ -14,7 +14,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample, opened
 from tests.sim.logs import final_map, joined_log, samples, scenario, streams
-from tests.support import submap
+from tests.support import fused_map, submap
 
 MS = 1_000_000
 
@@ -92,17 +92,11 @@ def fused(stamp_ns: int, last: int, **fields: object) -> Outgoing:
         "reasons": (),
         "final": False,
     } | fields
-    message = m.FusedMap(
+    message = fused_map(
         stamp_ns=stamp_ns,
-        rule="join",
-        digest=bytes(8),
         frame="r1/0",
         final=values["final"],
-        provisional=False,
-        exchange=0,
         members=values["members"],
-        missing=(),
-        joint=False,
         ids=from_ids([1]),
         means=from_floats([0.0, 0.0]),
         covariance=from_floats([1.0, 0.0, 1.0]),

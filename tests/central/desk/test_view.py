@@ -30,7 +30,7 @@ from team.wire import views
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Sample
 from team.wire.codec import decoded
-from tests.support import spd
+from tests.support import fused_map, spd
 
 S = 1_000_000_000
 
@@ -177,22 +177,11 @@ def test_no_robot_hears_a_view(node):
 
 def test_the_blocks_of_a_joint_covariance_are_those_of_the_whole_matrix():
     P = spd(6)
-    joint = m.FusedMap(
-        stamp_ns=0,
-        rule="join",
-        digest=bytes(8),
-        frame="r1/1",
-        final=False,
-        provisional=False,
-        exchange=0,
-        members=(),
-        missing=(),
+    joint = fused_map(
         joint=True,
         ids=from_ids([1, 2, 3]),
         means=from_floats(range(6)),
         covariance=translate.joint_bytes(P),
-        chi2=0.0,
-        dof=0,
     )
     blocks = msgspec.structs.replace(
         joint, joint=False, covariance=translate.block_bytes(translate.blocks_of(P))
@@ -283,22 +272,10 @@ def test_truth_that_is_far_ahead_is_kept_for_the_estimates():
 
 
 def test_a_maps_nees_is_of_each_landmark():
-    fused = m.FusedMap(
-        stamp_ns=0,
-        rule="join",
-        digest=bytes(8),
-        frame="r1/1",
-        final=False,
-        provisional=False,
-        exchange=0,
-        members=(),
-        missing=(),
-        joint=False,
+    fused = fused_map(
         ids=from_ids([4, 7]),
         means=from_floats([1.0, 0.0, 5.0, 5.0]),
         covariance=from_floats([0.25, 0.0, 1.0] * 2),
-        chi2=0.0,
-        dof=0,
     )
     fit = TrueLandmarks(np.array([4], np.uint32), np.zeros((1, 2))).fit(fused)
     assert fit is not None

@@ -10,6 +10,7 @@ from sim.launch import live
 from sim.launch.watch import Watch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
+from tests.support import fused_map
 
 
 def status(node: str, state: str, **figures: float) -> m.Status:
@@ -47,17 +48,7 @@ def told(robots: int, *, truth: bool) -> Watch:
         )  # fmt: skip
         if truth:
             watch.errors._robot(f"r{k}").tally.take(np.array([3.0, 9.0]), 3)
-    watch.fused = m.FusedMap(
-        stamp_ns=0,
-        rule="join",
-        digest=bytes(8),
-        frame="r1/1",
-        final=False,
-        provisional=False,
-        exchange=0,
-        members=(),
-        missing=(),
-        joint=False,
+    watch.fused = fused_map(
         ids=from_ids([1, 2]),
         means=from_floats([0.0] * 4),
         covariance=from_floats([1.0, 0.0, 1.0] * 2),

@@ -12,6 +12,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
 from tests.sim.logs import samples
+from tests.support import fused_map
 
 SECOND = 1_000_000_000
 COVARIANCE = np.array([[0.09, 0.01, 0.0], [0.01, 0.04, 0.005], [0.0, 0.005, 0.01]])
@@ -107,16 +108,8 @@ def test_the_map_is_judged_by_landmark_and_the_newest_counts(joint: bool) -> Non
     P = root @ root.T + 0.01 * np.eye(6)
     content = translate.covariance_bytes(P, joint=joint)
     for deviation in (np.array([5.0, 5.0]), np.array([0.1, -0.2])):
-        fused = m.FusedMap(
+        fused = fused_map(
             stamp_ns=9,
-            rule="join",
-            digest=bytes(8),
-            frame="r1/1",
-            final=False,
-            provisional=False,
-            exchange=0,
-            members=(),
-            missing=(),
             joint=joint,
             ids=from_ids(ids),
             means=from_floats(positions + deviation),

@@ -13,6 +13,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 from team.wire.codec import WireError, decoded, encoded
+from tests.support import fused_map
 from tests.teams import of, stream, world_of
 
 SCENARIO = m.Configuration(
@@ -315,23 +316,7 @@ def test_without_truth_there_is_none():
 
 def test_it_is_finished_with_the_final_map():
     node = world()
-    fused = m.FusedMap(
-        stamp_ns=0,
-        rule="join",
-        digest=bytes(8),
-        frame="",
-        final=False,
-        provisional=False,
-        exchange=0,
-        members=(),
-        missing=(),
-        joint=False,
-        ids=b"",
-        means=b"",
-        covariance=b"",
-        chi2=0.0,
-        dof=0,
-    )
+    fused = fused_map(frame="")
     node.handle(fused, 0)
     assert not node.finished
     node.handle(msgspec.structs.replace(fused, final=True), 0)
