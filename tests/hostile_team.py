@@ -3,7 +3,7 @@
 Everything is drawn from a NumPy generator, so that a seed names a session.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from random import Random
 
 import msgspec
@@ -182,39 +182,38 @@ class Team:
 
     def ends(self) -> list[m.Message]:
         """The last words of the robots and of the world."""
-        out: list[m.Message] = []
-        for robot, count in self._next.items():
-            now_ns = count * 10 * S
-            out.append(
-                m.Progress(
-                    stamp_ns=now_ns,
-                    node=f"robot/{robot}",
-                    robot=robot,
-                    incarnation=1,
-                    measurements=1000,
-                    submaps=count,
-                )
-            )
-            out.append(
-                m.Done(
-                    stamp_ns=now_ns,
-                    robot=robot,
-                    incarnation=1,
-                    measurements=1000,
-                    steps=500,
-                    submaps=count,
-                    ledger=(),
-                )
-            )
-        return [
-            *out,
-            m.End(
-                stamp_ns=10**12,
-                streams=tuple(
-                    m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS
-                ),
-            ),
-        ]
+        return last_words(self._next)
+
+
+def progress(robot: str, submaps: int) -> m.Progress:
+    """What a robot says that has published so many submaps of ten seconds."""
+    return m.Progress(
+        stamp_ns=submaps * 10 * S,
+        node=f"robot/{robot}",
+        robot=robot,
+        incarnation=1,
+        measurements=1000,
+        submaps=submaps,
+    )
+
+
+def last_words(submaps: Mapping[str, int]) -> list[m.Message]:
+    """Of robots that have published so many submaps each, and of the world."""
+    out: list[m.Message] = []
+    for robot, count in submaps.items():
+        said = progress(robot, count)
+        done = m.Done(
+            stamp_ns=said.stamp_ns,
+            robot=robot,
+            incarnation=1,
+            measurements=said.measurements,
+            steps=500,
+            submaps=count,
+            ledger=(),
+        )
+        out += [said, done]
+    streams = tuple(m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS)
+    return [*out, m.End(stamp_ns=10**12, streams=streams)]
 
 
 def centre_session(

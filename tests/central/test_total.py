@@ -17,7 +17,18 @@ from team.config import FusionRule
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps
 from team.wire.codec import decoded, encoded
-from tests.hostile_team import CONFIG, ROBOTS, S, Team, centre_session, covariance, numbers, packed
+from tests.hostile_team import (
+    CONFIG,
+    ROBOTS,
+    S,
+    Team,
+    centre_session,
+    covariance,
+    last_words,
+    numbers,
+    packed,
+    progress,
+)
 
 SESSIONS = int(os.environ.get("TEAMSLAM_STORM", "4"))
 FEW = settings(max_examples=SESSIONS, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -82,39 +93,7 @@ def concluded(messages, config=None):
     for each in messages:
         if isinstance(each, m.Submap):
             count[each.robot] += 1
-    ends = []
-    for robot, submaps in count.items():
-        now_ns = submaps * 10 * S
-        ends.append(
-            m.Progress(
-                stamp_ns=now_ns,
-                node=f"robot/{robot}",
-                robot=robot,
-                incarnation=1,
-                measurements=1000,
-                submaps=submaps,
-            )
-        )
-        ends.append(
-            m.Done(
-                stamp_ns=now_ns,
-                robot=robot,
-                incarnation=1,
-                measurements=1000,
-                steps=500,
-                submaps=submaps,
-                ledger=(),
-            )
-        )
-    ends.append(
-        m.End(
-            stamp_ns=10**12,
-            streams=tuple(
-                m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS
-            ),
-        )
-    )
-    taken = [decoded(encoded(each), type(each)) for each in [*messages, *ends]]
+    taken = [decoded(encoded(each), type(each)) for each in [*messages, *last_words(count)]]
     centre, _ = centre_session(taken, config)
     assert centre.final is not None
     return centre.final
@@ -360,17 +339,7 @@ class HostileTeam(RuleBasedStateMachine):
 
     @rule(robot=st.sampled_from(ROBOTS), submaps=st.integers(0, 8))
     def reports(self, robot, submaps):
-        now_ns = submaps * 10 * S
-        self.hear(
-            m.Progress(
-                stamp_ns=now_ns,
-                node=f"robot/{robot}",
-                robot=robot,
-                incarnation=1,
-                measurements=1000,
-                submaps=submaps,
-            )
-        )
+        self.hear(progress(robot, submaps))
 
     @rule()
     def is_withdrawn(self):
