@@ -25,12 +25,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from kills import PROGRAM, final_in, lacking
+from kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
 
-from sim.in_memory.team import run_team
 from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
-from team.wire.channels import FINAL_MAP
 
 NET = "10.213.77"
 PORT = 7447
@@ -167,14 +164,6 @@ def cut_and_wait(run: Run, hub: str, rng: random.Random, nodes, started, options
         time.sleep(0.02)
 
 
-def await_text(path: Path, text: str) -> None:
-    end = time.monotonic() + 120.0
-    while not (path.exists() and text in path.read_text()):
-        if time.monotonic() > end:
-            raise RuntimeError(f"{path}: not within 120 s: {text}")
-        time.sleep(0.05)
-
-
 def row(run: Run) -> str:
     cuts = ", ".join(f"{node} at {at:.1f} for {for_s:g}" for at, node, for_s in run.cuts)
     wrong = {node: status for node, status in run.exits.items() if status}
@@ -203,11 +192,9 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
-        scenario = Path(place) / "short.toml"
-        scenario.write_text(f'base = "thesis"\n[world]\nsteps = {options.steps}\n')
+        scenario = shortened(Path(place), options.steps)
         resolved = load(scenario)
-        samples = run_team(resolved, streams_of(resolved))
-        (expected,) = [s.payload for s in samples if s.key == FINAL_MAP.key()]
+        expected = expected_of(resolved)
         robots = [robot.id for robot in resolved.robots]
         runs = []
         for number in range(options.runs):

@@ -27,11 +27,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from kills import PROGRAM, children, final_in
+from kills import PROGRAM, await_text, children, expected_of, final_in, shortened
 
-from sim.in_memory.team import run_team
 from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
 from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
 from team.keys.roster import nodes_of
@@ -41,6 +39,8 @@ from team.wire.codec import WireError
 from team.wire.zenoh_bus import ZenohBus
 from tests.hostile_team import OF_THE_RUN, PAIR, mutated, payloads
 
+PATIENCE_S = 600.0
+"""Of a process to begin: kernels may have to be compiled."""
 SUBMAPS = 1_500
 """Hostile submaps of a storm: the centre folds each of them that it does not refuse."""
 
@@ -100,8 +100,7 @@ def nodes(options: argparse.Namespace) -> dict[str, object]:
     """A team with a stranger in it: what became of it."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place).resolve()
-        scenario = folder / "long.toml"
-        scenario.write_text(f'base = "thesis"\n[world]\nsteps = {options.steps}\n')
+        scenario = shortened(folder, options.steps)
         resolved = load(scenario)
         door_of: list[str] = []
         credentials = None
@@ -116,9 +115,9 @@ def nodes(options: argparse.Namespace) -> dict[str, object]:
              "--output", "run", "--json", "result.json", *door_of],
             cwd=folder, stdout=said, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
         )  # fmt: skip
-        endpoint = await_text(folder / "run" / "router.log", "listening at ").split()[0]
+        endpoint = await_text(folder / "run" / "router.log", "listening at ", PATIENCE_S).split()[0]
         for robot in PAIR:
-            await_text(folder / "run" / f"robot-{robot}.log", "connected")
+            await_text(folder / "run" / f"robot-{robot}.log", "connected", PATIENCE_S)
         began = time.monotonic()
         with ZenohBus(resolved.team, endpoint, 20.0, credentials) as bus:
             sent = storm(bus, options, launch)
@@ -139,9 +138,7 @@ def nodes(options: argparse.Namespace) -> dict[str, object]:
         final = final_in(folder)
         equal = None
         if options.keys:
-            samples = run_team(resolved, streams_of(resolved))
-            (expected,) = [s.payload for s in samples if s.key == ch.FINAL_MAP.key()]
-            equal = final == expected
+            equal = final == expected_of(resolved)
         if options.keep:
             subprocess.run(["cp", "-r", folder, options.keep], check=False)
     return {
@@ -151,16 +148,6 @@ def nodes(options: argparse.Namespace) -> dict[str, object]:
         "deaths": [line for line in text.splitlines() if "is started again" in line],
         "final": final is not None, "left": len(left), "failures": result.get("failures", []),
     }  # fmt: skip
-
-
-def await_text(path: Path, text: str) -> str:
-    """What follows a text in a file, once it stands there."""
-    end = time.monotonic() + 600.0  # kernels may have to be compiled
-    while not (path.exists() and text in path.read_text("utf-8", "replace")):
-        if time.monotonic() > end:
-            raise RuntimeError(f"{path}: not within 600 s: {text}")
-        time.sleep(0.05)
-    return path.read_text("utf-8", "replace").partition(text)[2]
 
 
 def main() -> int:

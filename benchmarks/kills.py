@@ -27,7 +27,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load
+from sim.scenarios.scenario import Scenario, load
 from sim.scenarios.source import streams_of
 from team.keys.authority import make_keys
 from team.keys.roster import nodes_of
@@ -115,6 +115,30 @@ def final_in(folder: Path) -> bytes | None:
             for sample in open_log(path).samples((FINAL_MAP,)):
                 return sample.payload
     return None
+
+
+def shortened(folder: Path, steps: int) -> Path:
+    """A scenario file: `thesis` with so many steps."""
+    scenario = folder / "short.toml"
+    scenario.write_text(f'base = "thesis"\n[world]\nsteps = {steps}\n')
+    return scenario
+
+
+def expected_of(scenario: Scenario) -> bytes:
+    """The final map's bytes of a team to which nothing happens."""
+    samples = run_team(scenario, streams_of(scenario))
+    (expected,) = [s.payload for s in samples if s.key == FINAL_MAP.key()]
+    return expected
+
+
+def await_text(path: Path, text: str, patience_s: float = 120.0) -> str:
+    """What follows a text in a file, once it stands there."""
+    end = time.monotonic() + patience_s
+    while not (path.exists() and text in path.read_text("utf-8", "replace")):
+        if time.monotonic() > end:
+            raise RuntimeError(f"{path}: not within {patience_s:g} s: {text}")
+        time.sleep(0.05)
+    return path.read_text("utf-8", "replace").partition(text)[2]
 
 
 def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespace) -> Run:
@@ -242,14 +266,12 @@ def main() -> int:
     options = parser.parse_args()
     options.what = options.what.split(",")
     with tempfile.TemporaryDirectory() as name:
-        scenario = Path(name) / "short.toml"
-        scenario.write_text(f'base = "thesis"\n[world]\nsteps = {options.steps}\n')
+        scenario = shortened(Path(name), options.steps)
         resolved = load(scenario)
         options.keys_made = Path(name) / "keys"
         if options.keys:
             make_keys(options.keys_made, resolved.team, nodes_of([r.id for r in resolved.robots]))
-        samples = run_team(resolved, streams_of(resolved))
-        (expected,) = [s.payload for s in samples if s.key == FINAL_MAP.key()]
+        expected = expected_of(resolved)
         busy = [
             subprocess.Popen([sys.executable, "-c", "while True: pass"])
             for _ in range(options.load)
