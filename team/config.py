@@ -15,6 +15,10 @@ NonNegative = Annotated[float, Meta(ge=0.0)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 
+UNNAMED = 2**31
+"""Landmark numbers below this are names, as of a barcode. From here on they are given by whoever
+associates: in a submap 2³¹ + a local index, in the team's map 2³¹ | a name of its first member.
+"""
 Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
 Estimator = Literal[
     "hybrid",

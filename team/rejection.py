@@ -19,6 +19,7 @@ class Rejection(StrEnum):
     SENSOR_LIMITS = "outside the sensor's limits"
     ITSELF = "a robot does not see itself"
     NO_LANDMARKS = "this estimator uses no landmarks"
+    NO_ASSOCIATION = "this estimator takes no landmarks without identities"
     NO_TEAMMATES = "sightings are not used by this estimator"
     NO_NODE = "no pose node near it"
     """Of an inter-robot measurement: no pose of the submap is near its time."""

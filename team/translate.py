@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -11,9 +11,9 @@ from jaxtyping import Float, UInt32
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
 from team.estimation.map_joining.joining import Contribution, InitialPoseFactor, Sighting
-from team.estimation.submap import NO_COLUMNS, LocalMap
+from team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
 from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, stamps
+from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, octets, stamps
 from team.wire.codec import unsound
 
 NO_MAP = bytes(8)
@@ -73,6 +73,25 @@ def scan_of(message: m.Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray
     )
 
 
+class Detected(NamedTuple):
+    """One scan of landmarks without identities; the last two are empty where there are none."""
+
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+    covariances: Float[np.ndarray, "_ 3"]
+    signatures: Float[np.ndarray, " _"]
+
+
+def detected_of(message: m.Detections) -> Detected:
+    """A scan of detections in the machine's byte order."""
+    return Detected(
+        floats(message.ranges, "ranges").astype(np.float64),
+        floats(message.bearings, "bearings").astype(np.float64),
+        floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3),
+        floats(message.signatures, "signatures").astype(np.float64),
+    )
+
+
 def motion_of(message: m.Odometry, clock_offset_s: float) -> tuple[int, int, float, float]:
     """(end [team time, ns], duration [ns], forward [m/s], yaw rate [rad/s]) of one interval.
 
@@ -126,6 +145,9 @@ def submap_message(
         biases=local.biases,
         sensitivity=from_floats(local.sensitivity),
         gated=gated,
+        counts=from_ids(local.unnamed.counts),
+        seen=np.packbits(local.unnamed.seen, axis=1, bitorder="little").tobytes(),
+        keyframes=local.unnamed.seen.shape[1],
     )
 
 
@@ -139,7 +161,15 @@ def local_map_of(message: m.Submap) -> LocalMap:
         stamps(message.nodes, "nodes").astype(np.int64),
         message.biases,
         _sensitivity_of(message),
+        _unnamed_of(message),
     )
+
+
+def _unnamed_of(message: m.Submap) -> Unnamed:
+    counts = ids(message.counts, "counts").astype(np.uint32)
+    rows = octets(message.seen, "seen").reshape(len(counts), -(-message.keyframes // 8))
+    seen = np.unpackbits(rows, axis=1, count=message.keyframes, bitorder="little")
+    return Unnamed(counts, seen.astype(np.bool_))
 
 
 def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:

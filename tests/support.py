@@ -11,6 +11,7 @@ from typing import Self
 import msgspec
 import numpy as np
 
+from team.config import UNNAMED
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Bus, Sample
@@ -170,6 +171,16 @@ def examples() -> Iterator[m.Message]:
         ranges=from_floats([2.0, 3.5]),
         bearings=from_floats([0.5, -1]),
     )
+    yield m.Detections(
+        stamp_ns=2_500,
+        robot="alpha",
+        incarnation=1,
+        number=3,
+        ranges=from_floats([2.0, 3.5]),
+        bearings=from_floats([0.5, -1]),
+        covariances=blocks,
+        signatures=from_floats([0.25, 0.5]),
+    )
     yield m.Sightings(
         stamp_ns=3_000,
         robot="alpha",
@@ -196,7 +207,7 @@ def examples() -> Iterator[m.Message]:
         last_measurement=19,
         start_ns=8_000,
         config=digest,
-        ids=two,
+        ids=from_ids([4, UNNAMED + 1]),
         mean=from_floats(range(10)),
         covariance=packed(spd(10)),
         nodes=from_stamps([8_500]),
@@ -204,6 +215,9 @@ def examples() -> Iterator[m.Message]:
         biases=("bearing", "range_scale"),
         sensitivity=from_floats(np.arange(20) / 16.0),
         gated=3,
+        counts=from_ids([6]),
+        seen=b"\x05\x01",
+        keyframes=9,
     )
     yield m.SightingFactor(
         stamp_ns=8_500,

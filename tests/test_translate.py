@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team import translate
-from team.config import RobotConfig
+from team.config import UNNAMED, RobotConfig
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
-from team.estimation.submap import LocalMap
+from team.estimation.submap import LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import decoded, encoded
@@ -21,8 +21,12 @@ from tests.estimation.submap_world import correlated
 def local_map(ids, seed):
     rng = np.random.default_rng(seed)
     n = 3 + 2 * len(ids)
+    numbers = np.array(sorted(ids), np.uint32)
+    unnamed = np.count_nonzero(numbers >= UNNAMED)
+    counts = rng.integers(1, 9, unnamed).astype(np.uint32)
+    seen = rng.random((unnamed, seed)) < 0.5
     return LocalMap(
-        np.array(sorted(ids), np.uint32), rng.normal(size=n), correlated(np.ones(n), rng)
+        numbers, rng.normal(size=n), correlated(np.ones(n), rng), unnamed=Unnamed(counts, seen)
     )
 
 
@@ -40,6 +44,8 @@ def test_a_submap_survives_the_wire_bit_for_bit(ids, seed):
     assert found.ids.tobytes() == local.ids.tobytes()
     assert found.mean.tobytes() == local.mean.tobytes()
     assert found.covariance.tobytes() == local.covariance.tobytes()
+    assert (found.unnamed.counts == local.unnamed.counts).all()
+    assert np.array_equal(found.unnamed.seen, local.unnamed.seen)
     again = translate.submap_message("r1", 2, 5, (10, 19), (1_000, 2_000), b"settings", found)
     assert encoded(again) == encoded(message)
     assert (there.first_measurement, there.last_measurement) == (10, 19)

@@ -3,12 +3,27 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
+from jaxtyping import Bool, Float, Int64, UInt32
 
 from team.config import Bias
 
 NO_NODES = np.empty(0, np.int64)
 NO_COLUMNS = np.empty((0, 0))
+
+
+@dataclass(frozen=True)
+class Unnamed:
+    """What a window knows of its U landmarks without names, by ascending number.
+
+    counts: by how many measurements each was seen, at least 1. seen: by which of the window's
+    keyframes with detections; two that one keyframe saw are two landmarks.
+    """
+
+    counts: UInt32[np.ndarray, " U"]
+    seen: Bool[np.ndarray, "U keyframes"]
+
+
+NONE_UNNAMED = Unnamed(np.empty(0, np.uint32), np.empty((0, 0), np.bool_))
 
 
 @dataclass(frozen=True)
@@ -22,6 +37,7 @@ class LocalMap:
     node_stamps: team time of the K pose nodes [ns], strictly ascending.
     biases, sensitivity: errors b that the robot's submaps share, ascending, and a row ∂mean/∂b of
     each: given b the mean is mean + bᵀ sensitivity.
+    unnamed: of the landmarks without names, those from number 2³¹ on.
     The start pose is exactly zero with zero uncertainty: nothing from outside the window is in it.
     """
 
@@ -31,6 +47,7 @@ class LocalMap:
     node_stamps: Int64[np.ndarray, " K"] = field(default_factory=NO_NODES.copy)
     biases: tuple[Bias, ...] = ()
     sensitivity: Float[np.ndarray, "B _"] = field(default_factory=NO_COLUMNS.copy)
+    unnamed: Unnamed = NONE_UNNAMED
 
     @property
     def end_pose(self) -> Float[np.ndarray, "3"]:
@@ -55,7 +72,9 @@ class LocalMap:
     @property
     def without_biases(self) -> "LocalMap":
         """The same, the errors that the robot's submaps share taken as zero."""
-        return LocalMap(self.ids, self.mean, self.covariance, self.node_stamps)
+        return LocalMap(
+            self.ids, self.mean, self.covariance, self.node_stamps, unnamed=self.unnamed
+        )
 
     @property
     def without_nodes(self) -> "LocalMap":
@@ -70,4 +89,5 @@ class LocalMap:
             self.covariance[np.ix_(kept, kept)],
             biases=self.biases,
             sensitivity=self.sensitivity[:, kept] if self.biases else NO_COLUMNS,
+            unnamed=self.unnamed,
         )

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from team.recording.reader import Log
-from team.recording.tables import HEAD, Exported, numbers_of
+from team.recording.tables import HEAD, Exported, numbers_of, table_of
 from team.wire.channels import Channel
 from team.wire.messages import Digest, Message
 
@@ -28,12 +28,13 @@ def export_csv(log: Log, folder: Path, channels: Collection[Channel] | None = No
     with ExitStack() as files:
         writers: dict[str, tuple[Path, Any]] = {}  # csv keeps its writer's type to itself
         for sample, channel, message in exported.messages(log, channels):
-            if channel.name not in writers:
-                path = folder / f"{channel.name}.csv"
+            name = table_of(channel, message)
+            if name not in writers:
+                path = folder / f"{name}.csv"
                 file = files.enter_context(path.open("w", newline="", encoding="utf-8"))
-                writers[channel.name] = (path, csv.writer(file, lineterminator="\n"))
-                writers[channel.name][1].writerow((*HEAD, *message.__struct_fields__))
-            path, writer = writers[channel.name]
+                writers[name] = (path, csv.writer(file, lineterminator="\n"))
+                writers[name][1].writerow((*HEAD, *message.__struct_fields__))
+            path, writer = writers[name]
             writer.writerow((sample.key, sample.counter, sample.wall_ns, *_cells(message)))
             exported.rows[path] = exported.rows.get(path, 0) + 1
     return exported

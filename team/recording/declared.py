@@ -54,7 +54,7 @@ def misdeclared(of: Declared) -> str | None:
     row = channel_of(of.key)
     if row is None:
         return None if VIEW.owner(of.key) is not None else "no channel has this key"
-    kind = row[0].message
+    kind = row[0].kind_of(of.schema)
     if (of.encoding, of.schema) != ("msgpack", tag_of(kind)):
         said = f"{of.encoding or 'no encoding'}, {of.schema or 'no schema'}"
         return f"declared as {said}; its messages are msgpack, {tag_of(kind)}"

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from team.recording.reader import Log
-from team.recording.tables import Exported, numbers_of, type_of_numbers
+from team.recording.tables import Exported, numbers_of, table_of, type_of_numbers
 from team.wire.channels import Channel
 from team.wire.messages import Digest, Message
 
@@ -76,10 +76,11 @@ def export_parquet(log: Log, folder: Path, channels: Collection[Channel] | None 
     with ExitStack() as files:
         tables: dict[str, tuple[Path, _Table]] = {}
         for sample, channel, message in exported.messages(log, channels):
-            if channel.name not in tables:
-                path = folder / f"{channel.name}.parquet"
-                tables[channel.name] = (path, files.enter_context(_Table(path, channel.message)))
-            path, table = tables[channel.name]
+            name, kind = table_of(channel, message), type(message)
+            if name not in tables:
+                path = folder / f"{name}.parquet"
+                tables[name] = (path, files.enter_context(_Table(path, kind)))
+            path, table = tables[name]
             head = (sample.key, sample.counter, min(sample.wall_ns, 2**63 - 1))
             table.add(head, message, len(sample.payload))
             exported.rows[path] = exported.rows.get(path, 0) + 1

@@ -20,6 +20,8 @@ from mcap.writer import Writer
 
 from team.recording.schemas import declaration_of
 from team.wire.bus import Sample
+from team.wire.channels import channel_of
+from team.wire.codec import tag_in
 
 METADATA = "teamslam"
 CHUNK_NS = 500_000_000
@@ -52,7 +54,7 @@ class Recorder:
         self._prefix = f"team/{team}/"
         self._queue: SimpleQueue[Sample | None] = SimpleQueue()
         self._counts: dict[str, Count] = defaultdict(lambda: Count(0, 0))
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         self._failure: Exception | None = None
         self._in_chunk = 0
@@ -147,9 +149,10 @@ class Recorder:
 
     def _write(self, sample: Sample) -> None:
         self._bound_chunk(sample)
-        channel = self._channels.get(sample.key)
+        of = sample.key, self._tag(sample)
+        channel = self._channels.get(of)
         if channel is None:
-            channel = self._channels[sample.key] = self._register(sample.key)
+            channel = self._channels[of] = self._register(*of)
         self._writer.add_message(
             channel_id=channel,
             log_time=max(sample.stamp_ns, 0),
@@ -160,8 +163,15 @@ class Recorder:
         messages, size = self._counts[sample.key]
         self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
 
-    def _register(self, key: str) -> int:
-        said = declaration_of(key)
+    def _tag(self, sample: Sample) -> str:
+        """Of a key that carries several kinds of messages, that of this one: each is declared."""
+        found = channel_of(sample.key)
+        if found is None or not found[0].alternatives:
+            return ""
+        return tag_in(sample.payload)
+
+    def _register(self, key: str, tag: str) -> int:
+        said = declaration_of(key, tag)
         if said is None:  # of no row: kept as it is, verified by nobody
             return self._writer.register_channel(self._prefix + key, "", 0)
         if said.schema not in self._schemas:

@@ -28,11 +28,14 @@ class Declaration(NamedTuple):
     text: bytes
 
 
-def declaration_of(key: str) -> Declaration | None:
-    """The declaration of a relative key of the team; None for a key that no row has."""
+def declaration_of(key: str, tag: str = "") -> Declaration | None:
+    """The declaration of a relative key of the team; None for a key that no row has.
+
+    tag: of the message, where the key carries more than one kind.
+    """
     found = channel_of(key)
     if found is not None:
-        kind = found[0].message
+        kind = found[0].kind_of(tag)
         return Declaration("msgpack", tag_of(kind), "jsonschema", schema_of(kind))
     view = view_of(key)
     if view is None:

@@ -11,17 +11,19 @@ from typing import Any
 from numpy.typing import NDArray
 
 from team.recording.reader import Log
-from team.wire.arrays import floats, ids, stamps
+from team.wire.arrays import floats, ids, octets, stamps
 from team.wire.bus import Sample, opened
 from team.wire.channels import Channel, channel_of
 from team.wire.codec import WireError
-from team.wire.messages import Message
+from team.wire.messages import Message, tag_of
 
 HEAD = ("key", "counter", "wall_ns")
 _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "ids": ids,
     "stamps": stamps,
     "nodes": stamps,
+    "counts": ids,
+    "seen": octets,
 }
 """How the bytes of a field are read by its name; all others are floats."""
 
@@ -49,6 +51,12 @@ class Exported:
                 self.unsound += 1
                 continue
             yield sample, channel, message
+
+
+def table_of(channel: Channel, message: Message) -> str:
+    """The table's name: the channel's; of an alternative message on its key, the message's."""
+    kind = type(message)
+    return channel.name if kind is channel.message else tag_of(kind).partition("/")[0]
 
 
 def numbers_of(name: str, value: bytes) -> NDArray[Any]:

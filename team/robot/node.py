@@ -410,6 +410,9 @@ class RobotNode:
                 out += self._drive(measurement)
             case m.Observations():
                 self._observe(measurement)
+            case m.Detections():
+                self._goes_in(measurement)
+                self._ledger[Rejection.NO_ASSOCIATION.disposition] += 1
             case m.Sightings():
                 out += self._sight(measurement)
         if self._taking is not None:

@@ -38,6 +38,11 @@ def stamps(data: Stamps, what: str) -> NDArray[np.int64]:
     return _array(data, "<i8", what)
 
 
+def octets(data: bytes, what: str) -> NDArray[np.uint8]:
+    """A read-only uint8 view."""
+    return _array(data, "u1", what)
+
+
 def from_floats(values: Any) -> Floats:
     """Little-endian float64 bytes, C order."""
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
@@ -98,6 +103,15 @@ def check_packed_covariance(data: Floats, n: int, what: str) -> None:
         lower = np.zeros((n, n))
         lower.T[np.triu_indices(n)] = floats(data, what)
         _check_positive(_unit_diagonal(lower, what), what)
+
+
+def check_blocks(data: Floats, count: int, what: str) -> None:
+    """Raise ValueError unless `count` packed 2 × 2 covariances (3 floats each) are there."""
+    check_finite(data, what, 3 * count)
+    a, b, c = floats(data, what).reshape(count, 3).T
+    root = np.sqrt(np.maximum(a, 0.0)) * np.sqrt(np.maximum(c, 0.0))  # a·c could overflow
+    if not np.all(np.abs(b) < root):
+        raise ValueError(f"not positive definite: {what}")
 
 
 def _unit_diagonal(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:

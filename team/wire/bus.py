@@ -120,7 +120,7 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     if found is None:
         raise WireError("wrong tag", f"no channel has the key {sample.key[:200]!r}")
     channel, name = found
-    message = decoded(sample.payload, channel.message)
+    message: Message = decoded(sample.payload, *channel.kinds)
     robot = getattr(message, "robot", name)
     if "{robot}" in channel.template and robot != name:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
@@ -149,7 +149,7 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
     Raises `WireError` where it is no message that answers this query, or one of another robot.
     """
     message: Message = decoded(payload)
-    of = next((c for c in REPLIES[channel] if isinstance(message, c.message)), None)
+    of = next((c for c in REPLIES[channel] if isinstance(message, c.kinds)), None)
     robot = getattr(message, "robot", getattr(message, "node", ""))
     if of is None or ("{robot}" in channel.template and robot != name):
         text = f"{type(message).__name__} of {robot!r} is no reply to {channel.key(name)!r}"

@@ -33,7 +33,10 @@ _PATTERNS = {"robot": _NAME, "node": f"{_NAME}(?:/{_NAME})?", "view": ".+"}
 
 @dataclass(frozen=True)
 class Channel:
-    """One row: what travels on a key, how often, how, and what a log does with it."""
+    """One row: what travels on a key, how often, how, and what a log does with it.
+
+    alternatives: messages that may travel on the key in the place of `message`, or among them.
+    """
 
     name: str
     template: str
@@ -43,6 +46,16 @@ class Channel:
     recorded: bool
     recomputable: bool
     meaning: str
+    alternatives: tuple[type[m.Message], ...] = ()
+
+    @property
+    def kinds(self) -> tuple[type[m.Message], ...]:
+        """The messages that may travel on the key."""
+        return (self.message, *self.alternatives)
+
+    def kind_of(self, tag: str) -> type[m.Message]:
+        """The message that has this tag; the first one where none has it."""
+        return next((kind for kind in self.kinds if m.tag_of(kind) == tag), self.message)
 
     def key(self, name: str = "") -> str:
         """The key for one robot or node."""
@@ -70,7 +83,7 @@ START = Channel(name="start", template="source/{robot}/start", message=m.Initial
 ODOMETRY = Channel(name="odometry", template="source/{robot}/odometry", message=m.Odometry, rate="8-100 Hz", delivery="stream", recorded=True,
                    recomputable=False, meaning="one odometry interval")  # fmt: skip
 OBSERVATIONS = Channel(name="observations", template="source/{robot}/observations", message=m.Observations, rate="1-30 Hz",
-                       delivery="stream", recorded=True, recomputable=False, meaning="landmarks seen")  # fmt: skip
+                       delivery="stream", recorded=True, recomputable=False, alternatives=(m.Detections,), meaning="landmarks seen, with identities or without")  # fmt: skip
 SIGHTINGS = Channel(name="sightings", template="source/{robot}/sightings", message=m.Sightings, rate="0-10 Hz", delivery="stream", recorded=True,
                     recomputable=False, meaning="teammates seen")  # fmt: skip
 SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)

@@ -36,10 +36,11 @@ def encoded(message: Message) -> bytes:
     return cast(bytes, msgpack.packb(fields, use_bin_type=True))
 
 
-def decoded(payload: bytes, expected: type[M] | None = None) -> M:
+def decoded(payload: bytes, *expected: type[M]) -> M:
     """The message in `payload`, checked field by field; raises `WireError`.
 
-    `expected` is the class that the channel carries; without it any known message is accepted.
+    `expected` are the classes that the channel carries; without any, every known message is
+    accepted.
     """
     fields = _unpacked(payload)
     return cast(M, _converted(fields, _kind(fields, expected)))
@@ -75,6 +76,12 @@ def _converted(fields: object, kind: type[Message]) -> Message:
     return message
 
 
+def tag_in(payload: bytes) -> str:
+    """The tag that a payload begins with, as far as it can be read; empty where there is none."""
+    text = payload[2 : 2 + (payload[1] & 31)] if len(payload) > 1 and payload[1] >> 5 == 5 else b""
+    return text.decode("ascii", "replace")
+
+
 def _unpacked(payload: bytes) -> object:
     if len(payload) > LARGEST_PAYLOAD:
         raise WireError("too large", f"{len(payload)} bytes, {LARGEST_PAYLOAD} at most")
@@ -103,16 +110,17 @@ def _unpacked(payload: bytes) -> object:
         raise WireError("damaged", str(error)) from None
 
 
-def _kind(fields: object, expected: type[Message] | None) -> type[Message]:
+def _kind(fields: object, expected: tuple[type[Message], ...]) -> type[Message]:
     if not (isinstance(fields, list) and fields and isinstance(fields[0], str)):
         raise WireError("wrong tag", "a message is an array that begins with its tag")
     tag = fields[0]
     kind = BY_TAG.get(tag)
-    if kind is not None and (expected is None or kind is expected):
+    if kind is not None and (not expected or kind in expected):
         return kind
-    wanted = "" if expected is None else str(expected.__struct_config__.tag)
+    wanted = [str(each.__struct_config__.tag) for each in expected]
     name = tag[:60].partition("/")[0]
-    known = [wanted] if wanted else [t for t in BY_TAG if t.startswith(f"{name}/")]
-    if any(t.partition("/")[0] == name for t in known):
+    known = [t for t in wanted or BY_TAG if t.startswith(f"{name}/")]
+    if known:
         raise WireError("wrong version", f"{tag[:60]!r} where {', '.join(known)} is understood")
-    raise WireError("wrong tag", f"{tag[:60]!r}" + (f" where {wanted!r} belongs" if wanted else ""))
+    belongs = " or ".join(map(repr, wanted))
+    raise WireError("wrong tag", f"{tag[:60]!r}" + (f" where {belongs} belongs" if wanted else ""))

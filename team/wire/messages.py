@@ -17,12 +17,14 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from team.config import UNNAMED
 from team.wire.arrays import (
     Floats,
     Ids,
     Stamps,
     check_angles,
     check_ascending,
+    check_blocks,
     check_covariance,
     check_finite,
     check_packed_covariance,
@@ -103,6 +105,34 @@ class Observations(
         check_angles(self.bearings, "bearings", n)
 
 
+class Detections(
+    Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="detections/1"
+):
+    """Range [m] and bearing [rad] of L landmarks without identities, seen at stamp_ns in one scan.
+
+    Some may be clutter, that is no landmark at all. Two of one scan are never the same landmark.
+    covariances: L × 3 floats, packed 2 × 2 of (range, bearing), or empty: the sensor's own.
+    signatures: L floats that look alike for the same landmark, such as a trunk's diameter [m], or
+    empty.
+    """
+
+    ranges: Floats
+    bearings: Floats
+    covariances: Floats = b""
+    signatures: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        n = len(floats(self.ranges, "ranges"))
+        check_finite(self.ranges, "ranges")
+        if n and floats(self.ranges, "ranges").min() < 0.0:
+            raise ValueError("out of bounds: a range is negative")
+        check_angles(self.bearings, "bearings", n)
+        if self.covariances:
+            check_blocks(self.covariances, n, "covariances")
+        if self.signatures:
+            check_finite(self.signatures, "signatures", n)
+
+
 class Sightings(
     Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="sightings/1"
 ):
@@ -177,6 +207,12 @@ class Submap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag=
     given the error b of the bearings [rad], of the scale of the ranges or of the speed, the mean is
     mean + b · sensitivity. gated: so many of its landmark measurements no others of the window
     confirmed; they are not in it.
+
+    ids from 2³¹ on are landmarks without a name, which the window associated itself: 2³¹ + a local
+    index. counts: of each of these, ascending, by how many measurements. keyframes: the window's
+    keyframes with detections; seen: a row of ⌈keyframes/8⌉ bytes of each unnamed landmark, bit k of
+    it (the least of byte k // 8 first) says that keyframe k saw it: two that one keyframe saw are
+    two landmarks.
     """
 
     robot: Name
@@ -194,6 +230,9 @@ class Submap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag=
     biases: tuple[Bias, ...] = ()
     sensitivity: Floats = b""
     gated: Count = 0
+    counts: Ids = b""
+    seen: bytes = b""
+    keyframes: Count = 0
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")
@@ -210,6 +249,18 @@ class Submap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag=
             raise ValueError("out of bounds: a node is not in the submap's time")
         if self.last_measurement < self.first_measurement or self.stamp_ns < self.start_ns:
             raise ValueError("out of bounds: the interval of measurements or of time is empty")
+        self._check_unnamed()
+
+    def _check_unnamed(self) -> None:
+        numbers, counts = ids(self.ids, "ids"), ids(self.counts, "counts")
+        unnamed = int((numbers >= UNNAMED).sum())
+        if len(counts) != unnamed:
+            raise ValueError(f"wrong length: counts has {len(counts)} numbers, {unnamed} expected")
+        rows = -(-self.keyframes // 8) * unnamed
+        if len(self.seen) != rows:
+            raise ValueError(f"wrong length: seen has {len(self.seen)} bytes, {rows} expected")
+        if unnamed and not counts.min():
+            raise ValueError("out of bounds: a landmark of no measurement, by counts")
 
 
 class SightingFactor(
@@ -659,11 +710,7 @@ def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: 
     if joint:
         check_packed_covariance(covariance, 2 * n, "covariance")
         return
-    check_finite(covariance, "covariance", 3 * n)
-    a, b, c = floats(covariance, "covariance").reshape(n, 3).T
-    root = np.sqrt(np.maximum(a, 0.0)) * np.sqrt(np.maximum(c, 0.0))  # a·c could overflow
-    if not np.all(np.abs(b) < root):
-        raise ValueError("not positive definite: covariance")
+    check_blocks(covariance, n, "covariance")
 
 
 def tag_of(message: type[Message]) -> str:

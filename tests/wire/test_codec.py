@@ -10,9 +10,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from team.config import UNNAMED
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded
+from team.wire.channels import OBSERVATIONS
+from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded, tag_in
 from tests.support import ROOT, examples, odometry, packed, spd, submap
 
 EXAMPLES = {m.tag_of(type(message)): message for message in examples()}
@@ -25,7 +27,7 @@ names = st.from_regex(r"[a-z][a-z0-9_]{0,31}", fullmatch=True)
 
 def reason_of(payload: bytes, expected: type[m.Message] | None = None) -> str:
     with pytest.raises(WireError) as caught:
-        decoded(payload, expected)
+        decoded(payload, *([expected] if expected else []))
     return caught.value.reason
 
 
@@ -63,21 +65,61 @@ def test_a_last_word_from_before_the_last_map_has_none() -> None:
 
 
 def test_a_submap_from_before_the_pose_nodes_has_none() -> None:
-    shorter = msgpack.packb(fields_of(submap(0))[:-5])
+    shorter = msgpack.packb(fields_of(submap(0))[:-8])
     assert decoded(shorter) == submap(0)
     assert (submap(0).nodes, submap(0).sightings) == (b"", 0)
 
 
 def test_a_submap_from_before_the_sensitivities_has_none() -> None:
-    shorter = msgpack.packb(fields_of(submap(0))[:-3])
+    shorter = msgpack.packb(fields_of(submap(0))[:-6])
     assert decoded(shorter) == submap(0)
     assert (submap(0).biases, submap(0).sensitivity) == ((), b"")
 
 
 def test_a_submap_from_before_the_gate_has_all_its_measurements() -> None:
-    shorter = msgpack.packb(fields_of(submap(0))[:-1])
+    shorter = msgpack.packb(fields_of(submap(0))[:-4])
     assert decoded(shorter) == submap(0)
     assert submap(0).gated == 0
+
+
+def test_a_submap_from_before_landmarks_without_names_has_none() -> None:
+    shorter = msgpack.packb(fields_of(submap(0))[:-3])
+    assert decoded(shorter) == submap(0)
+    assert (submap(0).counts, submap(0).seen, submap(0).keyframes) == (b"", b"", 0)
+
+
+@pytest.mark.parametrize(
+    ("counts", "seen", "keyframes", "why"),
+    [
+        ([6], b"\1\2", 8, "wrong length"),
+        ([6], b"\1", 9, "wrong length"),
+        ([6, 6], b"\1\2", 9, "wrong length"),
+        ([], b"", 0, "wrong length"),
+        ([0], b"\1\2", 9, "out of bounds"),
+    ],
+)
+def test_a_submap_whose_counts_do_not_fit_its_unnamed_landmarks_is_refused(
+    counts: list[int], seen: bytes, keyframes: int, why: str
+) -> None:
+    fields = fields_of(EXAMPLES["submap/1"])
+    fields[-3:] = [from_ids(counts), seen, keyframes]
+    assert reason_of(msgpack.packb(fields)) == why
+
+
+def test_a_key_of_two_kinds_takes_both_and_names_both_for_a_third() -> None:
+    kinds = OBSERVATIONS.kinds
+    for tag in ("observations/1", "detections/1"):
+        payload = encoded(EXAMPLES[tag])
+        assert decoded(payload, *kinds) == EXAMPLES[tag]
+        assert tag_in(payload) == tag
+    with pytest.raises(WireError, match="'observations/1' or 'detections/1' belongs"):
+        decoded(encoded(odometry(0)), *kinds)
+    with pytest.raises(WireError, match="wrong version: 'detections/9' where detections/1 is"):
+        decoded(msgpack.packb(["detections/9"]), *kinds)
+
+
+def test_no_tag_is_read_where_there_is_none() -> None:
+    assert [tag_in(data) for data in (b"", b"\x98", b"\x98\x01\x02")] == ["", "", ""]
 
 
 @pytest.mark.parametrize(
@@ -93,7 +135,7 @@ def test_a_submap_whose_sensitivities_do_not_fit_is_refused(
     biases: tuple[str, ...], numbers: int, why: str
 ) -> None:
     fields = fields_of(submap(0))
-    fields[-3:-1] = [biases, from_floats(np.zeros(numbers))]
+    fields[-6:-4] = [biases, from_floats(np.zeros(numbers))]
     assert reason_of(msgpack.packb(fields)) == why
 
 
@@ -143,7 +185,7 @@ def test_observations_come_back_as_they_went(seen: list[tuple[int, float, float]
 
 
 @settings(deadline=None)
-@given(st.sets(st.integers(0, 2**32 - 1), max_size=6), st.integers(0, 2**32))
+@given(st.sets(st.integers(0, UNNAMED - 1), max_size=6), st.integers(0, 2**32))
 def test_submaps_come_back_as_they_went(ids: set[int], seed: int) -> None:
     n = 3 + 2 * len(ids)
     root = np.random.default_rng(seed).normal(size=(n, n))
@@ -204,6 +246,7 @@ NAN, INF = struct.pack("<d", float("nan")), struct.pack("<d", float("inf"))
 POSE = EXAMPLES["pose/1"]
 SUBMAP = EXAMPLES["submap/1"]
 SEEN = EXAMPLES["observations/1"]
+FOUND = EXAMPLES["detections/1"]
 MAP = EXAMPLES["map/1"]
 MET = EXAMPLES["sighting_factor/1"]
 HUGE = [1.0, 1.7e308, 0.0, -1.7e308, 1.0, 0.0, 0.0, 0.0, 1.0]
@@ -261,6 +304,10 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("too deep", b"\x91" * 100_000, None),
         ("damaged", b"\xc1", None),
         ("damaged", b"\x91\xa1\xff", None),
+        ("wrong length", with_fields(FOUND, bearings=b""), None),
+        ("wrong length", with_fields(FOUND, signatures=bytes(8)), None),
+        ("out of bounds", with_fields(FOUND, ranges=from_floats([-1.0, 0.0])), None),
+        ("not positive definite", with_fields(FOUND, covariances=bytes(48)), None),
         ("wrong field", with_fields(SUBMAP, robot="Not A Name"), None),
         ("wrong field", with_fields(SUBMAP, incarnation=-1), None),
         ("wrong field", with_fields(SUBMAP, incarnation=1.5), None),
@@ -268,7 +315,7 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("wrong field", with_fields(SUBMAP, stamp_ns=2**62), None),
         ("wrong field", with_fields(EXAMPLES["status/1"], figures={"x": float("nan")}), None),
         ("wrong field", with_fields(EXAMPLES["odometry/1"], forward=float("nan")), None),
-        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-6]), None),
+        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-9]), None),
     ],
 )
 def test_an_unsound_payload_is_refused_for_its_reason(
