@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+import msgspec
 import numpy as np
 
 from central.fused import JOINT_LANDMARKS, receivable, version_entry
@@ -305,12 +306,19 @@ class JoinRule(SubmapRule):
         for robot, incarnation in sorted(fold.home):
             if fold.home[(robot, incarnation)] != fold.main_key:
                 continue
-            poses, covariances = marginals.trajectory(fold, robot, incarnation)
+            found = marginals.trajectory(fold, robot, incarnation)
+            poses, covariances = found.poses, found.covariances
             ends = [s.stamp_ns for s in self._set.chain((robot, incarnation))][: len(poses)]
             message = translate.trajectory_message(
                 ends[-1], robot, incarnation, digest, ends, poses, covariances
             )
-            paths.append(((robot, incarnation), message))
+            with_start = msgspec.structs.replace(
+                message,
+                start=from_floats(found.start),
+                start_covariance=from_floats(found.start_covariance),
+                crosses=from_floats(found.crosses),
+            )
+            paths.append(((robot, incarnation), with_start))
         return paths
 
 

@@ -21,6 +21,7 @@ class Rejection(StrEnum):
     NO_LANDMARKS = "this estimator uses no landmarks"
     NO_ASSOCIATION = "this estimator takes no landmarks without identities"
     NO_TEAMMATES = "sightings are not used by this estimator"
+    NO_NODES = "sightings need pose nodes, and front_end.node_s is 0"
     NO_NODE = "no pose node near it"
     """Of an inter-robot measurement: no pose of the submap is near its time."""
     LATE = "counted in a window that ends before its stamp"

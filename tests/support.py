@@ -316,6 +316,9 @@ def examples() -> Iterator[m.Message]:
         stamps=from_stamps([9_000]),
         poses=three,
         covariances=from_floats(spd(3)),
+        start=from_floats([0.5, 0.25, 0.125]),
+        start_covariance=from_floats(spd(3)),
+        crosses=from_floats(range(9)),
     )
     yield m.Progress(
         stamp_ns=9_000, node="central", robot="alpha", incarnation=1, measurements=128, submaps=6

@@ -225,9 +225,11 @@ def _conclude(
 
     from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
     from central.desk.evaluation.history import history
+    from central.desk.export.take_home import taken_home
     from central.desk.report.page import write_report
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
+    from central.desk.verification.recorded import recorded
     from team.recording.reader import LogError, open_log
 
     console = Console()
@@ -253,7 +255,8 @@ def _conclude(
         for note in evaluation.notes:
             console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         if report:
-            run = Run(evaluation, history(log.samples()), log.metadata)
+            home = taken_home(recorded(log))
+            run = Run(evaluation, history(log.samples()), log.metadata, taken_home=home)
             if (line := nis_line(run)) is not None:
                 console.print(line, highlight=False, soft_wrap=True)
             for path in write_report(run, outcome.folder, {**figures, **run_figures(run)}):

@@ -90,9 +90,11 @@ def report(
 
     from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
     from central.desk.evaluation.history import history
+    from central.desk.export.take_home import taken_home
     from central.desk.report.page import write_report
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
+    from central.desk.verification.recorded import recorded
     from team.recording.reader import open_log
 
     _check_folder(output)
@@ -102,7 +104,8 @@ def report(
         typer.echo(f"{text}, --no-ledger leaves it out" if ledger else "this log is long", err=True)
     evaluation = with_holes(evaluate(opened.samples()), opened)
     found, why = _ledger(opened) if ledger else (None, Run.no_ledger)
-    run = Run(evaluation, history(opened.samples()), opened.metadata, found, why)
+    home = taken_home(recorded(opened))
+    run = Run(evaluation, history(opened.samples()), opened.metadata, found, why, home)
     figures = to_json(
         evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
     )

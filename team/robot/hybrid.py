@@ -100,7 +100,7 @@ class HybridEstimator:
     def _with_submap(self, closed: ClosedWindow) -> Estimates:
         """The pose and the map are new with a submap."""
         begun_at = self.whole.mean[:3]
-        cloud = None if closed.particles is None else thinned(closed.particles, begun_at)
+        cloud = None if closed.window is None else thinned(closed.window.particles, begun_at)
         self.whole = self._joined(closed.local)
         return Estimates(closed=closed, pose_ns=closed.end_ns, map_ns=closed.end_ns, cloud=cloud)
 

@@ -271,6 +271,9 @@ class RobotNode:
                 self.warnings.append(f"no use for a {type(message).__name__}")
         return self._go_on()
 
+    def window_closed(self, closed: ClosedWindow) -> None:
+        """A window has become a submap: what else is made of it is not the robot's task."""
+
     def status(self) -> m.Status:
         """What the robot is doing, for people."""
         figures = {
@@ -594,6 +597,7 @@ class RobotNode:
             local=closed.local,
         )
         self._closed.append(plain)
+        self.window_closed(closed)
         self._window, self._aside = [], 0
         released = self._held.put(said)
         self._sent.note(released)

@@ -505,7 +505,10 @@ class Prior(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="
 class Trajectory(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="trajectory/1"):
     """A robot's smoothed poses in the final map: K stamps, K × 3 poses, K × 9 floats.
 
-    Under `join` those of its submaps' ends, under `batch` those of its keyframes.
+    Under `join` those of its submaps' ends, under `batch` those of its keyframes. start,
+    start_covariance: where the first submap begins, 3 and 9 floats; crosses: K × 9 floats, the
+    covariance of each pose with the one before it, of the first with the start, row by row. These
+    three are empty under `batch`.
     """
 
     robot: Name
@@ -514,9 +517,16 @@ class Trajectory(Message, frozen=True, kw_only=True, array_like=True, gc=False, 
     stamps: Stamps
     poses: Floats
     covariances: Floats
+    start: Floats = b""
+    start_covariance: Floats = b""
+    crosses: Floats = b""
 
     def check(self) -> None:  # noqa: D102
         k = len(stamps(self.stamps, "stamps"))
+        if self.start or self.start_covariance or self.crosses:
+            check_finite(self.start, "start", 3)
+            check_finite(self.start_covariance, "start_covariance", 9)
+            check_finite(self.crosses, "crosses", 9 * k)
         check_finite(self.poses, "poses", 3 * k)
         check_finite(self.covariances, "covariances", 9 * k)
         for i in range(k):

@@ -24,8 +24,13 @@ def write_tum(path: Path, file: FilePath) -> None:
         for stamp, (x, y, _), qz, qw in zip(
             path.stamps_ns.tolist(), path.poses, np.sin(half), np.cos(half), strict=True
         ):
-            sign, (seconds, rest) = "-" * (stamp < 0), divmod(abs(stamp), 10**9)
-            lines.write(f"{sign}{seconds}.{rest:09d} {x:.17g} {y:.17g} 0 0 0 {qz:.17g} {qw:.17g}\n")
+            lines.write(f"{seconds(stamp)} {x:.17g} {y:.17g} 0 0 0 {qz:.17g} {qw:.17g}\n")
+
+
+def seconds(stamp_ns: int) -> str:
+    """A stamp in seconds, to the nanosecond."""
+    whole, rest = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' * (stamp_ns < 0)}{whole}.{rest:09d}"
 
 
 def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePath]:

@@ -1,7 +1,8 @@
 """Pictures of a run: the map with its uncertainty, and the robots' errors within their bounds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,7 @@ from central.desk.drawing import (
 )
 from central.desk.evaluation.errors import Path
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
+from central.desk.paths import SmoothedPath
 
 # Matplotlib takes half a second to import: a run that draws nothing has no use for it
 if TYPE_CHECKING:
@@ -33,15 +35,20 @@ LABELLED_LANDMARKS = 60
 DPI = 120
 
 
-def map_picture(evaluation: Evaluation, path: FilePath) -> bool:
-    """Landmarks with 95 % ellipses, the truth, the paths; False where there is nothing to draw."""
+def map_picture(
+    evaluation: Evaluation, path: FilePath, paths: Mapping[str, SmoothedPath] = MappingProxyType({})
+) -> bool:
+    """Landmarks with 95 % ellipses, the truth, the paths; False where there is nothing to draw.
+
+    paths: smoothed ones at the rate of keyframes; without them lines go from submap to submap.
+    """
     if evaluation.map is None and not evaluation.robots:
         return False
     figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
     colours = robot_colours(evaluation.robots)
     for i, (name, robot) in enumerate(evaluation.robots.items()):
-        _draw_paths(axis, name, robot, colours[name], first=i == 0)
+        _draw_paths(axis, name, robot, colours[name], first=i == 0, dense=paths.get(name))
     _draw_landmarks(axis, evaluation)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
@@ -103,10 +110,19 @@ def new_figure(
     return figure, [list(row) for row in grid]
 
 
-def _draw_paths(axis: "Axes", name: str, robot: RobotResult, colour: str, *, first: bool) -> None:
-    """The true path thin, a square at its start; the smoothed ends of submaps, or else online."""
+def _draw_paths(
+    axis: "Axes",
+    name: str,
+    robot: RobotResult,
+    colour: str,
+    *,
+    first: bool,
+    dense: SmoothedPath | None,
+) -> None:
+    """The true path thin, a square at its start; the smoothed path, or else the online one."""
     truth, smoothed = _thinned(robot.truth), robot.smoothed_path
-    known = truth if len(truth.stamps_ns) else smoothed
+    line = smoothed if dense is None else _thinned(Path(dense.stamps_ns, dense.poses))
+    known = truth if len(truth.stamps_ns) else line
     if len(truth.stamps_ns):
         x, y, _ = truth.poses.T
         label = "true paths" if first else None
@@ -115,9 +131,10 @@ def _draw_paths(axis: "Axes", name: str, robot: RobotResult, colour: str, *, fir
         x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
         axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
     if len(smoothed.stamps_ns):
-        x, y, _ = smoothed.poses.T
-        axis.plot(x, y, color=colour, linewidth=0.8, alpha=0.6, zorder=2)
-        axis.plot(x, y, color=colour, linestyle="", marker="o", markersize=4.5, zorder=3)
+        axis.plot(*line.poses.T[:2], color=colour, linewidth=1.1, alpha=0.8, zorder=2)
+        axis.plot(
+            *smoothed.poses.T[:2], color=colour, linestyle="", marker="o", markersize=3.5, zorder=3
+        )
         axis.plot([], [], color=colour, marker="o", label=name)
     else:
         x, y, _ = _thinned(robot.online_path).poses.T
@@ -128,13 +145,13 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     truth, fused = evaluation.true_landmarks, evaluation.map
     if len(truth):
         axis.plot(
-            *truth.T, linestyle="", marker="x", markersize=8, markeredgewidth=1.6,
+            *truth.T, linestyle="", marker="x", markersize=6, markeredgewidth=0.9,
             color=TRUE_LANDMARK_COLOUR, label="true landmarks", zorder=6,
         )  # fmt: skip
     if fused is None or not len(fused.ids):
         return
     axis.plot(
-        *fused.means.T, linestyle="", marker=".", markersize=6, color=MAP_COLOUR,
+        *fused.means.T, linestyle="", marker=".", markersize=2, color=MAP_COLOUR,
         label="landmarks of the map, 95 % ellipses", zorder=7,
     )  # fmt: skip
     blocks = landmark_blocks(fused.covariance)

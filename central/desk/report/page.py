@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from central.desk.export.take_home import write_map, write_paths
 from central.desk.export.tum import write_trajectories
 from central.desk.pictures.run import error_picture, map_picture
 from central.desk.pictures.time import (
@@ -83,7 +84,7 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
         for name in ("map", "errors", "consistency", "traffic", "latency", "timeline")
     )
     drawn = {
-        map_png: map_picture(evaluation, map_png),
+        map_png: map_picture(evaluation, map_png, run.paths),
         errors_png: error_picture(evaluation, errors_png),
         consistency_png: consistency_picture(evaluation, history, consistency_png),
         traffic_png: traffic_picture(history, traffic_png),
@@ -97,7 +98,26 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
     page.write_text(_page(run, pictures), encoding="utf-8")
     trajectories = directory / "trajectories"
     paths = write_trajectories(evaluation, trajectories)
-    return [page, data, *pictures.values(), *([trajectories] if paths else [])]
+    return [
+        page,
+        data,
+        *_taken_home(run, directory),
+        *pictures.values(),
+        *([trajectories] if paths else []),
+    ]
+
+
+def _taken_home(run: Run, directory: Path) -> list[Path]:
+    """The map and the paths as tables, where there are any; what was written."""
+    home, written = run.taken_home, []
+    if run.evaluation.map is not None:
+        written += write_map(
+            run.evaluation.map, {} if home is None else home.measurements, directory
+        )
+    if run.paths:
+        write_paths(run.paths, directory / "paths")
+        written.append(directory / "paths")
+    return written
 
 
 def _page(run: Run, pictures: Mapping[str, Path]) -> str:

@@ -9,7 +9,9 @@ import numpy as np
 from central.desk.evaluation.evaluation import Evaluation
 from central.desk.evaluation.history import History
 from central.desk.evaluation.trajectories import TrajectoryErrors, trajectory_errors
+from central.desk.export.take_home import TakenHome
 from central.desk.ledger import Ledger
+from central.desk.paths import SmoothedPath
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,8 @@ class Run:
     """A run as its log tells it.
 
     provenance: the log's metadata. ledger: what `verify-ledger` finds, None where it was not asked
-    or where the log lacks what it needs: `no_ledger` says which.
+    or where the log lacks what it needs: `no_ledger` says which. taken_home: paths at the rate of
+    keyframes, and counts; None where they were not asked for.
     """
 
     evaluation: Evaluation
@@ -25,6 +28,12 @@ class Run:
     provenance: Mapping[str, str]
     ledger: Ledger | None = None
     no_ledger: str = "not asked for; `teamslam verify-ledger LOG` proves it"
+    taken_home: TakenHome | None = None
+
+    @property
+    def paths(self) -> Mapping[str, SmoothedPath]:
+        """The smoothed paths by robot, where they were asked for."""
+        return {} if self.taken_home is None else self.taken_home.paths
 
     def trajectories(self) -> dict[str, dict[str, TrajectoryErrors]]:
         """By robot and by kind of path ("smoothed", "online"); those that have truth."""

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
+from team.estimation.hybrid_slam.window import Window
 from team.estimation.submap import LocalMap
 
 
@@ -12,7 +12,8 @@ from team.estimation.submap import LocalMap
 class ClosedWindow:
     """A submap with the names of its inputs, and the inter-robot measurements from its pose nodes.
 
-    particles: those at its end. innovation: of the window's measurements that were predicted.
+    window, keyframes_ns: its particles with their paths, and the keyframes' team times; None where
+    the window had no solution. innovation: of the window's measurements that were predicted.
     gated: measurements that no others of the window confirmed, and that are not in the submap.
     late: scans of the interval that are stamped behind the window's end; they are rejected.
     unsolved: scans that led to no Gaussian, of which only the odometry's motion is in the submap.
@@ -25,7 +26,8 @@ class ClosedWindow:
     end_ns: int
     local: LocalMap
     sightings: tuple[NodeSighting, ...] = ()
-    particles: Particles | None = None
+    window: Window | None = None
+    keyframes_ns: tuple[int, ...] = ()
     innovation: Innovation = NOTHING
     gated: int = 0
     late: int = 0

@@ -39,6 +39,7 @@ class OpenWindow:
         config = self._config
         self.particles = windows.opened(config.front_end, config.sensor)
         self._generator = generator(config.seed, config.id, *self._key)
+        self.keyframes_ns: tuple[int, ...] = ()
 
     @property
     def gated(self) -> int:
@@ -91,6 +92,7 @@ class OpenWindow:
             self._generator,
             keyframe.forward,
         )
+        self.keyframes_ns = (*self.keyframes_ns, keyframe.stamp_ns)
         if keyframe.is_node:
             self.particles = windows.marked(self.particles, keyframe.stamp_ns)
 

@@ -68,7 +68,7 @@ class HybridSlam:
     def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
         """Take inter-robot measurements; the reason if they are rejected."""
         if self._grid is None:
-            return Rejection.NO_TEAMMATES
+            return Rejection.NO_NODES
         if self._start_ns is None:
             return Rejection.OLDER
         return self._grid.observe(stamp_ns, measurement, looks)
@@ -142,7 +142,8 @@ class HybridSlam:
                 closed,
                 local=submap,
                 sightings=() if self._grid is None else self._grid.sightings(),
-                particles=self.window.particles,
+                window=self.window,
+                keyframes_ns=self._open.keyframes_ns,
                 innovation=self.window.innovation,
             )
         self._innovation = self._innovation.plus(closed.innovation)

@@ -4,6 +4,7 @@ Everything is in the frame of an island: the main one, or the one that a stream 
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -38,10 +39,17 @@ class LandmarkBlocks(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """End poses of a stream's submaps in their order, each with its covariance."""
+    """End poses of a stream's submaps in their order, each with its covariance.
+
+    start, start_covariance: where the first one begins. crosses: the covariance of each pose with
+    the one before it, of the first with the start.
+    """
 
     poses: Float[np.ndarray, "K 3"]
     covariances: Float[np.ndarray, "K 3 3"]
+    start: Float[np.ndarray, "3"]
+    start_covariance: Float[np.ndarray, "3 3"]
+    crosses: Float[np.ndarray, "K 3 3"]
 
 
 class BiasEstimate(NamedTuple):
@@ -197,11 +205,22 @@ def _priors_in(
 def trajectory(fold: Fold, robot: str, incarnation: int) -> Trajectory:
     """Where the submaps of a stream end, in the frame of its island."""
     island = fold.island(robot, incarnation)
-    nodes = island.graph.streams[(robot, incarnation)][1:]
-    marginals = [_own_marginal(island, node) for node in nodes]
+    nodes = island.graph.streams[(robot, incarnation)]
+    (start, start_covariance), *ends = (_own_marginal(island, node) for node in nodes)
     return Trajectory(
-        np.array([pose for pose, _ in marginals]), np.array([spread for _, spread in marginals])
+        np.array([pose for pose, _ in ends]),
+        np.array([spread for _, spread in ends]),
+        start,
+        start_covariance,
+        np.array([_cross(island, after, before) for before, after in pairwise(nodes)]),
     )
+
+
+def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
+    """The covariance between two poses that a submap ties."""
+    if island.graph.fixed[row] or island.graph.fixed[column]:
+        return np.zeros((3, 3))
+    return island.graph.pattern.block(island.selected_covariance, row, column)
 
 
 def joint_cost(fold: Fold) -> Agreement:

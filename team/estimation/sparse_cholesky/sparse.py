@@ -77,6 +77,18 @@ class Pattern:
         begin = int(self.value_start[self.column_start[variable]])
         return values[begin : begin + size * size].reshape(size, size)
 
+    def block(self, values: Values, row: int, column: int) -> Float[np.ndarray, "j k"]:
+        """Block (row, column) of a symmetric matrix on this pattern; zero where none is stored."""
+        lower, upper = max(row, column), min(row, column)
+        begin, end = self.column_start[upper], self.column_start[upper + 1]
+        found = begin + np.flatnonzero(self.rows[begin:end] == lower)
+        if not len(found):
+            return np.zeros((int(self.sizes[row]), int(self.sizes[column])))
+        shape = int(self.sizes[lower]), int(self.sizes[upper])
+        first = int(self.value_start[found[0]])
+        stored = values[first : first + shape[0] * shape[1]].reshape(shape)
+        return stored if row == lower else stored.T
+
 
 @dataclass(frozen=True, eq=False)
 class Analysis:

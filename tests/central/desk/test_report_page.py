@@ -47,7 +47,14 @@ def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Pat
     run = run_of(log, seed="1")
     paths = write_report(run, tmp_path / "new", to_json(run.evaluation, run_figures(run)))
     names = [path.name for path in paths]
-    assert names == ["report.html", "report.json", *(f"{p}.png" for p in PICTURES), "trajectories"]
+    assert names == [
+        "report.html",
+        "report.json",
+        "map.csv",
+        "map.json",
+        *(f"{p}.png" for p in PICTURES),
+        "trajectories",
+    ]
     page = paths[0].read_text("utf-8")
     assert page.count("data:image/png;base64,") == len(PICTURES)
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)

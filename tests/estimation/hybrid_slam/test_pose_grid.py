@@ -11,6 +11,7 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.models import Increment
+from team.rejection import Rejection
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
 
@@ -170,4 +171,4 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
 
 def test_a_slam_without_nodes_does_not_use_sightings():
     slam = HybridSlam(config(), 1)
-    assert slam.sight(SECOND, 1, look()) == "sightings are not used by this estimator"
+    assert slam.sight(SECOND, 1, look()) == Rejection.NO_NODES

@@ -8,7 +8,7 @@ import pytest
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.map_joining import conditioning, whole_map
 from team.estimation.map_joining.conditioning import RobotPrior, Shared, followed, pose_now
-from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
 from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.estimation.map_joining.marginals import prior_for, trajectory
 from team.estimation.map_joining.whole_map import without
@@ -310,3 +310,15 @@ def test_the_team_pose_is_consistent_whatever_the_lag_of_the_last_broadcast():
     low, high = chi2_interval(3, 0.999, runs)
     assert low < honest < high
     assert twice > high
+
+
+def test_a_trajectory_has_the_joint_covariance_of_neighbouring_poses():
+    world = team(5, submaps=4, sigmas=LINEAR)
+    fold = joined(world.submaps, world.starts)
+    island, path = fold.island("r1", 0), trajectory(fold, "r1", 0)
+    nodes = island.graph.streams["r1", 0]
+    np.testing.assert_array_equal(path.crosses[0], np.zeros((3, 3)))  # the start is exactly known
+    for k in range(1, 4):
+        mean, covariance = joint_marginal(island, [nodes[k], nodes[k + 1]])
+        np.testing.assert_allclose(mean[3:], path.poses[k])
+        np.testing.assert_allclose(covariance[3:, :3], path.crosses[k], rtol=1e-6, atol=1e-12)

@@ -1,0 +1,99 @@
+"""What a user takes home from a run: the map and the paths as tables that anything reads.
+
+`map.csv` and `map.json` have a landmark a row, `paths/<robot>.csv` and `.tum` a pose a row. Metres,
+seconds, radians, all in the frame that the map names; numbers in full, so that they can be read
+back to the last bit.
+"""
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+from central.desk.drawing import landmark_blocks
+from central.desk.evaluation.errors import Path
+from central.desk.evaluation.evaluation import MapResult
+from central.desk.export.tum import seconds, write_tum
+from central.desk.paths import SmoothedPath, smoothed_paths
+from central.desk.verification.recorded import Recorded
+from team.wire import messages as m
+from team.wire.arrays import ids
+
+MAP_COLUMNS = (
+    "id", "x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "measurements", "frame",
+)  # fmt: skip
+PATH_COLUMNS = (
+    "t_s", "x_m", "y_m", "theta_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_xt_m_rad",
+    "cov_yt_m_rad", "cov_tt_rad2",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TakenHome:
+    """The robots' smoothed paths, and how many measurements of each landmark the log has."""
+
+    paths: Mapping[str, SmoothedPath]
+    measurements: Mapping[int, int]
+
+
+def taken_home(found: Recorded) -> TakenHome:
+    """Paths at keyframe rate and counts, of a log."""
+    counts = Counter[int]()
+    for stream in found.measurements.values():
+        for message in stream.values():
+            if isinstance(message, m.Observations):
+                counts.update(ids(message.ids, "ids").tolist())
+    return TakenHome(smoothed_paths(found), counts)
+
+
+def write_map(
+    fused: MapResult, measurements: Mapping[int, int], folder: FilePath
+) -> list[FilePath]:
+    """Write map.csv and map.json; what was written.
+
+    A landmark's covariance is its own 2 × 2 block; how landmarks go together is in the log.
+    """
+    rows: list[dict[str, Any]] = []
+    blocks = landmark_blocks(fused.covariance)
+    for landmark, (x, y), block in zip(
+        fused.ids.tolist(), fused.means.tolist(), blocks.tolist(), strict=True
+    ):
+        (xx, xy), (_, yy) = block
+        count = measurements.get(landmark, 0)
+        values = (landmark, x, y, xx, xy, yy, count, fused.frame)
+        rows.append(dict(zip(MAP_COLUMNS, values, strict=True)))
+    table, data = folder / "map.csv", folder / "map.json"
+    with table.open("w", encoding="utf-8", newline="") as lines:
+        writer = csv.DictWriter(lines, MAP_COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    whole = {
+        "frame": fused.frame,
+        "set": fused.digest,
+        "final_map_sha256": fused.payload_sha256,
+        "landmarks": [{k: v for k, v in row.items() if k != "frame"} for row in rows],
+    }
+    data.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+    return [table, data]
+
+
+def write_paths(paths: Mapping[str, SmoothedPath], folder: FilePath) -> list[FilePath]:
+    """Write <robot>.csv and <robot>.tum into the folder; what was written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for robot, path in paths.items():
+        table, tum = folder / f"{robot}.csv", folder / f"{robot}.tum"
+        with table.open("w", encoding="ascii", newline="") as lines:
+            writer = csv.writer(lines, lineterminator="\n")
+            writer.writerow(PATH_COLUMNS)
+            for stamp, pose, P in zip(
+                path.stamps_ns.tolist(), path.poses.tolist(), path.covariances, strict=True
+            ):
+                upper = P[(0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)].tolist()
+                writer.writerow([seconds(stamp), *pose, *upper])
+        write_tum(Path(path.stamps_ns, path.poses), tum)
+        written += [table, tum]
+    return written

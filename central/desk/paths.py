@@ -1,0 +1,121 @@
+"""Smoothed paths at the rate of keyframes: from a log's final map and its measurements.
+
+The final map has each robot's poses at the ends of its submaps. Between them the robot's windows
+are computed again from the recorded measurements, and each window's path is placed between its two
+ends (`team.estimation.hybrid_slam.window_path`).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import takewhile
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from central.desk.verification.recorded import Recorded, RerunError
+from team import translate
+from team.config import RobotConfig
+from team.containment import Boundary
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.window_path import Ends, placed, window_path
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+
+
+@dataclass(frozen=True)
+class SmoothedPath:
+    """A robot's poses (x [m], y [m], theta [rad]) in the final map, by stamp, with covariances.
+
+    at_keyframes: between the ends of submaps, too.
+    """
+
+    stamps_ns: Int64[np.ndarray, " K"]
+    poses: Float[np.ndarray, "K 3"]
+    covariances: Float[np.ndarray, "K 3 3"]
+    at_keyframes: bool
+
+
+class _Windows(RobotNode):
+    """The robot's node over its recorded measurements, which keeps what its windows became."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        super().__init__(config)
+        self.closed: list[ClosedWindow] = []
+
+    def window_closed(self, closed: ClosedWindow) -> None:
+        """Keep it."""
+        self.closed.append(closed)
+
+
+def smoothed_paths(
+    found: Recorded, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, SmoothedPath]:
+    """The path of every robot that is in the final map; `progress` hears each robot's name."""
+    last: dict[tuple[str, int], m.Trajectory] = {}
+    for message in found.of(ch.TRAJECTORY):
+        if isinstance(message, m.Trajectory):
+            last[message.robot, message.incarnation] = message
+    by_robot: dict[str, list[SmoothedPath]] = {}
+    for (robot, incarnation), message in sorted(last.items()):
+        progress(robot)
+        windows = _windows(found, robot, incarnation) if message.crosses else {}
+        by_robot.setdefault(robot, []).append(_between_ends(found, message, windows))
+    return {robot: _joined(parts) for robot, parts in by_robot.items()}
+
+
+def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, ClosedWindow]:
+    """The windows of an incarnation by the stamp of their end, as far as its measurements reach."""
+    try:
+        config, _ = found.robot_config(robot)
+    except RerunError:
+        return {}
+    if config.estimator != "hybrid":
+        return {}
+    node, boundary = _Windows(config), Boundary(ch.robot_node(robot))
+    boundary.give(node, m.Liveliness(stamp_ns=0, node="central", alive=False))
+    measurements = found.measurements.get((robot, incarnation), {})
+    whole = range(max(measurements, default=-1) + 1)
+    for number in takewhile(measurements.__contains__, whole):
+        boundary.give(node, measurements[number])
+    end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(whole))
+    boundary.give(node, m.End(stamp_ns=0, streams=(end,)))
+    return {closed.end_ns: closed for closed in node.closed}
+
+
+def _between_ends(
+    found: Recorded, message: m.Trajectory, windows: Mapping[int, ClosedWindow]
+) -> SmoothedPath:
+    """The path of one incarnation: of each submap its keyframes, then its end."""
+    stamps, poses = translate.trajectory_of(message)
+    covariances = floats(message.covariances, "covariances").reshape(-1, 3, 3)
+    if not windows:
+        return SmoothedPath(stamps, poses, covariances, at_keyframes=False)
+    factor = found.central_config()[0].covariance_factor
+    crosses = floats(message.crosses, "crosses").reshape(-1, 3, 3)
+    before = floats(message.start, "start")
+    spread = floats(message.start_covariance, "start_covariance").reshape(3, 3)
+    first = windows.get(int(stamps[0]))
+    parts = [] if first is None else [(np.array([first.start_ns]), before[None], spread[None])]
+    for stamp, pose, covariance, cross in zip(stamps, poses, covariances, crosses, strict=True):
+        closed = windows.get(int(stamp))
+        if closed is not None and closed.window is not None and closed.keyframes_ns:
+            path = window_path(closed.window, closed.keyframes_ns)
+            ends = Ends(before, pose, np.block([[spread, cross.T], [cross, covariance]]))
+            within = path.stamps_ns < stamp
+            placed_poses, placed_covariances = placed(path, ends, factor)
+            parts.append((path.stamps_ns[within], placed_poses[within], placed_covariances[within]))
+        parts.append((np.array([stamp]), pose[None], covariance[None]))
+        before, spread = pose, covariance
+    return SmoothedPath(*(np.concatenate(each) for each in zip(*parts, strict=True)), True)
+
+
+def _joined(parts: list[SmoothedPath]) -> SmoothedPath:
+    """The incarnations of a robot one behind the other."""
+    return SmoothedPath(
+        np.concatenate([part.stamps_ns for part in parts]),
+        np.concatenate([part.poses for part in parts]),
+        np.concatenate([part.covariances for part in parts]),
+        at_keyframes=all(part.at_keyframes for part in parts),
+    )

@@ -1,0 +1,98 @@
+"""The path within a closed window, given where the window ends.
+
+A submap keeps the pose at its window's end. What the particles know of the poses before it is here
+as a linear Gaussian of that end, so that a map that moves the two ends of a window moves the path
+between them, and the path has a covariance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation.geometry import Pose, wrapped
+from team.estimation.hybrid_slam.moments import mean_direction, sample_factor
+from team.estimation.hybrid_slam.window import POSE_JITTER, Window
+
+
+@dataclass(frozen=True)
+class WindowPath:
+    """The K keyframes of a window, in the frame of its start.
+
+    x_k = mean_k + gain_k (end − end_mean); poses are (x [m], y [m], theta [rad]). covariances: of
+    what is left of x_k given the end.
+    """
+
+    stamps_ns: Int64[np.ndarray, " K"]
+    means: Float[np.ndarray, "K 3"]
+    gains: Float[np.ndarray, "K 3 3"]
+    covariances: Float[np.ndarray, "K 3 3"]
+    end_mean: Float[np.ndarray, "3"]
+
+
+def window_path(window: Window, keyframes_ns: Sequence[int]) -> WindowPath:
+    """The path of a closed window's particles, regressed on their end.
+
+    With the particles' covariances P over (x_k, end), gain = P_ke P_ee⁻¹ and what is left is
+    P_kk − gain P_ek; P_ee has POSE_JITTER as the submap's end has.
+    """
+    weights = np.exp(window.particles.log_weights)
+    poses = np.concatenate((window.paths, window.particles.poses[None]))
+    means = np.array([_mean(each, weights) for each in poses])
+    off = poses - means[:, None]
+    off[:, :, 2] = np.arctan2(np.sin(off[:, :, 2]), np.cos(off[:, :, 2]))
+    scaled = sample_factor(weights) * weights[None, :, None] * off
+    P_ee = scaled[-1].T @ off[-1] + np.diag(POSE_JITTER)
+    P_ke = np.einsum("kmi,mj->kij", scaled[:-1], off[-1])
+    P_kk = np.einsum("kmi,kmj->kij", scaled[:-1], off[:-1]) + np.diag(POSE_JITTER)
+    gains = np.linalg.solve(P_ee, P_ke.transpose(0, 2, 1)).transpose(0, 2, 1)
+    left = P_kk - gains @ P_ke.transpose(0, 2, 1)
+    return WindowPath(
+        np.array(keyframes_ns, np.int64),
+        means[:-1],
+        gains,
+        0.5 * (left + left.transpose(0, 2, 1)),
+        means[-1],
+    )
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Where a window lies in the map: its start and its end with their joint 6 × 6 covariance."""
+
+    start: Pose
+    end: Pose
+    covariance: Float[np.ndarray, "6 6"]
+
+
+def placed(
+    path: WindowPath, ends: Ends, covariance_factor: float = 1.0
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
+    """The keyframes' poses and covariances in the map's frame, in (x, y, theta).
+
+    x = start ∘ (mean + gain (start⁻¹ ∘ end − end_mean)), by first order in both ends and in what is
+    left; that is taken times covariance_factor, as the map takes the submap's covariance.
+    """
+    heading = ends.start[2]
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    local_end = turn.T @ (ends.end - ends.start)
+    off = local_end - path.end_mean
+    off[2] = wrapped(off[2])
+    local = path.means + path.gains @ off
+    poses = ends.start + local @ turn.T
+    poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
+    J_end_start = np.column_stack((-turn.T[:, :2], [local_end[1], -local_end[0], -1.0]))
+    covariances = np.empty((len(local), 3, 3))
+    for k, (gain, left) in enumerate(zip(path.gains, path.covariances, strict=True)):
+        moved = turn @ gain
+        J = np.concatenate((moved @ J_end_start, moved @ turn.T), axis=1)
+        J[:, :3] += np.eye(3)
+        J[:, 2] += [-s * local[k, 0] - c * local[k, 1], c * local[k, 0] - s * local[k, 1], 0.0]
+        covariances[k] = J @ ends.covariance @ J.T + covariance_factor * (turn @ left @ turn.T)
+    return poses, 0.5 * (covariances + covariances.transpose(0, 2, 1))
+
+
+def _mean(poses: Float[np.ndarray, "M 3"], weights: Float[np.ndarray, " M"]) -> Pose:
+    return np.array([*(weights @ poses[:, :2]), mean_direction(poses[:, 2], weights)])
