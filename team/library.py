@@ -227,7 +227,8 @@ def join(
     return JoinedMap(
         landmarks=marginals.landmark_map(fold),
         trajectories={
-            robot: marginals.trajectory(fold, robot, _INCARNATION) for robot in sorted(inside)
+            robot: Trajectory(*marginals.trajectory(fold, robot, _INCARNATION)[:2])
+            for robot in sorted(inside)
         },
         chi2=cost.chi2,
         dof=cost.dof,

@@ -108,7 +108,12 @@ def _between_ends(
             parts.append((path.stamps_ns[within], placed_poses[within], placed_covariances[within]))
         parts.append((np.array([stamp]), pose[None], covariance[None]))
         before, spread = pose, covariance
-    return SmoothedPath(*(np.concatenate(each) for each in zip(*parts, strict=True)), True)
+    return SmoothedPath(
+        np.concatenate([part[0] for part in parts]),
+        np.concatenate([part[1] for part in parts]),
+        np.concatenate([part[2] for part in parts]),
+        at_keyframes=True,
+    )
 
 
 def _joined(parts: list[SmoothedPath]) -> SmoothedPath:

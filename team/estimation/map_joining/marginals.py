@@ -39,6 +39,13 @@ class LandmarkBlocks(NamedTuple):
 
 
 class Trajectory(NamedTuple):
+    """Smoothed poses in their order, each with its covariance."""
+
+    poses: Float[np.ndarray, "K 3"]
+    covariances: Float[np.ndarray, "K 3 3"]
+
+
+class EndPoses(NamedTuple):
     """End poses of a stream's submaps in their order, each with its covariance.
 
     start, start_covariance: where the first one begins. crosses: the covariance of each pose with
@@ -202,12 +209,12 @@ def _priors_in(
     return priors
 
 
-def trajectory(fold: Fold, robot: str, incarnation: int) -> Trajectory:
+def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
     """Where the submaps of a stream end, in the frame of its island."""
     island = fold.island(robot, incarnation)
     nodes = island.graph.streams[(robot, incarnation)]
     (start, start_covariance), *ends = (_own_marginal(island, node) for node in nodes)
-    return Trajectory(
+    return EndPoses(
         np.array([pose for pose, _ in ends]),
         np.array([spread for _, spread in ends]),
         start,
