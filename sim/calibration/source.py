@@ -4,11 +4,12 @@ from pathlib import Path
 
 import msgspec
 
+from sim.datasets.kinds import UTIAS_MARKER, kind_of
 from sim.datasets.tables import opened as opened_set
 from sim.datasets.utias_log import present_robots
 from sim.recorded.streams import recorded_streams
 from sim.scenarios.scenario import Scenario, ScenarioError, load, loads, with_options
-from sim.scenarios.source import streams_of
+from sim.scenarios.source import scenario_beside, streams_of
 from sim.world.streams import WorldStreams
 from team.recording.reader import open_log
 from team.wire import channels as ch
@@ -19,7 +20,7 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
 
 
 def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
-    """The measurements of a log (`.mcap`) with its scenario, or of a UTIAS set with `utias`.
+    """The measurements of a log (`.mcap`) with its scenario, or of a data set with its own.
 
     Of a log the first incarnation of each robot is taken; of a set, all robots that it has files
     of. Raises DatasetError, LogError or ScenarioError.
@@ -37,8 +38,10 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
 
 
 def _with_its_robots(path: Path) -> Scenario:
-    """The scenario `utias` with the robots that the set has files of, however many."""
-    with opened_set(str(path), "Barcodes.dat") as files:
+    """The data set's own scenario with the robots that it has files of, however many."""
+    if kind_of(path) == "folder":
+        return with_options(load(scenario_beside(path)), dataset=path)
+    with opened_set(str(path), UTIAS_MARKER) as files:
         present = present_robots(files)
     scenario = with_options(load("utias"), robots=max(present, default=None), dataset=path)
     robots = tuple(robot for robot in scenario.robots if int(robot.id[1:]) in present)

@@ -25,6 +25,7 @@ from sim.cli.options import (
     over_tls,
     parsed_speed,
     refuse_open_door,
+    scenario_for,
     scenario_of,
 )
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
@@ -43,7 +44,7 @@ def launch(
     scenario: Annotated[
         str | None,
         typer.Argument(
-            help="A built-in scenario or a .toml file; default: thesis, with --dataset utias."
+            help="A built-in scenario or a .toml file; default: thesis, or the data set's own."
         ),
     ] = None,
     dataset: Dataset = None,
@@ -96,7 +97,7 @@ def launch(
 
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
-    name = scenario or ("utias" if dataset is not None else "thesis")
+    name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
     resolved = with_options(
         scenario_of(name),
         robots=robots,
@@ -163,9 +164,9 @@ def _keep_showing(url: str, log: Path) -> None:
 def _check_world(scenario: Scenario) -> None:
     """A data set that can not be read is found before any process starts."""
     from sim.scenarios.source import streams_of
-    from sim.world.config import UtiasWorld
+    from sim.world.config import FolderWorld, UtiasWorld
 
-    if isinstance(scenario.world, UtiasWorld):
+    if isinstance(scenario.world, UtiasWorld | FolderWorld):
         streams_of(scenario)
 
 

@@ -39,13 +39,7 @@ class Log:
 
     def until(self, end_ns: int) -> "Log":
         """The log up to the last odometry interval that ends at end_ns or before."""
-        whole = self.intervals.end_ns <= end_ns
-        intervals = Intervals(
-            self.intervals.end_ns[whole],
-            self.intervals.duration_ns[whole],
-            self.intervals.forward[whole],
-            self.intervals.yaw_rate[whole],
-        )
+        intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
         last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
         samples = int(np.searchsorted(self.truth_ns, end_ns)) + 1
         return replace(

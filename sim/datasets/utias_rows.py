@@ -83,10 +83,10 @@ def measurements_of(
     known = codes[at] == rows[:, 1]
     positive = rows[:, 2] > 0.0
     measurements = Measurements(
-        nanoseconds(rows[:, 0]), subjects[at], rows[:, 2].copy(), _on_circle(rows[:, 3])
+        nanoseconds(rows[:, 0]), subjects[at], rows[:, 2].copy(), on_circle(rows[:, 3])
     )
     kept = known & positive
-    single = _first_of_each(measurements.stamps_ns, measurements.subjects, kept)
+    single = first_of_each(measurements.stamps_ns, measurements.subjects, kept)
     notes = (
         counted(backward, "measurement", "earlier than the row before: sorted by time"),
         counted(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
@@ -129,14 +129,14 @@ def start_pose(
     if first == last:
         return None
     poses = truth[first:last]
-    apart = np.abs(_on_circle(poses[:, 2, np.newaxis] - poses[:, 2]))
+    apart = np.abs(on_circle(poses[:, 2, np.newaxis] - poses[:, 2]))
     middle = int(np.argmin(apart.sum(axis=1)))
     agreeing = apart[middle] <= START_SPREAD_RAD
     since = (truth_ns[first:last][agreeing] - start_ns).astype(np.float64)
     x, y, heading = poses[agreeing].T
-    turned = _on_circle(heading - poses[middle, 2])
+    turned = on_circle(heading - poses[middle, 2])
     at = [float(np.interp(0.0, since, values)) for values in (x, y, turned)]
-    return np.array([at[0], at[1], _on_circle(np.array(at[2] + poses[middle, 2])).item()])
+    return np.array([at[0], at[1], on_circle(np.array(at[2] + poses[middle, 2])).item()])
 
 
 def _by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
@@ -145,7 +145,7 @@ def _by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], 
     return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward
 
 
-def _first_of_each(
+def first_of_each(
     stamps_ns: Int64[np.ndarray, " R"],
     subjects: UInt32[np.ndarray, " R"],
     kept: Bool[np.ndarray, " R"],
@@ -159,7 +159,7 @@ def _first_of_each(
     return single
 
 
-def _on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+def on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
     """The angles in (−π, π]; those that are there already keep their bits."""
     turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
     turned = np.where(turned == -np.pi, np.pi, turned)

@@ -2,10 +2,10 @@
 
 base = "thesis"            # optional: a built-in scenario that this file changes
 name, team, seed, estimator, fusion, exchange
-[world]      kind = "simulated" | "utias", then the fields of sim.world.config
+[world]      kind = "simulated" | "utias" | "folder", then the fields of sim.world.config
 [defaults]   fields of every robot (team.config.RobotConfig)
 [[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS
-             world: its five
+             world: its five; in a world of a folder: those that it has
 [central]    fields of central.config.CentralConfig
 """
 
@@ -19,6 +19,7 @@ from typing import Any
 import msgspec
 
 from central.config import CentralConfig
+from sim.datasets.folder import robots_of
 from sim.scenarios.checks import ScenarioError, check_fields, check_known, plain
 from team.config import RobotConfig
 
@@ -78,11 +79,7 @@ def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
     if count is not None and "robots" in fields:
         raise ScenarioError("robot_count and [[robots]] exclude each other: leave one away")
     world = checked_table(fields.get("world", {}), "world")
-    if count is not None:
-        unnamed = checked_count(count)
-    else:
-        unnamed = UTIAS_ROBOTS if world.get("kind") == "utias" else 0
-    robots = fields.get("robots", [{}] * unnamed)
+    robots = fields.get("robots", _unnamed(world, count))
     if not isinstance(robots, list):
         raise ScenarioError("expected [[robots]], an array of tables, at robots")
     for i, robot in enumerate(robots):
@@ -93,6 +90,17 @@ def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
     ]
     _check_part(checked_table(fields.get("central", {}), "central"), CentralConfig, "central", {})
     return {"team": fields["name"]} | fields
+
+
+def _unnamed(world: Fields, count: object) -> list[Fields]:
+    """The robots of a document that names none."""
+    if count is not None:
+        return [{}] * checked_count(count)
+    if world.get("kind") == "folder":
+        path = world.get("path")
+        named = robots_of(path) if isinstance(path, str) and path else ("r1",)
+        return [{"id": name} for name in named]
+    return [{}] * (UTIAS_ROBOTS if world.get("kind") == "utias" else 0)
 
 
 def checked_table(value: object, at: str) -> Fields:

@@ -12,6 +12,9 @@ from typing import Any
 import msgspec
 
 from central.team_config import TeamConfig
+from sim.datasets.folder import robots_of
+from sim.datasets.kinds import kind_of
+from sim.datasets.tables import DatasetError
 from sim.scenarios.checks import ScenarioError, check_fields, plain
 from sim.scenarios.document import (
     MAX_ROBOTS,
@@ -22,7 +25,7 @@ from sim.scenarios.document import (
     named_document,
     resolved,
 )
-from sim.world.config import SimulatedWorld, UtiasWorld, World
+from sim.world.config import FolderWorld, SimulatedWorld, UtiasWorld, World
 from team.config import Estimator, Exchange, FusionRule
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from team.registry import absence
@@ -30,7 +33,11 @@ from team.registry import absence
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
            "with_options"]  # fmt: skip
 
-WORLDS: dict[str, type[World]] = {"simulated": SimulatedWorld, "utias": UtiasWorld}
+WORLDS: dict[str, type[World]] = {
+    "simulated": SimulatedWorld,
+    "utias": UtiasWorld,
+    "folder": FolderWorld,
+}
 
 
 class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,15 +76,44 @@ def with_options(
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
     fields |= {key: value for key, value in changes.items() if value is not None}
+    if dataset is not None:
+        fields["world"] = _world_of(scenario, str(dataset))
+    world = fields["world"]
+    if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
+        fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
     if robots is not None:
         fields["robots"] = _counted(fields["robots"], robots)
-    if dataset is not None:
-        if not isinstance(scenario.world, UtiasWorld):
-            raise ScenarioError(
-                f"{scenario.name}: a simulated world takes no data set; use the scenario `utias`"
-            )
-        fields["world"]["path"] = str(dataset)
     return _converted(fields)
+
+
+def _world_of(scenario: Scenario, path: str) -> Fields:
+    """The scenario's world with another data set, of whichever kind that is."""
+    world = scenario.world
+    if isinstance(world, SimulatedWorld):
+        raise ScenarioError(
+            f"{scenario.name}: a simulated world takes no data set; use the scenario `utias` or "
+            "`recorded`"
+        )
+    fields: Fields = msgspec.to_builtins(world)
+    kind = _kind_of(path, "utias" if isinstance(world, UtiasWorld) else "folder")
+    if kind != fields["kind"]:
+        common = {field.name for field in msgspec.structs.fields(WORLDS[kind])}
+        fields = {name: value for name, value in fields.items() if name in common}
+    return fields | {"kind": kind, "path": path}
+
+
+def _kind_of(path: str, otherwise: str) -> str:
+    """The kind of a data set; what can not be told is found wrong when it is read."""
+    try:
+        return kind_of(path)
+    except DatasetError:
+        return otherwise
+
+
+def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
+    """The robots that the data set has; where it has none of them, its own after their pattern."""
+    kept = [robot for robot in robots if robot["id"] in names]
+    return kept or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
 
 
 def dumps(scenario: Scenario) -> str:

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import msgspec
 
+from sim.datasets.folder import SCENARIO, folder, robots_of
+from sim.datasets.kinds import UTIAS_MARKER, kind_of
 from sim.datasets.tables import opened
 from sim.datasets.utias import utias
 from sim.datasets.utias_log import present_robots
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario
-from sim.world.config import SimulatedWorld
+from sim.world.config import FolderWorld, SimulatedWorld
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
 from team.pairs import NEEDS_MAP
@@ -20,7 +22,17 @@ def streams_of(scenario: Scenario) -> WorldStreams:
     """Simulate the world or read its data set; raises DatasetError."""
     if isinstance(scenario.world, SimulatedWorld):
         return simulated(scenario.world, scenario.robots, noise_seed(scenario))
+    if isinstance(scenario.world, FolderWorld):
+        return folder(scenario.world, scenario.robots)
     return utias(scenario.world, scenario.robots)
+
+
+def scenario_beside(path: str | Path) -> str:
+    """The scenario that a data set brings with it, or the built-in one for its kind."""
+    if kind_of(path) == "utias":
+        return "utias"
+    own = Path(path) / SCENARIO
+    return str(own) if own.is_file() else "recorded"
 
 
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
@@ -32,8 +44,11 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     world = scenario.world
     if isinstance(world, SimulatedWorld) or not world.path:
         return scenario, None
-    with opened(world.path, "Barcodes.dat") as files:
-        present = {f"r{number}" for number in present_robots(files)}
+    if isinstance(world, FolderWorld):
+        present = set(robots_of(world.path))
+    else:
+        with opened(world.path, UTIAS_MARKER) as files:
+            present = {f"r{number}" for number in present_robots(files)}
     kept = tuple(robot for robot in scenario.robots if robot.id in present)
     missing = [robot.id for robot in scenario.robots if robot.id not in present]
     if not kept or not missing:

@@ -1,4 +1,4 @@
-"""The two kinds of world that a scenario may name, as a user describes them."""
+"""The kinds of world that a scenario may name, as a user describes them."""
 
 from itertools import pairwise
 from math import hypot
@@ -89,10 +89,24 @@ class UtiasWorld(
             raise ValueError("start_sigma_m and start_sigma_rad are both 0 or both above 0")
 
 
-def starts_unknown(world: SimulatedWorld | UtiasWorld, robot: str) -> bool:
+class FolderWorld(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="folder"
+):
+    """A data set in a folder (or zip) of CSV tables, with a sub-folder for each robot.
+
+    path: the folder. unknown_starts: as in a simulated world, beside the robots without start.csv.
+    duration_s: only this much from the team's first measurement.
+    """
+
+    path: str = ""
+    unknown_starts: tuple[str, ...] = ()
+    duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
+
+
+def starts_unknown(world: SimulatedWorld | UtiasWorld | FolderWorld, robot: str) -> bool:
     """Whether the team is not told where this robot starts."""
     named = world.unknown_starts
     return robot in named or ("*" in named and f"!{robot}" not in named)
 
 
-World = SimulatedWorld | UtiasWorld
+World = SimulatedWorld | UtiasWorld | FolderWorld

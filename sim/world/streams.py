@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt8, UInt32
+from jaxtyping import Bool, Float, Int64, UInt8, UInt32
 
 START = 0
 OBSERVATIONS = 1
@@ -40,6 +40,10 @@ class Intervals:
     duration_ns: Int64[np.ndarray, " I"]
     forward: Float[np.ndarray, " I"]
     yaw_rate: Float[np.ndarray, " I"]
+
+    def where(self, chosen: Bool[np.ndarray, " I"]) -> "Intervals":
+        """The chosen ones."""
+        return Intervals(*(part[chosen] for part in vars(self).values()))
 
 
 @dataclass(frozen=True)

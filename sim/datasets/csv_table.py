@@ -1,0 +1,167 @@
+"""Comma-separated tables with named columns: exact to the last bit, exact about what is wrong."""
+
+import csv
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from math import isfinite
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from sim.datasets.tables import LARGEST, DatasetError, File
+
+T = TypeVar("T")
+NANO = Decimal(10**9)
+SHOWN = 60
+"""Letters of a faulty cell or line that an error shows."""
+LARGEST_NAME = 2**31 - 1
+"""Landmarks with names have numbers up to this; the numbers beyond it are of those without."""
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """The cells of a table by column, as text; lines: each row's line in the file, from 1.
+
+    name: of the file, as errors have it.
+    """
+
+    name: str
+    columns: dict[str, list[str]]
+    lines: list[int]
+
+    def __len__(self) -> int:
+        """The number of rows."""
+        return len(self.lines)
+
+    def has(self, *columns: str) -> bool:
+        """Whether all these columns are there."""
+        return all(column in self.columns for column in columns)
+
+    def numbers(self, *columns: str) -> Float[np.ndarray, "rows columns"]:
+        """The columns' finite numbers; raises DatasetError."""
+        taken = [np.array(self._parsed(column, _number)) for column in columns]
+        return np.column_stack(taken).astype(np.float64) if taken else np.zeros((len(self), 0))
+
+    def stamps(self, column: str, unit_s: Decimal = Decimal(1)) -> Int64[np.ndarray, " rows"]:
+        """Times in nanoseconds, exactly as the text says them; raises DatasetError."""
+        scale = unit_s * NANO
+        parsed = self._parsed(column, lambda text: _stamp_ns(text, scale))
+        return np.array(parsed, dtype=np.int64)
+
+    def names(self, column: str) -> UInt32[np.ndarray, " rows"]:
+        """Landmarks' numbers; raises DatasetError."""
+        return np.array(self._parsed(column, _landmark), dtype=np.uint32)
+
+    def rows(self, chosen: Iterable[bool]) -> "CsvTable":
+        """The chosen rows."""
+        kept = [i for i, each in enumerate(chosen) if each]
+        columns = {name: [cells[i] for i in kept] for name, cells in self.columns.items()}
+        return CsvTable(self.name, columns, [self.lines[i] for i in kept])
+
+    def error(self, row: int, column: str, problem: str) -> DatasetError:
+        """What is wrong in one cell."""
+        return DatasetError(f"{self.name}, line {self.lines[row]}, column {column}: {problem}")
+
+    def fault(self, problem: str) -> DatasetError:
+        """What is wrong with its columns."""
+        return DatasetError(f"{self.name}, line 1: {problem}")
+
+    def _parsed(self, column: str, parse: Callable[[str], T]) -> list[T]:
+        cells = self.columns[column]
+        try:
+            return [parse(cell) for cell in cells]
+        except ValueError:
+            pass
+        for row, cell in enumerate(cells):
+            try:
+                parse(cell)
+            except ValueError as error:
+                raise self.error(row, column, str(error)) from None
+        raise AssertionError(column)
+
+
+def read_table(file: File, name: str, known: Sequence[str] | None = None) -> CsvTable:
+    """A table whose first line names its columns; empty lines and lines with `#` are left out.
+
+    known: the columns that may be there; None: any. Raises DatasetError.
+    """
+    try:
+        text = file.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{name}: not UTF-8 text ({error.reason}); save it as UTF-8") from None
+    rows = csv.reader(text.splitlines())
+    try:
+        header = _header(rows, name)
+        lines, cells = [], []
+        for row in rows:
+            if row and not row[0].startswith("#"):
+                lines.append(rows.line_num)
+                cells.append(row)
+    except csv.Error as error:
+        raise DatasetError(f"{name}, line {rows.line_num}: {error}; check its quotes") from None
+    _check_header(header, name, known)
+    for line, row in zip(lines, cells, strict=True):
+        if len(row) != len(header):
+            raise DatasetError(
+                f"{name}, line {line}: {len(row)} columns, {len(header)} expected "
+                f"({', '.join(header)}): `{','.join(row)[:SHOWN]}`"
+            )
+    by_column = zip(*cells, strict=True) if cells else ([] for _ in header)
+    columns = {column: list(each) for column, each in zip(header, by_column, strict=True)}
+    return CsvTable(name, columns, lines)
+
+
+def _header(rows: Iterable[list[str]], name: str) -> list[str]:
+    for row in rows:
+        if row and not row[0].startswith("#"):
+            return [column.strip() for column in row]
+    raise DatasetError(f"{name}: empty; its first line names the columns, as t_s,landmark,…")
+
+
+def _check_header(header: list[str], name: str, known: Sequence[str] | None) -> None:
+    if len(header) == 1 and any(mark in header[0] for mark in (";", "\t")):
+        raise DatasetError(f"{name}, line 1: columns are parted by commas, not by ; or tabs")
+    for i, column in enumerate(header):
+        if column in header[:i]:
+            raise DatasetError(f"{name}, line 1: two columns are called {column!r}")
+        if known is not None and column not in known:
+            raise DatasetError(
+                f"{name}, line 1: unknown column {column!r}; known: {', '.join(known)}. "
+                "`teamslam import` takes other names by a map of columns"
+            )
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{text[:SHOWN]!r} is not a number") from None
+    if not isfinite(value):
+        raise ValueError(f"{text[:SHOWN]!r} is not finite")
+    if abs(value) > LARGEST:
+        raise ValueError(f"{text[:SHOWN]} is out of bounds (largest: {LARGEST:g})")
+    return value
+
+
+def _stamp_ns(text: str, scale: Decimal) -> int:
+    try:
+        value = Decimal(text) * scale
+    except InvalidOperation:
+        raise ValueError(f"{text[:SHOWN]!r} is not a time in numbers") from None
+    if not value.is_finite() or abs(value) > LARGEST * 1e9:
+        raise ValueError(
+            f"{text[:SHOWN]} is out of bounds: a time is finite and at most {LARGEST:g} s"
+        )
+    return int(value.to_integral_value())
+
+
+def _landmark(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        raise ValueError(f"{text[:SHOWN]!r} is not a whole number") from None
+    if not 0 <= value <= LARGEST_NAME:
+        raise ValueError(f"{value} is out of bounds: a landmark has a number from 0 to 2^31 - 1")
+    return value

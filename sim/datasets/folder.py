@@ -1,0 +1,271 @@
+"""A data set in a folder (or zip) of CSV tables: a sub-folder for each robot.
+
+r1/odometry.csv       t_s with forward_m_s,yaw_rate_rad_s or x_m,y_m,theta_rad or
+                      dx_m,dy_m,dtheta_rad
+r1/observations.csv   t_s,landmark with range_m,bearing_rad or x_m,y_m
+r1/sightings.csv      t_s,teammate with range_m,bearing_rad or x_m,y_m    (optional)
+r1/start.csv          x_m,y_m,theta_rad, with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt  (optional)
+r1/truth.csv          t_s,x_m,y_m,theta_rad                               (optional)
+landmarks.csv         landmark,x_m,y_m: the true ones                     (optional)
+scenario.toml         what the team is told                               (optional)
+"""
+
+import re
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from sim.datasets import folder_tables as rows
+from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.tables import DatasetError, File
+from sim.datasets.utias_rows import Measurements
+from sim.world.config import FolderWorld, starts_unknown
+from sim.world.streams import (
+    Detections,
+    Intervals,
+    RobotStream,
+    StartPose,
+    WorldStreams,
+    grouped,
+    robot_stream,
+)
+from team.config import RobotConfig
+
+ROBOT_NAME = "[a-z][a-z0-9_]{0,31}"
+STREAM_FILES = ("odometry.csv", "observations.csv")
+"""A folder with one of these is a robot's."""
+ONE_ROBOT = "r1"
+"""The name of a robot whose tables lie in the data set's folder itself."""
+SCENARIO = "scenario.toml"
+EXPECTED = (
+    "expected a folder with a sub-folder for each robot, named as in r1, with odometry.csv and "
+    "observations.csv (docs/your_data.md)"
+)
+COVARIANCE = rows.POSE_COVARIANCE
+TABLES = {
+    "odometry": ("t_s", "duration_s", *rows.SPEEDS, *rows.POSES, *rows.INCREMENTS, *COVARIANCE),
+    "observations": ("t_s", "landmark", *rows.POLAR, *rows.POINTS),
+    "sightings": ("t_s", "teammate", *rows.POLAR, *rows.POINTS),
+    "start": (*rows.POSES, *COVARIANCE),
+    "truth": ("t_s", *rows.POSES),
+    "landmarks": ("landmark", *rows.POINTS),
+}
+"""The columns that a table may have."""
+REQUIRED = {
+    "odometry": ("t_s",),
+    "observations": ("t_s", "landmark"),
+    "sightings": ("t_s", "teammate"),
+    "start": rows.POSES,
+    "truth": ("t_s", *rows.POSES),
+    "landmarks": ("landmark", *rows.POINTS),
+}
+
+
+@contextmanager
+def opened_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
+    """The data set's folder, and each robot's by name; raises DatasetError."""
+    place = Path(path)
+    if not place.exists():
+        raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
+    if place.is_dir():
+        yield place, _robots_in(place, path)
+        return
+    try:
+        with zipfile.ZipFile(place) as archive:
+            root = zipfile.Path(archive)
+            entries = list(root.iterdir())
+            only = entries[0] if len(entries) == 1 and entries[0].is_dir() else root
+            yield only, _robots_in(only, path)
+    except zipfile.BadZipFile as error:
+        raise DatasetError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
+
+
+def is_folder(path: str | Path) -> bool:
+    """Whether there is a data set of CSV tables."""
+    try:
+        with opened_folder(str(path)):
+            return True
+    except (DatasetError, OSError):
+        return False
+
+
+def robots_of(path: str) -> tuple[str, ...]:
+    """The names of a folder's robots: r2 before r10; raises DatasetError."""
+    with opened_folder(path) as (_, robots):
+        return tuple(robots)
+
+
+def _robots_in(root: File, path: str) -> Mapping[str, File]:
+    if any((root / name).is_file() for name in STREAM_FILES):
+        return {ONE_ROBOT: root}
+    entries: dict[str, File] = {entry.name: entry for entry in root.iterdir()}
+    found = {
+        name: entry
+        for name, entry in entries.items()
+        if entry.is_dir() and any((entry / each).is_file() for each in STREAM_FILES)
+    }
+    if not found:
+        raise DatasetError(f"{path}: no robot in it; {EXPECTED}")
+    for name in found:
+        if not re.fullmatch(ROBOT_NAME, name):
+            raise DatasetError(
+                f"{path}: the folder {name!r} can not be a robot's name: a small letter, then "
+                "small letters, digits and _ (32 at most); rename it"
+            )
+    return {name: found[name] for name in sorted(found, key=_natural)}
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
+    """The measurements of these robots; raises DatasetError.
+
+    Odometry's stamps are moved by the robot's clock_offset_s, which it puts right by itself.
+    """
+    if not world.path:
+        raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
+    clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
+    with opened_folder(world.path) as (root, folders):
+        missing = [name for name in clocks if name not in folders]
+        if missing:
+            raise DatasetError(
+                f"{world.path}: no robot {', '.join(missing)} in it, but {', '.join(folders)}: "
+                "give --robots, or a scenario with its names"
+            )
+        read = [_robot_rows(name, folders[name], clocks) for name in clocks]
+        surveyed = _table(root, "landmarks", "")
+    if world.duration_s is not None:
+        end_ns = min(each.start_ns for each in read) + round(world.duration_s * 1e9)
+        read = [each.until(end_ns) for each in read]
+    ids, positions = (
+        (np.empty(0, np.uint32), None) if surveyed is None else rows.landmarks_of(surveyed)
+    )
+    notes = () if len(ids) else ("no landmarks.csv: the map's error can not be computed",)
+    return WorldStreams(
+        streams=tuple(_stream(each, world, clocks) for each in read),
+        landmark_ids=ids,
+        landmarks=positions if len(ids) else None,
+        source=f"data set {Path(world.path).resolve().name}",
+        notes=notes,
+    )
+
+
+@dataclass(frozen=True)
+class RobotRows:
+    """One robot's tables in order of time; looked: when it looked and saw nothing."""
+
+    robot: str
+    start: StartPose | None
+    intervals: Intervals
+    seen: Measurements
+    looked: Int64[np.ndarray, " E"]
+    met: Measurements
+    truth_ns: Int64[np.ndarray, " T"]
+    truth: Float[np.ndarray, "T 3"]
+    notes: tuple[str, ...]
+
+    @property
+    def start_ns(self) -> int:
+        """Where the first measurement begins."""
+        intervals = self.intervals
+        first = (
+            intervals.end_ns[:1] - intervals.duration_ns[:1],
+            self.seen.stamps_ns[:1],
+            self.looked[:1],
+            self.met.stamps_ns[:1],
+        )
+        return int(np.concatenate(first).min())
+
+    def until(self, end_ns: int) -> "RobotRows":
+        """What is there up to the last odometry interval that ends at end_ns or before."""
+        intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
+        last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
+        samples = int(np.searchsorted(self.truth_ns, end_ns)) + 1
+        return replace(
+            self,
+            intervals=intervals,
+            seen=self.seen.where(self.seen.stamps_ns <= last_ns),
+            looked=self.looked[self.looked <= last_ns],
+            met=self.met.where(self.met.stamps_ns <= last_ns),
+            truth_ns=self.truth_ns[:samples],
+            truth=self.truth[:samples],
+        )
+
+
+def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows:
+    odometry, observed, sighted, truth, start = (
+        _table(place, kind, robot)
+        for kind in ("odometry", "observations", "sightings", "truth", "start")
+    )
+    intervals, notes = rows.intervals_of(odometry, clocks[robot])
+    end_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else None
+    if end_ns is None:
+        notes.append("no odometry: only what it saw is given")
+    seen, looked, said = rows.measurements_of(observed, "measurement", None, end_ns)
+    notes += said
+    if not len(seen.stamps_ns):
+        notes.append("no observations: only its odometry is given")
+    met, _, said = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), end_ns)
+    notes += said
+    if end_ns is None and not len(seen.stamps_ns) and not len(met.stamps_ns):
+        raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
+    truth_ns, poses, said = rows.truth_of(truth)
+    notes += said if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
+    return RobotRows(
+        robot=robot,
+        start=None if start is None else rows.start_of(start),
+        intervals=intervals,
+        seen=seen,
+        looked=looked,
+        met=met,
+        truth_ns=truth_ns,
+        truth=poses,
+        notes=tuple(notes),
+    )
+
+
+def _table(place: File, kind: str, robot: str) -> CsvTable | None:
+    """A table with the columns that it needs; None where it is missing or has no row."""
+    file = place / f"{kind}.csv"
+    if not file.is_file():
+        return None
+    table = read_table(file, f"{robot}/{file.name}" if robot else file.name, TABLES[kind])
+    for column in REQUIRED[kind]:
+        if not table.has(column):
+            raise table.fault(f"no column {column}; known: {', '.join(TABLES[kind])}")
+    return table if len(table) else None
+
+
+def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
+    seen, met, known = read.seen, read.met, len(read.truth) > 0
+    observations = grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings)
+    return robot_stream(
+        robot=read.robot,
+        start_ns=read.start_ns,
+        start=None if starts_unknown(world, read.robot) else read.start,
+        intervals=read.intervals,
+        observations=_with_empty(observations, read.looked),
+        sightings=grouped(met.stamps_ns, met.subjects, met.ranges, met.bearings),
+        teammates=tuple(clocks),
+        truth_ns=read.truth_ns if known else None,
+        truth=read.truth if known else None,
+        notes=read.notes,
+        clock_offset_ns=clocks[read.robot],
+    )
+
+
+def _with_empty(seen: Detections, looked: Int64[np.ndarray, " E"]) -> Detections:
+    """The messages with further ones that are empty."""
+    looked = np.setdiff1d(looked, seen.stamps_ns)
+    stamps = np.concatenate([seen.stamps_ns, looked])
+    counts = np.concatenate([np.diff(seen.offsets), np.zeros(len(looked), np.int64)])
+    order = np.argsort(stamps, kind="stable")
+    offsets = np.concatenate([[0], np.cumsum(counts[order])]).astype(np.int64)
+    return replace(seen, stamps_ns=stamps[order], offsets=offsets)

@@ -1,0 +1,246 @@
+"""Data sets in folders of CSV tables: bits stay, what is dropped is counted, damage is named."""
+
+import dataclasses
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sim.cli.main import app
+from sim.datasets.folder import folder
+from sim.datasets.folder_writer import seconds, write_folder
+from sim.datasets.tables import DatasetError
+from sim.in_memory.team import final_map, run_team
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from sim.world.config import FolderWorld
+from sim.world.streams import RobotStream, StartPose, WorldStreams
+from team.config import RobotConfig
+from tests import teams
+
+HOUR = "1248272272.841"
+
+
+def data_set(path: Path, **tables: str) -> Path:
+    """A robot's tables by name; `landmarks` lies beside it."""
+    for name, text in tables.items():
+        place = path if name == "landmarks" else path / "r1"
+        place.mkdir(parents=True, exist_ok=True)
+        (place / f"{name}.csv").write_text(text)
+    return path
+
+
+def read(path: Path, *robots: str, **options: object) -> WorldStreams:
+    team = [RobotConfig(id=name) for name in robots or ("r1",)]
+    return folder(FolderWorld(path=str(path), **options), team)  # type: ignore[arg-type]
+
+
+def only(path: Path, **options: object) -> RobotStream:
+    return read(path, **options).streams[0]
+
+
+def same(a: object, b: object) -> bool:
+    """Equal in every array's type and bits, whatever is noted."""
+    if dataclasses.is_dataclass(a):
+        fields = [f.name for f in dataclasses.fields(a) if f.name not in ("notes", "source")]
+        return type(a) is type(b) and all(same(getattr(a, f), getattr(b, f)) for f in fields)
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and (a.dtype, a.tobytes()) == (b.dtype, b.tobytes())
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a == b
+
+
+SPEEDS = "t_s,forward_m_s,yaw_rate_rad_s\n0,1,0.1\n1,2,0.2\n3,0,0\n"
+SEEN = "t_s,landmark,range_m,bearing_rad\n1,7,2.5,0.5\n1,3,1.5,-0.5\n2,7,2.4,0.4\n"
+
+
+def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path) -> None:
+    names = ("r9", "r2", "r1")
+    off = StartPose(np.array([0.1, 1 / 3, -2.0]), np.array([[2, 1, 0], [1, 3, 1], [0, 1, 1.5]]))
+    streams = [teams.stream(name, 9, known=False, seen_every=2) for name in names]
+    streams[2] = dataclasses.replace(streams[2], start=off)
+    world = WorldStreams(
+        tuple(dataclasses.replace(each, teammates=names) for each in streams),
+        np.array([2, 5], np.uint32),
+        np.array([[0.1, 1 / 3], [1e-17, -2.0]]),
+        "test",
+    )
+    write_folder(world, tmp_path)
+    again = read(tmp_path, *names)
+    assert same(again.streams[1:], world.streams[1:])
+    assert "of itself" in str(again.streams[0].notes)  # all of them see r9, it too
+    assert same((again.landmark_ids, again.landmarks), (world.landmark_ids, world.landmarks))
+
+
+def test_a_simulated_world_keeps_its_bits_with_its_empty_scans_and_sightings(
+    tmp_path: Path,
+) -> None:
+    world = streams_of(load("waypoints"))
+    assert any(0 in np.diff(each.landmark_detections.offsets) for each in world.streams)
+    write_folder(world, tmp_path)
+    assert same(read(tmp_path, *(each.robot for each in world.streams)), world)
+
+
+def test_stamps_keep_their_nanoseconds(tmp_path: Path) -> None:
+    text = f"t_s,landmark,range_m,bearing_rad\n{HOUR}000001,7,1,0\n{HOUR}000002,7,1,0\n"
+    stamps = only(data_set(tmp_path, observations=text)).landmark_detections.stamps_ns
+    assert stamps.tolist() == [1248272272841000001, 1248272272841000002]
+    assert seconds(1248272272841000001) == f"{HOUR}000001"
+    assert [seconds(each) for each in (0, -1, 10 * 10**9)] == ["0", "-0.000000001", "10"]
+
+
+def test_speeds_hold_until_the_next_row_or_for_a_duration(tmp_path: Path) -> None:
+    held = only(data_set(tmp_path, odometry=SPEEDS, observations=SEEN)).intervals
+    assert held.end_ns.tolist() == [10**9, 3 * 10**9]
+    assert held.forward.tolist() == [1.0, 2.0]
+    ended = "t_s,duration_s,forward_m_s,yaw_rate_rad_s\n1,0.5,1,0.1\n3,2,2,0.2\n"
+    means = only(data_set(tmp_path, odometry=ended)).intervals
+    assert means.end_ns.tolist() == [10**9, 3 * 10**9]
+    assert means.duration_ns.tolist() == [5 * 10**8, 2 * 10**9]
+
+
+@pytest.mark.parametrize("form", ["poses", "increments"])
+def test_poses_and_increments_are_the_arcs_between_them(tmp_path: Path, form: str) -> None:
+    quarter = "t_s,x_m,y_m,theta_rad\n0,5,5,3\n2,{},{},{}\n"
+    x, y = 5 + np.cos(3) - np.sin(3), 5 + np.sin(3) + np.cos(3)
+    text = quarter.format(x, y, 3 + np.pi / 2 - 2 * np.pi)
+    if form == "increments":
+        text = f"t_s,duration_s,dx_m,dy_m,dtheta_rad\n2,2,1,1,{np.pi / 2}\n"
+    driven = only(data_set(tmp_path, odometry=text)).intervals
+    np.testing.assert_allclose(driven.forward, [np.pi / 4], rtol=1e-14)
+    np.testing.assert_allclose(driven.yaw_rate, [np.pi / 4], rtol=1e-14)
+
+
+def test_points_are_taken_as_range_and_bearing(tmp_path: Path) -> None:
+    text = "t_s,landmark,x_m,y_m\n1,7,3,4\n1,8,-1,0\n"
+    seen = only(data_set(tmp_path, observations=text)).landmark_detections
+    assert seen.ranges.tolist() == [5.0, 1.0]
+    assert seen.bearings.tolist() == [np.arctan2(4.0, 3.0), np.pi]
+
+
+def test_tables_of_one_robot_may_lie_in_the_folder_itself(tmp_path: Path) -> None:
+    (tmp_path / "odometry.csv").write_text(SPEEDS)
+    stream = only(tmp_path)
+    assert (stream.robot, stream.start) == ("r1", None)
+
+
+def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path: Path) -> None:
+    seen = SEEN + "1,7,2.5,0.5\n2,9,0,0.1\n2,9,-1,0.1\n0.5,9,1,0.1\n9,9,1,0.1\n"
+    stream = only(data_set(tmp_path, odometry=SPEEDS + "3,1,1\n", observations=seen))
+    assert stream.notes == (
+        "1 odometry row dropped: another row has the same time, so it lasts no time "
+        "(r1/odometry.csv, at line 5)",
+        "2 measurements earlier than the row before: sorted by time "
+        "(r1/observations.csv, first at line 5)",
+        "2 measurements dropped: range not above 0 (r1/observations.csv, first at line 6)",
+        "1 measurement dropped: a second one of the same landmark at the same time "
+        "(r1/observations.csv, at line 5)",
+        "1 measurement dropped: after its last odometry, where its motion is not known "
+        "(r1/observations.csv, at line 9)",
+        "no truth.csv: its trajectory's error can not be computed",
+    )
+    assert stream.landmark_detections.ids.tolist() == [9, 7, 3, 7]
+
+
+def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> None:
+    text = "t_s,teammate,range_m,bearing_rad\n1,r2,1,0\n1,r9,1,0\n1,r1,1,0\n"
+    data_set(tmp_path, odometry=SPEEDS, sightings=text)
+    (tmp_path / "r2").mkdir()
+    (tmp_path / "r2" / "odometry.csv").write_text(SPEEDS)
+    stream = read(tmp_path, "r1", "r2").streams[0]
+    assert stream.sightings(1).teammates == ("r2",)
+    assert [note.partition(" (")[0] for note in stream.notes[1:3]] == [
+        "1 sighting dropped: of itself",
+        "1 sighting dropped: of a robot that is not in the team",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("table", "text", "words"),
+    [
+        ("odometry", "", "r1/odometry.csv: empty; its first line names the columns"),
+        ("odometry", "t_s;v\n", "r1/odometry.csv, line 1: columns are parted by commas"),
+        ("odometry", "t_s,speed\n0,1\n", "line 1: unknown column 'speed'; known: t_s"),
+        ("odometry", "t_s,t_s\n", "line 1: two columns are called 't_s'"),
+        ("odometry", "t_s,x_m\n0,1\n", "line 1: no odometry in its columns; give t_s with one of"),
+        ("odometry", SPEEDS + "4,1\n", "line 5: 2 columns, 3 expected (t_s, forward_m_s"),
+        ("odometry", SPEEDS + "4,1,x\n", "line 5, column yaw_rate_rad_s: 'x' is not a number"),
+        ("odometry", SPEEDS + "4,nan,0\n", "line 5, column forward_m_s: 'nan' is not finite"),
+        ("odometry", SPEEDS + "later,1,0\n", "line 5, column t_s: 'later' is not a time"),
+        ("odometry", SPEEDS + "1e400,1,0\n", "line 5, column t_s: 1e400 is out of bounds"),
+        ("observations", "t_s,range_m\n1,1\n", "line 1: no column landmark; known: t_s"),
+        ("observations", "t_s,landmark\n1,1\n", "line 1: no measurement in its columns"),
+        ("observations", SEEN + "3,tag7,1,0\n", "line 5, column landmark: 'tag7' is not a whole"),
+        ("observations", SEEN + "3,-1,1,0\n", "column landmark: -1 is out of bounds"),
+        ("start", "x_m,y_m,theta_rad\n0,0,0\n1,1,1\n", "2 rows: one pose is where"),
+        ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),
+    ],
+)
+def test_damage_names_file_line_column_and_remedy(
+    tmp_path: Path, table: str, text: str, words: str
+) -> None:
+    with pytest.raises(DatasetError) as error:
+        only(data_set(tmp_path, odometry=SPEEDS, observations=SEEN, **{table: text})
+             if table not in ("odometry", "observations")
+             else data_set(data_set(tmp_path, odometry=SPEEDS), **{table: text}))  # fmt: skip
+    assert words in str(error.value)
+
+
+def test_only_a_part_is_read_when_asked(tmp_path: Path) -> None:
+    data_set(tmp_path, odometry=SPEEDS, observations=SEEN)
+    stream = only(tmp_path, duration_s=1.5)
+    assert stream.intervals.end_ns.tolist() == [10**9]
+    assert stream.landmark_detections.stamps_ns.tolist() == [10**9]
+
+
+def two_robots(path: Path) -> Scenario:
+    for name in ("alice", "bob"):
+        (path / name).mkdir(parents=True)
+        (path / name / "odometry.csv").write_text(SPEEDS)
+    return with_options(load("recorded"), dataset=path)
+
+
+def test_the_robots_are_the_folders_whatever_the_scenario_calls_its_own(tmp_path: Path) -> None:
+    scenario = two_robots(tmp_path)
+    assert [robot.id for robot in scenario.robots] == ["alice", "bob"]
+    assert scenario.robots[0].motion == load("recorded").robots[0].motion
+    assert len(with_options(scenario, robots=1).robots) == 1
+    own = tmp_path / "scenario.toml"
+    own.write_text('base = "recorded"\n[world]\npath = "."\n[[robots]]\nid = "bob"\n')
+    assert scenario_beside(tmp_path) == str(own)
+    assert [robot.id for robot in with_options(load(own), dataset=tmp_path).robots] == ["bob"]
+
+
+def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path: Path) -> None:
+    scenario = two_robots(tmp_path)
+    (tmp_path / "bob" / "odometry.csv").unlink()
+    kept, said = with_present_robots(scenario)
+    assert [robot.id for robot in kept.robots] == ["alice"]
+    assert said is not None
+    assert said.startswith("bob: no files in")
+
+
+def test_a_team_maps_a_folder_as_it_maps_the_world_that_was_written(tmp_path: Path) -> None:
+    scenario = with_options(load("waypoints"), robots=1)
+    world = scenario.world
+    scenario = msgspec.structs.replace(
+        scenario,
+        world=msgspec.structs.replace(world, steps=25),  # type: ignore[arg-type]
+    )
+    streams = streams_of(scenario)
+    write_folder(streams, tmp_path)
+    again = msgspec.structs.replace(scenario, world=FolderWorld(path=str(tmp_path)))
+    first = final_map(list(run_team(scenario, streams)))
+    assert final_map(list(run_team(again, streams_of(again)))) == first
+
+
+def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path: Path) -> None:
+    data_set(tmp_path, odometry=SPEEDS, observations=SEEN + "x,1,1,1\n")
+    result = CliRunner().invoke(app, ["launch", "--dataset", str(tmp_path)])
+    assert "no scenario given" in result.output
+    assert "teamslam calibrate" in result.output
+    assert isinstance(result.exception, DatasetError)
+    assert "line 5, column t_s: 'x' is not a time" in str(result.exception)
