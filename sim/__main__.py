@@ -1,5 +1,11 @@
-"""`python -m sim` is `teamslam`."""
+"""`python -m sim` is `teamslam`; what `launch` forks its processes from begins here, too."""
+
+import sys
 
 from sim.cli.main import main
 
+if sys.argv[1:2] == ["template"]:
+    from sim.launch.template import become_a_process
+
+    become_a_process()  # returns in a forked process, with the words of its own command
 main()

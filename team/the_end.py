@@ -14,8 +14,21 @@ FINAL_S = 3.0
 FINAL_ASK_S = 2.0
 SINCE = "TEAMSLAM_SINCE"
 """Environment variable: when this process's run began [ns, wall clock], if not with itself."""
-_STARTED = time.monotonic()
 _LOG = logging.getLogger("teamslam")
+
+
+class _Life:
+    """When this process began; for one that was forked: the fork."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        self.began = time.monotonic()
+
+
+_LIFE = _Life()
+os.register_at_fork(after_in_child=_LIFE.begin)
 
 
 class TheEnd:
@@ -33,7 +46,7 @@ class TheEnd:
         self._due = 0.0
         began = os.environ.get(SINCE)
         self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
-        self._began = _STARTED
+        self._began = _LIFE.began
 
     def missed(self) -> list[Sample]:
         """The final map, if the router has it; it is asked at most every FINAL_S."""

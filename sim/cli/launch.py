@@ -1,9 +1,9 @@
 """`teamslam launch`."""
 
 import json
-import threading
 import time
 from contextlib import nullcontext
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,9 +33,10 @@ from sim.scenarios.scenario import Scenario, doubts, with_options
 
 if TYPE_CHECKING:
     from sim.launch.launch import Outcome
+    from sim.launch.plan import Plan
 
-PREPARING_S = 2.0
-"""The kernels are spoken of when they take longer: then they are being compiled."""
+COMPILING_S = 3.0
+"""Between two lines on kernels that are being compiled."""
 app = typer.Typer()
 
 
@@ -116,18 +117,15 @@ def launch(
     log = record or folder / "log.mcap"
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
-    from sim.launch.launch import LaunchError, Plan
-    from sim.launch.launch import launch as launched
-    from sim.launch.live import shown
+    folder.mkdir(parents=True, exist_ok=True)
+    from sim.launch.plan import Plan
 
-    _prepare(resolved)
-    door = listen if keys is None else over_tls(listen)
     plan = Plan(
         scenario=resolved,
         folder=folder,
         log=log,
         speed=pace,
-        listen=door,
+        listen=listen if keys is None else over_tls(listen),
         views=views,
         end_silent_s=end_silent,
         keys=keys and keys.resolve(),
@@ -139,17 +137,32 @@ def launch(
         else nullcontext()
     )
     with page as at:
-        try:
-            with shown(f"{resolved.name}, seed {resolved.seed}") as show:
-                outcome = launched(plan, show)
-        except LaunchError as error:
-            fail(str(error), FAILED)
-        except KeyboardInterrupt:
-            kept = f"; {log} holds what was recorded" if log.exists() else ""
-            fail(f"interrupted: every process of the team was ended{kept}", FAILED)
+        outcome = _launched(plan)
         _conclude(resolved, outcome, json_file, report=report)
         if at is not None:
             _keep_showing(at.url, log)
+
+
+def _launched(plan: "Plan") -> "Outcome":
+    """Start the template first: it imports while this process does."""
+    from sim.launch.processes import Starter
+
+    scenario = plan.scenario
+    warm = (scenario.estimator, scenario.fusion)
+    with Starter(time.time_ns(), warm, plan.folder / "template.log", _Compiling().tell) as starter:
+        from sim.launch.launch import LaunchError, launch
+        from sim.launch.live import shown
+
+        if not starter.is_warm:
+            _compile(scenario)
+        try:
+            with shown(f"{scenario.name}, seed {scenario.seed}") as show:
+                return launch(plan, starter, show)
+        except LaunchError as error:
+            fail(str(error), FAILED)
+        except KeyboardInterrupt:
+            kept = f"; {plan.log} holds what was recorded" if plan.log.exists() else ""
+            fail(f"interrupted: every process of the team was ended{kept}", FAILED)
 
 
 def _keep_showing(url: str, log: Path) -> None:
@@ -201,21 +214,30 @@ def _keep_earlier(log: Path) -> None:
         typer.echo(f"{log} was there already: it is now {aside}", err=True)
 
 
-def _prepare(scenario: Scenario) -> None:
-    from sim.launch.warm_up import warm_up
+class _Compiling:
+    """Tells how far the kernels are, which are compiled once per machine."""
 
-    text = "preparing the kernels (compiled once per machine) …"
-    said = threading.Timer(PREPARING_S, typer.echo, [text], {"err": True})
-    said.start()
-    began = time.monotonic()
-    try:
+    def __init__(self) -> None:
+        self._began = time.monotonic()
+        self._due = self._began + COMPILING_S
+
+    def tell(self, done: int, of: int) -> None:
+        """Now and then: how many kernels of about how many are compiled, and how long it takes."""
+        now = time.monotonic()
+        if now >= self._due:
+            self._due = now + COMPILING_S
+            left_s = (now - self._began) / done * (of - done)
+            text = f"compiling the kernels, once per machine: {done} of about {of}"
+            typer.echo(f"{text}, about {left_s:.0f} s left", err=True)
+
+
+def _compile(scenario: Scenario) -> None:
+    """Where there is no template to do it: the processes would all compile the same."""
+    from sim.launch.warm_up import warm_up
+    from team.estimation.compiling import compilations
+
+    with compilations(_Compiling().tell):
         warm_up(scenario.estimator, scenario.fusion)
-    finally:
-        said.cancel()
-        said.join()
-    took = time.monotonic() - began
-    if took > PREPARING_S:
-        typer.echo(f"kernels ready after {took:.1f} s", err=True)
 
 
 def _conclude(
@@ -235,7 +257,10 @@ def _conclude(
 
     console = Console()
     extra: dict[str, Any] = {
-        "processes": {e.name: {"pid": e.pid, "exit": e.exit} for e in outcome.processes},
+        "processes": {
+            ended.name: {"pid": ended.pid, "exit": ended.exit} | asdict(outcome.used[ended.name])
+            for ended in outcome.processes
+        },
         "failures": outcome.failures,
         "restarts": outcome.restarts,
         "given_up": outcome.given_up,

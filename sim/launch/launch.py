@@ -7,10 +7,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sim.launch.plan import Plan
+from sim.launch.processes import Starter, Used
 from sim.launch.supervision import failure, supervise
 from sim.launch.supervisor import Ended, Supervised, end_all
 from sim.launch.watch import Watch
-from sim.scenarios.scenario import Scenario, dumps
+from sim.scenarios.scenario import dumps
 from team.keys.credentials import credentials_of
 from team.wire import channels as ch
 from team.wire.bus import BusError
@@ -28,7 +30,10 @@ class LaunchError(RuntimeError):
 
 @dataclass
 class Outcome:
-    """What a launch left behind; restarts: how often each process was started again."""
+    """What a launch left behind.
+
+    restarts: how often each process was started again. used: what each took, all its lives.
+    """
 
     log: Path
     folder: Path
@@ -37,29 +42,10 @@ class Outcome:
     failures: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
     given_up: list[str] = field(default_factory=list)
+    used: dict[str, Used] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What is to be launched."""
-
-    scenario: Scenario
-    folder: Path
-    log: Path
-    speed: float
-    listen: str
-    views: bool = True
-    end_silent_s: float | None = None
-    keys: Path | None = None
-    insecure: bool = False
-
-    @property
-    def door(self) -> list[str]:
-        """How every process gets in: the option, or nothing where the door is open."""
-        return [] if self.keys is None else ["--keys", str(self.keys)]
-
-
-def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
+def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outcome:
     """Start router, recorder, world, centre and robots; return when all have ended.
 
     `show` is called again and again with what is known. A process that dies is started again, or
@@ -68,16 +54,15 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     KeyboardInterrupt.
     """
     began = time.monotonic()
-    plan.folder.mkdir(parents=True, exist_ok=True)
     resolved = plan.folder / "scenario.json"
     resolved.write_text(dumps(plan.scenario))
-    watch = Watch(began=began, robots=len(plan.scenario.robots))
-    since_ns = time.time_ns()
     with _interruptible(), _services() as services:
+        router = _start_router(plan, services, starter)
+        watch = Watch(began=began, robots=len(plan.scenario.robots))
         team = plan.scenario.team
         own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
         door = "".join(f" {word}" for word in plan.door)
-        endpoint = _start_router(plan, services, since_ns)
+        endpoint = _endpoint(router)
         watch.place = f"--team {team} --connect {endpoint}{door}"
         with ZenohBus(team, endpoint, keys=own) as bus:
             bus.subscribe(ch.STATUS)
@@ -87,7 +72,7 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
             for channel in watch.errors.listens:
                 bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):
-                services.append(Supervised(name, arguments, plan.folder, since_ns))
+                services.append(Supervised(name, arguments, plan.folder, starter))
             supervise(services, bus, watch, show, plan.end_silent_s)
         ended = end_all([service.child for service in services])
     failures = watch.failures + [
@@ -100,8 +85,16 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     if watch.fused is not None and watch.fused.lost:
         names = ", ".join(watch.fused.lost)
         failures.append(f"the final map is provisional: {names} lost, and not wholly in it")
-    wall_s = time.monotonic() - began
-    return Outcome(plan.log, plan.folder, wall_s, ended, failures, watch.restarts, watch.given_up)
+    return Outcome(
+        plan.log,
+        plan.folder,
+        time.monotonic() - began,
+        ended,
+        failures,
+        watch.restarts,
+        watch.given_up,
+        {s.name: s.used.and_later(e.used) for s, e in zip(services, ended, strict=True)},
+    )
 
 
 @contextmanager
@@ -123,12 +116,16 @@ def _services() -> Iterator[list[Supervised]]:
         end_all([service.child for service in services])
 
 
-def _start_router(plan: Plan, services: list[Supervised], since_ns: int) -> str:
-    """Start the router; where it listens. Started again it listens there, too."""
+def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> Supervised:
     door = [*plan.door, *(["--insecure"] if plan.insecure else [])]
     command = ["router", "--listen", plan.listen, *door]
-    service = Supervised("router", command, plan.folder, since_ns)
+    service = Supervised("router", command, plan.folder, starter)
     services.append(service)
+    return service
+
+
+def _endpoint(service: Supervised) -> str:
+    """Where the router listens. Started again it listens there, too."""
     router = service.child
     deadline = time.monotonic() + ROUTER_PATIENCE_S
     while time.monotonic() < deadline:

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console, Group
@@ -13,9 +14,11 @@ from rich.table import Table
 from rich.text import Text
 
 from central.desk.evaluation.events import without_decimals
-from sim.launch.truth import LiveErrors
 from sim.launch.watch import Watch
 from team.wire import messages as m
+
+if TYPE_CHECKING:
+    from sim.launch.truth import LiveErrors
 
 LINE_S = 5.0
 """Wall time between two plain lines."""
@@ -173,7 +176,7 @@ _SHOWN_AT_MOST = 12
 """Robots with a row of their own: a table that is higher than the terminal would be cut."""
 
 
-def _robots(statuses: Mapping[str, m.Status], errors: LiveErrors) -> Table:
+def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
     """A row for each robot; NEES and coverage of its poses where there is a truth."""
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     judged = any(errors.of(n.removeprefix("robot/")).count for n in statuses)

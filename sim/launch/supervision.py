@@ -18,6 +18,8 @@ SILENT_S = 10.0
 """A process that runs and has said nothing for so long is named."""
 STARTING_S = 60.0
 """… one that starts and has not said anything yet, after so long: a busy machine is slow."""
+MEASURE_S = 2.0
+"""Between two looks at the processes' share of memory; the last is at the final map."""
 LEAVING_S = 60.0
 """A process that is there so long after the final map is ended, and named."""
 _NODES = {"router": "router", "world": "world", "central": "central"}
@@ -40,7 +42,7 @@ def supervise(
 
     end_silent_s: a process that has said nothing for so long is ended, so that it is started again.
     """
-    silence = Silence(end_silent_s)
+    silence, memory = Silence(end_silent_s), Memory()
     over_at: float | None = None
     while True:
         try:
@@ -49,6 +51,7 @@ def supervise(
             watch.failures.append(str(error))
             return
         is_final = watch.fused is not None and watch.fused.final
+        memory.look(services, is_final=is_final)
         for service in services:
             _look_after(service, bus, watch, is_final=is_final)
         if any(s.given_up and s.name in _WITHOUT_IT_NO_MAP for s in services):
@@ -102,6 +105,22 @@ def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
             watch.failures.append(
                 f"{name} had not left {LEAVING_S:g} s after the final map{stopped}: it was ended"
             )
+
+
+class Memory:
+    """Measures the processes' share of memory now and then, the last time at the final map."""
+
+    def __init__(self) -> None:
+        self._due = 0.0
+        self._over = False
+
+    def look(self, services: Sequence[Supervised], *, is_final: bool) -> None:
+        """Measure if it is time."""
+        now = time.monotonic()
+        if (now >= self._due or is_final) and not self._over:
+            self._due, self._over = now + MEASURE_S, is_final
+            for service in services:
+                service.child.measure()
 
 
 class Silence:

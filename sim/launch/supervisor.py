@@ -1,17 +1,13 @@
 """Child processes: started, started again, ended, and spoken of by name when they fail."""
 
-import os
+import math
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
-from team.shell import PARENT
-from team.the_end import SINCE
+from sim.launch.processes import Starter, Used
 
 LAST_LINES = 12
 """Lines of a failed process's output that are shown."""
@@ -23,23 +19,13 @@ FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 """A process that dies waits from the first to the longest of these until it is started again."""
 _PROC = Path("/proc")
-_ONE_THREAD = dict.fromkeys(
-    (
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-        "NUMBA_NUM_THREADS",
-    ),
-    "1",
-)
 
 
 @dataclass(frozen=True)
 class Ended:
     """How a process ended: its exit status (negative: the signal that ended it), its last lines.
 
-    asked: we had asked it to stop, and it did.
+    asked: we had asked it to stop, and it did. used: what it took.
     """
 
     name: str
@@ -47,6 +33,7 @@ class Ended:
     exit: int
     last_lines: tuple[str, ...]
     asked: bool
+    used: Used
 
     @property
     def how(self) -> str:
@@ -60,29 +47,24 @@ class Child:
     """One `teamslam …` process, its output in a file of its own."""
 
     def __init__(
-        self, name: str, arguments: Sequence[str], folder: Path, since_ns: int, life: int = 0
+        self, name: str, arguments: Sequence[str], folder: Path, starter: Starter, life: int = 0
     ) -> None:
         self.name = name
         self.started = time.monotonic()
         self._asked = False
         self.output = folder / f"{name}.log"
-        # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
-        command = [sys.executable, "-P", "-m", "sim", *arguments]
-        self._file: IO[bytes] = self.output.open("ab" if life else "wb")
-        self._before = self.output.stat().st_size
-        self._process = subprocess.Popen(  # noqa: S603 - our own program, no shell
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=self._file,
-            stderr=subprocess.STDOUT,
-            env=_environment(os.environ, since_ns),
-            start_new_session=True,
-        )
+        with self.output.open("ab" if life else "wb") as file:
+            self._before = self.output.stat().st_size
+            self._process = starter.start(arguments, file.fileno())
 
     @property
     def pid(self) -> int:
         """The process id."""
         return self._process.pid
+
+    def measure(self) -> None:
+        """Note its share of memory."""
+        self._process.measure()
 
     @property
     def exit(self) -> int | None:
@@ -100,22 +82,19 @@ class Child:
 
     def kill(self) -> None:
         """End it, stopped or not; nobody asked it before."""
-        self._process.kill()
+        self._process.signal(signal.SIGKILL)
 
     def stop(self) -> None:
         """Ask it to stop."""
         if self.exit is None:
             self._asked = True
-            self._process.terminate()
+            self._process.signal(signal.SIGTERM)
 
     def end(self, deadline: float) -> Ended:
         """Wait until `deadline` (monotonic), then end it; how it ended."""
-        try:
-            self._process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._file.close()
+        while not self._process.wait(max(0.0, deadline - time.monotonic())):
+            self.kill()
+            deadline = math.inf
         return self.ended()
 
     def ended(self) -> Ended:
@@ -123,7 +102,7 @@ class Child:
         status = self.exit
         assert status is not None
         asked = self._asked and status != -signal.SIGKILL
-        return Ended(self.name, self.pid, status, self.last_lines(), asked)
+        return Ended(self.name, self.pid, status, self.last_lines(), asked, self._process.used)
 
     def last_lines(self) -> tuple[str, ...]:
         """The end of what it printed."""
@@ -136,23 +115,24 @@ class Supervised:
     """A process that is started again by the same command when it dies, after longer and longer.
 
     One that dies FRUITLESS times in a row without getting any further is given up. reached: how far
-    it had come at its last death, in whatever it counts.
+    it had come at its last death, in whatever it counts. used: what its earlier lives took.
     """
 
     name: str
     arguments: list[str]
     folder: Path
-    since_ns: int
+    starter: Starter
     restarts: int = 0
     fruitless: int = 0
     reached: float = -1.0
     given_up: bool = False
     over: bool = False
     due: float | None = None
+    used: Used = field(default_factory=Used)
     child: Child = field(init=False)
 
     def __post_init__(self) -> None:
-        self.child = Child(self.name, self.arguments, self.folder, self.since_ns)
+        self.child = Child(self.name, self.arguments, self.folder, self.starter)
 
     @property
     def is_watched(self) -> bool:
@@ -174,17 +154,8 @@ class Supervised:
         if self.due is not None and time.monotonic() >= self.due:
             self.due = None
             self.restarts += 1
-            self.child.end(0.0)
-            self.child = Child(self.name, self.arguments, self.folder, self.since_ns, self.restarts)
-
-
-def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
-    """A child's environment: one BLAS thread, tied to this process, unbuffered output.
-
-    since_ns: when the run began, for a child that is started again after its end.
-    """
-    tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
-    return {**mine, **_ONE_THREAD, **tied}
+            self.used = self.used.and_later(self.child.end(0.0).used)
+            self.child = Child(self.name, self.arguments, self.folder, self.starter, self.restarts)
 
 
 def end_all(children: Sequence[Child], *, last: str = "recorder") -> list[Ended]:

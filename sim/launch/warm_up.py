@@ -31,7 +31,7 @@ def warm_up(estimator: str, fusion: str) -> None:
         return  # with NUMBA_DISABLE_JIT nothing is compiled
     done = Path(cached.cache_path) / f"ready-{_program(estimator, fusion)}"
     if not done.exists():
-        _run(estimator, fusion)
+        run_small_team(estimator, fusion)
         with suppress(OSError):  # then the next launch does it again
             done.touch()
 
@@ -48,7 +48,11 @@ def _program(estimator: str, fusion: str) -> str:
     return digest.hexdigest()
 
 
-def _run(estimator: str, fusion: str) -> None:
+def run_small_team(estimator: str, fusion: str) -> None:
+    """Run a small team of two in memory: every kernel that the pair uses is compiled or loaded.
+
+    They move by different models, and the centre's loss is robust: kernels of both kinds are ready.
+    """
     from sim.in_memory.team import run_team
 
     scenario = with_options(load("thesis"), estimator=estimator, fusion=fusion)

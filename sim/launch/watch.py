@@ -2,17 +2,27 @@
 
 import time
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from sim.launch.truth import LiveErrors
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, opened
 from team.wire.codec import WireError
 from team.wire.newer import is_newer_map
 
+if TYPE_CHECKING:
+    from sim.launch.truth import LiveErrors
+
 TURN_S = 0.1
 _PROGRESS = ("measurements", "submaps", "messages")
 """Figures of a status that grow as its node gets on."""
+
+
+def _no_errors() -> "LiveErrors":
+    """Imported here: it takes longer than all else that a launch needs to start its processes."""
+    from sim.launch.truth import LiveErrors
+
+    return LiveErrors()
 
 
 @dataclass
@@ -29,7 +39,7 @@ class Watch:
     failures: list[str] = field(default_factory=list)
     began: float = field(default_factory=time.monotonic)
     robots: int = 0
-    errors: LiveErrors = field(default_factory=LiveErrors)
+    errors: "LiveErrors" = field(default_factory=_no_errors)
     place: str = ""
     notes: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)

@@ -47,6 +47,8 @@ async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team: 
     killed = []
     for words in (("robot", "r1"), ("central",), ("world",), ("router",)):
         pid = await team.pid(*words)
+        assert standing(pid) == (launch.pid, pid, pid), "its parent, its group, its session"
+        assert Path(f"/proc/{pid}/fd/0").readlink() == Path(os.devnull)
         os.kill(pid, signal.SIGKILL)
         killed.append(f"{'-'.join(words)} (pid {pid}) was ended by SIGKILL: it is started again")
         await until(lambda text=killed[-1]: text in launch.said(), killed[-1], 20.0)  # type: ignore[misc]
@@ -63,6 +65,12 @@ async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team: 
     )
 
 
+def standing(pid: int) -> tuple[int, int, int]:
+    """The parent, the process group and the session of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[1]), int(fields[2]), int(fields[3])
+
+
 def other(team: Processes, words: tuple[str, ...]) -> int | None:
     """The id of the process of these words, if there is one."""
     found = [pid for pid, line in team.alive().items() if {"sim", *words} <= set(line)]
@@ -75,6 +83,7 @@ async def test_a_recorder_that_is_killed_goes_on_and_what_it_had_reads_and_can_b
     launch, folder = await launched(team)
     path = folder / "log.mcap"
     await until(lambda: submaps_in(path) > 0, "the recorder flushes", 10.0)
+    os.kill(await team.pid("template"), signal.SIGKILL)  # then it starts from scratch
     os.kill(await team.pid("record"), signal.SIGKILL)
     cut = open_log(Path(shutil.copy(path, team.folder / "cut.mcap")))
     assert not cut.complete
@@ -170,7 +179,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
 
 async def test_no_process_outlives_a_launch_that_is_killed(team: Processes) -> None:
     launch, folder = await launched(team)
-    assert len(team.alive()) == 8
+    assert len(team.alive()) == 9, "the launch, its template, and seven that are forked from it"
     launch.signal(signal.SIGKILL)
     assert await launch.ended() == -signal.SIGKILL
     await team.none_left(5.0)

@@ -50,6 +50,12 @@ def test_the_json_of_a_launch_has_every_figure(launched: Launched) -> None:
         assert result["channels"][key]["messages"] > 0
 
 
+def test_the_json_of_a_launch_says_what_every_process_took(launched: Launched) -> None:
+    for name, process in launched.result["processes"].items():
+        assert 0.0 < process["cpu_s"] < launched.result["wall_s"], name
+        assert 5.0 < process["pss_mb"] < process["peak_rss_mb"], name
+
+
 def test_every_published_measurement_is_consumed_once(launched: Launched) -> None:
     for name, robot in launched.result["robots"].items():
         assert robot["measurements_published"] == robot["measurements_consumed"] > 2 * STEPS

@@ -72,6 +72,12 @@ pre { overflow-x: auto; background: #f6f6f6; padding: .6rem; font-size: .85rem; 
 """
 
 
+PSS_NOTE = (
+    "RSS: resident memory, shared pages included. PSS at the end of the run: a page that n "
+    "processes share counts 1/n in each."
+)
+
+
 def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
     """Write report.html, report.json, pictures and trajectories into the folder; what was written.
 
@@ -95,7 +101,7 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
     data = directory / "report.json"
     data.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     page = directory / "report.html"
-    page.write_text(_page(run, pictures), encoding="utf-8")
+    page.write_text(_page(run, pictures, figures.get("processes", {})), encoding="utf-8")
     trajectories = directory / "trajectories"
     paths = write_trajectories(evaluation, trajectories)
     return [
@@ -120,7 +126,9 @@ def _taken_home(run: Run, directory: Path) -> list[Path]:
     return written
 
 
-def _page(run: Run, pictures: Mapping[str, Path]) -> str:
+def _page(
+    run: Run, pictures: Mapping[str, Path], processes: Mapping[str, Mapping[str, float | None]]
+) -> str:
     title = escape(title_of(run.evaluation))
     sections = [
         ("Map", [_image(pictures, "map", wide=False), *_own_maps(run)]),
@@ -131,6 +139,7 @@ def _page(run: Run, pictures: Mapping[str, Path]) -> str:
         ("Events", _events(run, pictures)),
         ("Latency", _latency(run, pictures)),
         ("Traffic", _traffic(run, pictures)),
+        ("Processes", _processes(processes)),
         ("Origin", _origin(run)),
     ]
     there = [(name, "\n".join(filter(None, parts))) for name, parts in sections]
@@ -143,6 +152,22 @@ def _page(run: Run, pictures: Mapping[str, Path]) -> str:
         f"<style>{_STYLE}</style>\n<h1>{title}</h1>\n<nav>{links}</nav>\n"
         f"{_table((), team_rows(run.evaluation), words=True)}\n{_notes(run)}\n{body}\n</html>\n"
     )
+
+
+def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]:
+    """What each process of a launch took; a log alone does not tell."""
+    if not processes:
+        return []
+    rows = [
+        (
+            name,
+            shown(took.get("cpu_s"), ".2f", ""),
+            shown(took.get("peak_rss_mb"), ".0f", ""),
+            shown(took.get("pss_mb"), ".0f", ""),
+        )
+        for name, took in processes.items()
+    ]
+    return [_table(("process", "CPU\n[s]", "peak RSS\n[MB]", "PSS\n[MB]"), rows), _note(PSS_NOTE)]
 
 
 def _notes(run: Run) -> str:

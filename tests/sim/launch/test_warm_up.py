@@ -17,7 +17,7 @@ def test_a_program_warms_its_kernels_up_once_and_another_program_its_own(
 ) -> None:
     before = stamps()
     ran: list[tuple[str, str]] = []
-    monkeypatch.setattr(warm_up, "_run", lambda *pair: ran.append(pair))
+    monkeypatch.setattr(warm_up, "run_small_team", lambda *pair: ran.append(pair))
     monkeypatch.setattr(warm_up, "_VERSIONS", (str(tmp_path),))
     pairs = [("hybrid", "join"), ("hybrid", "join"), ("ekf-slam", "latest"), ("hybrid", "join")]
     try:

@@ -1,0 +1,203 @@
+"""How the processes of a team are started: forked from the warm template, or each from scratch."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+from sim.launch.linux import adopt_orphans
+from team.shell import PARENT
+from team.the_end import SINCE
+
+# -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
+PROGRAM = (sys.executable, "-P", "-m", "sim")
+TEMPLATE = "template"
+"""`python -m sim template FD ESTIMATOR RULE`: what a launch starts, no command of a user's."""
+LOOK_S = 0.005
+"""Between two looks at a process that is to end."""
+PATIENCE_S = 600.0
+"""A template answers within this time, though it may have to compile all kernels before."""
+_LARGEST_ANSWER = 64
+_ROOM = 4_096
+"""Bytes of a forked process's command line; the template is started with as many spaces."""
+_ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMBA_NUM_THREADS",
+    ),
+    "1",
+)
+
+
+@dataclass(frozen=True)
+class Used:
+    """What a process has taken: CPU, its largest resident set, and its share of memory at the end.
+
+    The pages that n processes have in common count 1/n in the share of each. None: not known.
+    """
+
+    cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
+    pss_mb: float | None = None
+
+    def and_later(self, later: "Used") -> "Used":
+        """Of two lives of one process, this one the earlier."""
+        pss_mb = self.pss_mb if later.pss_mb is None else later.pss_mb
+        peak_rss_mb = max(self.peak_rss_mb, later.peak_rss_mb)
+        return Used(self.cpu_s + later.cpu_s, peak_rss_mb, pss_mb)
+
+
+class Process:
+    """A child of this process by its id.
+
+    exit: its status (negative: the signal that ended it), None while it runs. used: what it has
+    taken; of its share of memory the last that was measured.
+    """
+
+    def __init__(self, pid: int, started: "subprocess.Popen[bytes] | None" = None) -> None:
+        self.pid = pid
+        self.exit: int | None = None
+        self.used = Used()
+        self._started = started
+
+    def poll(self) -> int | None:
+        """Its exit status; None while it runs."""
+        if self.exit is None:
+            pid, status, used = os.wait4(self.pid, os.WNOHANG)
+            if pid:
+                self.exit = os.waitstatus_to_exitcode(status)
+                # Bytes on macOS, kilobytes elsewhere.
+                peak_rss_mb = used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+                cpu_s = used.ru_utime + used.ru_stime
+                self.used = replace(self.used, cpu_s=cpu_s, peak_rss_mb=peak_rss_mb)
+                if self._started is not None:
+                    self._started.returncode = self.exit
+        return self.exit
+
+    def measure(self) -> None:
+        """Note its share of memory, where the system tells (Linux)."""
+        with suppress(OSError, StopIteration):
+            lines = Path(f"/proc/{self.pid}/smaps_rollup").read_text().splitlines()
+            pss_kb = int(next(line for line in lines if line.startswith("Pss:")).split()[1])
+            self.used = replace(self.used, pss_mb=pss_kb / 1e3)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it has ended within this time."""
+        deadline = time.monotonic() + timeout_s
+        while self.poll() is None:
+            if time.monotonic() >= deadline:
+                return False
+            time.sleep(LOOK_S)
+        return True
+
+    def signal(self, number: int) -> None:
+        """Send it a signal, if it has not ended."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+
+class Starter:
+    """Starts the processes of one run; a context that ends the template.
+
+    warm: the estimator and the rule whose kernels a template loads, from which all are forked; None
+    or where the system has no orphans' parent: each is started from scratch, as whoever comes after
+    a template that has died. said: where the template tells what went wrong. compiled: called while
+    the template compiles kernels, with how many it has of about how many.
+    """
+
+    def __init__(
+        self,
+        since_ns: int,
+        warm: tuple[str, str] | None,
+        said: Path,
+        compiled: Callable[[int, int], None] = lambda done, of: None,
+    ) -> None:
+        self._compiled = compiled
+        self._environment = _environment(os.environ, since_ns)
+        self._template: Process | None = None
+        self._asks: socket.socket | None = None
+        if warm is not None and adopt_orphans():
+            self._start_template(warm, said)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_template()
+
+    @property
+    def is_warm(self) -> bool:
+        """Whether there is a template."""
+        return self._asks is not None
+
+    def start(self, words: Sequence[str], output: int) -> Process:
+        """Start `teamslam TEMPLATES`; output: the descriptor of its output and errors."""
+        if self._asks is not None:
+            try:
+                return Process(self._forked(self._asks, words, output))
+            except OSError:
+                self._end_template()
+        started = subprocess.Popen(  # noqa: S603 - our own program, no shell
+            [*PROGRAM, *words],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=self._environment,
+            start_new_session=True,
+        )
+        return Process(started.pid, started)
+
+    def _forked(self, asks: socket.socket, words: Sequence[str], output: int) -> int:
+        """The id of a process that the template has forked; OSError if it does not answer."""
+        socket.send_fds(asks, [json.dumps(list(words)).encode()], [output])
+        while answer := asks.recv(_LARGEST_ANSWER):
+            match answer.decode().split():
+                case ["started", pid]:
+                    return int(pid)
+                case ["compiled", done, of]:
+                    self._compiled(int(done), int(of))
+        raise ConnectionResetError("the template has ended")
+
+    def _start_template(self, warm: tuple[str, str], said: Path) -> None:
+        self._asks, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._asks.settimeout(PATIENCE_S)
+        number = str(theirs.fileno())
+        with theirs, said.open("wb") as file:
+            started = subprocess.Popen(  # noqa: S603 - our own program, no shell
+                [*PROGRAM, TEMPLATE, number, *warm, " " * _ROOM],
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                start_new_session=True,
+                pass_fds=[theirs.fileno()],
+            )
+        self._template = Process(started.pid, started)
+
+    def _end_template(self) -> None:
+        if self._asks is not None:
+            self._asks.close()
+            self._asks = None
+        if self._template is not None:
+            self._template.signal(9)
+            self._template.wait(PATIENCE_S)
+            self._template = None
+
+
+def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
+    """A child's environment: one BLAS thread, tied to this process, unbuffered output.
+
+    since_ns: when the run began, for a child that is started again after its end.
+    """
+    tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
+    return {**mine, **_ONE_THREAD, **tied}

@@ -1,0 +1,131 @@
+"""The warm template: a process of one thread that has imported and loaded what a team needs.
+
+`launch` starts it first. Each process of the team is forked from it, which takes milliseconds where
+imports and kernels take two seconds, and shares its memory. A forked process has the launch as its
+parent, its own session, no input and its output in its own file, and goes on as if it had been
+started by its command line: docs/decisions/0076-warm-template.md.
+"""
+
+import gc
+import importlib
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from dataclasses import dataclass
+
+from sim.launch.linux import end_with_parent, threads, write_command_line
+from sim.launch.processes import TEMPLATE
+
+LARGEST_REQUEST = 65_536
+LIGHT = ("team.keys.roster", "team.shell", "team.wire.zenoh_bus")
+"""What the router needs: it is forked before anything else is imported."""
+HEAVY = (
+    "central.desk.view.node",
+    "central.main",
+    "sim.in_memory.team",
+    "sim.publisher.main",
+    "team.recording.own_log",
+    "team.recording.provenance",
+    "team.recording.shell",
+    "team.robot.main",
+)
+"""What all others need."""
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What to start, and the file for its output."""
+
+    words: list[str]
+    output: int
+
+
+def become_a_process() -> None:
+    """Be the template that sys.argv speaks of; return in each forked process, with its sys.argv.
+
+    The template itself never returns: it ends when its launch does.
+    """
+    end_with_parent(signal.SIGKILL)
+    launch, estimator, rule = os.getppid(), sys.argv[3], sys.argv[4]
+    write_command_line(sys.orig_argv[: sys.orig_argv.index(TEMPLATE) + 1])
+    asked = socket.socket(fileno=int(sys.argv[2]))
+    for module in LIGHT:
+        importlib.import_module(module)
+    while _is_asked(asked, 0.0):  # the router does not wait for the others' imports
+        if _serve(asked, launch):
+            return
+    for module in HEAVY:
+        importlib.import_module(module)
+    from sim.launch.warm_up import run_small_team
+    from team.estimation.compiling import compilations
+
+    with compilations(lambda done, of: asked.sendall(f"compiled {done} {of}".encode())):
+        run_small_team(estimator, rule)
+    # What lives now stays where it is: the collector of a forked process does not touch it.
+    gc.collect()
+    gc.freeze()
+    while True:
+        if _serve(asked, launch):
+            return
+
+
+def _is_asked(asked: socket.socket, patience_s: float) -> bool:
+    return bool(select.select([asked], [], [], patience_s)[0])
+
+
+def _serve(asked: socket.socket, launch: int) -> bool:
+    """Fork the process that is asked for; True in that process."""
+    request = _received(asked)
+    if threads() != 1:
+        sys.exit(f"the template has {threads()} threads: a fork would not be safe")
+    read, write = os.pipe()
+    between = os.fork()
+    if between == 0:
+        _fork_again(write, launch)
+        asked.close()
+        os.close(read)
+        _begin(request)
+        return True
+    os.close(write)
+    os.close(request.output)
+    os.waitpid(between, 0)  # from now on the launch is the parent
+    with open(read, "rb") as pipe:
+        asked.sendall(pipe.read())
+    return False
+
+
+def _received(asked: socket.socket) -> _Request:
+    payload, files, _, _ = socket.recv_fds(asked, LARGEST_REQUEST, 1)
+    if not payload:
+        os._exit(0)  # the launch has ended
+    return _Request(json.loads(payload), files[0])
+
+
+def _fork_again(write: int, launch: int) -> None:
+    """Return in a child of this process, which ends: the child then is the launch's."""
+    between = os.getpid()
+    child = os.fork()
+    if child:
+        os.write(write, f"started {child}".encode())
+        os._exit(0)
+    os.close(write)
+    while os.getppid() == between:
+        time.sleep(0.001)
+    if os.getppid() != launch:  # which has ended meanwhile
+        os._exit(1)
+
+
+def _begin(request: _Request) -> None:
+    """Be the process that was asked for: its session, its streams, its words."""
+    os.setsid()
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    for source, target in ((nothing, 0), (request.output, 1), (request.output, 2)):
+        os.dup2(source, target)
+    os.close(nothing)
+    os.close(request.output)
+    sys.argv[1:] = request.words
+    write_command_line([*sys.orig_argv[: sys.orig_argv.index(TEMPLATE)], *request.words])
