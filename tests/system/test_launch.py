@@ -54,6 +54,8 @@ def test_the_json_of_a_launch_says_what_every_process_took(launched: Launched) -
     for name, process in launched.result["processes"].items():
         assert 0.0 < process["cpu_s"] < launched.result["wall_s"], name
         assert 5.0 < process["pss_mb"] < process["peak_rss_mb"], name
+    page = (launched.log.parent / "report.html").read_text()
+    assert '<h2 id="processes">' in page
 
 
 def test_every_published_measurement_is_consumed_once(launched: Launched) -> None:
