@@ -180,6 +180,27 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     marker_sigma: NonNegative = 0.0
 
 
+class Association(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a window finds out which detections without identities are of one landmark.
+
+    gate: the largest squared Mahalanobis distance of a detection from its landmark, χ² of two
+    degrees of freedom (13.8: one in a thousand of the right ones is beyond).
+    variance_factor: detections' covariances are taken times this while associating; below 1 where
+    the noise that estimation needs is systematic, and neighbours would be taken for one.
+    least_seen: a landmark that fewer detections of the window support stays out.
+    slack_m: two landmarks that no scan saw together are one if they are within the gate with this
+    much slack. slip_m: the largest jump of the odometry that is looked for; 0: none.
+    detection_probability: of a landmark in view; what was seen too rarely for it is clutter.
+    """
+
+    gate: Positive = 13.8
+    variance_factor: Positive = 1.0
+    least_seen: Annotated[int, Meta(ge=1, le=1000)] = 2
+    slack_m: NonNegative = 0.03
+    slip_m: NonNegative = 0.0
+    detection_probability: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.9
+
+
 class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The particle front end of one window and the rule that closes the window.
 

@@ -1,0 +1,217 @@
+"""The association of one closed window: track, smooth, associate again, merge, drop.
+
+No truth, no map and no other window goes in, so a submap's landmarks are its own measurements'
+alone. There is one association of a window: particles are not asked, and nothing is averaged.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.config import Association
+from team.estimation.association.matching import best_pairs_first, squared_distances
+from team.estimation.association.scans import (
+    NOBODY,
+    Scans,
+    pose_jacobians,
+    rotation,
+    seen_from,
+)
+from team.estimation.association.smoothing import Smoothed, smoothed
+from team.estimation.association.tracking import Slip, slip_covariance, tracked
+
+
+@dataclass(frozen=True)
+class Associated:
+    """Which landmark each detection of a window is of.
+
+    landmark_of: by detection, in [0, L); NOBODY of what stays out. names: of each landmark, NOBODY
+    of those without; by name, then in the order in which the window saw them. counts: by how many
+    detections. seen: by which keyframes. slips: where the odometry was wrong.
+    clutter: of the detections that stay out, those whose place was looked at again in vain.
+    """
+
+    landmark_of: Int64[np.ndarray, " N"]
+    names: Int64[np.ndarray, " L"]
+    counts: Int64[np.ndarray, " L"]
+    seen: Bool[np.ndarray, "L K"]
+    slips: tuple[Slip, ...]
+    clutter: Bool[np.ndarray, " N"]
+
+
+def associated(scans: Scans, settings: Association) -> Associated:
+    """The window's one association; raises LinAlgError where the window has no solution."""
+    first = tracked(scans, settings)
+    scans = _with_slips(scans, first.slips)
+    landmark_of, names = first.landmark_of, np.array(first.names, np.int64)
+    now = smoothed(scans, landmark_of, first.poses, first.landmarks)
+    landmark_of, names, points = _again(scans, names, now, settings)
+    now = smoothed(scans, landmark_of, now.poses, points)
+    landmark_of, names, points = _merged(scans, landmark_of, names, now, settings)
+    now = smoothed(scans, landmark_of, now.poses, points)
+    confirmed = _confirmed(landmark_of, names, settings)
+    clutter = _looked_in_vain(scans, landmark_of, confirmed, now, settings)
+    kept = np.where(confirmed[landmark_of], landmark_of, NOBODY)
+    landmark_of, names, _ = _renumbered(kept, names, now.landmarks)
+    seen = _seen(scans, landmark_of, len(names))
+    counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(names))
+    return Associated(landmark_of, names, counts, seen, tuple(first.slips), clutter)
+
+
+def _with_slips(scans: Scans, slips: list[Slip]) -> Scans:
+    covariances = scans.motion_covariances.copy()
+    for slip in slips:
+        covariances[slip.keyframe] += slip_covariance(slip.by)
+    return replace(scans, motion_covariances=covariances)
+
+
+def _seen(
+    scans: Scans, landmark_of: Int64[np.ndarray, " N"], landmarks: int
+) -> Bool[np.ndarray, "L K"]:
+    seen = np.zeros((landmarks, len(scans.motions)), np.bool_)
+    used = landmark_of != NOBODY
+    seen[landmark_of[used], scans.keyframes[used]] = True
+    return seen
+
+
+def _renumbered(
+    landmark_of: Int64[np.ndarray, " N"],
+    names: Int64[np.ndarray, " before"],
+    points: Float[np.ndarray, "before 2"],
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """Landmarks that have a detection, by name, those without by their first detection."""
+    kept, first = np.unique(landmark_of, return_index=True)
+    kept, first = kept[kept != NOBODY], first[kept != NOBODY]
+    unnamed = names[kept] == NOBODY
+    kept = kept[np.lexsort((np.where(unnamed, first, names[kept]), unnamed))]
+    number = np.full(len(names) + 1, NOBODY)  # the last one is that of NOBODY
+    number[kept] = np.arange(len(kept))
+    return number[landmark_of], names[kept], points[kept]
+
+
+def _again(
+    scans: Scans, names: Int64[np.ndarray, " before"], now: Smoothed, settings: Association
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """Every scan once more, from the smoothed path against the landmarks of the whole window.
+
+    What matches none founds a landmark, for the scans that follow too.
+    """
+    k, n = len(now.poses), len(now.covariance)
+    most = n + 2 * len(scans.points)
+    P = np.zeros((most, most))
+    P[:n, :n] = now.covariance
+    known, points = list(names), np.concatenate((now.landmarks, np.empty((len(scans.points), 2))))
+    landmark_of, bounds = np.full(len(scans.points), NOBODY), scans.bounds
+    for i in range(k):
+        of_scan = slice(bounds[i], bounds[i + 1])
+        at, R, named = scans.points[of_scan], scans.covariances[of_scan], scans.names[of_scan]
+        if not len(at):
+            continue
+        tight = settings.variance_factor * R
+        count, pose = len(known), slice(3 * i, 3 * i + 3)
+        turn = rotation(now.poses[i, 2])
+        seen = (points[:count] - now.poses[i, :2]) @ turn
+        Hp = pose_jacobians(seen)
+        rows = slice(3 * k, 3 * k + 2 * count)
+        own = P[rows, rows].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+        cross = P[pose, rows].reshape(3, count, 2).transpose(1, 0, 2)
+        mixed = Hp @ cross @ turn
+        spread = Hp @ P[pose, pose] @ Hp.transpose(0, 2, 1) + turn.T @ own @ turn
+        spread += mixed + mixed.transpose(0, 2, 1)
+        squared, logs = squared_distances(at[:, None] - seen[None], spread[None] + tight[:, None])
+        same = named[:, None] == np.array(known)[None]
+        gate = np.where(named[:, None] == NOBODY, settings.gate, np.inf)
+        squared = np.where(same, np.minimum(squared, 1e12) / gate, np.inf)
+        found = best_pairs_first(squared, squared * settings.gate + logs, 1.0)
+        for row in np.nonzero(found == NOBODY)[0]:
+            end = 3 * k + 2 * len(known)
+            new = slice(end, end + 2)
+            G = turn @ np.array([[1.0, 0.0, -at[row, 1]], [0.0, 1.0, at[row, 0]]])
+            P[new, :end] = G @ P[pose, :end]
+            P[:end, new] = P[new, :end].T
+            P[new, new] = G @ P[pose, pose] @ G.T + turn @ R[row] @ turn.T
+            points[len(known)] = now.poses[i, :2] + turn @ at[row]
+            found[row] = len(known)
+            known.append(named[row])
+        landmark_of[of_scan] = found
+    return _renumbered(landmark_of, np.array(known, np.int64), points[: len(known)])
+
+
+def _merged(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    names: Int64[np.ndarray, " before"],
+    now: Smoothed,
+    settings: Association,
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """Unnamed landmarks at one place that no scan saw together are one, the closest first."""
+    count, first = len(names), 3 * len(now.poses)
+    seen = _seen(scans, landmark_of, count)
+    together = (seen.astype(np.int64) @ seen.T.astype(np.int64)) > 0
+    P = now.covariance[first:, first:].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
+    own = P[np.arange(count), np.arange(count)]
+    S = own[:, None] + own[None] - P - P.transpose(0, 1, 3, 2) + settings.slack_m**2 * np.eye(2)
+    apart = now.landmarks[:, None] - now.landmarks[None]
+    squared, _ = squared_distances(apart, S)
+    unnamed = names == NOBODY
+    may = (squared < settings.gate) & ~together & unnamed[:, None] & unnamed[None]
+    rows, columns = np.nonzero(np.triu(may, 1))
+    root = np.arange(count)
+    for index in np.argsort(squared[rows, columns], kind="stable"):
+        a, b = root[rows[index]], root[columns[index]]
+        if a != b and not (seen[a] & seen[b]).any():
+            keep, gone = (a, b) if seen[a].sum() >= seen[b].sum() else (b, a)
+            seen[keep] |= seen[gone]
+            root[root == gone] = keep
+    return _renumbered(root[landmark_of], names, now.landmarks)
+
+
+def _confirmed(
+    landmark_of: Int64[np.ndarray, " N"], names: Int64[np.ndarray, " L"], settings: Association
+) -> Bool[np.ndarray, " L"]:
+    """Named landmarks, and those that were seen often enough."""
+    counts = np.bincount(landmark_of, minlength=len(names))
+    return np.asarray((counts >= settings.least_seen) | (names != NOBODY))
+
+
+def _looked_in_vain(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    confirmed: Bool[np.ndarray, " L"],
+    now: Smoothed,
+    settings: Association,
+) -> Bool[np.ndarray, " N"]:
+    """Of what is not confirmed: where a landmark would have been seen more often.
+
+    A place counts as looked at by a keyframe if it saw something at least as far off, and lies
+    between the outermost bearings of what it saw. Seen c times in v such looks, a landmark that is
+    detected with probability p would be seen so rarely in fewer than 1 of 20 cases.
+    """
+    clutter = np.zeros(len(landmark_of), np.bool_)
+    scan_of = scans.keyframes
+    first = np.unique(scan_of, return_index=True)[1]
+    if not len(first):
+        return clutter
+    bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
+    farthest = np.maximum.reduceat(np.hypot(scans.points[:, 0], scans.points[:, 1]), first)
+    least, most = np.minimum.reduceat(bearings, first), np.maximum.reduceat(bearings, first)
+    poses = now.poses[scan_of[first]]
+    for landmark in np.nonzero(~confirmed)[0]:
+        members = np.nonzero(landmark_of == landmark)[0]
+        places = seen_from(poses, np.broadcast_to(now.landmarks[landmark], (len(poses), 2)))
+        bearing = np.arctan2(places[:, 1], places[:, 0])
+        inside = (least <= bearing) & (bearing <= most)
+        looks = np.count_nonzero(inside & (np.hypot(places[:, 0], places[:, 1]) <= farthest))
+        clutter[members] = _rare(len(members), max(int(looks), len(members)), settings)
+    return clutter
+
+
+def _rare(seen: int, looks: int, settings: Association) -> bool:
+    """Whether P(at most `seen` of `looks` detections) < 0.05 with the detection probability."""
+    p = settings.detection_probability
+    term, total = (1.0 - p) ** looks, 0.0
+    for c in range(seen + 1):
+        total += term
+        term *= (looks - c) / (c + 1.0) * p / (1.0 - p)
+    return total < 0.05

@@ -1,0 +1,295 @@
+"""The first pass over a window: an extended Kalman filter with the best pair first.
+
+Smith, Self and Cheeseman 1990, with detections as points. Odometry that slips is noticed: where few
+detections match although landmarks are about, and nearly all do if the robot has jumped (Ortín,
+Montiel 2001; one-point RANSAC), the motion is taken as that much more uncertain.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.stats import chi2
+
+from team.config import Association
+from team.estimation.association.matching import best_pairs_first, squared_distances
+from team.estimation.association.scans import NOBODY, Scans, pose_jacobians, rotation
+from team.estimation.geometry import adjoint, compose, inverse
+
+FEW = 0.5
+"""Of a scan's detections: fewer that match are few …"""
+MOST = 0.7
+"""… and so many that match after one jump are no chance."""
+RARE = 1e-3
+"""A joint distance that right pairs exceed so rarely is a surprise."""
+SLIP_TURN = 0.1
+"""A robot that slips may turn by about this [rad]."""
+SLIP_DETECTIONS = 3
+"""A slip is looked for from so many detections on."""
+
+
+class Slip(NamedTuple):
+    """Up to this keyframe the odometry was wrong by about this (forward [m], left [m], turn)."""
+
+    keyframe: int
+    by: Float[np.ndarray, "3"]
+
+
+class Tracked(NamedTuple):
+    """What the first pass found; the landmark of each detection, and where they are."""
+
+    landmark_of: Int64[np.ndarray, " N"]
+    names: list[int]
+    poses: Float[np.ndarray, "K 3"]
+    landmarks: Float[np.ndarray, "L 2"]
+    slips: list[Slip]
+
+
+class Tracker:
+    """The filter's state: the pose, the landmarks so far, and their joint covariance."""
+
+    def __init__(self, settings: Association, most: int) -> None:
+        self._settings = settings
+        self.pose = np.zeros(3)
+        self.names: list[int] = []
+        self._points = np.empty((most, 2))
+        self._P = np.zeros((3 + 2 * most, 3 + 2 * most))
+
+    @property
+    def landmarks(self) -> Float[np.ndarray, "L 2"]:
+        """Where they are, in the window's frame."""
+        return self._points[: len(self.names)]
+
+    @property
+    def _size(self) -> int:
+        return 3 + 2 * len(self.names)
+
+    def move(self, motion: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> None:
+        """The motion up to the next keyframe."""
+        n = self._size
+        Ad = adjoint(inverse(motion))
+        self.pose = compose(self.pose, motion)
+        self._P[:3, :n] = Ad @ self._P[:3, :n]
+        self._P[:n, :3] = self._P[:n, :3] @ Ad.T
+        self._P[:3, :3] += covariance
+
+    def predicted(self) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
+        """Each landmark as the robot would see it, and how sure that is."""
+        count = len(self.names)
+        turn = rotation(self.pose[2])
+        seen = (self.landmarks - self.pose[:2]) @ turn
+        Hp = pose_jacobians(seen)
+        n = self._size
+        own = self._P[3:n, 3:n].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+        cross = self._P[:3, 3:n].reshape(3, count, 2).transpose(1, 0, 2)
+        mixed = Hp @ cross @ turn
+        S = Hp @ self._P[:3, :3] @ Hp.transpose(0, 2, 1)
+        return seen, S + turn.T @ own @ turn + mixed + mixed.transpose(0, 2, 1)
+
+    def shift(self, by: Float[np.ndarray, "3"]) -> None:
+        """The robot has slipped by about this (forward, left, turn)."""
+        self.pose = compose(self.pose, by)
+        self._P[:3, :3] += slip_covariance(by)
+
+    def update(
+        self,
+        landmarks: Int64[np.ndarray, " m"],
+        points: Float[np.ndarray, "m 2"],
+        covariances: Float[np.ndarray, "m 2 2"],
+    ) -> None:
+        """These landmarks were seen there: one joint update."""
+        m, n = len(landmarks), self._size
+        if not m:
+            return
+        H, seen = self._jacobian(landmarks)
+        P = self._P[:n, :n]
+        HP = H @ P
+        S = HP @ H.T
+        S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
+        gain = np.linalg.solve(S, HP).T
+        step = gain @ (points - seen).ravel()
+        P -= gain @ HP
+        self._P[:n, :n] = 0.5 * (P + P.T)
+        self.pose = compose(self.pose, step[:3])
+        self._points[: len(self.names)] += step[3:].reshape(-1, 2)
+
+    def _jacobian(
+        self, landmarks: Int64[np.ndarray, " m"]
+    ) -> tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "m 2"]]:
+        """∂h/∂state of these landmarks, and h."""
+        m = len(landmarks)
+        turn = rotation(self.pose[2])
+        seen = (self.landmarks[landmarks] - self.pose[:2]) @ turn
+        H = np.zeros((m, 2, self._size))
+        H[:, :, :3] = pose_jacobians(seen)
+        columns = 3 + 2 * landmarks[:, None] + np.arange(2)
+        H[np.arange(m)[:, None, None], np.arange(2)[:, None], columns[:, None, :]] = turn.T
+        return H.reshape(2 * m, -1), seen
+
+    def found(
+        self, point: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"], name: int
+    ) -> int:
+        """A landmark that was not known; its index."""
+        index, n = len(self.names), self._size
+        turn = rotation(self.pose[2])
+        G = turn @ np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
+        new = slice(n, n + 2)
+        self._P[new, :n] = G @ self._P[:3, :n]
+        self._P[:n, new] = self._P[new, :n].T
+        self._P[new, new] = G @ self._P[:3, :3] @ G.T + turn @ covariance @ turn.T
+        self._points[index] = self.pose[:2] + turn @ point
+        self.names.append(name)
+        return index
+
+    def matched(
+        self,
+        points: Float[np.ndarray, "n 2"],
+        covariances: Float[np.ndarray, "n 2 2"],
+        names: Int64[np.ndarray, " n"],
+    ) -> Int64[np.ndarray, " n"]:
+        """The landmark of each detection of a scan, NOBODY of those that match none."""
+        if not len(points) or not self.names:
+            return np.full(len(points), NOBODY)
+        seen, spread = self.predicted()
+        S = spread[None] + self._settings.variance_factor * covariances[:, None]
+        squared, logs = squared_distances(points[:, None] - seen[None], S)
+        known = np.array(self.names)
+        squared = np.where(names[:, None] == known[None], squared, np.inf)
+        found = best_pairs_first(squared, squared + logs, self._settings.gate)
+        for row in np.nonzero(names != NOBODY)[0]:  # a name is believed, however far it is
+            same = np.nonzero(known == names[row])[0]
+            found[row] = same[0] if len(same) else NOBODY
+        return found
+
+    def surprise(
+        self,
+        landmarks: Int64[np.ndarray, " m"],
+        points: Float[np.ndarray, "m 2"],
+        covariances: Float[np.ndarray, "m 2 2"],
+    ) -> float:
+        """The joint squared Mahalanobis distance of these pairs, over what it should not exceed."""
+        m, n = len(landmarks), self._size
+        if not m:
+            return 0.0
+        H, seen = self._jacobian(landmarks)
+        S = H @ self._P[:n, :n] @ H.T
+        S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
+        error = (points - seen).ravel()
+        return float(error @ np.linalg.solve(S, error) / chi2.isf(RARE, 2 * m))
+
+    def jump(
+        self,
+        points: Float[np.ndarray, "n 2"],
+        covariances: Float[np.ndarray, "n 2 2"],
+        found: Int64[np.ndarray, " n"],
+    ) -> Float[np.ndarray, "3"] | None:
+        """(forward, left, turn) of the one slip that explains most of a scan; None if none does.
+
+        It must explain more pairs than those `found` without it, and together they must fit better
+        by more than one pair that fits not at all.
+
+        Each pair of a detection and a landmark near it proposes a slip, given that the pose may be
+        wrong by slip_m; the other pairs are counted given that one.
+        """
+        gate, reach = self._settings.gate, self._settings.slip_m
+        seen, spread = self.predicted()
+        Hp = pose_jacobians(seen)
+        loose = np.diag([(0.5 * reach) ** 2, (0.5 * reach) ** 2, SLIP_TURN**2])
+        tight = self._P[:3, :3]
+        own = spread - Hp @ tight @ Hp.transpose(0, 2, 1)
+        own += 1e-6 * np.eye(2) + np.maximum(-np.linalg.eigvalsh(own)[:, :1, None], 0.0) * np.eye(2)
+        HpD = Hp @ (loose + tight)
+        offsets = points[:, None] - seen[None]
+        near = np.hypot(offsets[..., 0], offsets[..., 1]) < reach
+        least = MOST * max(int(near.any(axis=1).sum()), SLIP_DETECTIONS)
+        known = np.nonzero(found != NOBODY)[0]
+        before, _ = squared_distances(
+            offsets[known, found[known]], spread[found[known]] + covariances[known]
+        )
+        most = gate * (len(points) - len(known) - 1) + float(np.minimum(before, gate).sum())
+        best = (max(least, len(known) + 1) - 1e-9, 0.0)
+        slip = None
+        for row, column in np.argwhere(near):
+            C = HpD[column] @ Hp.transpose(0, 2, 1)  # of the proposing one with each
+            gain = C.transpose(0, 2, 1) @ np.linalg.inv(C[column] + own[column] + covariances[row])
+            S = HpD @ Hp.transpose(0, 2, 1) - gain @ C + own
+            moved = offsets - np.einsum("lij,j->li", gain, offsets[row, column])
+            squared, logs = squared_distances(moved, S[None] + covariances[:, None])
+            pairs = best_pairs_first(squared, squared + logs, gate)
+            rows = np.nonzero(pairs != NOBODY)[0]
+            figure = float(len(rows)), -float(squared[rows, pairs[rows]].sum())
+            if figure > best and gate * (len(points) - len(rows)) - figure[1] < most:
+                best, slip = figure, (rows, pairs[rows])
+        if slip is None:
+            return None
+        rows, columns = slip
+        H = Hp[columns].reshape(-1, 3)
+        S = H @ (loose + tight) @ H.T
+        m = len(rows)
+        S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances[rows] + own[columns]
+        error = offsets[rows, columns].ravel()
+        return np.asarray((loose + tight) @ H.T @ np.linalg.solve(S, error))
+
+
+def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Of a motion that slipped by about this (forward, left, turn): as large again."""
+    metres, turn = max(float(np.hypot(*slip[:2])), 0.02), max(abs(float(slip[2])), 0.02)
+    return np.diag([metres**2, metres**2, turn**2])
+
+
+def tracked(scans: Scans, settings: Association) -> Tracked:
+    """The first association of a window's detections, scan by scan."""
+    tracker = Tracker(settings, len(scans.points))
+    landmark_of = np.full(len(scans.points), NOBODY)
+    bounds = scans.bounds
+    poses = np.empty_like(scans.motions)
+    slips: list[Slip] = []
+    for k, motion in enumerate(scans.motions):
+        tracker.move(motion, scans.motion_covariances[k])
+        of_scan = slice(bounds[k], bounds[k + 1])
+        points, covariances = scans.points[of_scan], scans.covariances[of_scan]
+        names = scans.names[of_scan]
+        found = tracker.matched(points, covariances, names)
+        if settings.slip_m and _looks_slipped(tracker, found, points, covariances, settings.slip_m):
+            by = tracker.jump(points, covariances, found)
+            if by is not None:
+                slips.append(Slip(k, by))
+                tracker.shift(by)
+                found = tracker.matched(points, covariances, names)
+        known = np.nonzero(found != NOBODY)[0]
+        tracker.update(found[known], points[known], covariances[known])
+        for row in np.nonzero(found == NOBODY)[0]:
+            found[row] = tracker.found(points[row], covariances[row], int(names[row]))
+        landmark_of[of_scan] = found
+        poses[k] = tracker.pose
+    return Tracked(landmark_of, tracker.names, poses, tracker.landmarks.copy(), slips)
+
+
+def _looks_slipped(
+    tracker: Tracker,
+    found: Int64[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 2"],
+    covariances: Float[np.ndarray, "n 2 2"],
+    reach: float,
+) -> bool:
+    """Whether few match, some miss a landmark nearby, or the pairs do not fit together."""
+    known = np.nonzero(found != NOBODY)[0]
+    if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
+        return False
+    if len(known) < FEW * len(points) or _missed_nearby(tracker, found, points, reach):
+        return True
+    return tracker.surprise(found[known], points[known], covariances[known]) > 1.0
+
+
+def _missed_nearby(
+    tracker: Tracker,
+    found: Int64[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 2"],
+    reach: float,
+) -> bool:
+    """Whether a detection and a landmark that match nothing lie within reach of each other."""
+    seen, _ = tracker.predicted()
+    free = np.ones(len(seen), np.bool_)
+    free[found[found != NOBODY]] = False
+    offsets = points[found == NOBODY][:, None] - seen[free][None]
+    return bool((np.hypot(offsets[..., 0], offsets[..., 1]) < reach).any())

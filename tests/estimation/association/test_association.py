@@ -1,0 +1,196 @@
+"""Association inside a window: simulated windows whose right answer is known."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from team.config import Association
+from team.estimation.association.association import Associated, associated
+from team.estimation.association.matching import best_pairs_first, squared_distances
+from team.estimation.association.scans import (
+    NOBODY,
+    Scans,
+    path_of,
+    points_of,
+    rotations,
+    seen_from,
+)
+from team.estimation.association.smoothing import smoothed
+
+SETTINGS = Association()
+MOTION_NOISE = np.diag([0.02, 0.01, 0.01]) ** 2
+RANGE_M, VIEW_M = 0.05, 6.0
+
+
+def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
+    """(scans, the landmark of each detection or NOBODY): a drive through a grid of landmarks."""
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(np.arange(-4, 12), np.arange(-4, 5)), -1).reshape(-1, 2) * spacing
+    landmarks = grid[rng.random(len(grid)) < 0.5] + 0.1 * rng.normal(size=(1, 2))
+    true = np.tile([0.4, 0.0, 0.05], (steps, 1))
+    poses = path_of(true)
+    measured = true + rng.normal(size=true.shape) * np.sqrt(np.diag(MOTION_NOISE))
+    if slip is not None:
+        measured[slip[0]] += slip[1]
+    keyframes, points, labels = [], [], []
+    for k, pose in enumerate(poses):
+        seen = seen_from(np.tile(pose, (len(landmarks), 1)), landmarks)
+        near = np.hypot(*seen.T) < VIEW_M
+        for label in np.nonzero(near & (rng.random(len(near)) >= missed))[0]:
+            keyframes.append(k)
+            points.append(seen[label] + RANGE_M * rng.normal(size=2))
+            labels.append(label)
+        for _ in range(rng.poisson(clutter * near.sum())):
+            keyframes.append(k)
+            points.append(rng.uniform(-VIEW_M, VIEW_M, 2))
+            labels.append(NOBODY)
+    n = len(points)
+    scans = Scans(
+        measured,
+        np.tile(MOTION_NOISE, (steps, 1, 1)),
+        np.array(keyframes),
+        np.array(points),
+        np.tile(RANGE_M**2 * np.eye(2), (n, 1, 1)),
+        np.full(n, NOBODY),
+    )
+    return scans, np.array(labels)
+
+
+def pairs(found: np.ndarray, labels: np.ndarray) -> tuple[float, float]:
+    """Pairwise (precision, recall) of the detections that are of a landmark."""
+    real = labels != NOBODY
+    found, labels = found[real], labels[real]
+    same = labels[:, None] == labels[None]
+    said = (found[:, None] == found[None]) & (found[:, None] != NOBODY)
+    np.fill_diagonal(same, False)
+    np.fill_diagonal(said, False)
+    return (same & said).sum() / said.sum(), (same & said).sum() / same.sum()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_window_of_separate_landmarks_is_associated_without_an_error(seed):
+    scans, labels = window(seed, clutter=0.2, missed=0.1)
+    result = associated(scans, SETTINGS)
+    precision, recall = pairs(result.landmark_of, labels)
+    assert precision == 1.0
+    assert recall > 0.97
+    kept_clutter = (result.landmark_of != NOBODY) & (labels == NOBODY)
+    assert kept_clutter.sum() < 0.2 * (labels == NOBODY).sum()
+
+
+def test_landmarks_nearer_than_the_noise_are_not_told_apart_which_the_score_notices():
+    scans, labels = window(0, spacing=0.1)
+    assert pairs(associated(scans, SETTINGS).landmark_of, labels)[0] < 0.9
+
+
+def test_one_scan_never_sees_a_landmark_twice():
+    scans, _ = window(1, clutter=0.5, spacing=0.5)
+    result = associated(scans, SETTINGS)
+    used = result.landmark_of != NOBODY
+    seen = list(zip(scans.keyframes[used], result.landmark_of[used], strict=True))
+    assert len(seen) == len(set(seen))
+    assert result.seen.sum() == len(seen)
+    assert (result.counts == result.seen.sum(axis=1)).all()
+    assert (result.counts >= SETTINGS.least_seen).all()
+
+
+def test_what_is_looked_at_again_in_vain_is_clutter_and_what_is_not_is_unconfirmed():
+    scans, labels = window(2, clutter=0.3)
+    result = associated(scans, SETTINGS)
+    out = result.landmark_of == NOBODY
+    assert not result.clutter[~out].any()
+    assert result.clutter[labels == NOBODY].mean() > 0.5
+    assert not result.clutter[labels != NOBODY].any()
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.8])
+def test_a_slip_of_the_odometry_is_named_and_costs_no_landmark(reach):
+    scans, labels = window(3, slip=(12, np.array([0.3, 0.25, 0.0])))
+    result = associated(scans, Association(slip_m=reach))
+    recall = pairs(result.landmark_of, labels)[1]
+    if not reach:
+        assert recall < 0.9, "without the search the window falls into two halves"
+        return
+    assert recall > 0.97
+    slip = max(result.slips, key=lambda each: float(np.hypot(*each.by[:2])))
+    assert slip.keyframe == 12
+    assert np.allclose(slip.by[:2], [-0.3, -0.25], atol=0.1)
+
+
+def test_named_detections_are_believed_beside_those_without_a_name():
+    scans, labels = window(4)
+    tags = np.where(labels % 3 == 0, labels + 7, NOBODY)
+    result = associated(replace(scans, names=tags), SETTINGS)
+    assert (result.names[result.landmark_of[tags != NOBODY]] == tags[tags != NOBODY]).all()
+    assert pairs(result.landmark_of, labels) == (1.0, 1.0)
+    named = result.names[result.names != NOBODY]
+    assert (np.diff(named) > 0).all()
+    assert (result.names[len(named) :] == NOBODY).all()
+
+
+def test_the_same_window_gives_the_same_bits_and_truth_is_no_input():
+    scans, _ = window(5, clutter=0.2)
+    first, second = (associated(scans, SETTINGS) for _ in range(2))
+    for name in ("landmark_of", "counts", "seen", "clutter"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+    assert isinstance(first, Associated)
+
+
+def test_the_best_pair_comes_first_and_each_is_taken_once():
+    squared = np.array([[1.0, 0.5], [2.0, 0.1], [30.0, 40.0]])
+    assert best_pairs_first(squared, squared, 13.8).tolist() == [0, 1, NOBODY]
+
+
+def test_squared_distances_are_those_of_the_matrix_inverse():
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(4, 3, 2, 2))
+    S = roots @ roots.transpose(0, 1, 3, 2) + 0.1 * np.eye(2)
+    d = rng.normal(size=(4, 3, 2))
+    squared, logs = squared_distances(d, S)
+    assert np.allclose(squared, np.einsum("abi,abij,abj->ab", d, np.linalg.inv(S), d))
+    assert np.allclose(logs, np.linalg.slogdet(S)[1])
+
+
+def test_points_carry_the_covariance_of_range_and_bearing():
+    ranges, bearings = np.array([3.0]), np.array([0.7])
+    variances = np.array([[0.04, 0.001, 0.0009]])
+    points, covariances = points_of(ranges, bearings, variances)
+    rng = np.random.default_rng(1)
+    R = np.array([[0.04, 0.001], [0.001, 0.0009]]) / 100.0
+    drawn = rng.multivariate_normal([3.0, 0.7], R, 100_000)
+    cloud = np.column_stack((drawn[:, 0] * np.cos(drawn[:, 1]), drawn[:, 0] * np.sin(drawn[:, 1])))
+    assert np.allclose(points[0], cloud.mean(axis=0), atol=1e-3)
+    assert np.allclose(100.0 * np.cov(cloud.T), covariances[0], rtol=0.05, atol=1e-4)
+
+
+def test_the_smoothed_window_is_consistent_and_one_with_half_the_noise_claimed_is_not():
+    ratios = []
+    for claimed in (1.0, 0.25):
+        squared = dof = 0.0
+        for seed in range(6):
+            scans, labels = window(seed, steps=15)
+            scans = replace(scans, covariances=claimed * scans.covariances)
+            _, landmark_of = np.unique(labels, return_inverse=True)
+            poses = path_of(scans.motions)
+            first = np.unique(landmark_of, return_index=True)[1]
+            at = poses[scans.keyframes[first]]
+            turned = np.einsum("nij,nj->ni", rotations(at[:, 2]), scans.points[first])
+            landmarks = at[:, :2] + turned
+            result = smoothed(scans, landmark_of, poses, landmarks)
+            squared, dof = squared + result.squared, dof + result.dof
+        ratios.append(squared / dof)
+    assert 0.9 < ratios[0] < 1.1
+    assert ratios[1] > 2.0
+
+
+def test_landmarks_that_one_scan_saw_together_are_never_merged():
+    scans, labels = window(6, spacing=1.0)
+    result = associated(scans, Association(slack_m=5.0))
+    by_scan = [labels[scans.keyframes == k] for k in range(len(scans.motions))]
+    together = {pair for seen in by_scan for pair in combinations(sorted(seen), 2)}
+    members = [set(labels[result.landmark_of == i]) for i in range(len(result.counts))]
+    merged = {pair for labelled in members for pair in combinations(sorted(labelled), 2)}
+    assert merged, "with so much slack what was never seen together is merged"
+    assert not merged & together
