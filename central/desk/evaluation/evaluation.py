@@ -111,7 +111,8 @@ class Evaluation:
 
     true_landmarks: all of them, seen or not. notes: what the world had to say of its data, and what
     each node set aside. faults: how many messages were.
-    unsound: samples that are no sound message.
+    unsound: samples that are no sound message. arbitrary_frame: no robot knew its initial pose, so
+    the map's frame is not the truth's, and only aligned errors mean something.
     """
 
     scenario: TeamConfig | None
@@ -124,6 +125,7 @@ class Evaluation:
     cost_by_robot: Mapping[str, float]
     faults: int = 0
     scale_by_robot: Mapping[str, float] = field(default_factory=dict)
+    arbitrary_frame: bool = False
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
@@ -161,7 +163,14 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         cost_by_robot=_by_robot(log, "joint_cost_per_dof."),
         faults=len(faults),
         scale_by_robot=_by_robot(log, "covariance_scale."),
+        arbitrary_frame=_is_arbitrary(log),
     )
+
+
+def _is_arbitrary(log: Collected) -> bool:
+    """Whether there are initial poses in the log, and all of them unknown."""
+    starts = [each for robot in log.robots for each in log.messages(ch.START, robot)]
+    return bool(starts) and not any(isinstance(s, m.InitialPose) and s.pose for s in starts)
 
 
 def _lost(fused: MapResult | None) -> list[str]:
@@ -224,6 +233,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "final_map_digest": None if fused is None else fused.digest,
         "final_map_sha256": None if fused is None else fused.payload_sha256,
         "final_map_frame": None if fused is None else fused.frame,
+        "frame_is_arbitrary": evaluation.arbitrary_frame,
         "not_joined": [] if fused is None else list(fused.reasons),
         "joined": [] if fused is None else list(fused.joined),
         "withdrawn": [] if fused is None else list(fused.withdrawn),

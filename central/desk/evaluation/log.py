@@ -133,6 +133,8 @@ class Collected:
         traffic = self.traffic[sample.key]
         traffic.messages += 1
         traffic.bytes += len(sample.payload)
+        if channel == ch.START.name:
+            self.kept[sample.key].append(sample)
         if channel in _SENSORS:
             self._count(sample, robot, odometry=channel == ch.ODOMETRY.name)
         elif channel in _LATEST:

@@ -1,6 +1,7 @@
 """Pictures of a run: the map with its uncertainty, and the robots' errors within their bounds."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -16,9 +17,10 @@ from central.desk.drawing import (
     landmark_blocks,
     robot_colours,
 )
-from central.desk.evaluation.errors import Path
+from central.desk.evaluation.errors import Path, moved
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.paths import SmoothedPath
+from team.estimation.geometry import inverse
 
 # Matplotlib takes half a second to import: a run that draws nothing has no use for it
 if TYPE_CHECKING:
@@ -44,6 +46,7 @@ def map_picture(
     """
     if evaluation.map is None and not evaluation.robots:
         return False
+    evaluation = _in_the_maps_frame(evaluation)
     figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
     colours = robot_colours(evaluation.robots)
@@ -71,8 +74,33 @@ def map_picture(
     return True
 
 
+def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
+    """Where the map's frame is arbitrary, the truth moved into it by the map's alignment."""
+    fused = evaluation.map
+    motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
+    if not evaluation.arbitrary_frame or motion is None:
+        return evaluation
+    back = inverse(motion)
+
+    def moved_path(path: Path) -> Path:
+        turned = path.poses[:, 2:] + back[2]
+        return Path(path.stamps_ns, np.hstack((moved(back, path.poses[:, :2]), turned)))
+
+    return replace(
+        evaluation,
+        true_landmarks=moved(back, evaluation.true_landmarks),
+        robots={n: replace(r, truth=moved_path(r.truth)) for n, r in evaluation.robots.items()},
+    )
+
+
 def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
-    """Errors of x, y and heading over team time with ±3σ; False where no robot has truth."""
+    """Errors of x, y and heading over team time with ±3σ.
+
+    False where no robot has truth, or where the map's frame is arbitrary: errors as the paths lie
+    would say nothing.
+    """
+    if evaluation.arbitrary_frame:
+        return False
     shown = {n: r for n, r in evaluation.robots.items() if r.online or r.smoothed}
     names = list(shown)[:DRAWN_ROBOTS]
     if not names:
@@ -264,6 +292,9 @@ def _title(evaluation: Evaluation) -> list[str]:
         second.append("no final map")
     elif fused.errors is not None:
         errors = fused.errors
+        if evaluation.arbitrary_frame:
+            aligned = "" if errors.aligned_rmse_m is None else f"{errors.aligned_rmse_m:.3g} m"
+            return [_heading(evaluation), " · ".join([*second, f"landmark RMSE {aligned} aligned"])]
         text = f"landmark RMSE {errors.rmse_m:.3g} m"
         if errors.aligned_rmse_m is not None:
             text += f" ({errors.aligned_rmse_m:.3g} m aligned)"

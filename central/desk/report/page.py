@@ -182,7 +182,8 @@ def _own_maps(run: Run) -> list[str]:
 
 
 def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
-    rows = [robot_row(name, robot) for name, robot in run.evaluation.robots.items()]
+    arbitrary = run.evaluation.arbitrary_frame
+    rows = [robot_row(n, robot, arbitrary=arbitrary) for n, robot in run.evaluation.robots.items()]
     if not rows:
         return []
     return [
@@ -227,13 +228,15 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
 
 
 def _paths(run: Run) -> list[str]:
-    rows = [path_row(name, robot) for name, robot in run.evaluation.robots.items()]
+    arbitrary = run.evaluation.arbitrary_frame
+    rows = [path_row(n, robot, arbitrary=arbitrary) for n, robot in run.evaluation.robots.items()]
     if all(cell == "–" for row in rows for cell in row[1:]):
         return []
     absolute = [
         (
             name, kind, f"{errors.poses:,}",
-            shown(errors.ape_m, ".3f", ""), shown(errors.ape_aligned_m, ".3f", ""),
+            shown(None if arbitrary else errors.ape_m, ".3f", ""),
+            shown(errors.ape_aligned_m, ".3f", ""),
             _degrees(errors.ape_aligned_rad), shown(errors.rpe_m, ".3f", ""),
             _degrees(errors.rpe_rad),
         )
@@ -241,11 +244,12 @@ def _paths(run: Run) -> list[str]:
         for kind, errors in of.items()
     ]  # fmt: skip
     headings = (
-        "robot", "path", "poses", "APE\n[m]", "APE moved\n[m]", "APE moved\n[°]", "RPE\n[m]",
-        "RPE\n[°]",
+        "robot", "path", "poses", "APE\n[m]", "APE by\nitself [m]", "APE by\nitself [°]",
+        "RPE\n[m]",        "RPE\n[°]",
     )  # fmt: skip
     note = (
-        "RMS with evo's definitions; moved: after the rigid motion that aligns the path itself; "
+        "RMS with evo's definitions; by itself: after the rigid motion that aligns this path, "
+        "not the map; "
         "RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
         "evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum gives the same."
     )

@@ -10,6 +10,7 @@ from central.desk.evaluation.evaluation import Evaluation, RobotResult
 
 ABSURD_NEES = 1000
 """Beyond this a NEES per dof is over-confident by any measure."""
+ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 _COUNT_AGAIN = ("kalman", "kalman-per-axis")
 Rows = Sequence[tuple[str, str]]
 
@@ -23,7 +24,8 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     for heading in ROBOT_HEADINGS:
         robots.add_column(Text(heading), justify="left" if heading == "robot" else "right")
     for name, robot in evaluation.robots.items():
-        robots.add_row(*(Text(cell) for cell in robot_row(name, robot)))
+        cells = robot_row(name, robot, arbitrary=evaluation.arbitrary_frame)
+        robots.add_row(*(Text(cell) for cell in cells))
     if unfused(evaluation):
         own = Table(caption=OWN_NOTE)
         for heading in OWN_HEADINGS:
@@ -37,7 +39,8 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     for heading in PATH_HEADINGS:
         paths.add_column(Text(heading), justify="left" if heading == "robot" else "right")
     for name, robot in evaluation.robots.items():
-        paths.add_row(*(Text(cell) for cell in path_row(name, robot)))
+        cells = path_row(name, robot, arbitrary=evaluation.arbitrary_frame)
+        paths.add_row(*(Text(cell) for cell in cells))
     return [team, robots, paths]
 
 
@@ -54,7 +57,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
     fused = evaluation.map
     if fused is None:
         return [("final map", "none: the run did not come to its end")]
-    errors = fused.errors
+    errors, arbitrary = fused.errors, evaluation.arbitrary_frame
     if not len(fused.ids) and fused.reasons:
         return [("final map", f"empty: {'; '.join(fused.reasons)}")]
     rows = [("landmarks", str(len(fused.ids)))]
@@ -65,20 +68,20 @@ def team_rows(evaluation: Evaluation) -> Rows:
         kind = "joint" if fused.joint else "blocks only"
         verdict = "in" if errors.in_band else "outside"
         rows += [
-            ("landmark RMSE", f"{errors.rmse_m:.3f} m"),
+            ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m"),
             ("after rigid alignment", shown(errors.aligned_rmse_m, ".3f", " m")),
-            (
-                "map NEES per dof",
-                _absurd(evaluation)
-                if errors.nees_per_dof > ABSURD_NEES
-                else f"{errors.nees_per_dof:.4g}, {verdict} 95 % of {low:.2f}…{high:.2f} ({kind})",
-            ),
         ]
+        if not arbitrary:
+            band = f"{verdict} 95 % of {low:.2f}…{high:.2f} ({kind})"
+            absurd = errors.nees_per_dof > ABSURD_NEES
+            nees = _absurd(evaluation) if absurd else f"{errors.nees_per_dof:.4g}, {band}"
+            rows.append(("map NEES per dof", nees))
         shape = errors.shape
         if shape is not None:
             nees = f"{shape.nees_per_landmark:.2f}, 2 is right; {shape.coverage:.0%} within 95 %"
             rows.append(("shape NEES/landmark", nees))
-        rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
+        if not arbitrary:
+            rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
     rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
     rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += [("joined", words) for words in fused.joined]
@@ -104,7 +107,8 @@ def robot_note(evaluation: Evaluation) -> str:
     """What has to be known to read the robots' rows."""
     online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
     star = ", * of online ones" if online else ""
-    return f"a step is one odometry interval; errors of smoothed poses{star}"
+    frame = "; positions as aligned with the map" if evaluation.arbitrary_frame else ""
+    return f"a step is one odometry interval; errors of smoothed poses{star}{frame}"
 
 
 ROBOT_HEADINGS = (
@@ -113,19 +117,22 @@ ROBOT_HEADINGS = (
 )  # fmt: skip
 
 
-def robot_row(name: str, robot: RobotResult) -> tuple[str, ...]:
-    """The cells under ROBOT_HEADINGS."""
+def robot_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple[str, ...]:
+    """The cells under ROBOT_HEADINGS; in an arbitrary frame only the aligned errors."""
     used = robot.consumption
     errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
     measurements = f"all {used.published}"
     if used.consumed != used.published:
         measurements = f"{'–' if used.consumed is None else used.consumed}/{used.published}"
+    position = None if errors is None else errors.position_rmse_m
+    if arbitrary:
+        errors, mark, position = None, "", robot.aligned_rmse_m
     return (
         name,
         str(used.steps),
         measurements,
         str(used.submaps),
-        shown(None if errors is None else errors.position_rmse_m, ".3f", mark),
+        shown(position, ".3f", mark),
         shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
         shown(None if errors is None else errors.nees_per_dof, ".3g", mark),
         shown(robot.uplink_bytes_per_step, ".1f", ""),
@@ -133,19 +140,23 @@ def robot_row(name: str, robot: RobotResult) -> tuple[str, ...]:
 
 
 PATH_HEADINGS = (
-    "robot", "path\n[m]", "moved\n[m]", "NEES\n/dof", "in\n95 %",
-    "online\n[m]", "moved\n[m]", "NEES\n/dof", "in\n95 %",
+    "robot", "path\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
+    "online\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
 )  # fmt: skip
-PATH_NOTE = "position RMSE of the smoothed path and online; moved: as the map to align it"
+PATH_NOTE = "position RMSE of the smoothed path, then online; aligned: moved as the map is"
 
 
-def path_row(name: str, robot: RobotResult) -> tuple[str, ...]:
-    """Position errors, NEES and coverage of the smoothed and of the online path."""
+def path_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple[str, ...]:
+    """Position errors, NEES and coverage of the smoothed and of the online path.
+
+    In an arbitrary frame only the aligned errors.
+    """
     cells = [name]
-    for errors, aligned in (
+    for of, aligned in (
         (robot.smoothed, robot.aligned_rmse_m),
         (robot.online, robot.online_aligned_rmse_m),
     ):
+        errors = None if arbitrary else of
         cells += [
             shown(None if errors is None else errors.position_rmse_m, ".3f", ""),
             shown(aligned, ".3f", ""),
@@ -156,9 +167,9 @@ def path_row(name: str, robot: RobotResult) -> tuple[str, ...]:
 
 
 OWN_HEADINGS = (
-    "robot", "land-\nmarks", "RMSE\n[m]", "moved\n[m]", "NEES\n/dof", "95 % of it", "in\n95 %",
+    "robot", "land-\nmarks", "RMSE\n[m]", "aligned\n[m]", "NEES\n/dof", "95 % of it", "in\n95 %",
 )  # fmt: skip
-OWN_NOTE = "each robot's own last map; moved: to align it"
+OWN_NOTE = "each robot's own last map; aligned: moved rigidly onto the truth"
 
 
 def unfused(evaluation: Evaluation) -> bool:
