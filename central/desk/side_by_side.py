@@ -15,7 +15,7 @@ from central.desk.drawing import (
     landmark_blocks,
 )
 from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
-from central.desk.pictures.run import DPI
+from central.desk.pictures.style import save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,7 +88,7 @@ def comparison_picture(recorded: Evaluation, changed: Evaluation, path: Path) ->
     axis.set_axisbelow(True)
     axis.set_title("Final maps with 95 % ellipses", fontsize=12)
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3, frameon=False)
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)
     return True
 
 

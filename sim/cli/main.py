@@ -10,6 +10,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
 from sim.cli.calibrate import app as calibrate_commands  # noqa: E402
+from sim.cli.compare import app as compare_commands  # noqa: E402
 from sim.cli.keys import app as key_commands  # noqa: E402
 from sim.cli.launch import app as launch_commands  # noqa: E402
 from sim.cli.log import app as log_tools  # noqa: E402
@@ -30,7 +31,7 @@ app = typer.Typer(
 )
 for _part in (
     launch_commands, scenario_commands, node_commands, key_commands, recorded_commands,
-    rerun_commands, view_commands, calibrate_commands,
+    rerun_commands, compare_commands, view_commands, calibrate_commands,
 ):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)

@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from central.desk.pictures.style import Form, Look, Picture, Style
 from sim.cli.options import (
+    FAILED,
     LOOPBACK,
     WRONG_USE,
     Keys,
@@ -84,6 +86,15 @@ def report(
         bool,
         typer.Option(help="Prove the ledger: the robots consume the recorded measurements again."),
     ] = True,
+    look: Annotated[
+        Look | None, typer.Option("--style", help="Pictures in this style, beside the page's.")
+    ] = None,
+    form: Annotated[
+        Form | None, typer.Option("--format", help="Pictures in this format, beside the page's.")
+    ] = None,
+    picture: Annotated[
+        Picture | None, typer.Option(help="This picture alone, and no page.")
+    ] = None,
 ) -> None:
     """A page, pictures, tables and figures of a run, from its log alone."""
     from rich.console import Console
@@ -91,7 +102,7 @@ def report(
     from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
     from central.desk.evaluation.history import history
     from central.desk.export.take_home import taken_home
-    from central.desk.report.page import write_report
+    from central.desk.report.page import write_pictures, write_report
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
     from central.desk.verification.recorded import recorded
@@ -104,12 +115,21 @@ def report(
         typer.echo(f"{text}, --no-ledger leaves it out" if ledger else "this log is long", err=True)
     evaluation = with_holes(evaluate(opened.samples()), opened)
     found, why = _ledger(opened) if ledger else (None, Run.no_ledger)
+    console = Console()
     home = taken_home(recorded(opened))
     run = Run(evaluation, history(opened.samples()), opened.metadata, found, why, home)
+    if look or form or picture:
+        style = Style(look or Look.SCREEN, form or (Form.PDF if look else Form.PNG), picture)
+        drawn = write_pictures(run, output, style)
+        for path in drawn.values():
+            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        if picture is not None:
+            if not drawn:
+                fail(f"{log} has nothing to draw in the picture {picture}", FAILED)
+            return
     figures = to_json(
         evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
     )
-    console = Console()
     for table in summary_tables(evaluation):
         console.print(table)
     for note in evaluation.notes:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 LINE_S = 5.0
 """Wall time between two plain lines."""
-SETTLED_S = 2.0
+SETTLED_S = 5.0
 """A warning that a node takes back sooner, as while a team starts, is no line."""
 PATIENCE_S = 8.0
 """Processes start slowly on a busy machine: nobody is missed before."""

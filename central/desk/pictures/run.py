@@ -20,6 +20,7 @@ from central.desk.drawing import (
 from central.desk.evaluation.errors import Path, moved
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.paths import SmoothedPath
+from central.desk.pictures.style import save
 from team.estimation.geometry import inverse
 
 # Matplotlib takes half a second to import: a run that draws nothing has no use for it
@@ -34,7 +35,6 @@ DRAWN_POINTS = 4000
 DRAWN_BARS = 60
 """Smoothed poses with a bar, evenly among all; more would hide the online ones."""
 LABELLED_LANDMARKS = 60
-DPI = 120
 
 
 def map_picture(
@@ -70,7 +70,7 @@ def map_picture(
         frameon=False,
         fontsize=10,
     )
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)
     return True
 
 
@@ -121,7 +121,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     figure.suptitle(f"{_heading(evaluation)}: pose errors and what the robots believe{more}")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=10)
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)
     return True
 
 

@@ -22,7 +22,8 @@ from central.desk.drawing import (
 )
 from central.desk.evaluation.evaluation import Evaluation
 from central.desk.evaluation.history import History, Traffic
-from central.desk.pictures.run import DPI, new_figure, thinning
+from central.desk.pictures.run import new_figure, thinning
+from central.desk.pictures.style import save
 from team.estimation.consistency import chi2_interval
 from team.wire import channels as ch
 from team.wire.channels import channel_of
@@ -87,7 +88,7 @@ def consistency_picture(evaluation: Evaluation, history: History, path: FilePath
         axis.set_axisbelow(True)
         axis.legend(loc="upper left", fontsize=8, ncols=4, framealpha=0.85)
     axes[-1][0].set_xlabel("team time [s]")
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)
     return True
 
 
@@ -205,7 +206,7 @@ def traffic_picture(history: History, path: FilePath) -> bool:
         axis.set_title(title, fontsize=10)
         axis.set_ylabel("payload [B/s]")
     axes[-1][0].set_xlabel("team time [s]")
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)
     return True
 
 
@@ -288,7 +289,7 @@ def latency_picture(history: History, path: FilePath) -> bool:
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)
     return True
 
 
@@ -315,7 +316,7 @@ def timeline_picture(history: History, path: FilePath) -> bool:
     axis.set_ylim(len(nodes) - 0.5, -0.5)
     axis.set_xlabel("team time [s]")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)
     return True
 
 

@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from math import degrees
 from pathlib import Path
@@ -14,6 +14,7 @@ from jaxtyping import Float
 from central.desk.export.take_home import write_map, write_paths
 from central.desk.export.tum import write_trajectories
 from central.desk.pictures.run import error_picture, map_picture
+from central.desk.pictures.style import SCREEN, Picture, Style, drawn_in
 from central.desk.pictures.time import (
     consistency_picture,
     latency_picture,
@@ -78,26 +79,31 @@ PSS_NOTE = (
 )
 
 
+def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str, Path]:
+    """Draw the pictures of a run in a style; by name what there was to draw."""
+    evaluation, history = run.evaluation, run.history
+    draw: dict[Picture, Callable[[Path], bool]] = {
+        Picture.MAP: lambda path: map_picture(evaluation, path, run.paths),
+        Picture.ERRORS: lambda path: error_picture(evaluation, path),
+        Picture.CONSISTENCY: lambda path: consistency_picture(evaluation, history, path),
+        Picture.TRAFFIC: lambda path: traffic_picture(history, path),
+        Picture.LATENCY: lambda path: latency_picture(history, path),
+        Picture.TIMELINE: lambda path: timeline_picture(history, path),
+    }
+    directory.mkdir(parents=True, exist_ok=True)
+    with drawn_in(style):
+        paths = {each: directory / f"{each}.{style.form}" for each in style.wanted}
+        return {str(each): path for each, path in paths.items() if draw[each](path)}
+
+
 def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
     """Write report.html, report.json, pictures and trajectories into the folder; what was written.
 
     figures: those of the evaluation and of the run. A picture that has nothing to show is left out.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    evaluation, history = run.evaluation, run.history
-    map_png, errors_png, consistency_png, traffic_png, latency_png, timeline_png = (
-        directory / f"{name}.png"
-        for name in ("map", "errors", "consistency", "traffic", "latency", "timeline")
-    )
-    drawn = {
-        map_png: map_picture(evaluation, map_png, run.paths),
-        errors_png: error_picture(evaluation, errors_png),
-        consistency_png: consistency_picture(evaluation, history, consistency_png),
-        traffic_png: traffic_picture(history, traffic_png),
-        latency_png: latency_picture(history, latency_png),
-        timeline_png: timeline_picture(history, timeline_png),
-    }
-    pictures = {path.stem: path for path, there in drawn.items() if there}
+    evaluation = run.evaluation
+    pictures = write_pictures(run, directory)
     data = directory / "report.json"
     data.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     page = directory / "report.html"

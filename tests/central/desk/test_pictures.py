@@ -10,14 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from central.desk.compare import compare_rows
 from central.desk.drawing import ELLIPSE_SCALE, colour_of, ellipses, in_order, robot_colours
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
+from central.desk.evaluation.history import history
 from central.desk.pictures.run import (
     error_picture,
     label_offsets,
     map_picture,
 )
-from central.desk.report.tables import summary_tables
+from central.desk.pictures.style import Form, Look, Picture, Style
+from central.desk.report.page import write_pictures
+from central.desk.report.run import Run
+from central.desk.report.tables import summary_tables, team_rows
 from team.wire import channels as ch
 from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
 
@@ -140,3 +145,33 @@ def test_labels_point_away_from_their_neighbours() -> None:
     assert left[0] < 0.0 < right[0]
     assert left[1] == right[1] == 0.0
     assert (alone > 0.0).all()
+
+
+def test_a_picture_for_a_paper_is_a_pdf_without_a_title(tmp_path: Path) -> None:
+    of = scenario(robots=2)
+    log = joined_log(of, 0.1)
+    run = Run(evaluate(log), history(log), {})
+    style = Style(Look.PAPER, Form.PDF, Picture.MAP)
+    drawn = write_pictures(run, tmp_path, style)
+    assert [path.name for path in tmp_path.iterdir()] == ["map.pdf"]
+    assert drawn["map"].read_bytes().startswith(b"%PDF")
+    svg = write_pictures(run, tmp_path, Style(Look.PAPER, Form.SVG, Picture.MAP))["map"].read_text()
+    titled = write_pictures(run, tmp_path, Style(Look.SCREEN, Form.SVG, Picture.MAP))["map"]
+    assert "small, seed 1" not in svg
+    assert svg != titled.read_text()
+
+
+def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path: Path) -> None:
+    of = scenario(robots=2)
+    world = msgspec.structs.replace(of.world, unknown_starts=("*",))
+    log = joined_log(msgspec.structs.replace(of, world=world), 0.1)
+    run = evaluate(log)
+    assert run.arbitrary_frame
+    assert not evaluate(joined_log(of, 0.1)).arbitrary_frame
+    told = dict(team_rows(run))
+    assert "arbitrary" in told["landmark RMSE"]
+    assert told["after rigid alignment"] != "–"
+    assert "map NEES per dof" not in told
+    assert not error_picture(run, tmp_path / "errors.png")
+    assert map_picture(run, tmp_path / "map.png")
+    assert compare_rows({"a": run, "b": run})[3] == ("landmark RMSE [m]", ("–", "–"))

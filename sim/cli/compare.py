@@ -1,0 +1,65 @@
+"""`teamslam compare`: runs side by side."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from central.desk.pictures.style import Form
+from sim.cli.options import WRONG_USE, fail
+
+app = typer.Typer()
+FEWEST = 2
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="Runs' folders, or their logs; two or more.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the picture here (png, svg, pdf).")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+) -> None:
+    """Runs side by side: a column for each in a table, and a picture with -o."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from central.desk.compare import compare_figures, compare_picture, compare_rows
+    from central.desk.evaluation.evaluation import evaluate
+    from team.recording.reader import open_log
+
+    if len(runs) < FEWEST:
+        fail("one run alone is compared with nothing: give two or more", WRONG_USE)
+    if output is not None:
+        _check_picture(output)
+    evaluated = {}
+    for path in runs:
+        log = path / "log.mcap" if path.is_dir() else path
+        name = path.name if path.is_dir() else path.stem if path.stem != "log" else path.parent.name
+        while name in evaluated:
+            name += "'"
+        evaluated[name] = evaluate(open_log(log).samples())
+    table = Table(box=box.SIMPLE)
+    table.add_column("", no_wrap=True)
+    for name in evaluated:
+        table.add_column(Text(name), justify="right")
+    for figure, cells in compare_rows(evaluated):
+        table.add_row(Text(figure), *(Text(cell) for cell in cells))
+    Console().print(table)
+    if output is not None and compare_picture(evaluated, output):
+        typer.echo(f"wrote {output}")
+    if json_file is not None:
+        json_file.write_text(json.dumps(compare_figures(evaluated), indent=2) + "\n")
+
+
+def _check_picture(path: Path) -> None:
+    """End the command where the name is not that of a picture, or its folder is not there."""
+    forms = [form.value for form in Form]
+    if path.suffix.removeprefix(".") not in forms:
+        names = ", ".join(f".{form}" for form in forms)
+        fail(f"-o {path}: a picture's name ends in one of {names}", WRONG_USE)
+    if not path.parent.is_dir():
+        fail(f"-o {path}: there is no folder {path.parent}; make it first", WRONG_USE)
