@@ -38,6 +38,14 @@ class Handler(Protocol):
 
 
 @runtime_checkable
+class TakesSamples(Protocol):
+    """A handler that needs the very bytes of a message, too: it may hand them on."""
+
+    def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
+        """Take one message, as `handle`."""
+
+
+@runtime_checkable
 class Guarded(Protocol):
     """A handler that knows what can not be true of its team."""
 
@@ -106,6 +114,8 @@ class Boundary:
             if refused is not None:
                 self._refuse(sample, refused)
                 return []
+            if _takes_samples(type(node)):
+                return node.handle_sample(message, sample)  # type: ignore[attr-defined, no-any-return]
             return node.handle(message, sample.stamp_ns)
         except Exception as error:
             out = [self.note(error, sample, tag)]
@@ -155,6 +165,11 @@ class Boundary:
         dropped = f"{self.refused} dropped at the door, the last: {self.last_refused}"
         raised = f"{self.faults} set aside after a fault, the last: {self.last}"
         return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
+
+
+@cache
+def _takes_samples(kind: type) -> bool:
+    return issubclass(kind, TakesSamples)
 
 
 @cache

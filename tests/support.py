@@ -139,6 +139,34 @@ def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
     return msgspec.structs.replace(message, node=speaker) if isinstance(message, says) else message
 
 
+def peers_examples(digest: bytes) -> Iterator[m.Message]:
+    """One of every message between peers."""
+    holding = m.Holding(
+        robot="alpha", incarnation=1, start=True, sequences=(0, 4, 6, 6), digest=digest, newest_ns=9
+    )
+    statements = m.Statements(robot="alpha", count=2, digest=digest)
+    yield m.SetSummary(
+        stamp_ns=9,
+        node="robot/bravo",
+        serial=3,
+        digest=digest,
+        holdings=(holding,),
+        statements=(statements,),
+    )
+    wanted = m.Wanted(robot="alpha", incarnation=1, start=False, first=5, last=5)
+    yield m.MembersRequest(stamp_ns=9, node="robot/bravo", wanted=(wanted,), statements=("alpha",))
+    yield m.Members(
+        stamp_ns=9,
+        node="robot/alpha",
+        keys=("robot/alpha/submap",),
+        payloads=(b"bytes",),
+        signatures=(b"",),
+    )
+    yield m.Concluded(
+        stamp_ns=9, robot="alpha", serial=1, digest=digest, sha256=4 * digest, submaps=7
+    )
+
+
 def examples() -> Iterator[m.Message]:
     """One message of every class, with every array filled."""
     two, three = from_ids([4, 7]), from_floats([1.0, -0.5, 0.25])
@@ -354,6 +382,7 @@ def examples() -> Iterator[m.Message]:
     yield m.FinalMapRequest(stamp_ns=0, node="robot/alpha")
     yield m.FinalMapReply(stamp_ns=0, age_ns=5_000_000_000, final=b"\x91\xc0", missed=True)
     yield m.OrdersRequest(stamp_ns=0)
+    yield from peers_examples(digest)
     yield m.Fault(
         stamp_ns=9_000,
         node="central",

@@ -5,6 +5,7 @@ team time, the publisher's wall clock and its counter of this key. A node never 
 shell takes samples from it, decodes them at the door, and publishes what the node returns.
 """
 
+import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -19,10 +20,12 @@ from team.wire.messages import (
     FusedMap,
     Liveliness,
     MapEstimate,
+    Members,
     Message,
     ParticleCloud,
     Prior,
     Progress,
+    SetSummary,
     Status,
     Withdrawal,
 )
@@ -56,6 +59,7 @@ class BusError(RuntimeError):
     """The bus can not do what it was asked: nobody listens, the port is taken, the link is cut."""
 
 
+_PLACES = re.compile(r"\{(robot|node)\}")
 Answer = Callable[[bytes], Iterable[bytes]]
 """Answers a query: the request's payload in, the replies' payloads out."""
 
@@ -137,6 +141,8 @@ def _said_by(channel: Channel, message: Message) -> str | None:
     match message:
         case Configuration() | Progress() | Status() | Liveliness() | Fault():
             return message.node
+        case SetSummary() | Members():
+            return message.node
         case Withdrawal() if channel is ORDER:
             return message.by
         case _:
@@ -151,7 +157,8 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
     message: Message = decoded(payload)
     of = next((c for c in REPLIES[channel] if isinstance(message, c.kinds)), None)
     robot = getattr(message, "robot", getattr(message, "node", ""))
-    if of is None or ("{robot}" in channel.template and robot != name):
+    named = _PLACES.search(channel.template) is not None
+    if of is None or (named and robot != name):
         text = f"{type(message).__name__} of {robot!r} is no reply to {channel.key(name)!r}"
         raise WireError("wrong field", text)
     return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, NO_COUNTER)

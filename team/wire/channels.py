@@ -175,16 +175,34 @@ FINAL_KEPT = Channel(name="final_kept", template="router/final", message=m.Final
 ORDERS_KEPT = Channel(name="orders_kept", template="router/orders", message=m.OrdersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                       meaning="a query; the replies are the orders `given_up` that hold, when who gave them has left, too")  # fmt: skip
 
+TEAM_MAP = Channel(name="team_map", template="robot/{robot}/team/map", message=m.FusedMap, rate="one per broadcast", delivery="latest", recorded=True,
+                   recomputable=True, meaning="the team's map by the peer's own fold")  # fmt: skip
+TEAM_PRIOR = Channel(name="team_prior", template="robot/{robot}/team/prior", message=m.Prior, rate="one per broadcast", delivery="latest", recorded=True,
+                     recomputable=True, meaning="the joint marginal that the peer needs, by its own fold")  # fmt: skip
+TEAM_FINAL = Channel(name="team_final", template="robot/{robot}/team/final", message=m.FusedMap, rate="once", delivery="latest", recorded=True,
+                     recomputable=True, meaning="the final map by the peer's own fold")  # fmt: skip
+TEAM_TRAJECTORY = Channel(name="team_trajectory", template="robot/{robot}/team/trajectory", message=m.Trajectory, rate="once per incarnation",
+                          delivery="all", recorded=True, recomputable=True, meaning="the peer's smoothed path in its final map")  # fmt: skip
+SET_SUMMARY = Channel(name="set_summary", template="{node}/set", message=m.SetSummary, rate="at most 1 Hz, when it has changed", delivery="latest",
+                      recorded=True, recomputable=False, meaning="what a peer has of the team's set")  # fmt: skip
+CONCLUDED = Channel(name="concluded", template="robot/{robot}/concluded", message=m.Concluded, rate="once", delivery="all", recorded=True, recomputable=False,
+                    meaning="a peer has its final map")  # fmt: skip
+MEMBERS = Channel(name="members", template="{node}/members", message=m.MembersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+                  meaning="a query to a peer; the replies are members of the set, as `carried`")  # fmt: skip
+CARRIED = Channel(name="carried", template="{node}/carried", message=m.Members, rate="as asked for", delivery="stream", recorded=False, recomputable=False,
+                  meaning="members of the set, of whichever robot, from a peer that has them")  # fmt: skip
+
 VIEW = Channel(name="view", template="view/{view}", message=m.Message, rate="about 1 Hz of team time", delivery="latest", recorded=True, recomputable=False,
                meaning="what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
-QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT)
+QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT, MEMBERS)
 REPLIES = {
     MEASUREMENTS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
     SENT: (START, SUBMAP, SIGHTING_FACTOR),
     ORDERS_KEPT: (GIVEN_UP,),
+    MEMBERS: (CARRIED,),
 }
 """The channels whose messages answer a query."""
 UNOPENED = (*QUERIES, VIEW)

@@ -1,0 +1,134 @@
+"""A peer's own fold: the centre's node, fed from the peer's set instead of from the network.
+
+So its maps are the centre's, byte for byte, wherever the set is the same. A set that has changed
+in what was folded already (somebody contradicted himself), or that grows behind the final map, is
+folded anew.
+"""
+
+import hashlib
+from collections.abc import Callable
+from typing import Literal
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from team.containment import Boundary
+from team.peers.node import PeerNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded
+
+FoldWhen = Literal["always", "end"]
+"""When a peer folds: as the set grows, or only when the whole set is there."""
+
+
+class PeerFold:
+    """Folds the set of a `PeerNode`; `name` is the node for faults.
+
+    final: the newest final map; finals: how many there were.
+    """
+
+    def __init__(
+        self,
+        config: CentralConfig,
+        robots: tuple[str, ...],
+        peer: PeerNode,
+        when: FoldWhen = "always",
+        make: Callable[[CentralConfig, tuple[str, ...]], CentralNode] = CentralNode,
+    ) -> None:
+        self._make, self._config, self._robots = make, config, robots
+        self._peer = peer
+        self.boundary = Boundary(peer.node)
+        self._end: m.End | None = None
+        self._progress: dict[str, m.Progress] = {}
+        self._alive: dict[str, bool] = {}
+        self.final: m.FusedMap | None = None
+        self.finals = 0
+        self._waits = when == "end"
+        self._begin()
+
+    def _begin(self) -> None:
+        self.centre = self._make(self._config, self._robots)
+        for robot in self._robots:  # whoever was never in reach is as one that is lost
+            for alive in (True, self._alive.get(robot, False)):
+                node = ch.robot_node(robot)
+                self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
+        if self._end is not None:
+            self._give(self._end)
+        for said in self._progress.values():
+            self._give(said)
+
+    def note(self, message: m.Message) -> list[Outgoing]:
+        """Take what is no member: progress, liveliness, the end of the streams."""
+        match message:
+            case m.End():
+                self._end = message
+            case m.Progress():
+                self._progress[message.robot] = message
+            case m.Liveliness():
+                robot = ch.robot_of(message.node)
+                if robot is None:
+                    return []
+                self._alive[robot] = message.alive
+            case _:
+                return []
+        return [*self._give(message), *self.grow()]
+
+    def grow(self) -> list[Outgoing]:
+        """Fold what the set has more; what there is to say of it."""
+        if self._waits:
+            if not self._whole:
+                return []
+            self._waits = False
+        out: list[Outgoing] = []
+        again = self._peer.rebuild
+        news = [] if again else list(self._peer.news())
+        if self.centre.finished and not again:
+            again = any(not isinstance(each, m.Concluded) for each in news)
+        if again:
+            self._peer.again()
+            news = list(self._peer.news())
+            self._begin()
+        for message in news:
+            out += self._give(message)
+        return out
+
+    def _give(self, message: m.Message) -> list[Outgoing]:
+        before = self.centre.finished
+        out = self.boundary.give(self.centre, message)
+        if self.centre.finished and not before:
+            self.final = self.centre.final
+            self.finals += 1
+        return out
+
+    @property
+    def _whole(self) -> bool:
+        """Everything that anyone has said he has sent is here, as far as is known."""
+        if self._end is None:
+            return False
+        replica = self._peer.replica
+        for each in self._end.streams:
+            done = replica.statements.get(each.robot, {}).get(("done", each.incarnation))
+            gone = ("given_up", 0) in replica.statements.get(each.robot, {})
+            if done is None or not isinstance(done.message, m.Done):
+                if not gone:
+                    return False
+                continue
+            if replica.share_of((each.robot, each.incarnation)).count < done.message.submaps:
+                return False
+        return True
+
+    def conclusion(self, robot: str) -> m.Concluded | None:
+        """What a robot's peer says of its final map."""
+        final = self.final
+        if final is None:
+            return None
+        before = self._peer.replica.concluded.get(robot)
+        return m.Concluded(
+            stamp_ns=final.stamp_ns,
+            robot=robot,
+            serial=1 if before is None else before.serial + 1,
+            digest=final.digest,
+            sha256=hashlib.sha256(encoded(final)).digest(),
+            submaps=self._peer.replica.submaps,
+        )

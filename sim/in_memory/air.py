@@ -1,0 +1,73 @@
+"""A radio between robots, in team time and by chance that a seed fixes: who reaches whom, delay,
+loss, duplicates, and how many bytes a link carries.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from team.estimation.randomness import generator
+
+EVERYONE = "*"
+Reach = Callable[[str, str, int], bool]
+"""Whether two nodes reach each other at a team time [ns]."""
+
+
+def always(one: str, other: str, now_ns: int) -> bool:
+    """Everyone reaches everyone."""
+    return True
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """These nodes reach each other from begin_ns until end_ns, whatever else holds."""
+
+    nodes: frozenset[str]
+    begin_ns: int
+    end_ns: int
+
+
+def meetings(windows: Sequence[Meeting]) -> Reach:
+    """Only in the given windows, and only whom they name."""
+
+    def reach(one: str, other: str, now_ns: int) -> bool:
+        return any(
+            {one, other} <= each.nodes and each.begin_ns <= now_ns < each.end_ns for each in windows
+        )
+
+    return reach
+
+
+@dataclass
+class Air:
+    """loss, duplicates: probabilities per message. delay_ns: the least and the greatest; messages
+    overtake each other. bytes_per_s: of each link; None: no limit.
+    """
+
+    reach: Reach = always
+    loss: float = 0.0
+    duplicates: float = 0.0
+    delay_ns: tuple[int, int] = (0, 0)
+    bytes_per_s: float | None = None
+    seed: int = 0
+    sent: dict[tuple[str, str], int] = field(default_factory=dict)
+    _busy: dict[tuple[str, str], float] = field(default_factory=dict)
+    _number: int = 0
+
+    def arrivals(self, sender: str, to: str, size: int, now_ns: int) -> list[int]:
+        """When a message arrives: never, once or twice."""
+        if not self.reach(sender, to, now_ns):
+            return []
+        self.sent[sender, to] = self.sent.get((sender, to), 0) + size
+        begin = float(now_ns)
+        if self.bytes_per_s is not None:
+            begin = max(begin, self._busy.get((sender, to), 0.0)) + size / self.bytes_per_s * 1e9
+            self._busy[sender, to] = begin
+        if not (self.loss or self.duplicates or self.delay_ns[1]):
+            return [int(begin)]
+        self._number += 1
+        draws = generator(self.seed, "air", 0, self._number)
+        if draws.random() < self.loss:
+            return []
+        copies = 2 if draws.random() < self.duplicates else 1
+        low, high = self.delay_ns
+        return [int(begin) + low + int(draws.random() * (high - low)) for _ in range(copies)]

@@ -1,0 +1,230 @@
+"""A team without a centre in one process: the same nodes, a radio of ours between them, team time.
+
+The world reaches every robot, as its own sensors do; robots reach each other as the air allows.
+"""
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from central.peers.robot import PeerRobot
+from sim.in_memory.air import Air
+from sim.in_memory.team import ROUND_S, World
+from sim.publisher.node import WorldNode, expected_nodes
+from sim.scenarios.scenario import Scenario
+from sim.scenarios.source import tells_map
+from sim.world.streams import WorldStreams
+from team import translate
+from team.config import RobotConfig
+from team.containment import Boundary
+from team.peers.members import Member
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample
+from team.wire.codec import encoded
+
+AFTER_S = 3600.0
+"""Team time behind the end of the streams after which peers that lack something give in."""
+Make = Callable[[Scenario, RobotConfig], PeerRobot]
+
+
+def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
+    """A robot of a scenario that is its own centre."""
+    names = [each.id for each in scenario.robots]
+    return PeerRobot(config, scenario.central, names, scenario.exchange)
+
+
+@dataclass
+class _Seat:
+    node: PeerRobot
+    boundary: Boundary
+    bytes_up: int = 0
+    bytes_down: int = 0
+    reached: set[str] = field(default_factory=set)
+
+
+class PeerTeam:
+    """Peers in a world, and the air between them; `run` yields what a recorder would take.
+
+    seats: by robot. complete_ns: when each robot had its final map, in team time.
+    """
+
+    def __init__(self, scenario: Scenario, air: Air, make: Make = peer_of) -> None:
+        self.scenario = scenario
+        self.air = air
+        self._make = make
+        self.seats: dict[str, _Seat] = {}
+        for config in scenario.robots:
+            self.seat(config)
+        self.complete_ns: dict[str, int] = {}
+        self.now_ns = 0
+        self._heap: list[tuple[int, int, str, str, Sample]] = []
+        self._sent = 0
+        self._log: list[Sample] = []
+        self._counters: dict[str, int] = {}
+
+    def seat(self, config: RobotConfig) -> None:
+        """Put a robot there that knows nothing yet: at the start, or after a death."""
+        node = self._make(self.scenario, config)
+        self.seats[config.id] = _Seat(node, Boundary(node.name))
+
+    def run(
+        self, world: World, steps: Callable[["PeerTeam"], None] | None = None
+    ) -> Iterator[Sample]:
+        """Until all peers have the same final map and nothing is on its way; `steps` is called
+        once a round, and may kill and seat.
+        """
+        self._world, self._world_boundary = world, Boundary("world")
+        self._source(world.begin())
+        for robot, seat in self.seats.items():
+            self._enter(robot, seat)
+        ended_ns: int | None = None
+        self.now_ns = world.now_ns
+        while True:
+            published = world.publish(0.0)
+            self._source(published)
+            self.now_ns = max(self.now_ns, world.now_ns)
+            if not published:
+                self.now_ns += round(ROUND_S * 1e9)
+            if steps is not None:
+                steps(self)
+            self._see()
+            self._arrive()
+            for robot, seat in self.seats.items():
+                self._say(robot, seat.node.tick(self.now_ns * 1e-9))
+            yield from self._taken()
+            if getattr(world, "ended", not published):
+                ended_ns = self.now_ns if ended_ns is None else ended_ns
+                if self._agree or self.now_ns - ended_ns > AFTER_S * 1e9:
+                    break
+        yield from self._taken()
+
+    def _enter(self, robot: str, seat: _Seat) -> None:
+        self._say(robot, seat.node.begin())
+        token = m.Liveliness(stamp_ns=0, node=seat.node.name, alive=True)
+        self._to_world(Outgoing(ch.ALIVE, seat.node.name, token))
+
+    def restart(self, config: RobotConfig, restored: Iterable[Member] = ()) -> None:
+        """A robot that died is there again, with what it has kept on disk; it asks its source for
+        what comes behind that.
+        """
+        world = self._world
+        assert isinstance(world, WorldNode)
+        self.seat(config)
+        seat = self.seats[config.id]
+        seat.node.restore(restored)
+        self._enter(config.id, seat)
+        incarnation = max(1, seat.node.node.incarnation)
+        while True:
+            first = seat.node.node.next_measurement
+            request = m.MeasurementsRequest(
+                stamp_ns=0, robot=config.id, incarnation=incarnation, first=first, last=-1
+            )
+            for reply in world.measurements(encoded(request)):
+                key = ch.MEASUREMENTS.key(config.id)
+                said = seat.boundary.take_reply(seat.node, key, reply, m.Measurement)
+                self._say(config.id, said)
+            if seat.node.node.next_measurement == first:
+                return
+
+    # The world.
+
+    def _source(self, said: Sequence[Outgoing]) -> None:
+        for each in said:
+            sample = self._sample(each)
+            self._log.append(sample)
+            found = ch.channel_of(sample.key)
+            assert found is not None
+            for robot, seat in self.seats.items():
+                mine = found[0] in seat.node.listens and found[1] in ("", robot)
+                if mine:
+                    self._say(robot, seat.boundary.take(seat.node, sample))
+
+    def _to_world(self, out: Outgoing) -> None:
+        sample = self._sample(out)
+        self._world_boundary.take(self._world, sample)
+
+    # The air.
+
+    def _say(self, robot: str, said: Sequence[Outgoing]) -> None:
+        """What a robot says reaches the world, and others as far as the air carries it."""
+        for out in said:
+            if out.channel is ch.MEMBERS:
+                request = Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, -1)
+                to = ch.robot_of(out.name)
+                if to in self.seats:
+                    self._send(robot, to, request)
+                continue
+            sample = self._sample(out)
+            self._log.append(sample)
+            if out.channel in self._world.listens:
+                self._world_boundary.take(self._world, sample)
+            if out.channel is ch.CONCLUDED:
+                self.complete_ns[robot] = self.now_ns
+            for other, its in self.seats.items():
+                if other != robot and out.channel in its.node.overhears:
+                    self._send(robot, other, sample)
+
+    def _send(self, sender: str, to: str, sample: Sample) -> None:
+        size = len(sample.payload)
+        self.seats[sender].bytes_up += size
+        for at_ns in self.air.arrivals(sender, to, size, self.now_ns):
+            self._sent += 1
+            heapq.heappush(self._heap, (at_ns, self._sent, sender, to, sample))
+
+    def _arrive(self) -> None:
+        while self._heap and self._heap[0][0] <= self.now_ns:
+            _, _, sender, to, sample = heapq.heappop(self._heap)
+            seat = self.seats.get(to)
+            if seat is None:
+                continue
+            seat.bytes_down += len(sample.payload)
+            if sample.key == ch.MEMBERS.key(seat.node.name):
+                for reply in seat.node.answer(sample.payload):
+                    key = ch.CARRIED.key(seat.node.name)
+                    self._send(to, sender, Sample(key, reply, sample.stamp_ns, 0, -1))
+                continue
+            self._say(to, seat.boundary.take(seat.node, sample))
+
+    def _see(self) -> None:
+        """Tell everyone who has come into reach and who has left it."""
+        for robot, seat in self.seats.items():
+            for other in self.seats:
+                if other == robot:
+                    continue
+                there = self.air.reach(robot, other, self.now_ns)
+                if there != (other in seat.reached):
+                    (seat.reached.add if there else seat.reached.discard)(other)
+                    node = ch.robot_node(other)
+                    token = m.Liveliness(stamp_ns=0, node=node, alive=there)
+                    sample = Sample(ch.ALIVE.key(node), encoded(token), 0, 0, 0)
+                    self._say(robot, seat.boundary.take(seat.node, sample))
+
+    @property
+    def _agree(self) -> bool:
+        """All have a final map of one set and know that of each other; nothing is on its way."""
+        finals = [seat.node.final for seat in self.seats.values()]
+        digests = {final.digest for final in finals if final is not None}
+        return not self._heap and len(digests) == 1 and all(f is not None for f in finals)
+
+    def _sample(self, out: Outgoing) -> Sample:
+        counter = self._counters.get(out.key, 0)
+        self._counters[out.key] = counter + 1
+        return Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, counter)
+
+    def _taken(self) -> list[Sample]:
+        taken, self._log = self._log, []
+        return taken
+
+
+def peer_world(scenario: Scenario, streams: WorldStreams) -> WorldNode:
+    """The world of a team without a centre."""
+    expected = expected_nodes([each.id for each in scenario.robots], recorder=False)
+    announced = translate.configured("world", 0, 0, scenario)
+    return WorldNode(
+        streams,
+        expected - {"central"},
+        announced,
+        tells_map=tells_map(scenario, streams),
+        batch_s=ROUND_S,
+    )

@@ -1,0 +1,1 @@
+"""The team's set as every peer keeps it: what is in it, what to ask of whom, and its file."""

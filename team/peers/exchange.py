@@ -1,0 +1,137 @@
+"""What one peer asks of another, given the other's summary, and what it answers."""
+
+from collections.abc import Collection, Iterator, Sequence
+from itertools import islice
+
+from team.peers.members import Member, Stream
+from team.peers.replica import MOST_SEQUENCES, Replica, intervals
+from team.wire import messages as m
+
+MOST_WANTED = 64
+"""Intervals in one question."""
+MOST_ASKED = 512
+"""Submaps in one question."""
+ANSWER_BYTES = 1 * 2**20
+"""Of members in one answer at the most, but for one that is larger itself; who lacks more asks
+again."""
+BATCH_BYTES = 64 * 2**10
+"""Of members in one message of an answer."""
+
+
+def wanted(
+    replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
+) -> m.MembersRequest | None:
+    """What the summary's node has and this replica lacks; None: nothing.
+
+    not_now: (stream, sequence) that somebody has been asked for a moment ago. A stream of which
+    both have the same sequences by different digests is asked for whole: someone contradicts
+    himself, and the smaller of two members is everybody's.
+    """
+    if summary.digest == replica.digest:
+        return None
+    found: list[m.Wanted] = []
+    asked = 0
+    for each in summary.holdings:
+        if each.robot not in replica.robots:
+            continue
+        stream = each.robot, each.incarnation
+        share = replica.share_of(stream)
+        start = each.start and share.start is None and (stream, -1) not in not_now
+        lacking = (
+            k
+            for first, last in _pairs(each.sequences)
+            for k in range(max(first, share.count), min(last + 1, MOST_SEQUENCES))
+            if k not in share.complete and (stream, k) not in not_now
+        )
+        lacks = list(islice(lacking, max(MOST_ASKED - asked, 0)))
+        if not lacks and not start and _contradicts(replica, each) and (stream, -2) not in not_now:
+            lacks, start = sorted(share.complete)[:MOST_ASKED], each.start
+        asked += len(lacks)
+        spans = _pairs(intervals(set(lacks), 0)) or ([(0, -1)] if start else [])
+        for i, (first, last) in enumerate(spans[:MOST_WANTED]):
+            found.append(
+                m.Wanted(
+                    robot=each.robot,
+                    incarnation=each.incarnation,
+                    start=start and i == 0,
+                    first=first,
+                    last=last,
+                )
+            )
+    statements = tuple(
+        each.robot
+        for each in summary.statements
+        if each.robot in replica.robots
+        and each.digest != getattr(replica.stated_of(each.robot), "digest", None)
+        and ((each.robot, 0), -3) not in not_now
+    )
+    if not found and not statements:
+        return None
+    return m.MembersRequest(
+        stamp_ns=summary.stamp_ns,
+        node="",
+        wanted=tuple(found[:MOST_WANTED]),
+        statements=statements,
+    )
+
+
+def named(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
+    """What a question names, as `not_now` of `wanted` takes it."""
+    for each in request.wanted:
+        stream = each.robot, each.incarnation
+        yield stream, -2
+        if each.start:
+            yield stream, -1
+        yield from ((stream, k) for k in range(each.first, each.last + 1))
+    yield from (((robot, 0), -3) for robot in request.statements)
+
+
+def _contradicts(replica: Replica, holding: m.Holding) -> bool:
+    """Whether a node's same sequences of a stream are others than the replica's."""
+    stream = holding.robot, holding.incarnation
+    mine = replica.told_of(stream)
+    same = mine is not None and (mine.start, mine.sequences) == (holding.start, holding.sequences)
+    return same and mine is not None and mine.digest != holding.digest
+
+
+def answered(replica: Replica, request: m.MembersRequest, node: str) -> list[m.Members]:
+    """The members that are asked for and here, by portions; the initial pose of a stream first."""
+    batches: list[list[Member]] = [[]]
+    total = size = 0
+    for member in _asked(replica, request):
+        if total and total + member.size > ANSWER_BYTES:
+            break
+        if batches[-1] and size + member.size > BATCH_BYTES:
+            batches.append([])
+            size = 0
+        batches[-1].append(member)
+        total, size = total + member.size, size + member.size
+    return [_message(node, request.stamp_ns, batch) for batch in batches if batch]
+
+
+def _asked(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
+    for each in request.wanted[:MOST_WANTED]:
+        share = replica.streams.get((each.robot, each.incarnation))
+        if share is None:
+            continue
+        if each.start and share.start is not None:
+            yield share.start
+        for sequence in range(each.first, min(each.last, each.first + MOST_ASKED) + 1):
+            if sequence in share.complete:
+                yield from share.parcel(sequence)
+    for robot in request.statements:
+        yield from replica.statements.get(robot, {}).values()
+
+
+def _message(node: str, stamp_ns: int, members: Sequence[Member]) -> m.Members:
+    return m.Members(
+        stamp_ns=stamp_ns,
+        node=node,
+        keys=tuple(each.key for each in members),
+        payloads=tuple(each.payload for each in members),
+        signatures=tuple(each.signature for each in members),
+    )
+
+
+def _pairs(ends: Sequence[int]) -> list[tuple[int, int]]:
+    return list(zip(ends[::2], ends[1::2], strict=True))

@@ -1,0 +1,68 @@
+"""A member of the team's set: the very bytes of who first said it, and its name in the set.
+
+What a map rests on: initial poses, submaps with the inter-robot measurements from them, orders
+(withdrawals, robots that are given up) and last words. A verdict on identities would be a further
+statement. That a peer has concluded is one on which no map rests.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample, opened
+
+Stream = tuple[str, int]
+"""(robot, incarnation)."""
+STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
+STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.CONCLUDED)
+CHANNELS = (*STREAMED, *STATED)
+"""The channels whose messages are members."""
+LARGEST_MEMBER = 4 * 2**20
+"""Bytes of one member at most: a submap of a thousand landmarks has two million."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """One member; `signature` is by who said it, empty where the team has no keys."""
+
+    key: str
+    payload: bytes
+    message: m.Message
+    signature: bytes = b""
+
+    @cached_property
+    def hash(self) -> bytes:
+        """32 bytes that name the member by its key and its bytes."""
+        named = len(self.key).to_bytes(2, "little") + self.key.encode() + self.payload
+        return hashlib.blake2b(named, digest_size=32).digest()
+
+    @property
+    def size(self) -> int:
+        """Bytes that it takes on the way and on disk, but for a few."""
+        return len(self.key) + len(self.payload) + len(self.signature)
+
+
+def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
+    """The member in a payload, checked at the door; raises WireError, ValueError."""
+    if len(payload) > LARGEST_MEMBER:
+        raise ValueError(f"too large: {len(payload)} bytes, {LARGEST_MEMBER} at most")
+    channel, _, message = opened(Sample(key, payload, 0, 0, -1))
+    if channel not in CHANNELS:
+        raise ValueError(f"wrong field: {key[:80]!r} is no key of a set's members")
+    return Member(key, payload, message, signature)
+
+
+def about(message: m.Message) -> str:
+    """The robot that a member is about: whose share of the set it belongs to."""
+    if isinstance(message, m.GivenUp):
+        return ch.robot_of(message.node) or ""
+    return str(getattr(message, "robot", ""))
+
+
+def said_by(key: str) -> str:
+    """The node that says what is on a member's key, as certificates name it: `robot-r1`."""
+    first, _, rest = key.partition("/")
+    name = rest.partition("/")[0]
+    return f"{first}-{name}" if first in ("robot", "source") else first

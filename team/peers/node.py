@@ -1,0 +1,209 @@
+"""A peer's part in spreading the set: members in, members out; no I/O, no clock.
+
+It says what it has (`SetSummary`), soon after that has changed and to whoever turns up; asks who
+says more for what it lacks; and answers. Members come from whoever has them, so news travels over
+third robots. What it has taken it hands on in an order in which a fold can take it: of each stream
+the initial pose, then the submaps without a gap.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from team.peers.exchange import answered, named, wanted
+from team.peers.members import CHANNELS, Member, Stream, member_of
+from team.peers.replica import SHARE, RefusedError, Replica
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample
+from team.wire.codec import WireError, decoded, encoded
+
+SUMMARY_S = 1.0
+"""Between two summaries at the least."""
+REPEAT_S = 10.0
+"""… and at the most: who has turned up unnoticed learns of what is here."""
+PATIENCE_S = 3.0
+"""What somebody was asked for is asked of another one after so long."""
+FRESH_S = 25.0
+"""A summary that is older says nothing of who is in reach."""
+Proof = Callable[[Member], str | None]
+"""Why a member that a third node carries is not to be believed; None: it is."""
+
+
+@dataclass
+class Carried:
+    """What has come over one node: members that were news, and bytes, news or not."""
+
+    members: int = 0
+    bytes: int = 0
+
+
+class PeerNode:
+    """One node's copy of the set, and its talk with others about it.
+
+    proof: checks members that come over third nodes; None: there are no keys, and everyone is
+    believed. carried: by the node over which it came. refused: members that were not kept, in
+    words the newest.
+    """
+
+    listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
+
+    def __init__(
+        self, node: str, robots: Sequence[str], proof: Proof | None = None, share: int = SHARE
+    ) -> None:
+        self.node = node
+        self.replica = Replica(robots, share)
+        self._proof = proof
+        self._now_s = 0.0
+        self._serial = 0
+        self._said: bytes | None = None
+        self._said_s = -REPEAT_S
+        self._answer_s: float | None = None
+        self._heard: dict[str, tuple[float, m.SetSummary]] = {}
+        self._asked: dict[tuple[Stream, int], float] = {}
+        self._fed: dict[Stream, int] = {}
+        self._news: list[m.Message] = []
+        self.rebuild = False
+        self.carried: dict[str, Carried] = defaultdict(Carried)
+        self.refused = 0
+        self.last_refused = ""
+        self.stamp_ns = 0
+
+    # Members.
+
+    def take(self, member: Member, carrier: str) -> bool:
+        """Take a member that came over a node; whether it was news."""
+        over = self.carried[carrier]
+        over.bytes += member.size
+        try:
+            outcome = self.replica.add(member)
+        except RefusedError as error:
+            self._refuse(f"{member.key}: {error}")
+            return False
+        if outcome == "known":
+            return False
+        over.members += 1
+        self.stamp_ns = max(self.stamp_ns, member.message.stamp_ns)
+        if not isinstance(member.message, m.InitialPose | m.Submap | m.SightingFactor):
+            self._news.append(member.message)
+        elif outcome == "replaced":
+            self.rebuild = True
+        return True
+
+    def take_sample(self, sample: Sample, carrier: str) -> bool:
+        """As `take`, of a sample on a member's key."""
+        try:
+            return self.take(member_of(sample.key, sample.payload), carrier)
+        except (WireError, ValueError) as error:
+            self._refuse(f"{sample.key}: {error}")
+            return False
+
+    def take_carried(self, carried: m.Members) -> list[Member]:
+        """Take what another node carries; the members that were news."""
+        news = []
+        for key, payload, signature in zip(
+            carried.keys, carried.payloads, carried.signatures, strict=True
+        ):
+            try:
+                member = member_of(key, payload, signature)
+            except (WireError, ValueError) as error:
+                self._refuse(f"{key[:80]} from {carried.node}: {error}")
+                continue
+            why = None if self._proof is None else self._proof(member)
+            if why is not None:
+                self._refuse(f"{key[:80]} from {carried.node}: {why}")
+            elif self.take(member, carried.node):
+                news.append(member)
+        return news
+
+    def _refuse(self, why: str) -> None:
+        self.refused += 1
+        self.last_refused = why
+
+    def news(self) -> Iterator[m.Message]:
+        """What a fold can take now and has not yet been handed, in order."""
+        for stream, share in sorted(self.replica.streams.items()):
+            fed = self._fed.get(stream, -1)
+            if share.start is None or fed >= share.count:
+                continue
+            if fed < 0:
+                yield share.start.message
+            for sequence in range(max(fed, 0), share.count):
+                yield from (member.message for member in share.parcel(sequence))
+            self._fed[stream] = share.count
+        told, self._news = self._news, []
+        yield from told
+
+    def again(self) -> None:
+        """Hand everything on once more: a fold begins anew."""
+        self.rebuild = False
+        self._fed.clear()
+        self._news = [
+            member.message
+            for robot in self.replica.robots
+            for _, member in sorted(self.replica.statements[robot].items())
+        ]
+
+    # Talk.
+
+    def hear(self, summary: m.SetSummary) -> list[Outgoing]:
+        """Take another's summary: ask for what it has more, and let it know of what is here."""
+        if summary.node == self.node:
+            return []
+        self._heard[summary.node] = self._now_s, summary
+        if self._said is not None and summary.digest != self._said:
+            self.greet()
+        return self._ask(summary)
+
+    def greet(self) -> None:
+        """Somebody is there who may lack something: say soon what is here."""
+        self._answer_s = self._now_s if self._answer_s is None else self._answer_s
+
+    def tick(self, now_s: float) -> list[Outgoing]:
+        """What there is to say by now: a summary that is due, questions that were not answered."""
+        self._now_s = now_s
+        self._asked = {name: until for name, until in self._asked.items() if until > now_s}
+        out: list[Outgoing] = []
+        for heard_s, summary in list(self._heard.values()):
+            if now_s - heard_s < FRESH_S and summary.digest != self.replica.digest:
+                out += self._ask(summary)
+        since_s = now_s - self._said_s
+        if since_s < SUMMARY_S:
+            return out
+        digest = self.replica.digest
+        if digest != self._said or self._answer_s is not None or since_s >= REPEAT_S:
+            self._said, self._said_s, self._answer_s = digest, now_s, None
+            summary = self.replica.summary(self.node, self._serial, self.stamp_ns)
+            self._serial += 1
+            out.append(Outgoing(ch.SET_SUMMARY, self.node, summary))
+        return out
+
+    def more_of(self, node: str) -> list[Outgoing]:
+        """A node has answered: ask for the rest of what it has."""
+        heard = self._heard.get(node)
+        return [] if heard is None else self._ask(heard[1])
+
+    def _ask(self, summary: m.SetSummary) -> list[Outgoing]:
+        request = wanted(self.replica, summary, self._asked)
+        if request is None:
+            return []
+        until_s = self._now_s + PATIENCE_S
+        self._asked |= dict.fromkeys(named(request), until_s)
+        asked = m.MembersRequest(
+            stamp_ns=request.stamp_ns,
+            node=self.node,
+            wanted=request.wanted,
+            statements=request.statements,
+        )
+        return [Outgoing(ch.MEMBERS, summary.node, asked)]
+
+    def answer(self, request: bytes) -> list[bytes]:
+        """The answer to a `MembersRequest`; raises WireError."""
+        wanted_of_us = decoded(request, m.MembersRequest)
+        return [encoded(batch) for batch in answered(self.replica, wanted_of_us, self.node)]
+
+    @property
+    def agrees(self) -> dict[str, bool]:
+        """Of each node whose summary has been heard, whether its set is this one."""
+        digest = self.replica.digest
+        return {n: s.digest == digest for n, (_, s) in sorted(self._heard.items())}

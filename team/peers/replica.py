@@ -1,0 +1,331 @@
+"""The team's set as one peer has it: grow-only, equal whatever the order in which members came.
+
+Members of one name that differ (a robot that contradicts itself) are decided by their bytes: the
+smaller hash stays, so that all peers agree. What may be kept is bounded: known robots, incarnations
+and sequences that can be, and a share of bytes for each robot, so that none fills another's disk.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, TypeVar
+
+from team.door import MOST_LIVES
+from team.peers.members import Member, Stream, about
+from team.wire import messages as m
+
+MOST_SEQUENCES = 200_000
+"""Submaps of one incarnation at the most."""
+MOST_STREAMS = 64
+"""Incarnations of one robot that are kept at the most."""
+MOST_STATEMENTS = 2 * MOST_STREAMS + 8
+"""Orders and last words about one robot at the most."""
+SHARE = 256 * 2**20
+"""Bytes about one robot at the most: 8 h of a submap of 4 kB every half second."""
+MOST_INTERVALS = 64
+"""Intervals of one stream that a summary names: what lies behind is named when gaps have closed."""
+MOST_LOOKS = 1024
+"""Inter-robot measurements from one submap at the most."""
+_WORD = 2**256
+K = TypeVar("K")
+
+Outcome = Literal["new", "known", "replaced"]
+Look = tuple[int, str]
+"""(stamp, teammate) of an inter-robot measurement."""
+
+
+class RefusedError(ValueError):
+    """A member that is not kept; the text says which bound it breaks."""
+
+
+@dataclass
+class StreamShare:
+    """What is here of one incarnation.
+
+    complete: sequences whose submap is here with all inter-robot measurements from it. sum: of the
+    complete ones' hashes, modulo 2²⁵⁶.
+    """
+
+    start: Member | None = None
+    submaps: dict[int, Member] = field(default_factory=dict)
+    factors: dict[int, dict[Look, Member]] = field(default_factory=dict)
+    complete: set[int] = field(default_factory=set)
+    count: int = 0
+    sum: int = 0
+    newest_ns: int = 0
+
+    def parcel(self, sequence: int) -> list[Member]:
+        """A complete submap behind the inter-robot measurements from it, in canonical order.
+
+        Of more than the submap says, the first ones.
+        """
+        submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
+        assert isinstance(submap.message, m.Submap)
+        looks = sorted(factors)[: submap.message.sightings]
+        return [*(factors[look] for look in looks), submap]
+
+    def note_complete(self, sequence: int) -> None:
+        """Count a submap that has just become complete."""
+        submap = self.submaps.get(sequence)
+        if submap is None or sequence in self.complete:
+            return
+        assert isinstance(submap.message, m.Submap)
+        if len(self.factors.get(sequence, ())) >= submap.message.sightings:
+            self.complete.add(sequence)
+            self.sum = (self.sum + _sum(self.parcel(sequence))) % _WORD
+            self.newest_ns = max(self.newest_ns, submap.message.stamp_ns)
+            while self.count in self.complete:
+                self.count += 1
+
+    def forget(self, sequence: int) -> None:
+        """A member of a submap is about to be replaced."""
+        if sequence in self.complete:
+            self.complete.discard(sequence)
+            self.sum = (self.sum - _sum(self.parcel(sequence))) % _WORD
+            self.count = min(self.count, sequence)
+
+
+class Have(NamedTuple):
+    """How much of a robot is here: submaps, and the end of the newest [ns of team time]."""
+
+    submaps: int
+    newest_ns: int
+
+
+class Replica:
+    """One peer's copy of the set of a team with the given robots.
+
+    replacements: how often a robot contradicted itself in what had been handed on.
+    """
+
+    def __init__(self, robots: Iterable[str], share: int = SHARE) -> None:
+        self.robots = tuple(sorted(robots))
+        self._share = share
+        self._bytes = dict.fromkeys(self.robots, 0)
+        self.streams: dict[Stream, StreamShare] = {}
+        self.statements: dict[str, dict[tuple[str, int], Member]] = {r: {} for r in self.robots}
+        self.replacements = 0
+        self._told: _Told | None = None
+
+    def add(self, member: Member) -> Outcome:
+        """Take a member; RefusedError where it can not be of this team or there is no room."""
+        message = member.message
+        robot = about(message)
+        if robot not in self._bytes:
+            raise RefusedError(f"of {robot or 'nobody'}, not in this team")
+        if self._bytes[robot] + member.size > self._share:
+            raise RefusedError(f"the share of {robot} is full: {self._share} bytes")
+        if isinstance(message, m.Submap | m.SightingFactor | m.InitialPose):
+            outcome = self._add_streamed(member, (robot, message.incarnation))
+            self.replacements += outcome == "replaced"
+        else:
+            outcome = self._add_stated(member, robot)
+        if outcome != "known":
+            self._bytes[robot] += member.size
+            self._told = None
+        return outcome
+
+    def _add_streamed(self, member: Member, stream: Stream) -> Outcome:
+        message = member.message
+        sequence = getattr(message, "sequence", 0)
+        if stream[1] > MOST_LIVES or sequence >= MOST_SEQUENCES:
+            raise RefusedError(f"submap {sequence} of incarnation {stream[1]} can not be")
+        share = self.streams.get(stream)
+        if share is None:
+            if sum(robot == stream[0] for robot, _ in self.streams) >= MOST_STREAMS:
+                raise RefusedError(f"{stream[0]} has {MOST_STREAMS} incarnations here already")
+            share = self.streams[stream] = StreamShare()
+        match message:
+            case m.InitialPose():
+                if share.start is not None and share.start.hash <= member.hash:
+                    return "known"
+                replaced = share.start is not None
+                share.start = member
+                return "replaced" if replaced else "new"
+            case m.Submap():
+                return self._put(share, sequence, share.submaps, sequence, member)
+            case m.SightingFactor():
+                look = message.stamp_ns, message.teammate
+                factors = share.factors.setdefault(sequence, {})
+                if look not in factors and len(factors) >= MOST_LOOKS:
+                    raise RefusedError(f"submap {sequence} of {stream[0]} has {MOST_LOOKS} looks")
+                return self._put(share, sequence, factors, look, member)
+            case _:
+                raise RefusedError("no member of a stream")
+
+    def _put(
+        self, share: StreamShare, sequence: int, among: dict[K, Member], name: K, member: Member
+    ) -> Outcome:
+        there = among.get(name)
+        if there is not None and there.hash <= member.hash:
+            return "known"
+        was_complete = sequence in share.complete
+        share.forget(sequence)
+        among[name] = member
+        share.note_complete(sequence)
+        return "replaced" if was_complete else "new"
+
+    def _add_stated(self, member: Member, robot: str) -> Outcome:
+        name = _stated(member.message)
+        among = self.statements[robot]
+        there = among.get(name)
+        if there is not None and _rank(there) >= _rank(member):
+            return "known"
+        if there is None and len(among) >= MOST_STATEMENTS:
+            raise RefusedError(f"{MOST_STATEMENTS} statements about {robot} are here already")
+        among[name] = member
+        return "new" if there is None else "replaced"
+
+    # What is here.
+
+    def share_of(self, stream: Stream) -> StreamShare:
+        """What is here of a stream; empty where nothing is."""
+        return self.streams.get(stream) or StreamShare()
+
+    def have(self, robot: str) -> Have:
+        """How much of a robot is here."""
+        shares = [share for (name, _), share in self.streams.items() if name == robot]
+        newest = max((share.newest_ns for share in shares), default=0)
+        return Have(sum(len(share.complete) for share in shares), newest)
+
+    @property
+    def submaps(self) -> int:
+        """How many complete submaps are here."""
+        return sum(len(share.complete) for share in self.streams.values())
+
+    @property
+    def concluded(self) -> dict[str, m.Concluded]:
+        """The peers whose final map is out, by robot, each by its own word."""
+        found = {}
+        for robot, statements in self.statements.items():
+            member = statements.get(("concluded", 0))
+            if member is not None and isinstance(member.message, m.Concluded):
+                found[robot] = member.message
+        return found
+
+    def members(self) -> Iterator[Member]:
+        """Every member in canonical order, such that a fold can take them one by one."""
+        for stream in sorted(self.streams):
+            share = self.streams[stream]
+            if share.start is not None:
+                yield share.start
+            for sequence in sorted(share.submaps.keys() | share.factors.keys()):
+                factors = share.factors.get(sequence, {})
+                yield from (factors[look] for look in sorted(factors))
+                if sequence in share.submaps:
+                    yield share.submaps[sequence]
+        for robot in self.robots:
+            yield from (self.statements[robot][name] for name in sorted(self.statements[robot]))
+
+    # What others are told.
+
+    def holding(self, stream: Stream) -> m.Holding | None:
+        """What is here of a stream; None: nothing that others could ask for."""
+        share = self.share_of(stream)
+        if share.start is None and not share.complete:
+            return None
+        return m.Holding(
+            robot=stream[0],
+            incarnation=stream[1],
+            start=share.start is not None,
+            sequences=intervals(share.complete, share.count),
+            digest=_digest(share.sum, () if share.start is None else (share.start,)),
+            newest_ns=share.newest_ns,
+        )
+
+    @property
+    def digest(self) -> bytes:
+        """Of all that others are told of: equal digests are equal sets."""
+        return self._telling.digest
+
+    def summary(self, node: str, serial: int, stamp_ns: int) -> m.SetSummary:
+        """What is here, in so few bytes that it can be told again and again."""
+        told = self._telling
+        return m.SetSummary(
+            stamp_ns=stamp_ns,
+            node=node,
+            serial=serial,
+            digest=told.digest,
+            holdings=tuple(told.holdings.values()),
+            statements=tuple(told.statements.values()),
+        )
+
+    def told_of(self, stream: Stream) -> m.Holding | None:
+        """What others are told of a stream."""
+        return self._telling.holdings.get(stream)
+
+    def stated_of(self, robot: str) -> m.Statements | None:
+        """What others are told of the statements about a robot."""
+        return self._telling.statements.get(robot)
+
+    @property
+    def _telling(self) -> "_Told":
+        if self._told is None:
+            held = ((stream, self.holding(stream)) for stream in sorted(self.streams))
+            holdings = {stream: each for stream, each in held if each is not None}
+            statements = {
+                robot: m.Statements(
+                    robot=robot, count=len(found), digest=_digest(0, found.values())
+                )
+                for robot, found in sorted(self.statements.items())
+                if found
+            }
+            whole = hashlib.blake2b(digest_size=8)
+            for digest in (h.digest for h in holdings.values()):
+                whole.update(digest)
+            for digest in (s.digest for s in statements.values()):
+                whole.update(digest)
+            self._told = _Told(whole.digest(), holdings, statements)
+        return self._told
+
+
+class _Told(NamedTuple):
+    """What a summary says, kept until something comes."""
+
+    digest: bytes
+    holdings: dict[Stream, m.Holding]
+    statements: dict[str, m.Statements]
+
+
+def _stated(message: m.Message) -> tuple[str, int]:
+    """A statement's name among those about its robot."""
+    match message:
+        case m.Done():
+            return "done", message.incarnation
+        case m.Withdrawal():
+            return "withdrawal", 0
+        case m.GivenUp():
+            return "given_up", 0
+        case m.Concluded():
+            return "concluded", 0
+        case _:
+            raise RefusedError(f"a {type(message).__name__} is no member of the set")
+
+
+def _rank(member: Member) -> tuple[int, bytes]:
+    """Of two statements of one name the greater stays: a later conclusion, else by the bytes."""
+    serial = member.message.serial if isinstance(member.message, m.Concluded) else 0
+    return serial, bytes(255 - byte for byte in member.hash)
+
+
+def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
+    """First, last, first, last, … of the closed intervals; `count`: those from 0 on without a gap.
+
+    Of more than MOST_INTERVALS the first ones.
+    """
+    ends: list[int] = [0, count - 1] if count else []
+    for each in sorted(s for s in sequences if s >= count):
+        if ends and ends[-1] == each - 1:
+            ends[-1] = each
+        else:
+            ends += [each, each]
+    return tuple(ends[: 2 * MOST_INTERVALS])
+
+
+def _sum(members: Iterable[Member]) -> int:
+    return sum(int.from_bytes(member.hash, "little") for member in members)
+
+
+def _digest(total: int, members: Iterable[Member]) -> bytes:
+    total = (total + _sum(members)) % _WORD
+    return hashlib.blake2b(total.to_bytes(32, "little"), digest_size=8).digest()

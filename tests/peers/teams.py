@@ -1,0 +1,198 @@
+"""Sets of small members, and peers that talk in any order, with loss, duplicates and partitions."""
+
+import random
+from collections.abc import Iterator, Sequence
+from functools import cache
+
+import msgspec
+
+from team.peers.members import Member, about
+from team.peers.node import PeerNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
+from tests.support import packed, spd, submap
+
+PACKED = packed(spd(2))
+
+
+def member(channel: ch.Channel, message: m.Message) -> Member:
+    return Member(channel.key(about(message)), encoded(message), message)
+
+
+def start(robot: str, incarnation: int = 1) -> Member:
+    pose = m.InitialPose(
+        stamp_ns=0,
+        robot=robot,
+        incarnation=incarnation,
+        number=0,
+        pose=from_floats([0.0, 0.0, 0.0]),
+        covariance=b"",
+    )
+    return member(ch.START, pose)
+
+
+def parcel(robot: str, sequence: int, mates: Sequence[str] = ()) -> list[Member]:
+    """A submap behind the inter-robot measurements from it."""
+    own = msgspec.structs.replace(submap(sequence, robot, 1), incarnation=1, sightings=len(mates))
+    factors = [
+        m.SightingFactor(
+            stamp_ns=own.stamp_ns,
+            robot=robot,
+            incarnation=1,
+            sequence=sequence,
+            config=own.config,
+            teammate=mate,
+            range=1.0,
+            bearing=0.0,
+            covariance=PACKED,
+            measurements=(own.first_measurement,),
+        )
+        for mate in mates
+    ]
+    return [*(member(ch.SIGHTING_FACTOR, each) for each in factors), member(ch.SUBMAP, own)]
+
+
+def done(robot: str, submaps: int) -> Member:
+    last = m.Done(
+        stamp_ns=submaps * 1_000_000,
+        robot=robot,
+        incarnation=1,
+        measurements=10 * submaps,
+        steps=0,
+        submaps=submaps,
+        ledger=(),
+    )
+    return member(ch.ROBOT_DONE, last)
+
+
+@cache
+def said(robot: str, submaps: int, mate: str) -> tuple[list[Member], ...]:
+    """What a robot says in its life, by occasion."""
+    parcels = [parcel(robot, k, [mate] if k % 3 == 1 else []) for k in range(submaps)]
+    return ([start(robot)], *parcels, [done(robot, submaps)])
+
+
+class Storm:
+    """Peers between whom a seed decides what arrives, when, how often, and who reaches whom."""
+
+    def __init__(self, seed: int, robots: int = 3, submaps: int = 4) -> None:
+        self.rng = random.Random(seed)
+        self.names = [f"r{i + 1}" for i in range(robots)]
+        self.nodes = {name: self.node(name) for name in self.names}
+        ring = zip(self.names, [*self.names[1:], self.names[0]], strict=True)
+        self.lives = {name: list(said(name, submaps, mate)) for name, mate in ring}
+        self.disk: dict[str, list[Member]] = {name: [] for name in self.names}
+        self.way: list[tuple[str, str, object]] = []
+        self.cut: set[frozenset[str]] = set()
+        self.now_s = 0.0
+
+    def node(self, name: str) -> PeerNode:
+        return PeerNode(ch.robot_node(name), self.names)
+
+    def run(self, turns: int = 10) -> None:
+        """Turns of chance; then everyone reaches everyone along a chain until nothing is said."""
+        for _ in range(turns):
+            self.turn()
+        self.cut = {
+            frozenset((a, b))
+            for i, a in enumerate(self.names)
+            for j, b in enumerate(self.names)
+            if abs(i - j) > 1
+        }
+        for name in self.names:
+            while self.lives[name]:
+                self.say(name)
+        for _ in range(60):
+            self.now_s += 1.0
+            self.talk()
+            if len({self.digest(name) for name in self.names}) == 1 and not self.way:
+                return
+
+    def digest(self, name: str) -> bytes:
+        return self.nodes[name].replica.digest
+
+    def turn(self) -> None:
+        self.now_s += 1.0
+        if self.rng.random() < 0.3:
+            pairs = [frozenset((a, b)) for a in self.names for b in self.names if a < b]
+            self.cut = set(self.rng.sample(pairs, self.rng.randrange(len(pairs) + 1)))
+        name = self.rng.choice(self.names)
+        if self.lives[name]:
+            self.say(name)
+        if self.rng.random() < 0.1:
+            self.kill(self.rng.choice(self.names))
+        self.talk(loss=0.2, late=0.3, twice=0.1)
+
+    def say(self, name: str) -> None:
+        members = self.lives[name].pop(0)
+        members = self.rng.sample(members, len(members))
+        for each in members:
+            self.keep(name, each, name)
+            for other in self.names:
+                self.send(name, other, each)
+
+    def keep(self, name: str, each: Member, carrier: str) -> None:
+        if self.nodes[name].take(each, carrier):
+            self.disk[name].append(each)
+
+    def kill(self, name: str) -> None:
+        """It comes back with what it had on disk, the end of which may be torn."""
+        kept = self.disk[name]
+        own = [each for each in kept if about(each.message) == name]
+        rest = [each for each in kept if about(each.message) != name]
+        self.disk[name] = own + rest[: len(rest) - self.rng.randrange(3)]
+        self.nodes[name] = self.node(name)
+        for each in self.disk[name]:
+            self.nodes[name].take(each, name)
+
+    def send(self, sender: str, to: str, what: object) -> None:
+        if sender != to and frozenset((sender, to)) not in self.cut:
+            self.way.append((sender, to, what))
+
+    def talk(self, loss: float = 0.0, late: float = 0.0, twice: float = 0.0) -> None:
+        for name, node in self.nodes.items():
+            self.spread(name, node.tick(self.now_s))
+        rounds = 0
+        while self.way and rounds < 20:
+            rounds += 1
+            going, self.way = self.way, []
+            self.rng.shuffle(going)
+            for sender, to, what in going:
+                if self.rng.random() < loss:
+                    continue
+                if self.rng.random() < late:
+                    self.way.append((sender, to, what))
+                    continue
+                for _ in range(2 if self.rng.random() < twice else 1):
+                    self.arrive(sender, to, what)
+            if late:
+                return
+
+    def arrive(self, sender: str, to: str, what: object) -> None:
+        node = self.nodes[to]
+        match what:
+            case Member():
+                self.keep(to, what, ch.robot_node(sender))
+            case m.SetSummary():
+                self.spread(to, node.hear(what))
+            case m.MembersRequest():
+                for reply in node.answer(encoded(what)):
+                    self.send(to, sender, decoded(reply, m.Members))
+            case m.Members():
+                self.disk[to] += node.take_carried(what)
+                self.spread(to, node.more_of(what.node))
+
+    def spread(self, name: str, out: Sequence[Outgoing]) -> None:
+        for each in out:
+            to = [ch.robot_of(each.name)] if each.channel is ch.MEMBERS else self.names
+            for other in to:
+                assert other is not None
+                self.send(name, other, each.message)
+
+    def fed(self, name: str) -> Iterator[m.Message]:
+        """What a fold that begins now is handed."""
+        self.nodes[name].again()
+        return self.nodes[name].news()

@@ -1,0 +1,141 @@
+"""The set of one peer: a union with bounds, its summary, and what is asked for given another's."""
+
+import random
+
+import msgspec
+import pytest
+
+from team.peers.exchange import MOST_ASKED, answered, wanted
+from team.peers.members import LARGEST_MEMBER, Member, member_of
+from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica, intervals
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import encoded
+from tests.peers.teams import done, member, parcel, said, start
+
+ROBOTS = ("r1", "r2")
+
+
+def replica_of(*members: Member, share: int = 2**20) -> Replica:
+    replica = Replica(ROBOTS, share)
+    for each in members:
+        replica.add(each)
+    return replica
+
+
+def everything() -> list[Member]:
+    lives = [*said("r1", 5, "r2"), *said("r2", 4, "r1")]
+    return [each for occasion in lives for each in occasion]
+
+
+def digest_of(replica: Replica) -> bytes:
+    return replica.summary("", 0, 0).digest
+
+
+def test_the_order_of_arrival_and_duplicates_change_nothing() -> None:
+    members = everything()
+    first = replica_of(*members)
+    for seed in range(20):
+        shuffled = members + members[::3]
+        random.Random(seed).shuffle(shuffled)
+        other = replica_of(*shuffled)
+        assert digest_of(other) == digest_of(first)
+        assert list(other.members()) == list(first.members())
+
+
+def test_of_two_members_of_one_name_the_same_stays_whichever_came_first() -> None:
+    (one,) = parcel("r1", 0)
+    assert isinstance(one.message, m.Submap)
+    other = member(ch.SUBMAP, msgspec.structs.replace(one.message, gated=7))
+    sets = [replica_of(start("r1"), a, b) for a, b in ((one, other), (other, one))]
+    assert digest_of(sets[0]) == digest_of(sets[1])
+    kept = min((one, other), key=lambda each: each.hash)
+    assert all(each.share_of(("r1", 1)).submaps[0] is kept for each in sets)
+
+
+def test_more_inter_robot_measurements_than_a_submap_says_end_with_equal_sets() -> None:
+    look, own = parcel("r1", 0, ["r2"])
+    assert isinstance(look.message, m.SightingFactor)
+    extra = member(ch.SIGHTING_FACTOR, msgspec.structs.replace(look.message, stamp_ns=1))
+    orders = ((look, own, extra), (extra, own, look), (extra, look, own))
+    assert len({digest_of(replica_of(start("r1"), *order)) for order in orders}) == 1
+
+
+def test_a_summary_names_gaps_and_what_is_asked_for_is_what_lacks() -> None:
+    parcels = [parcel("r1", k)[0] for k in range(9)]
+    here = replica_of(start("r1"), *(parcels[k] for k in (0, 1, 4, 5, 8)))
+    (holding,) = here.summary("", 0, 0).holdings
+    assert holding.sequences == (0, 1, 4, 5, 8, 8)
+    there = replica_of(*parcels[:7])
+    asked = wanted(here, there.summary("robot/r2", 0, 0))
+    assert asked is not None
+    assert [(w.start, w.first, w.last) for w in asked.wanted] == [(False, 2, 3), (False, 6, 6)]
+    back = wanted(there, here.summary("robot/r1", 0, 0))
+    assert back is not None
+    assert [(w.start, w.first, w.last) for w in back.wanted] == [(True, 8, 8)]
+
+
+def test_two_peers_that_ask_each_other_end_with_one_set() -> None:
+    occasions = [*said("r1", 5, "r2"), *said("r2", 4, "r1")]
+    one, other = (
+        replica_of(*(each for occasion in occasions[k::2] for each in occasion)) for k in (0, 1)
+    )
+    for _ in range(3):
+        for asker, answerer in ((one, other), (other, one)):
+            request = wanted(asker, answerer.summary("robot/r2", 0, 0))
+            for batch in [] if request is None else answered(answerer, request, "robot/r2"):
+                for key, payload in zip(batch.keys, batch.payloads, strict=True):
+                    asker.add(member_of(key, payload))
+    assert digest_of(one) == digest_of(other)
+    assert set(one.members()) == set(everything())
+
+
+def test_a_submap_without_its_inter_robot_measurements_is_not_told_as_here() -> None:
+    look, own = parcel("r1", 0, ["r2"])
+    replica = replica_of(start("r1"), own)
+    assert replica.summary("", 0, 0).holdings[0].sequences == ()
+    replica.add(look)
+    assert replica.summary("", 0, 0).holdings[0].sequences == (0, 0)
+
+
+def test_what_is_kept_is_bounded_by_robot() -> None:
+    with pytest.raises(RefusedError, match="of r9, not in this team"):
+        replica_of(start("r9"))
+    far = msgspec.structs.replace(parcel("r1", 0)[0].message, sequence=MOST_SEQUENCES)
+    with pytest.raises(RefusedError, match="can not be"):
+        replica_of(member(ch.SUBMAP, far))
+    first, second, third = (parcel("r1", k)[0] for k in range(3))
+    full = replica_of(first, second, share=first.size + second.size)
+    with pytest.raises(RefusedError, match="the share of r1 is full"):
+        full.add(third)
+    assert full.add(start("r2")) == "new"
+
+
+def test_what_is_asked_for_is_bounded_whatever_a_summary_claims() -> None:
+    claim = m.Holding(robot="r1", incarnation=1, start=True, sequences=(0, 2**62), digest=bytes(8))
+    summary = m.SetSummary(
+        stamp_ns=0, node="robot/r2", serial=0, digest=bytes(8), holdings=(claim,), statements=()
+    )
+    asked = wanted(replica_of(), summary)
+    assert asked is not None
+    assert sum(w.last - w.first + 1 for w in asked.wanted) == MOST_ASKED
+    strange = msgspec.structs.replace(claim, robot="r9")
+    assert wanted(replica_of(), msgspec.structs.replace(summary, holdings=(strange,))) is None
+
+
+def test_what_is_no_member_is_refused_at_the_door() -> None:
+    progress = m.Progress(
+        stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=1, submaps=0
+    )
+    with pytest.raises(ValueError, match="no key of a set's members"):
+        member_of("robot/r1/progress", encoded(progress))
+    with pytest.raises(ValueError, match="too large"):
+        member_of("robot/r1/submap", bytes(LARGEST_MEMBER + 1))
+    own = done("r1", 1)
+    with pytest.raises(ValueError, match="a message of 'r1' on the key"):
+        member_of("robot/r2/done", own.payload)
+
+
+def test_intervals_are_closed_and_part_by_gaps() -> None:
+    assert intervals({0, 1, 2, 5, 7, 8}, 3) == (0, 2, 5, 5, 7, 8)
+    assert intervals(set(), 0) == ()

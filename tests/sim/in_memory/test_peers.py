@@ -1,0 +1,104 @@
+"""Without a centre every peer ends with the central run's map, byte for byte."""
+
+import msgspec
+import pytest
+
+from sim.in_memory.air import Air, Meeting, meetings
+from sim.in_memory.peers import PeerTeam, peer_world
+from sim.in_memory.team import final_map, run_team
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import decoded, encoded
+
+SECOND = 1_000_000_000
+
+
+def scenario():
+    """Three robots; the third one meets the second one only."""
+    scenario = with_options(load("thesis"), robots=3)
+    return msgspec.structs.replace(
+        scenario, world=msgspec.structs.replace(scenario.world, steps=32)
+    )
+
+
+@pytest.fixture(scope="module")
+def central():
+    return list(run_team(scenario(), streams_of(scenario())))
+
+
+def peers(air, steps=None):
+    team = PeerTeam(scenario(), air)
+    samples = list(team.run(peer_world(scenario(), streams_of(scenario())), steps))
+    return team, samples
+
+
+def chain(one: str, other: str, now_ns: int) -> bool:
+    return abs(int(one[1:]) - int(other[1:])) == 1
+
+
+def test_every_peers_final_map_is_the_central_runs_though_it_meets_one_teammate_only(central):
+    team, samples = peers(Air(reach=chain, loss=0.2, duplicates=0.1, delay_ns=(0, 2 * SECOND)))
+    expected = encoded(final_map(central))
+    for robot, seat in team.seats.items():
+        assert seat.node.final is not None, robot
+        assert encoded(seat.node.final) == expected
+    own = [s.payload for s in samples if s.key == ch.SUBMAP.key("r1")]
+    assert own == [s.payload for s in central if s.key == ch.SUBMAP.key("r1")]
+    over = team.seats["r3"].node.peer.carried
+    assert over["robot/r1"].members == 0
+    assert over["robot/r2"].members > len(own)
+    poses = [decoded(s.payload, m.PoseEstimate) for s in samples if s.key == ch.TEAM_POSE.key("r3")]
+    priors = {
+        decoded(s.payload, m.Prior).digest for s in samples if s.key == ch.TEAM_PRIOR.key("r3")
+    }
+    assert poses
+    assert {pose.map_digest for pose in poses} <= priors
+
+
+def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(central):
+    """Robots meet two by two, r2 carries; r2 dies and has lost what it kept last."""
+    windows = meetings(
+        [
+            Meeting(frozenset({"r1", "r2"}), 10 * SECOND, 14 * SECOND),
+            Meeting(frozenset({"r2", "r3"}), 22 * SECOND, 25 * SECOND),
+            Meeting(frozenset({"r1", "r2", "r3"}), 60 * SECOND, 10**6 * SECOND),
+        ]
+    )
+    deaths = iter([16, 27])
+    due = next(deaths)
+
+    def die(team: PeerTeam) -> None:
+        nonlocal due
+        if team.now_ns >= due * SECOND:
+            due = next(deaths, 10**9)
+            kept = list(team.seats["r2"].node.peer.replica.members())
+            own = [each for each in kept if getattr(each.message, "robot", "") == "r2"]
+            team.restart(team.scenario.robots[1], own[:-1] if due > 100 else kept[:-3])
+
+    team, _ = peers(Air(reach=windows), die)
+    expected = encoded(final_map(central))
+    assert all(encoded(seat.node.final) == expected for seat in team.seats.values())
+    assert min(team.complete_ns.values()) >= 60 * SECOND
+
+
+def test_the_fold_of_a_set_that_changed_or_grew_is_the_fold_of_what_it_is_now(central):
+    """A robot that contradicts itself, and one that grows behind a final map."""
+    team, _ = peers(Air())
+    seat = team.seats["r1"]
+    before = seat.node.final
+    first = next(s for s in central if s.key == ch.SUBMAP.key("r2"))
+    submap = decoded(first.payload, m.Submap)
+    changed = (
+        Sample(first.key, encoded(msgspec.structs.replace(submap, gated=gated)), 0, 0, 0)
+        for gated in range(1, 100)
+    )
+    for sample in changed:
+        seat.boundary.take(seat.node, sample)
+        if seat.node.peer.replica.replacements:
+            break
+    assert seat.node.peer.replica.replacements == 1
+    assert seat.node.final.digest != before.digest
+    assert (seat.node.final.ids, seat.node.final.means) == (before.ids, before.means)
