@@ -19,7 +19,7 @@ LATE_NS = 400 * EARLY_NS
 """A stream's messages lie within a day before and 400 days after its initial pose's stamp."""
 OF_ROBOTS = (
     m.Measurement, m.Submap, m.SightingFactor, m.MapEstimate, m.Progress, m.Done, m.Rendezvous,
-    m.Innovation,
+    m.Innovation, m.Association,
 )  # fmt: skip
 """Messages about a stream: they carry its robot and its incarnation."""
 

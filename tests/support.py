@@ -135,7 +135,7 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
 def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
     """The message as the node says it that publishes on the channel's key for this name."""
     speaker = channel.speaker(name)
-    says = m.Configuration | m.Progress | m.Status | m.Liveliness | m.Fault
+    says = m.Configuration | m.Progress | m.Status | m.Liveliness | m.Fault | m.SetSummary
     return msgspec.structs.replace(message, node=speaker) if isinstance(message, says) else message
 
 
@@ -222,6 +222,19 @@ def examples() -> Iterator[m.Message]:
         stamp_ns=4_000, robot="alpha", stamps=from_stamps([0, 4_000]), poses=from_floats(range(6))
     )
     yield m.TruthLandmarks(stamp_ns=-5, ids=two, positions=means)
+    yield m.TruthLabels(
+        stamp_ns=-5,
+        robot="alpha",
+        stamps=from_stamps([2_500]),
+        counts=from_ids([2]),
+        labels=from_ids([7, m.NO_LABEL]),
+    )
+    yield m.TruthPositions(
+        stamp_ns=-5,
+        robot="alpha",
+        stamps=from_stamps([0, 4_000]),
+        positions=from_floats([0.0, 0.5, 1.0, 1.5]),
+    )
     yield m.KnownMap(stamp_ns=-5, ids=two, positions=means)
     yield m.Configuration(
         stamp_ns=0, node="robot/alpha", incarnation=1, digest=digest, configuration='{"seed": 7}'
@@ -246,6 +259,16 @@ def examples() -> Iterator[m.Message]:
         counts=from_ids([6]),
         seen=b"\x05\x01",
         keyframes=9,
+    )
+    yield m.Association(
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        sequence=5,
+        stamps=from_stamps([8_200, 8_400]),
+        counts=from_ids([1, 2]),
+        rows=from_ids([0, 0, 2]),
+        landmarks=from_ids([UNNAMED + 1, m.CLUTTER, m.UNCONFIRMED]),
     )
     yield m.SightingFactor(
         stamp_ns=8_500,

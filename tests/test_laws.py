@@ -290,14 +290,17 @@ def test_configurations_maps_priors_and_poses_name_their_inputs():
 
 @pytest.mark.parametrize("node", [WorldNode, RobotNode])
 def test_no_node_listens_to_the_truth(node):
-    assert not {ch.TRUTH, ch.TRUTH_LANDMARKS} & set(node.listens)
+    assert not {each for each in ch.CHANNELS if each.name.startswith("truth")} & set(node.listens)
+    assert {ch.TRUTH_LABELS, ch.TRUTH_POSITIONS} <= {
+        c for c in ch.CHANNELS if c.name.startswith("truth")
+    }
 
 
 @pytest.mark.parametrize("fusion", sorted({fusion for _, fusion in PAIRS}))
 def test_the_centre_listens_to_nothing_that_holds_the_truth_or_the_fused_map(fusion):
     fused = {ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.TEAM_POSE}
     listens = set(CentralNode(CentralConfig(fusion=fusion), ["r1"]).listens)
-    assert not {ch.TRUTH, ch.TRUTH_LANDMARKS} & listens
+    assert not {each for each in ch.CHANNELS if each.name.startswith("truth")} & listens
     assert not fused & listens
 
 

@@ -16,7 +16,8 @@ from team.wire.codec import WireError
 
 STEP_NS = 1_000_000_000
 """Team time between two looks at what became of the messages."""
-_SOURCE = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG, ch.END)
+_TRUTH = (ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS)
+_SOURCE = (*ch.SENSORS, *_TRUTH, ch.WORLD_CONFIG, ch.END)
 
 
 class RecordedWorld:
@@ -48,6 +49,8 @@ class RecordedWorld:
                     published.setdefault(place, (message.stamp_ns, out))
                 case m.Truth():
                     truths.append((message.stamp_ns, Outgoing(channel, name, message)))
+                case m.TruthLabels() | m.TruthPositions() if name not in without:
+                    self._said.append(Outgoing(channel, name, message))
                 case m.TruthLandmarks():
                     self._said.append(Outgoing(channel, "", message))
                 case m.Configuration():

@@ -23,6 +23,9 @@ _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "stamps": stamps,
     "nodes": stamps,
     "counts": ids,
+    "labels": ids,
+    "landmarks": ids,
+    "rows": ids,
     "seen": octets,
 }
 """How the bytes of a field are read by its name; all others are floats."""

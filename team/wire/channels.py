@@ -92,11 +92,17 @@ TRUTH = Channel(name="truth", template="truth/{robot}", message=m.Truth, rate="1
                 meaning="true poses; the evaluator's only")  # fmt: skip
 TRUTH_LANDMARKS = Channel(name="truth_landmarks", template="truth_landmarks", message=m.TruthLandmarks, rate="once", delivery="latest",
                           recorded=True, recomputable=False, meaning="true landmarks; the evaluator's only")  # fmt: skip
+TRUTH_LABELS = Channel(name="truth_labels", template="truth_labels/{robot}", message=m.TruthLabels, rate="once", delivery="all",
+                       recorded=True, recomputable=False, meaning="which landmarks detections are of; the evaluator's only")  # fmt: skip
+TRUTH_POSITIONS = Channel(name="truth_positions", template="truth_positions/{robot}", message=m.TruthPositions, rate="once", delivery="all",
+                          recorded=True, recomputable=False, meaning="positions by another sensor; the evaluator's only")  # fmt: skip
 
 ROBOT_CONFIG = Channel(name="robot_config", template="robot/{robot}/config", message=m.Configuration, rate="once per incarnation",
                        delivery="latest", recorded=True, recomputable=False, meaning="the robot's configuration")  # fmt: skip
 SUBMAP = Channel(name="submap", template="robot/{robot}/submap", message=m.Submap, rate="one per window", delivery="all", recorded=True, recomputable=True,
                  meaning="what the rule `join` consumes")  # fmt: skip
+ASSOCIATION = Channel(name="association", template="robot/{robot}/association", message=m.Association, rate="0-1 per window", delivery="latest",
+                      recorded=True, recomputable=True, meaning="what became of each detection without identity")  # fmt: skip
 SIGHTING_FACTOR = Channel(name="sighting_factor", template="robot/{robot}/sighting_factor", message=m.SightingFactor,
                           rate="0-1 per teammate and node", delivery="all", recorded=True, recomputable=True,
                           meaning="a teammate seen from a pose node; what the rule `join` consumes")  # fmt: skip

@@ -173,6 +173,45 @@ class TruthLandmarks(
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
 
 
+class TruthLabels(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="truth_labels/1"
+):
+    """Which landmarks a robot's detections are of, for the evaluator only.
+
+    stamps: of M scans of detections; counts: the detections of each; labels: by detection, the
+    landmark's number or NO_LABEL where it is clutter, or nobody knows.
+    """
+
+    robot: Name
+    stamps: Stamps
+    counts: Ids
+    labels: Ids
+
+    def check(self) -> None:  # noqa: D102
+        check_counts(self.counts, len(stamps(self.stamps, "stamps")), len(self.labels) // 4)
+        ids(self.labels, "labels")
+
+
+NO_LABEL = 2**32 - 1
+"""The label of a detection that is clutter, or of which nobody knows the landmark."""
+
+
+class TruthPositions(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="truth_positions/1"
+):
+    """Where another sensor, such as a GPS, says that a robot was, for the evaluator only.
+
+    T stamps and T × 2 floats (x, y) in a frame of its own; some may be wrong by metres.
+    """
+
+    robot: Name
+    stamps: Stamps
+    positions: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.positions, "positions", 2 * len(stamps(self.stamps, "stamps")))
+
+
 class KnownMap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="known_map/1"):
     """Prior map for localisation-only robots: L ids, L × 2 floats in the team's frame."""
 
@@ -261,6 +300,35 @@ class Submap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag=
             raise ValueError(f"wrong length: seen has {len(self.seen)} bytes, {rows} expected")
         if unnamed and not counts.min():
             raise ValueError("out of bounds: a landmark of no measurement, by counts")
+
+
+class Association(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="association/1"
+):
+    """What became of each detection without identity of a submap's window.
+
+    stamps: of M scans of detections; counts: the detections of each that came through the door;
+    rows: their places in the scan's message; landmarks: the submap's number of the landmark of each
+    (2³¹ + local), UNCONFIRMED or CLUTTER of what is in no submap.
+    """
+
+    robot: Name
+    incarnation: Count
+    sequence: Count
+    stamps: Stamps
+    counts: Ids
+    rows: Ids
+    landmarks: Ids
+
+    def check(self) -> None:  # noqa: D102
+        detections = len(ids(self.landmarks, "landmarks"))
+        check_counts(self.counts, len(stamps(self.stamps, "stamps")), detections)
+        if len(ids(self.rows, "rows")) != detections:
+            raise ValueError("wrong length: rows are not one for each of landmarks")
+
+
+UNCONFIRMED, CLUTTER = 0, 1
+"""In `Association.landmarks`: too rarely seen for a landmark, and so rarely that it is none."""
 
 
 class SightingFactor(
@@ -822,6 +890,13 @@ def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: 
         check_packed_covariance(covariance, 2 * n, "covariance")
         return
     check_blocks(covariance, n, "covariance")
+
+
+def check_counts(count_bytes: bytes, groups: int, total: int) -> None:
+    """Raise ValueError unless there is a count for each group and they sum to the total."""
+    counts = ids(count_bytes, "counts")
+    if len(counts) != groups or int(counts.sum(dtype=np.int64)) != total:
+        raise ValueError(f"wrong length: counts, {groups} groups of together {total} expected")
 
 
 def tag_of(message: type[Message]) -> str:
