@@ -62,7 +62,13 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     kind: "turn-then-drive" (thesis, section 4.3.1) turns by yaw_rate·t, then drives forward·t;
     "velocity" (Ma & Ma eq. 1-4) drives the arc of constant (forward, yaw_rate);
-    "differential-drive" (Downs eq. 2.3-2.4) drives that arc on two wheels wheel_base apart.
+    "differential-drive" (Downs eq. 2.3-2.4) drives that arc on two wheels wheel_base apart;
+    "ackermann" drives it as a car, whose axles are wheel_base apart and whose base is the middle of
+    the rear one: of a wheel's speed u and the steering angle s + steering_offset it makes
+    forward = u/(1 - tan(s)·wheel_offset/wheel_base) and yaw_rate = forward·tan(s)/wheel_base, where
+    the wheel whose speed is logged lies wheel_offset [m] left of the middle.
+    Odometry that tells a motion on SE(2) instead is an arc with a part to the left, of any kind; if
+    it claims a covariance, that counts, covariance_factor times, and not the noises below.
     forward [m], turn [rad], final_turn [rad] (a rotation after the motion) and lateral [m] are the
     independent noises. forward_scale and yaw_scale multiply the logged values first.
     alphas: Ma & Ma's α₁ … α₆, in addition: at speed v and yaw rate ω, forward has the variance
@@ -72,13 +78,15 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     the two make one error of (forward, turn), correlated where the wheels differ.
     turn_drag [m]: a base whose outer wheel is no faster than the logged speed loses
     turn_drag·|yaw rate| of it in a turn, at most all. veer [rad/m]: it turns so much on each metre.
+    shares: forward and lateral [m/m] and heading [rad/m], in addition: errors that are a share of
+    the way and stay so for shares_interval_s: the variance is (share·v)²·shares_interval_s·t.
     slow_scale: a base that creeps faster than it is told to has this scale, not forward_scale,
     where the logged speed is below slow_below [m/s].
     calibrated_speed: the logged speeds [m/s] from which forward_scale was learnt; where the robot
     is slower or faster the scale has an error of its own (the bias "forward_scale").
     """
 
-    kind: Literal["turn-then-drive", "velocity", "differential-drive"] = "velocity"
+    kind: Literal["turn-then-drive", "velocity", "differential-drive", "ackermann"] = "velocity"
     forward: MotionNoise = MotionNoise()
     turn: MotionNoise = MotionNoise()
     final_turn: MotionNoise = MotionNoise()
@@ -96,6 +104,11 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wheel_base: Positive | None = None
     left_wheel: NonNegative = 0.0
     right_wheel: NonNegative = 0.0
+    wheel_offset: float = 0.0
+    steering_offset: float = 0.0
+    shares: tuple[NonNegative, NonNegative, NonNegative] | None = None
+    shares_interval_s: Positive = 0.2
+    covariance_factor: Positive = 1.0
 
     def __post_init__(self) -> None:
         speeds = self.calibrated_speed
@@ -106,6 +119,10 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(
                 "differential-drive needs wheel_base, the distance of its wheels in metres"
             )
+        if self.kind == "ackermann" and self.wheel_base is None:
+            raise ValueError("ackermann needs wheel_base, the distance of its axles in metres")
+        if self.kind != "ackermann" and (self.wheel_offset or self.steering_offset):
+            raise ValueError(f"wheel_offset and steering_offset are a car's, not of {self.kind}")
         if not on_wheels and (self.left_wheel or self.right_wheel):
             raise ValueError(
                 f"left_wheel and right_wheel are noises of differential-drive, not of {self.kind}"
@@ -118,13 +135,14 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return (
             self.forward == self.turn == self.final_turn == self.lateral == none
             and not any(self.alphas or ())
+            and not any(self.shares or ())
             and not (self.left_wheel or self.right_wheel)
         )
 
     @property
     def slips(self) -> bool:
         """Whether it has noise behind the motion that odometry measures."""
-        final = any((self.alphas or ())[4:])
+        final = any((self.alphas or ())[4:]) or any((self.shares or ())[1:2])
         return final or self.final_turn != MotionNoise() or self.lateral != MotionNoise()
 
 
@@ -156,6 +174,8 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera that mismeasures a marker does so again a moment later). In a simulated world the rest is
     a first-order Gauss-Markov process for each landmark (and each teammate), whose correlation
     falls to 1/e in range_correlation_s or bearing_correlation_s.
+    mount: the sensor's pose (x [m], y [m], theta [rad]) on the robot's base; what it measures is
+    relative to it. covariance_factor: what covariances that come with measurements are taken times.
     A teammate's marker reads marker_range_offset [m] too long after this calibration, and lies
     marker_sigma [m] from the pose that its robot tracks.
     """
@@ -178,6 +198,13 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bearing_correlation_s: NonNegative = 10.0
     marker_range_offset: float = 0.0
     marker_sigma: NonNegative = 0.0
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    covariance_factor: Positive = 1.0
+
+    @property
+    def is_mounted(self) -> bool:
+        """Whether it is elsewhere than at its base's pose."""
+        return any(self.mount)
 
 
 class Association(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -14,6 +14,8 @@ class Rejection(StrEnum):
     NO_TIME = "odometry over no time"
     SPEED = "odometry beyond the bounds"
     """Of odometry: its time is believed, its motion is not."""
+    STEERING = "steering without a car's motion model"
+    """Of odometry: as SPEED; the robot's motion.kind is not "ackermann"."""
     TIME = "a time beyond the bounds"
     RANGE = "a range beyond the bounds"
     SENSOR_LIMITS = "outside the sensor's limits"
@@ -33,3 +35,7 @@ class Rejection(StrEnum):
     def disposition(self) -> str:
         """What the ledger counts it as."""
         return f"rejected: {self.value}"
+
+
+UNMEASURED = frozenset({None, Rejection.SPEED, Rejection.STEERING})
+"""Of odometry whose time counts, whether or not its motion does."""

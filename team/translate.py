@@ -8,9 +8,12 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from team.config import RobotConfig
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
 from team.estimation.map_joining.joining import Contribution, InitialPoseFactor, Sighting
+from team.estimation.odometry import Interval, moved, steered
+from team.estimation.scans import Scan, point_scan, polar_scan
 from team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, octets, stamps
@@ -64,12 +67,17 @@ def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
     )
 
 
-def scan_of(message: m.Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(ids, ranges [m], bearings [rad]) in the machine's byte order."""
-    return (
-        ids(message.ids, "ids").astype(np.uint32),
-        floats(message.ranges, "ranges").astype(np.float64),
-        floats(message.bearings, "bearings").astype(np.float64),
+def scan_of(message: m.AnyScan) -> Scan:
+    """Landmarks seen, in the machine's byte order; points become range and bearing."""
+    seen = ids(message.ids, "ids").astype(np.uint32)
+    own = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
+    claimed = own if message.covariances else None
+    if isinstance(message, m.Points):
+        positions = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
+        return point_scan(seen, positions, claimed)
+    ranges = floats(message.ranges, "ranges").astype(np.float64)
+    return polar_scan(
+        seen, ranges, floats(message.bearings, "bearings").astype(np.float64), claimed
     )
 
 
@@ -92,17 +100,29 @@ def detected_of(message: m.Detections) -> Detected:
     )
 
 
-def motion_of(message: m.Odometry, clock_offset_s: float) -> tuple[int, int, float, float]:
-    """(end [team time, ns], duration [ns], forward [m/s], yaw rate [rad/s]) of one interval.
+def end_of(message: m.AnyOdometry, clock_offset_s: float) -> int:
+    """When an interval of odometry ends in team time [ns].
 
     What the odometry's clock stamps t happened at t + clock_offset_s.
     """
-    return (
-        message.stamp_ns + round(clock_offset_s * 1e9),
-        message.duration_ns,
-        message.forward,
-        message.yaw_rate,
-    )
+    return message.stamp_ns + round(clock_offset_s * 1e9)
+
+
+def motion_of(message: m.AnyOdometry, config: RobotConfig) -> Interval:
+    """One interval of odometry as the robot's motion model reads it."""
+    end_ns, duration_ns = end_of(message, config.clock_offset_s), message.duration_ns
+    match message:
+        case m.Odometry():
+            return Interval(end_ns, duration_ns, message.forward, message.yaw_rate)
+        case m.Steering():
+            speeds = steered(config.motion, message.wheel_speed, message.steering)
+            return Interval(end_ns, duration_ns, *speeds)
+        case m.Increment():
+            covariance = floats(message.covariance, "covariance").astype(np.float64).reshape(-1, 3)
+            increment = floats(message.increment, "increment").astype(np.float64)
+            motion = moved(increment, covariance if message.covariance else None)
+            rates = motion.twist / max(duration_ns * 1e-9, 1e-9)
+            return Interval(end_ns, duration_ns, float(rates[0]), float(rates[2]), motion)
 
 
 def looks_of(

@@ -351,7 +351,8 @@ def payloads(rng: Random) -> Iterator[tuple[ch.Channel, str, bytes]]:
     of_type: dict[type, list[ch.Channel]] = {}
     for channel in ch.CHANNELS:
         if channel not in SKIPPED:
-            of_type.setdefault(channel.message, []).append(channel)
+            for kind in channel.kinds:
+                of_type.setdefault(kind, []).append(channel)
     while True:
         numbers = np.random.default_rng(rng.getrandbits(32))
         team = Team(numbers)

@@ -190,6 +190,24 @@ def examples() -> Iterator[m.Message]:
         forward=0.25,
         yaw_rate=-0.125,
     )
+    yield m.Increment(
+        stamp_ns=1_000,
+        robot="alpha",
+        incarnation=1,
+        number=2,
+        duration_ns=100_000_000,
+        increment=three,
+        covariance=from_floats(spd(3)),
+    )
+    yield m.Steering(
+        stamp_ns=1_000,
+        robot="alpha",
+        incarnation=1,
+        number=2,
+        duration_ns=100_000_000,
+        wheel_speed=2.5,
+        steering=-0.125,
+    )
     yield m.Observations(
         stamp_ns=2_000,
         robot="alpha",
@@ -198,6 +216,16 @@ def examples() -> Iterator[m.Message]:
         ids=two,
         ranges=from_floats([2.0, 3.5]),
         bearings=from_floats([0.5, -1]),
+        covariances=blocks,
+    )
+    yield m.Points(
+        stamp_ns=2_000,
+        robot="alpha",
+        incarnation=1,
+        number=3,
+        ids=two,
+        positions=means,
+        covariances=blocks,
     )
     yield m.Detections(
         stamp_ns=2_500,

@@ -174,7 +174,7 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
     def robot() -> tuple[Boundary, RobotNode]:
         return Boundary("robot/r1"), RobotNode(RobotConfig("r1"))
 
-    channel_of = {channel.message: channel for channel in ch.SENSORS}
+    channel_of = {kind: channel for channel in ch.SENSORS for kind in channel.kinds}
     measurements = [(channel_of[type(each)], "r1", each) for each in MEASUREMENTS["r1"]]
     plain, node = robot()
     wanted = given(plain, node, *measurements, (ch.END, "", END))

@@ -211,7 +211,7 @@ def test_a_scan_is_in_the_machines_byte_order_and_writable_by_nobody_elses_hand(
         ranges=from_floats([1.5, 2.5]),
         bearings=from_floats([0.5, -0.5]),
     )
-    ids, ranges, bearings = translate.scan_of(message)
+    ids, ranges, bearings, _ = translate.scan_of(message)
     assert (ids.tolist(), ranges.tolist(), bearings.tolist()) == ([4, 2], [1.5, 2.5], [0.5, -0.5])
     ranges[0] = 9.0
     assert translate.scan_of(message)[1][0] == 1.5

@@ -9,7 +9,8 @@ from typing import NamedTuple
 from team import translate
 from team.config import Bounds, RobotConfig
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.rejection import Rejection
+from team.estimation.scans import sensible
+from team.rejection import UNMEASURED
 from team.stream.inbox import Inbox
 from team.stream.judge import StreamJudge
 from team.wire import messages as m
@@ -72,18 +73,18 @@ class _Stream:
                 self.judge = StreamJudge(config.bounds)
             case m.InitialPose():
                 self.broken = True  # a later life of the stream begins who knows where
-            case m.Observations() if self.segmenter is not None:
-                ids, ranges, bearings = translate.scan_of(measurement)
-                near = self.judge.near(ranges)
+            case m.Observations() | m.Points() if self.segmenter is not None:
+                scan = translate.scan_of(measurement)
+                near = self.judge.near(scan.ranges)
+                near &= sensible(scan.own, scan.ranges, config.bounds)
                 if self.judge.time(measurement.stamp_ns) is None and (near.any() or not len(near)):
-                    scan = ids[near], ranges[near], bearings[near]
-                    self.segmenter.observe(measurement.stamp_ns, *scan)
-            case m.Odometry() if self.segmenter is not None:
-                motion = translate.motion_of(measurement, config.clock_offset_s)
+                    self.segmenter.observe(measurement.stamp_ns, *scan.only(near))
+            case m.Odometry() | m.Increment() | m.Steering() if self.segmenter is not None:
+                motion = translate.motion_of(measurement, config)
                 reason = self.judge.odometry(*motion)
-                if reason not in {None, Rejection.SPEED}:
+                if reason not in UNMEASURED:
                     return
-                end_ns, duration_ns, _, _ = motion
+                end_ns, duration_ns = motion[:2]
                 if self.segmenter.now_ns is None:
                     self.segmenter.begin(end_ns - duration_ns)
                 keyframes = self.segmenter.drive(*motion, measured=reason is None)

@@ -9,7 +9,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from central.desk.evaluation.errors import Path, on_circle
-from sim.world.streams import Detections, Intervals, RobotStream, WorldStreams
+from sim.world.streams import (
+    Detections,
+    Intervals,
+    ObservationMeasurement,
+    OdometryMeasurement,
+    RobotStream,
+    WorldStreams,
+)
+from team.config import MotionModel
+from team.estimation.odometry import Interval, moved, steered
+from team.estimation.scans import Scan, point_scan, polar_scan
 
 LARGEST_TURN_RAD = 0.35
 FASTEST_TURN_RAD_S = 3.0
@@ -45,21 +55,33 @@ class Reference:
     def between(self, begin_ns: int, end_ns: int) -> "Reference":
         """The same with the odometry and the measurements of [begin_ns, end_ns) only."""
         chosen = (self.intervals.end_ns >= begin_ns) & (self.intervals.end_ns < end_ns)
-        intervals = Intervals(*(part[chosen] for part in vars(self.intervals).values()))
         seen, sighted = (_between(each, begin_ns, end_ns) for each in (self.seen, self.sighted))
-        return replace(self, intervals=intervals, seen=seen, sighted=sighted)
+        return replace(self, intervals=self.intervals.where(chosen), seen=seen, sighted=sighted)
 
 
 def _between(seen: Detections, begin_ns: int, end_ns: int) -> Detections:
     first, last = (int(at) for at in np.searchsorted(seen.stamps_ns, [begin_ns, end_ns]))
-    rows = slice(int(seen.offsets[first]), int(seen.offsets[last]))
-    return Detections(
-        seen.stamps_ns[first:last],
-        seen.offsets[first : last + 1] - seen.offsets[first],
-        seen.ids[rows],
-        seen.ranges[rows],
-        seen.bearings[rows],
-    )
+    return seen.only(first, last)
+
+
+def scan_of(seen: ObservationMeasurement) -> Scan:
+    """What a robot's door makes of this scan."""
+    if seen.points is not None:
+        return point_scan(seen.ids, seen.points, seen.covariances)
+    return polar_scan(seen.ids, seen.ranges, seen.bearings, seen.covariances)
+
+
+def interval_of(told: OdometryMeasurement, motion: MotionModel) -> Interval:
+    """What a robot's door makes of this interval of odometry."""
+    if told.increment is not None:
+        motions = moved(told.increment, told.covariance)
+        rates = motions.twist / (told.duration_ns * 1e-9)
+        speeds = float(rates[0]), float(rates[2])
+        return Interval(told.stamp_ns, told.duration_ns, *speeds, motions)
+    speeds = told.forward, told.yaw_rate
+    if told.steered:
+        speeds = steered(motion, *speeds)
+    return Interval(told.stamp_ns, told.duration_ns, *speeds)
 
 
 def poses_at(

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int64
 
 from central.desk.evaluation.errors import Path, on_circle
 from central.tick_fold import join_settings
+from sim.calibration.data import interval_of, scan_of
 from sim.scenarios.scenario import Scenario
 from sim.world.streams import (
     OBSERVATIONS,
@@ -113,11 +114,9 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
         stream, LONGEST_NS if config.motion.kind != "turn-then-drive" else 0
     ):
         if isinstance(measurement, ObservationMeasurement):
-            slam.observe(
-                measurement.stamp_ns, (measurement.ids, measurement.ranges, measurement.bearings)
-            )
+            slam.observe(measurement.stamp_ns, scan_of(measurement))
             continue
-        closed = slam.drive(*measurement)
+        closed = slam.drive(*interval_of(measurement, config.motion))
         if closed is not None:
             tracks.append(_track(closed, stamps, window))
             stamps = []
@@ -160,6 +159,7 @@ def _goes_on(one: OdometryMeasurement, then: OdometryMeasurement, longest_ns: in
     """Whether the other follows without a gap, by the same command, and both are short."""
     return (
         then.stamp_ns - then.duration_ns == one.stamp_ns
+        and one.increment is None
         and (then.forward, then.yaw_rate) == (one.forward, one.yaw_rate)
         and one.duration_ns + then.duration_ns <= longest_ns
     )

@@ -68,19 +68,23 @@ class _Source:
             )
         kind = self.stream.kinds[index]
         if kind == s.ODOMETRY:
-            o = self.stream.odometry(index)
             stamp_ns -= self.stream.clock_offset_ns
-            return m.Odometry(
-                stamp_ns=stamp_ns,
-                robot=robot,
-                incarnation=incarnation,
-                number=measurement,
-                duration_ns=o.duration_ns,
-                forward=o.forward,
-                yaw_rate=o.yaw_rate,
+            return _odometry(
+                self.stream.odometry(index), stamp_ns, (robot, incarnation, measurement)
             )
         if kind == s.OBSERVATIONS:
             z = self.stream.observations(index)
+            covariances = b"" if z.covariances is None else from_floats(z.covariances)
+            if z.points is not None:
+                return m.Points(
+                    stamp_ns=stamp_ns,
+                    robot=robot,
+                    incarnation=incarnation,
+                    number=measurement,
+                    ids=from_ids(z.ids),
+                    positions=from_floats(z.points),
+                    covariances=covariances,
+                )
             return m.Observations(
                 stamp_ns=stamp_ns,
                 robot=robot,
@@ -89,6 +93,7 @@ class _Source:
                 ids=from_ids(z.ids),
                 ranges=from_floats(z.ranges),
                 bearings=from_floats(z.bearings),
+                covariances=covariances,
             )
         if kind == s.SIGHTINGS:
             t = self.stream.sightings(index)
@@ -113,6 +118,42 @@ class _Source:
             pose=pose,
             covariance=covariance,
         )
+
+
+def _odometry(
+    told: s.OdometryMeasurement, stamp_ns: int, name: tuple[str, int, int]
+) -> m.AnyOdometry:
+    """One interval as the odometry tells it; name: robot, incarnation, number."""
+    robot, incarnation, number = name
+    if told.increment is not None:
+        return m.Increment(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=incarnation,
+            number=number,
+            duration_ns=told.duration_ns,
+            increment=from_floats(told.increment),
+            covariance=b"" if told.covariance is None else from_floats(told.covariance),
+        )
+    if told.steered:
+        return m.Steering(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=incarnation,
+            number=number,
+            duration_ns=told.duration_ns,
+            wheel_speed=told.forward,
+            steering=told.yaw_rate,
+        )
+    return m.Odometry(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        number=number,
+        duration_ns=told.duration_ns,
+        forward=told.forward,
+        yaw_rate=told.yaw_rate,
+    )
 
 
 _CHANNEL_OF_KIND = {

@@ -11,6 +11,7 @@ from sim.world.streams import (
     StartPose,
     WorldStreams,
     grouped,
+    moved,
     robot_stream,
 )
 from team import translate
@@ -61,18 +62,11 @@ def _stream(
     clock_offset_s: float,
 ) -> RobotStream:
     starts = [each for each in measurements if isinstance(each, m.InitialPose)]
-    odometry = [each for each in measurements if isinstance(each, m.Odometry)]
-    seen = [each for each in measurements if isinstance(each, m.Observations)]
+    odometry = [each for each in measurements if isinstance(each, m.AnyOdometry)]
+    seen = [each for each in measurements if isinstance(each, m.AnyScan)]
     sighted = [each for each in measurements if isinstance(each, m.Sightings)]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
-    intervals = Intervals(
-        np.array(
-            [translate.motion_of(each, clock_offset_s)[0] for each in odometry], dtype=np.int64
-        ),
-        np.array([each.duration_ns for each in odometry], dtype=np.int64),
-        np.array([each.forward for each in odometry]),
-        np.array([each.yaw_rate for each in odometry]),
-    )
+    intervals = _intervals(robot, odometry, clock_offset_s)
     truth = sorted(truth, key=lambda each: each.stamp_ns)
     times = [stamps(each.stamps, "stamps") for each in truth]
     poses = [floats(each.poses, "poses").reshape(-1, 3) for each in truth]
@@ -81,7 +75,7 @@ def _stream(
         start_ns=measurements[0].stamp_ns,
         start=None if pose is None else StartPose(pose, covariance),
         intervals=intervals,
-        observations=_detections(seen, [ids(each.ids, "ids") for each in seen]),
+        observations=_observations(robot, seen),
         sightings=_detections(sighted, [_indices(each, robots) for each in sighted]),
         teammates=robots,
         truth_ns=np.concatenate(times) if times else None,
@@ -89,13 +83,73 @@ def _stream(
     )
 
 
+def _one_kind(robot: str, messages: Sequence[m.Message]) -> type[m.Message] | None:
+    """The class of all of these messages; raises ValueError where they differ."""
+    kinds = {type(each) for each in messages}
+    if len(kinds) > 1:
+        told = " and ".join(sorted(kind.__name__ for kind in kinds))
+        raise ValueError(f"{robot}: its stream has {told}; one form is needed")
+    return kinds.pop() if kinds else None
+
+
+def _intervals(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: float) -> Intervals:
+    ends = np.array([translate.end_of(each, clock_offset_s) for each in odometry], dtype=np.int64)
+    durations = np.array([each.duration_ns for each in odometry], dtype=np.int64)
+    kind = _one_kind(robot, odometry)
+    if kind is m.Increment:
+        told = [each for each in odometry if isinstance(each, m.Increment)]
+        increments = np.array([floats(each.increment, "increment") for each in told])
+        claims = {bool(each.covariance) for each in told}
+        if len(claims) > 1:
+            raise ValueError(f"{robot}: only some of its increments have a covariance")
+        if not claims.pop():
+            return moved(ends, durations, increments)
+        matrices = np.array([floats(each.covariance, "covariance") for each in told])
+        return moved(ends, durations, increments, matrices.reshape(-1, 3, 3))
+    pairs = np.array([
+        (each.wheel_speed, each.steering)
+        if isinstance(each, m.Steering)
+        else (each.forward, each.yaw_rate)
+        for each in odometry
+        if not isinstance(each, m.Increment)
+    ]).reshape(-1, 2)  # fmt: skip
+    return Intervals(ends, durations, pairs[:, 0], pairs[:, 1], steered=kind is m.Steering)
+
+
+def _observations(robot: str, messages: Sequence[m.AnyScan]) -> Detections:
+    kind = _one_kind(robot, messages)
+    scans = [translate.scan_of(each) for each in messages]
+    full = [k for k, scan in enumerate(scans) if len(scan.ids)]
+    at = np.repeat(
+        np.array([each.stamp_ns for each in messages], dtype=np.int64),
+        [len(scan.ids) for scan in scans],
+    )
+    none = np.empty(0)
+    points = claimed = None
+    if kind is m.Points:
+        told = [floats(x.positions, "positions") for x in messages if isinstance(x, m.Points)]
+        points = np.concatenate([none, *told]).reshape(-1, 2)
+    claims = {bool(messages[k].covariances) for k in full}
+    if len(claims) > 1:
+        raise ValueError(f"{robot}: only some of its observations have covariances")
+    if claims == {True}:
+        own = [floats(each.covariances, "covariances") for each in messages]
+        claimed = np.concatenate([none, *own]).reshape(-1, 3)
+    return grouped(
+        at,
+        np.concatenate([np.empty(0, np.uint32), *(scan.ids for scan in scans)]),
+        np.concatenate([none, *(scan.ranges for scan in scans)]),
+        np.concatenate([none, *(scan.bearings for scan in scans)]),
+        points,
+        claimed,
+    )
+
+
 def _indices(sighting: m.Sightings, robots: tuple[str, ...]) -> np.ndarray:
     return np.array([robots.index(name) for name in sighting.teammates], dtype=np.uint32)
 
 
-def _detections(
-    messages: Sequence[m.Observations] | Sequence[m.Sightings], names: Sequence[np.ndarray]
-) -> Detections:
+def _detections(messages: Sequence[m.Sightings], names: Sequence[np.ndarray]) -> Detections:
     counts = [len(each) for each in names]
     at = np.repeat(np.array([each.stamp_ns for each in messages], dtype=np.int64), counts)
     none = [np.empty(0)]

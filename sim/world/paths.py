@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-Kind = Literal["turn-then-drive", "velocity", "differential-drive"]
+Kind = Literal["turn-then-drive", "velocity", "differential-drive", "ackermann"]
 Pose = tuple[float, float, float]
 Step = tuple[float, float]
 
@@ -97,7 +97,7 @@ def moved(
 ) -> Pose:
     """The pose after one step, a slip to the left at its end and a last turn.
 
-    turn-then-drive: the whole turn first, then straight on. velocity and differential-drive: the
+    turn-then-drive: the whole turn first, then straight on. All others: the
     circular arc, whose chord has the length distance · sin(φ/2)/(φ/2) and the direction θ + φ/2.
     """
     x, y, heading = pose

@@ -33,24 +33,40 @@ class StartPose:
 class Intervals:
     """Odometry intervals: end stamp, length, and the mean forward speed [m/s] and yaw rate [rad/s].
 
-    Interval k ends where interval k + 1 begins.
+    Interval k ends where interval k + 1 begins. steered: a car's, of which forward is the speed of
+    the wheel [m/s] and yaw_rate the angle of the steering [rad]. increments: odometry that tells
+    motions instead, each the pose (x, y, theta) of its end in the frame of its start; forward and
+    yaw_rate are then not told. covariances: what it claims of them, in the frame of the end.
     """
 
     end_ns: Int64[np.ndarray, " I"]
     duration_ns: Int64[np.ndarray, " I"]
     forward: Float[np.ndarray, " I"]
     yaw_rate: Float[np.ndarray, " I"]
+    steered: bool = False
+    increments: Float[np.ndarray, "I 3"] | None = None
+    covariances: Float[np.ndarray, "I 3 3"] | None = None
 
     def where(self, chosen: Bool[np.ndarray, " I"]) -> "Intervals":
         """The chosen ones."""
-        return Intervals(*(part[chosen] for part in vars(self).values()))
+        return Intervals(
+            self.end_ns[chosen],
+            self.duration_ns[chosen],
+            self.forward[chosen],
+            self.yaw_rate[chosen],
+            self.steered,
+            None if self.increments is None else self.increments[chosen],
+            None if self.covariances is None else self.covariances[chosen],
+        )
 
 
 @dataclass(frozen=True)
 class Detections:
     """M messages of range-bearing measurements: message m has the rows offsets[m] … offsets[m + 1].
 
-    ids are landmark identities, or indices into a tuple of teammates.
+    ids are landmark identities, or indices into a tuple of teammates. points: what the sensor tells
+    are these (x, y) in its frame [m], and ranges and bearings are theirs. covariances: what it
+    claims of each, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points.
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -58,28 +74,51 @@ class Detections:
     ids: UInt32[np.ndarray, " R"]
     ranges: Float[np.ndarray, " R"]
     bearings: Float[np.ndarray, " R"]
+    points: Float[np.ndarray, "R 2"] | None = None
+    covariances: Float[np.ndarray, "R 3"] | None = None
 
     def rows(self, message: int) -> slice:
         """The rows of one message."""
         return slice(int(self.offsets[message]), int(self.offsets[message + 1]))
 
+    def only(self, first: int, last: int) -> "Detections":
+        """The messages first … last − 1."""
+        rows = slice(int(self.offsets[first]), int(self.offsets[last]))
+        return Detections(
+            self.stamps_ns[first:last],
+            self.offsets[first : last + 1] - self.offsets[first],
+            self.ids[rows],
+            self.ranges[rows],
+            self.bearings[rows],
+            None if self.points is None else self.points[rows],
+            None if self.covariances is None else self.covariances[rows],
+        )
+
 
 class OdometryMeasurement(NamedTuple):
-    """One interval that ends at stamp_ns."""
+    """One interval that ends at stamp_ns; the rest as in `Intervals`."""
 
     stamp_ns: int
     duration_ns: int
     forward: float
     yaw_rate: float
+    steered: bool = False
+    increment: Float[np.ndarray, "3"] | None = None
+    covariance: Float[np.ndarray, "3 3"] | None = None
 
 
 class ObservationMeasurement(NamedTuple):
-    """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty."""
+    """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty.
+
+    points, covariances: as in `Detections`.
+    """
 
     stamp_ns: int
     ids: UInt32[np.ndarray, " R"]
     ranges: Float[np.ndarray, " R"]
     bearings: Float[np.ndarray, " R"]
+    points: Float[np.ndarray, "R 2"] | None = None
+    covariances: Float[np.ndarray, "R 3"] | None = None
 
 
 class SightingMeasurement(NamedTuple):
@@ -129,14 +168,23 @@ class RobotStream:
             int(intervals.duration_ns[row]),
             float(intervals.forward[row]),
             float(intervals.yaw_rate[row]),
+            intervals.steered,
+            None if intervals.increments is None else intervals.increments[row],
+            None if intervals.covariances is None else intervals.covariances[row],
         )
 
     def observations(self, counter: int) -> ObservationMeasurement:
         """The landmarks seen, of the message with this measurement counter."""
         seen = self.landmark_detections
         at = seen.rows(self._row(counter, OBSERVATIONS))
-        stamp_ns = int(self.stamps_ns[counter])
-        return ObservationMeasurement(stamp_ns, seen.ids[at], seen.ranges[at], seen.bearings[at])
+        return ObservationMeasurement(
+            int(self.stamps_ns[counter]),
+            seen.ids[at],
+            seen.ranges[at],
+            seen.bearings[at],
+            None if seen.points is None else seen.points[at],
+            None if seen.covariances is None else seen.covariances[at],
+        )
 
     def sightings(self, counter: int) -> SightingMeasurement:
         """The teammates seen, of the message with this measurement counter."""
@@ -234,8 +282,21 @@ def grouped(
     ids: UInt32[np.ndarray, " R"],
     ranges: Float[np.ndarray, " R"],
     bearings: Float[np.ndarray, " R"],
+    points: Float[np.ndarray, "R 2"] | None = None,
+    covariances: Float[np.ndarray, "R 3"] | None = None,
 ) -> Detections:
     """Measurements in order of time → one message per stamp."""
     first = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[:1] - 1))
     offsets = np.append(first, len(stamps_ns)).astype(np.int64)
-    return Detections(stamps_ns[first], offsets, ids, ranges, bearings)
+    return Detections(stamps_ns[first], offsets, ids, ranges, bearings, points, covariances)
+
+
+def moved(
+    end_ns: Int64[np.ndarray, " I"],
+    duration_ns: Int64[np.ndarray, " I"],
+    increments: Float[np.ndarray, "I 3"],
+    covariances: Float[np.ndarray, "I 3 3"] | None = None,
+) -> Intervals:
+    """Odometry that tells motions on SE(2)."""
+    untold = np.zeros(len(end_ns))
+    return Intervals(end_ns, duration_ns, untold, untold, False, increments, covariances)

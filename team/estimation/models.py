@@ -77,11 +77,11 @@ def increment_of(
     ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
     d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the noises
     a (forward, on d), b (turn, on φ), c (final turn), l (lateral):
-    "velocity", "differential-drive": Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al.
-    table 5.3 and Ma & Ma eq. 1-4, with its limit φ → 0.
+    all others: Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al. table 5.3 and Ma & Ma
+    eq. 1-4, with its limit φ → 0.
     "turn-then-drive": turn φ + b, drive d + a, then (0, l, c): the thesis, section 4.3.1.
-    Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|, and what `_of_alphas` and
-    `_of_wheels` add; by the wheels alone are a and b correlated.
+    Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|, and what `_of_alphas`,
+    `_of_wheels` and the shares add; by the wheels alone are a and b correlated.
     """
     rate = motion.yaw_scale * yaw_rate
     if motion.yaw_rate_limit is not None:
@@ -91,6 +91,17 @@ def increment_of(
     logged = (motion.slow_scale if slow else motion.forward_scale) * forward * duration_s
     distance = math.copysign(max(abs(logged) - lost, 0.0), logged)
     turn = rate * duration_s + motion.veer * distance
+    variances = motion_variances(motion, duration_s, distance, turn)
+    kernel = _turn_then_drive if motion.kind == "turn-then-drive" else _arc
+    return Increment(*kernel(distance, turn, *variances))
+
+
+def motion_variances(
+    motion: MotionModel, duration_s: float, distance: float, turn: float
+) -> tuple[float, float, float, float, float]:
+    """Of (forward, turn, final turn, lateral) over a way and a turn, the third before the last two:
+    the covariance of forward and turn.
+    """
     forward_var = _variance(motion.forward, duration_s, distance, turn)
     turn_var = _variance(motion.turn, duration_s, distance, turn)
     final = _variance(motion.final_turn, duration_s, distance, turn)
@@ -102,8 +113,13 @@ def increment_of(
         added = _of_wheels(motion.wheel_base, motion.left_wheel, motion.right_wheel, distance, turn)
         forward_var, turn_var, both = forward_var + added[0], turn_var + added[1], added[2]
     lateral = _variance(motion.lateral, duration_s, distance, turn)
-    kernel = _turn_then_drive if motion.kind == "turn-then-drive" else _arc
-    return Increment(*kernel(distance, turn, forward_var, turn_var, both, final, lateral))
+    if motion.shares is not None and duration_s > 0.0:
+        held = distance * distance * motion.shares_interval_s / duration_s
+        along, across, heading = motion.shares
+        forward_var += along * along * held
+        lateral += across * across * held
+        turn_var += heading * heading * held
+    return forward_var, turn_var, both, final, lateral
 
 
 def _variance(noise: MotionNoise, duration_s: float, distance: float, turn: float) -> float:

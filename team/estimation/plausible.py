@@ -60,6 +60,11 @@ def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None
     return why
 
 
+def is_motion_spread(covariance: Matrix, bounds: Bounds) -> bool:
+    """Whether a motion on SE(2) is claimed to be as uncertain as the bounds allow."""
+    return _spread(covariance, np.array([False, False, True]), bounds) is None
+
+
 def are_landmarks(covariance: Matrix) -> bool:
     """Whether a joint covariance of points is finite and each point's own block is a covariance."""
     if not np.isfinite(covariance).all():

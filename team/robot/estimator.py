@@ -14,6 +14,8 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import Looks
+from team.estimation.odometry import Moved
+from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
 from team.pairs import ESTIMATORS
 from team.registry import loaded
@@ -21,8 +23,6 @@ from team.rejection import Rejection
 
 CLOUD_PARTICLES = 32
 """Particles in a cloud for viewers."""
-Scan = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Landmark ids, ranges [m] and bearings [rad] of one message."""
 
 
 class InitialPose(NamedTuple):
@@ -104,6 +104,7 @@ class RobotEstimator(Protocol):
         duration_ns: int,
         forward: float,
         yaw_rate: float,
+        moved: Moved | None = None,
         *,
         measured: bool = True,
     ) -> Estimates:

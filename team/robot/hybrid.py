@@ -15,7 +15,9 @@ from team.estimation.hybrid_slam.pose_grid import Looks
 from team.estimation.map_joining.conditioning import pose_now
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.map_joining.whole_map import WholeMap, absorbed, begun, joined
+from team.estimation.odometry import Moved
 from team.estimation.plausible import are_landmarks
+from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
 from team.rejection import Rejection
 from team.robot.estimator import (
@@ -24,7 +26,6 @@ from team.robot.estimator import (
     Estimates,
     InitialPose,
     KnownMap,
-    Scan,
     thinned,
 )
 
@@ -80,12 +81,14 @@ class HybridEstimator:
         duration_ns: int,
         forward: float,
         yaw_rate: float,
+        moved: Moved | None = None,
         *,
         measured: bool = True,
     ) -> Estimates:
         """Take one odometry interval; the submap that it closes, if it does."""
         self._open, before_ns = None, self._slam.last_keyframe_ns
-        closed = self._slam.drive(stamp_ns, duration_ns, forward, yaw_rate, measured=measured)
+        interval = stamp_ns, duration_ns, forward, yaw_rate, moved
+        closed = self._slam.drive(*interval, measured=measured)
         if closed is not None:
             return self._with_submap(closed)
         now_ns = self._slam.last_keyframe_ns

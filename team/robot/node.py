@@ -20,9 +20,10 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond, start_beyond
+from team.estimation.scans import sensible
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
-from team.rejection import Rejection
+from team.rejection import UNMEASURED, Rejection
 from team.robot.estimator import (
     AT_ORIGIN,
     NOTHING_KNOWN,
@@ -348,9 +349,9 @@ class RobotNode:
         for measurement in self._window:
             self._goes_in(measurement)
             match measurement:
-                case m.Odometry():
+                case m.Odometry() | m.Increment() | m.Steering():
                     self._go(measurement)
-                case m.Observations():
+                case m.Observations() | m.Points():
                     self._look(measurement)
                 case m.Sightings():
                     self._see(measurement)
@@ -404,14 +405,14 @@ class RobotNode:
         stamp_ns = self._team_time(measurement)
         self._now_ns = max(self._now_ns, stamp_ns)
         # What was seen at a stamp comes before the odometry that ends there, and may end a window.
-        ahead = 0 if isinstance(measurement, m.Odometry) else 1
+        ahead = 0 if isinstance(measurement, m.AnyOdometry) else 1
         self._passed_ns = max(self._passed_ns, stamp_ns - ahead)
         match measurement:
             case m.InitialPose():
                 self._ledger["start pose"] += 1
-            case m.Odometry():
+            case m.Odometry() | m.Increment() | m.Steering():
                 out += self._drive(measurement)
-            case m.Observations():
+            case m.Observations() | m.Points():
                 self._observe(measurement)
             case m.Detections():
                 self._goes_in(measurement)
@@ -432,8 +433,8 @@ class RobotNode:
 
     def _team_time(self, measurement: m.Measurement) -> int:
         """The measurement's stamp; the odometry's put right."""
-        if isinstance(measurement, m.Odometry):
-            return translate.motion_of(measurement, self.config.clock_offset_s)[0]
+        if isinstance(measurement, m.AnyOdometry):
+            return translate.end_of(measurement, self.config.clock_offset_s)
         return measurement.stamp_ns
 
     def _begin_incarnation(self, start: m.InitialPose) -> None:
@@ -487,7 +488,7 @@ class RobotNode:
             self.warnings.append(f"{np.count_nonzero(~inside)} known landmarks beyond the bounds")
         return KnownMap(known.ids[inside], known.landmarks[inside])
 
-    def _observe(self, measurement: m.Observations) -> None:
+    def _observe(self, measurement: m.AnyScan) -> None:
         self._goes_in(measurement)
         reason = self._look(measurement)
         self._ledger[self._estimator.used if reason is None else reason.disposition] += 1
@@ -500,7 +501,7 @@ class RobotNode:
         self._ledger[IN_SIGHTING if reason is None else reason.disposition] += 1
         return self._release(measurement.teammates)
 
-    def _drive(self, measurement: m.Odometry) -> list[Outgoing]:
+    def _drive(self, measurement: m.AnyOdometry) -> list[Outgoing]:
         self._steps += 1
         self.steps += 1
         self._goes_in(measurement)
@@ -511,15 +512,14 @@ class RobotNode:
 
     # A measurement within the bounds goes to the estimator; of one beyond them the reason is said.
 
-    def _look(self, measurement: m.Observations) -> Rejection | None:
+    def _look(self, measurement: m.AnyScan) -> Rejection | None:
         scan = translate.scan_of(measurement)
-        near = self._judge.near(scan[1])
+        near = self._judge.near(scan.ranges) & sensible(scan.own, scan.ranges, self.config.bounds)
         reason = self._judge.time(measurement.stamp_ns)
         if reason is None and len(near) and not near.any():
             reason = Rejection.RANGE
         if reason is None:
-            ids, ranges, bearings = (each[near] for each in scan)
-            reason = self._estimator.observe(measurement.stamp_ns, (ids, ranges, bearings))
+            reason = self._estimator.observe(measurement.stamp_ns, scan.only(near))
         return reason
 
     def _see(self, measurement: m.Sightings) -> Rejection | None:
@@ -540,10 +540,10 @@ class RobotNode:
             )
         return reason
 
-    def _go(self, measurement: m.Odometry) -> Estimates:
-        motion = translate.motion_of(measurement, self.config.clock_offset_s)
+    def _go(self, measurement: m.AnyOdometry) -> Estimates:
+        motion = translate.motion_of(measurement, self.config)
         self._unused = self._judge.odometry(*motion)
-        if self._unused not in {None, Rejection.SPEED}:
+        if self._unused not in UNMEASURED:
             return NOTHING_NEW
         return self._estimator.drive(*motion, measured=self._unused is None)
 

@@ -1,9 +1,13 @@
 """Whether a stream's measurements are physically sensible, one after the other."""
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float
 
 from team.config import Bounds
+from team.estimation.odometry import Interval, Moved
+from team.estimation.plausible import is_motion_spread as _spread
 from team.rejection import Rejection
 
 
@@ -21,7 +25,12 @@ class StreamJudge:
         self._jumped_ns: int | None = None
 
     def odometry(
-        self, stamp_ns: int, duration_ns: int, forward: float, yaw_rate: float
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        moved: Moved | None = None,
     ) -> Rejection | None:
         """Why an interval is refused: by `Rejection.SPEED` its motion alone, else all of it."""
         if duration_ns == 0:
@@ -36,10 +45,14 @@ class StreamJudge:
                 return Rejection.TIME
         self._now_ns, self._jumped_ns = stamp_ns, None
         bounds = self._bounds
+        interval = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
+        if math.isnan(forward):
+            return Rejection.STEERING
         sensible = (
             duration_ns <= bounds.interval_s * 1e9
-            and abs(forward) <= bounds.speed_m_s
+            and abs(interval.speed) <= bounds.speed_m_s
             and abs(yaw_rate) <= bounds.yaw_rate_rad_s
+            and (moved is None or moved.covariance is None or _spread(moved.covariance, bounds))
         )
         return None if sensible else Rejection.SPEED
 

@@ -81,9 +81,11 @@ class Channel:
 START = Channel(name="start", template="source/{robot}/start", message=m.InitialPose, rate="once per incarnation", delivery="all", recorded=True, recomputable=False,
                 meaning="measurement 0: the initial pose, if known")  # fmt: skip
 ODOMETRY = Channel(name="odometry", template="source/{robot}/odometry", message=m.Odometry, rate="8-100 Hz", delivery="stream", recorded=True,
-                   recomputable=False, meaning="one odometry interval")  # fmt: skip
+                   recomputable=False, meaning="one odometry interval: speeds, a motion or a car's steering",
+                   alternatives=(m.Increment, m.Steering))  # fmt: skip
 OBSERVATIONS = Channel(name="observations", template="source/{robot}/observations", message=m.Observations, rate="1-30 Hz",
-                       delivery="stream", recorded=True, recomputable=False, alternatives=(m.Detections,), meaning="landmarks seen, with identities or without")  # fmt: skip
+                       delivery="stream", recorded=True, recomputable=False, alternatives=(m.Points, m.Detections),
+                       meaning="landmarks seen: range and bearing or points, with identities or without")  # fmt: skip
 SIGHTINGS = Channel(name="sightings", template="source/{robot}/sightings", message=m.Sightings, rate="0-10 Hz", delivery="stream", recorded=True,
                     recomputable=False, meaning="teammates seen")  # fmt: skip
 SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)

@@ -88,14 +88,57 @@ class Odometry(Measurement, frozen=True, kw_only=True, array_like=True, gc=False
     yaw_rate: Real
 
 
+class Increment(
+    Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="increment/1"
+):
+    """One odometry interval that ends at stamp_ns, as the motion over it.
+
+    increment: 3 floats (forward [m], left [m], turn [rad]), the pose of its end in the frame of its
+    start. covariance: 3 × 3 floats, row by row, of an error in the frame of its end (pose ∘
+    Exp(error)); empty where the source claims none.
+    """
+
+    duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
+    increment: Floats
+    covariance: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.increment, "increment", 3)
+        if not abs(float(floats(self.increment, "increment")[2])) <= np.pi:
+            raise ValueError("out of bounds: increment turns outside (−π, π]")
+        if self.covariance:
+            check_covariance(self.covariance, 3, "covariance")
+
+
+class Steering(Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="steering/1"):
+    """One odometry interval of a car that ends at stamp_ns, as its encoders read it.
+
+    wheel_speed [m/s]: of the rear wheel that carries the encoder. steering [rad]: the angle of the
+    front wheels, left is positive. What the two mean is the robot's motion model's to say.
+    """
+
+    duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
+    wheel_speed: Real
+    steering: Real
+
+    def check(self) -> None:  # noqa: D102
+        if not abs(self.steering) < 0.5 * np.pi:
+            raise ValueError("out of bounds: steering is not within a quarter turn")
+
+
 class Observations(
     Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="observations/1"
 ):
-    """Range [m] and bearing [rad] of landmarks with known identities, seen at stamp_ns."""
+    """Range [m] and bearing [rad] of landmarks with known identities, seen at stamp_ns.
+
+    covariances: of each its own, 3 floats (range-range, range-bearing, bearing-bearing); empty
+    where they have the sensor's.
+    """
 
     ids: Ids
     ranges: Floats
     bearings: Floats
+    covariances: Floats = b""
 
     def check(self) -> None:  # noqa: D102
         n = len(ids(self.ids, "ids"))
@@ -103,6 +146,32 @@ class Observations(
         if n and floats(self.ranges, "ranges").min() < 0.0:
             raise ValueError("out of bounds: a range is negative")
         check_angles(self.bearings, "bearings", n)
+        if self.covariances:
+            check_blocks(self.covariances, n, "covariances")
+
+
+class Points(Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="points/1"):
+    """Places of landmarks with known identities in the sensor's frame, seen at stamp_ns.
+
+    positions: L × 2 floats (ahead [m], left [m]). covariances: of each its own, 3 floats (xx, xy,
+    yy); empty where they have the sensor's noise of range and bearing.
+    """
+
+    ids: Ids
+    positions: Floats
+    covariances: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        n = len(ids(self.ids, "ids"))
+        check_finite(self.positions, "positions", 2 * n)
+        if self.covariances:
+            check_blocks(self.covariances, n, "covariances")
+
+
+AnyOdometry = Odometry | Increment | Steering
+"""What tells of one odometry interval."""
+AnyScan = Observations | Points
+"""What tells of landmarks with known identities."""
 
 
 class Detections(

@@ -14,7 +14,7 @@ from team.recording import parquet_tables
 from team.recording.parquet_tables import export_parquet
 from team.recording.reader import Log, open_log
 from team.recording.recorder import Recorder
-from team.recording.tables import numbers_of
+from team.recording.tables import numbers_of, table_of
 from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import Sample
@@ -36,7 +36,9 @@ def recorded(path: Path, samples: list[Sample]) -> Log:
 
 
 def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
-    by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
+    by_class = {
+        kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds
+    }
     by_class[m.Configuration] = (
         c.ROBOT_CONFIG
     )  # of the three nodes that announce one, the example's
@@ -45,9 +47,11 @@ def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
     samples.append(Sample(samples[0].key, b"\x90", 0, 0, 99))
     exported = export_parquet(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
     assert exported.unsound == 1
-    assert len(exported.rows) == len({by_class[type(x)].name for x in kept})
+    assert len(exported.rows) == len({table_of(by_class[type(x)], x) for x in kept})
     for i, message in enumerate(kept):
-        table = pq.read_table(tmp_path / "out" / f"{by_class[type(message)].name}.parquet")
+        table = pq.read_table(
+            tmp_path / "out" / f"{table_of(by_class[type(message)], message)}.parquet"
+        )
         (row,) = [r for r in table.to_pylist() if r["counter"] == i]
         assert row["key"] == samples[i].key
         assert row["wall_ns"] == 7 + i

@@ -25,6 +25,7 @@ from team.recording.reader import Log, LogError, open_log
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.schemas import schema_of
 from team.recording.summary import summarised
+from team.recording.tables import table_of
 from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -574,7 +575,9 @@ def test_numbers_read_back_from_csv_are_the_same(
 
 
 def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: Path) -> None:
-    by_class = {channel.message: channel for channel in c.CHANNELS if channel.recorded}
+    by_class = {
+        kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds
+    }
     kept = [on_its_key(by_class[type(x)], "alpha", x) for x in examples() if type(x) in by_class]
     samples = [
         sampled(by_class[type(x)], getattr(x, "robot", "alpha"), x, i) for i, x in enumerate(kept)
@@ -582,7 +585,7 @@ def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: 
     samples += [replace(samples[0], payload=b"\x90"), Sample("view/scene", b"?", 0, 0, 0)]
     exported = export_csv(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
     assert exported.unsound == 1
-    assert {path.stem for path in exported.rows} == {by_class[type(x)].name for x in kept}
+    assert {path.stem for path in exported.rows} == {table_of(by_class[type(x)], x) for x in kept}
     for path, count in exported.rows.items():
         rows = rows_of(path)
         assert len(rows) == count

@@ -266,7 +266,7 @@ def test_everything_it_sends_passes_the_door():
         out += node.handle(prior(), 0)
     out += node.handle(END, 0)
     for o in out:
-        assert decoded(encoded(o.message), o.channel.message) == o.message
+        assert decoded(encoded(o.message), *o.channel.kinds) == o.message
     assert {o.channel for o in out} >= {ch.SUBMAP, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE}
 
 

@@ -64,6 +64,32 @@ def test_a_last_word_from_before_the_last_map_has_none() -> None:
     assert done.last_map == -1
 
 
+def test_observations_from_before_their_covariances_have_the_sensors() -> None:
+    found = decoded(msgpack.packb(fields_of(EXAMPLES["observations/1"])[:-1]), m.Observations)
+    assert found.covariances == b""
+
+
+@pytest.mark.parametrize(
+    ("tag", "field", "value", "why"),
+    [
+        ("increment/1", -2, from_floats([1.0, 0.0, 3.2]), "out of bounds"),
+        ("increment/1", -2, from_floats([1.0, 0.0]), "wrong length"),
+        ("increment/1", -1, from_floats(np.zeros(9)), "not positive definite"),
+        ("steering/1", -1, 1.6, "out of bounds"),
+        ("points/1", -2, from_floats([1.0, 0.0]), "wrong length"),
+        ("points/1", -1, from_floats([1.0, 2.0, 1.0] * 2), "not positive definite"),
+        ("observations/1", -1, from_floats([1.0, 0.0, 1.0]), "wrong length"),
+        ("observations/1", -1, from_floats([1.0, 0.0, -1.0] * 2), "not positive definite"),
+    ],
+)
+def test_a_general_measurement_that_can_not_be_is_refused(
+    tag: str, field: int, value: object, why: str
+) -> None:
+    fields = fields_of(EXAMPLES[tag])
+    fields[field] = value
+    assert reason_of(msgpack.packb(fields)) == why
+
+
 def test_a_submap_from_before_the_pose_nodes_has_none() -> None:
     shorter = msgpack.packb(fields_of(submap(0))[:-8])
     assert decoded(shorter) == submap(0)

@@ -32,7 +32,9 @@ def channel_table() -> str:
 
 
 def _carried(channel: c.Channel) -> str:
-    return "see Views" if channel is c.VIEW else f"`{m.tag_of(channel.message)}`"
+    if channel is c.VIEW:
+        return "see Views"
+    return ", ".join(f"`{m.tag_of(each)}`" for each in channel.kinds)
 
 
 def view_table() -> str:

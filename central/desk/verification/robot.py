@@ -125,7 +125,9 @@ def _first_of(
     steps = 0
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
     for counter in range(min(done.measurements, max(measurements) + 1), -1, -1):
-        steps += counter < done.measurements and isinstance(measurements.get(counter), m.Odometry)
+        steps += counter < done.measurements and isinstance(
+            measurements.get(counter), m.AnyOdometry
+        )
         if counter in begins and steps == done.steps:
             return counter
     return 0
@@ -215,7 +217,7 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     ):
         took, late = node.took(measurements[counter]), Rejection.LATE.disposition
         if late in took:  # an odometry interval that ends a window, and scans that it leaves behind
-            scans = [n for n in said if isinstance(measurements[n], m.Observations)]
+            scans = [n for n in said if isinstance(measurements[n], m.AnyScan)]
             scans = [n for n in scans if not said[n].startswith("rejected")]
             said |= dict.fromkeys(scans[-took.pop(late) :], late)
             said[counter] = HybridEstimator.used
@@ -224,8 +226,9 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     if said and done is not None:
         end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(said))
         for reason, count in node.took(m.End(stamp_ns=0, streams=(end,))).items():
-            kind = m.Sightings if reason == Rejection.NO_NODE.disposition else m.Observations
-            taken = [n for n in said if isinstance(measurements[n], kind)]
+            sighted = reason == Rejection.NO_NODE.disposition
+            kinds = (m.Sightings,) if sighted else (m.Observations, m.Points)
+            taken = [n for n in said if isinstance(measurements[n], kinds)]
             taken = [n for n in taken if not said[n].startswith("rejected")]
             said |= dict.fromkeys(taken[-count:], reason)
     return said

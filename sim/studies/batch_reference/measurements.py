@@ -97,9 +97,9 @@ def _chain(
 ) -> Chain | None:
     """None for a stream without odometry: it has no motion that links its poses."""
     odometry = [
-        translate.motion_of(measurement, config.clock_offset_s)
+        translate.motion_of(measurement, config)
         for measurement in measurements
-        if isinstance(measurement, m.Odometry)
+        if isinstance(measurement, m.AnyOdometry)
     ]
     if not odometry:
         return None
@@ -113,16 +113,14 @@ def _chain(
         match measurement:
             case m.InitialPose():
                 start = translate.pose_of(measurement)
-            case m.Observations():
+            case m.Observations() | m.Points():
                 segmenter.observe(measurement.stamp_ns, *translate.scan_of(measurement))
             case m.Sightings() if grid is not None:
                 grid.observe(
                     measurement.stamp_ns, measurement.number, translate.looks_of(measurement)
                 )
-            case m.Odometry():
-                keyframes += segmenter.drive(
-                    *translate.motion_of(measurement, config.clock_offset_s)
-                )
+            case m.Odometry() | m.Increment() | m.Steering():
+                keyframes += segmenter.drive(*translate.motion_of(measurement, config))
     last, rest = segmenter.cut(last_ns)
     keyframes += last
     if rest.mean.any() or rest.covariance.any():

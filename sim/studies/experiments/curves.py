@@ -227,7 +227,7 @@ def _landmark_curve(
         (
             int(translate.scan_of(message)[0][0])
             for message in messages(samples, ch.OBSERVATIONS.key(robot))
-            if isinstance(message, m.Observations) and message.ids
+            if isinstance(message, m.AnyScan) and message.ids
         ),
         None,
     )

@@ -195,7 +195,7 @@ def _heard(world: Mapping[str, Any]) -> _Run:
     cut.configure(config.id, config)
     for message in (opened(sample)[2] for sample in samples):
         match message:
-            case m.InitialPose() | m.Odometry() | m.Observations():
+            case m.Measurement() if not isinstance(message, m.Sightings):
                 cut.put(message)
             case m.End():
                 cut.end(message)

@@ -94,7 +94,8 @@ def _place(
     P_ll = G_p P_pp G_pᵀ + G_z R G_zᵀ, so its error is that of the pose too.
     """
     own = np.empty(3)
-    place(mean[at : at + 2], own, (mean[0], mean[1], mean[2]), measurement, sensor)
+    pose = (mean[0], mean[1], mean[2])
+    place(mean[at : at + 2], own, pose, measurement, sensor, np.empty(0))
     of_x, of_y = mean[1] - mean[at + 1], mean[at] - mean[0]
     for j in range(at):
         P[at, j] = P[0, j] + of_x * P[2, j]

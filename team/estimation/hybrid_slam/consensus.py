@@ -20,6 +20,7 @@ from team.config import Sensor
 from team.estimation.geometry import compose
 from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.models import Increment, located, variances
+from team.estimation.scans import Own
 
 EVIDENCE = math.log(100.0)
 """Log odds that a landmark's taken measurements must reach: they agree by chance once in a
@@ -44,13 +45,14 @@ class _Measurements:
         keyframes: Int64[np.ndarray, " N"],
         ids: UInt32[np.ndarray, " N"],
         measurements: Float[np.ndarray, "N 2"],
+        own: Own,
         sensor: Sensor,
         garbage: float,
     ) -> None:
         seen, self.keyframes = np.unique(keyframes, return_inverse=True)
         _, self.slots = np.unique(ids, return_inverse=True)
         self.landmarks = int(self.slots.max()) + 1
-        self.measurements = measurements
+        self.measurements, self.own = measurements, own
         self.sensor = variances(sensor)
         self.means, self.covariances = _between(motions, seen.tolist())
         reach = min(sensor.max_range, float(measurements[:, 0].max()))
@@ -65,17 +67,19 @@ def agreeing(
     keyframes: Int64[np.ndarray, " N"],
     ids: UInt32[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
+    own: Own,
     sensor: Sensor,
     garbage: float,
 ) -> Taken:
     """Measurements that agree with others of their landmark under the odometry alone.
 
     Of a landmark's measurements the one that the others support best places it, and they are taken
-    with it. motions[k] leads to keyframe k; measurements are calibrated; 0 < garbage < 1 is ε.
+    with it. motions[k] leads to keyframe k; measurements are calibrated, own the noises
+    that they claim; 0 < garbage < 1 is ε.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Measurements(motions, keyframes, ids, measurements, sensor, garbage)
+    window = _Measurements(motions, keyframes, ids, measurements, own, sensor, garbage)
     return _agreeing(window)[0]
 
 
@@ -84,6 +88,7 @@ def confirmed(
     keyframes: Int64[np.ndarray, " N"],
     ids: UInt32[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
+    own: Own,
     sensor: Sensor,
     garbage: float,
 ) -> Taken:
@@ -96,7 +101,7 @@ def confirmed(
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Measurements(motions, keyframes, ids, measurements, sensor, garbage)
+    window = _Measurements(motions, keyframes, ids, measurements, own, sensor, garbage)
     agreed, placed_by = _agreeing(window)
     taken = agreed
     path = np.zeros((len(window.means), 3))
@@ -118,6 +123,7 @@ def confirmed(
             window.keyframes,
             window.slots,
             measurements,
+            own,
             taken,
             window.sensor,
         )
@@ -148,10 +154,10 @@ def _agreeing(window: _Measurements) -> tuple[Taken, Int64[np.ndarray, " L"]]:
         window.keyframes,
         window.slots,
         window.measurements,
+        window.own,
         window.sensor,
         window.landmarks,
-        window.odds,
-        EVIDENCE - window.prior,
+        (window.odds, EVIDENCE - window.prior),
     )
 
 
@@ -174,7 +180,7 @@ def _smoothed(
     for _ in range(2):
         H, g = kernel.normal_equations(
             path, landmarks, window.means, metrics, window.keyframes, window.slots,
-            window.measurements, taken, window.sensor,
+            window.measurements, window.own, taken, window.sensor,
         )  # fmt: skip
         H[free, free] = 1.0 / far
         factor, indefinite = dpotrf(H, lower=1)
@@ -225,7 +231,7 @@ def _misread(
     for other in np.flatnonzero(count >= 2):
         as_other = kernel.left_out(
             path, landmarks, covariance, window.keyframes, np.full_like(window.slots, other),
-            window.measurements, np.zeros_like(taken), window.sensor,
+            window.measurements, window.own, np.zeros_like(taken), window.sensor,
         )  # fmt: skip
         predicted = np.bincount(window.slots[taken], as_other[taken], minlength=window.landmarks)
         own = total * (count - 1) / np.maximum(count, 1) - (window.odds - window.prior)

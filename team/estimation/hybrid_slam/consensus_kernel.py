@@ -19,6 +19,7 @@ from team.estimation.geometry import (
     logarithm,
     wrapped,
 )
+from team.estimation.hybrid_slam.landmark_kernel import innovation_of
 from team.estimation.models import NEAREST_M, landmark_jacobian, pose_jacobian, predicted
 
 Sensor3 = tuple[float, float, float]
@@ -78,6 +79,8 @@ def _prediction(
     seen: Float[np.ndarray, "2"],
     measurement: Float[np.ndarray, "2"],
     sensor: Sensor3,
+    seen_own: Float[np.ndarray, " own"],
+    own: Float[np.ndarray, " own"],
 ) -> float:
     """The log p(measurement | another one of the landmark, `seen` from where `pose` is relative
     to).
@@ -89,9 +92,13 @@ def _prediction(
     c, s = math.cos(bearing), math.sin(bearing)
     along = sensor[0] + sensor[1] * distance * distance
     across = sensor[2] * distance * distance
-    xx = along * c * c + across * s * s
-    xy = (along - across) * c * s
-    yy = along * s * s + across * c * c
+    both = 0.0
+    if len(seen_own) and seen_own[3] >= 0.0:
+        along, both = seen_own[0], seen_own[1] * distance
+        across = seen_own[2] * distance * distance
+    xx = along * c * c + across * s * s - 2.0 * both * c * s
+    xy = (along - across) * c * s + both * (c * c - s * s)
+    yy = along * s * s + across * c * c + 2.0 * both * c * s
     r, b = predicted(pose, np.array([distance * c, distance * s]))
     S = _sandwiched(pose_jacobian(r, b), spread)
     H = landmark_jacobian(r, pose[2] + b)
@@ -99,9 +106,10 @@ def _prediction(
         for q in range(2):
             S[p, q] += H[p, 0] * (xx * H[q, 0] + xy * H[q, 1])
             S[p, q] += H[p, 1] * (xy * H[q, 0] + yy * H[q, 1])
-    S[0, 0] += sensor[0] + sensor[1] * r * r
-    S[1, 1] += sensor[2]
-    e0, e1 = measurement[0] - r, wrapped(measurement[1] - b)
+    e0, e1, rr, rb, bb = innovation_of(measurement, own, sensor, r, wrapped(measurement[1] - b))
+    S[0, 0] += rr
+    S[0, 1] += rb
+    S[1, 1] += bb
     return _log_density(e0, e1, S[0, 0], S[0, 1], S[1, 1])
 
 
@@ -112,16 +120,16 @@ def agreement(
     keyframes: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
+    own: Float[np.ndarray, "N own"],
     sensor: Sensor3,
     landmarks: int,
-    odds: float,
-    enough: float,
+    odds: tuple[float, float],
 ) -> tuple[Bool[np.ndarray, " N"], Int64[np.ndarray, " L"]]:
     """The measurements that agree, and for each landmark the measurement that the others support
     best.
 
-    Measurement j supports i with max(0, log p(j | i, odometry) + odds); a landmark whose best
-    measurement has support above `enough` takes it and those that support it.
+    Measurement j supports i with max(0, log p(j | i, odometry) + odds[0]); a landmark whose best
+    measurement has support above odds[1] takes it and those that support it.
     """
     placed_by = np.full(landmarks, -1)
     support = np.full(landmarks, -1.0)
@@ -133,18 +141,22 @@ def agreement(
                     poses[keyframes[i], keyframes[j]],
                     spread[keyframes[i], keyframes[j]],
                 )
-                log = _prediction(motion, noise, measurements[i], measurements[j], sensor)
-                total += max(0.0, log + odds)
+                log = _prediction(
+                    motion, noise, measurements[i], measurements[j], sensor, own[i], own[j]
+                )
+                total += max(0.0, log + odds[0])
         if total > support[slots[i]]:
             support[slots[i]] = total
             placed_by[slots[i]] = i
     taken = np.zeros(len(slots), np.bool_)
     for j in range(len(slots)):
         i = placed_by[slots[j]]
-        if support[slots[j]] > enough:
+        if support[slots[j]] > odds[1]:
             motion, noise = poses[keyframes[i], keyframes[j]], spread[keyframes[i], keyframes[j]]
-            log = _prediction(motion, noise, measurements[i], measurements[j], sensor)
-            taken[j] = j == i or log + odds > 0.0
+            log = _prediction(
+                motion, noise, measurements[i], measurements[j], sensor, own[i], own[j]
+            )
+            taken[j] = j == i or log + odds[0] > 0.0
     return taken, placed_by
 
 
@@ -157,6 +169,7 @@ def normal_equations(
     keyframes: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
+    own: Float[np.ndarray, "N own"],
     used: Bool[np.ndarray, " N"],
     sensor: Sensor3,
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
@@ -179,9 +192,15 @@ def normal_equations(
     for n in range(len(keyframes)):
         if used[n]:
             J2, at2, innovation, variances = _row(
-                path, landmarks, keyframes[n], slots[n], measurements[n], sensor
+                path, landmarks, keyframes[n], slots[n], measurements[n], own[n], sensor
             )
-            metric[0, 0], metric[1, 1] = 1.0 / variances[0], 1.0 / variances[1]
+            r0, both, r1 = variances
+            metric[0, 0], metric[1, 1] = 1.0 / r0, 1.0 / r1
+            metric[0, 1] = metric[1, 0] = 0.0
+            if both != 0.0:
+                determinant = r0 * r1 - both * both
+                metric[0, 0], metric[1, 1] = r1 / determinant, r0 / determinant
+                metric[0, 1] = metric[1, 0] = -both / determinant
             _added(H, g, at2, J2, metric, innovation)
     return H[3:, 3:].copy(), g[3:].copy()
 
@@ -213,11 +232,10 @@ def _row(
     keyframe: int,
     slot: int,
     measurement: Float[np.ndarray, "2"],
+    own: Float[np.ndarray, " own"],
     sensor: Sensor3,
-) -> tuple[
-    Float[np.ndarray, "2 5"], Int64[np.ndarray, "5"], Float[np.ndarray, "2"], tuple[float, float]
-]:
-    """∂h/∂(pose, landmark), its columns' place in the state, z − h and R of one measurement."""
+) -> tuple[Float[np.ndarray, "2 5"], Int64[np.ndarray, "5"], Float[np.ndarray, "2"], Sensor3]:
+    """∂h/∂(pose, landmark), its columns' place in the state, z − h and R (rr, rb, bb)."""
     r, b = predicted(path[keyframe], landmarks[slot])
     J, at = np.empty((2, 5)), np.empty(5, np.int64)
     J[:, :3] = pose_jacobian(r, b)
@@ -226,8 +244,10 @@ def _row(
         at[i] = 3 * keyframe + i
     at[3] = 3 * len(path) + 2 * slot
     at[4] = at[3] + 1
-    innovation = np.array([measurement[0] - r, wrapped(measurement[1] - b)])
-    return J, at, innovation, (sensor[0] + sensor[1] * r * r, sensor[2])
+    of_range, of_bearing, rr, rb, bb = innovation_of(
+        measurement, own, sensor, r, wrapped(measurement[1] - b)
+    )
+    return J, at, np.array([of_range, of_bearing]), (rr, rb, bb)
 
 
 @compiled
@@ -238,6 +258,7 @@ def left_out(
     keyframes: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     measurements: Float[np.ndarray, "N 2"],
+    own: Float[np.ndarray, "N own"],
     used: Bool[np.ndarray, " N"],
     sensor: Sensor3,
 ) -> Float[np.ndarray, " N"]:
@@ -248,7 +269,9 @@ def left_out(
     """
     logs = np.empty(len(keyframes))
     for n in range(len(keyframes)):
-        J, at, e, variances = _row(path, landmarks, keyframes[n], slots[n], measurements[n], sensor)
+        J, at, e, variances = _row(
+            path, landmarks, keyframes[n], slots[n], measurements[n], own[n], sensor
+        )
         M = np.zeros((2, 2))
         for p in range(3 if keyframes[n] == 0 else 0, 5):
             for q in range(3 if keyframes[n] == 0 else 0, 5):
@@ -256,16 +279,17 @@ def left_out(
                 for i in range(2):
                     for j in range(2):
                         M[i, j] += J[i, p] * P * J[j, q]
-        r0, r1 = variances
+        r0, both, r1 = variances
         if not used[n]:
-            logs[n] = _log_density(e[0], e[1], r0 + M[0, 0], M[0, 1], r1 + M[1, 1])
+            logs[n] = _log_density(e[0], e[1], r0 + M[0, 0], both + M[0, 1], r1 + M[1, 1])
             continue
-        d00, d01, d11 = r0 - M[0, 0], -M[0, 1], r1 - M[1, 1]
+        d00, d01, d11 = r0 - M[0, 0], both - M[0, 1], r1 - M[1, 1]
+        of_noise = r0 * r1 - both * both
         determinant = d00 * d11 - d01 * d01
-        if not (d00 > 1e-9 * r0 and d11 > 1e-9 * r1 and determinant > 1e-12 * r0 * r1):
+        if not (d00 > 1e-9 * r0 and d11 > 1e-9 * r1 and determinant > 1e-12 * of_noise):
             logs[n] = -np.inf  # nothing else says where the landmark is
             continue
-        logs[n] = _log_density(e[0], e[1], d00, d01, d11) + math.log(determinant / (r0 * r1))
+        logs[n] = _log_density(e[0], e[1], d00, d01, d11) + math.log(determinant / of_noise)
     return logs
 
 

@@ -16,6 +16,7 @@ from team.estimation.compiled import compiled
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import fastslam_kernel
 from team.estimation.models import Increment, variances
+from team.estimation.scans import Own, unclaimed
 
 Proposal = Literal["fastslam2", "fastslam1"]
 
@@ -133,12 +134,14 @@ def propagated_and_updated(
     proposal: Proposal,
     resample_below: float,
     generator: np.random.Generator,
+    own: Own | None = None,
 ) -> tuple[Particles, StepInfo]:
     """One step: resample if the particles are thin, move, then take the measurements (`step`).
 
     Resampling comes first, when the effective sample size that the last step left is below
     `resample_below`·M: so the particles of a window's last step keep their weights. ranges [m] and
-    bearings [rad] are corrected by the calibration; an id may occur twice. Draws one uniform number
+    bearings [rad] are corrected by the calibration, own are the noises that they claim
+    (`team.estimation.scans`); an id may occur twice. Draws one uniform number
     if it resamples and M × 3 normal ones.
     Raises NotACovarianceError if the motion's covariance is not positive semi-definite.
     """
@@ -146,7 +149,7 @@ def propagated_and_updated(
     if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):
         particles, parents = resampled(particles, generator)
     moved, log_evidence = stepped(
-        particles, increment, sensor, ids, ranges, bearings, proposal, generator
+        particles, increment, sensor, ids, ranges, bearings, proposal, generator, own=own
     )
     return moved, StepInfo(effective_sample_size(moved.log_weights), parents, log_evidence)
 
@@ -160,6 +163,8 @@ def stepped(
     bearings: Float[np.ndarray, " n"],
     proposal: Proposal,
     generator: np.random.Generator,
+    *,
+    own: Own | None = None,
 ) -> tuple[Particles, float]:
     """As `propagated_and_updated` without resampling; the log evidence beside the particles."""
     count, known = len(particles.poses), len(particles.ids)
@@ -183,6 +188,7 @@ def stepped(
         first,
         np.column_stack((ranges, bearings)),
         variances(sensor),
+        unclaimed(len(ids)) if own is None else own,
         proposal == "fastslam2",
         poses,
         log_weights,

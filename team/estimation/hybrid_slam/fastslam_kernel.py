@@ -14,6 +14,7 @@ from team.estimation.geometry import swept, wrapped
 from team.estimation.hybrid_slam.landmark_kernel import (
     Triple,
     condition_on_measurement,
+    innovation_of,
     place,
     seen,
 )
@@ -129,6 +130,7 @@ def _condition_noise_on_measurement(
     pose: Triple,
     measurement: Float[np.ndarray, "2"],
     sensor: Triple,
+    own: Float[np.ndarray, " own"],
     mean: Float[np.ndarray, "2"],
     covariance: Float[np.ndarray, "3"],
 ) -> float:
@@ -142,18 +144,20 @@ def _condition_noise_on_measurement(
     c, s = math.cos(pose[2]), math.sin(pose[2])
     u, v = c * ex + s * ey, c * ey - s * ex
     xx, xy, yy = covariance[0], covariance[1], covariance[2]
+    of_range, of_bearing, rr, rb, bb = innovation_of(
+        measurement, own, sensor, distance, wrapped(measurement[1] - math.atan2(v, u))
+    )
     S_rr = xx * ex * ex + 2.0 * xy * ex * ey + yy * ey * ey
-    S_rr += sensor[0] + sensor[1] * distance * distance
-    S_rb = (xy * (ex * ex - ey * ey) + (yy - xx) * ex * ey) / distance
-    S_bb = (xx * ey * ey - 2.0 * xy * ex * ey + yy * ex * ex) / (distance * distance) + sensor[2]
+    S_rr += rr
+    S_rb = (xy * (ex * ex - ey * ey) + (yy - xx) * ex * ey) / distance + rb
+    S_bb = (xx * ey * ey - 2.0 * xy * ex * ey + yy * ex * ex) / (distance * distance) + bb
     slope = S_rb / S_rr
     r0, r1 = -u * L[0, 0] - v * L[1, 0], -v * L[1, 1]
     b0 = (v * L[0, 0] - u * L[1, 0]) / distance - L[2, 0] - slope * r0
     b1 = -u * L[1, 1] / distance - L[2, 1] - slope * r1
     b2 = -L[2, 2]
     m0, m1, m2 = noise_mean[0], noise_mean[1], noise_mean[2]
-    of_range = measurement[0] - distance
-    of_bearing = wrapped(measurement[1] - math.atan2(v, u)) - slope * of_range
+    of_bearing -= slope * of_range
     change = _condition_noise(noise_mean, root, (r0, r1, 0.0), of_range, S_rr)
     of_bearing -= b0 * (noise_mean[0] - m0) + b1 * (noise_mean[1] - m1) + b2 * (noise_mean[2] - m2)
     return change + _condition_noise(
@@ -172,6 +176,7 @@ def step(
     first: Bool[np.ndarray, " n"],
     measurements: Float[np.ndarray, "n 2"],
     sensor: Triple,
+    own: Float[np.ndarray, "n own"],
     improved: bool,
     poses: Float[np.ndarray, "M 3"],
     log_weights: Float[np.ndarray, " M"],
@@ -189,7 +194,7 @@ def step(
 
     Slots below `known` hold landmarks of earlier steps. A first sight has a flat prior and adds
     nothing; a second measurement of it in the same step updates it, but has no part in the
-    proposal. The last four arrays are written in place.
+    proposal. own: rows of `team.estimation.scans`. The last four arrays are written in place.
     Thrun et al. 2005, section 13.5-13.8; Montemerlo 2003, chapter 4.
     """
     noise_mean, root = np.empty(3), np.empty((3, 3))
@@ -209,6 +214,7 @@ def step(
                     pose,
                     measurements[k],
                     sensor,
+                    own[k],
                     means[i, slots[k]],
                     covariances[i, slots[k]],
                 )
@@ -222,9 +228,9 @@ def step(
         for k in range(len(slots)):
             mean, covariance = means[i, slots[k]], covariances[i, slots[k]]
             if first[k]:
-                place(mean, covariance, pose, measurements[k], sensor)
+                place(mean, covariance, pose, measurements[k], sensor, own[k])
             else:
                 log_weight += condition_on_measurement(
-                    mean, covariance, pose, measurements[k], sensor
+                    mean, covariance, pose, measurements[k], sensor, own[k]
                 )
         log_weights[i] += log_weight

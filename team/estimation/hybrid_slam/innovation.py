@@ -17,7 +17,7 @@ from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import compose, tangent, wrapped
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor, slots_of
-from team.estimation.hybrid_slam.landmark_kernel import Triple, seen
+from team.estimation.hybrid_slam.landmark_kernel import Triple, innovation_of, seen
 from team.estimation.models import (
     Increment,
     landmark_jacobian,
@@ -26,6 +26,7 @@ from team.estimation.models import (
     predicted,
     variances,
 )
+from team.estimation.scans import Own, unclaimed
 
 
 class Innovation(NamedTuple):
@@ -58,6 +59,7 @@ def innovation(
     ids: UInt32[np.ndarray, " n"],
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
+    own: Own | None = None,
 ) -> Innovation:
     """ν = z − ẑ of one keyframe's measurements in the metric of their joint predictive covariance
     S.
@@ -71,7 +73,7 @@ def innovation(
     It is the prediction before the measurements: FastSLAM 2.0 draws its particles from a proposal
     that has seen them, so after that step there is no innovation left to judge. A first sight has a
     flat prior and is left out. ranges [m] and bearings [rad] are accepted and corrected by the
-    calibration. R is white, as in the particles' weights.
+    calibration, own are the noises that they claim. R is white, as in the particles' weights.
     Raises NotACovarianceError if S is not positive definite.
     """
     _, slots, _ = slots_of(particles.ids, ids)
@@ -88,6 +90,7 @@ def innovation(
         slots[known],
         np.column_stack((ranges, bearings))[known],
         variances(sensor),
+        (unclaimed(len(ids)) if own is None else own)[known],
     )
     return _squared(error, S)
 
@@ -153,6 +156,7 @@ def _predictive(
     slots: Int64[np.ndarray, " n"],
     measurements: Float[np.ndarray, "n 2"],
     sensor: Triple,
+    own: Float[np.ndarray, "n own"],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
     """(z − ẑ, S) of n measurements as (range, bearing, range, …), m = 2n; L Lᵀ is the motion's Q.
 
@@ -171,9 +175,16 @@ def _predictive(
         )  # fmt: skip
         A[:, 4 * i : 4 * i + 3] *= root
         for k in range(len(slots)):
-            distance = measurements[k, 0] - errors[2 * k, i]
-            S[2 * k, 2 * k] += weights[i] * (sensor[0] + sensor[1] * distance * distance)
-            S[2 * k + 1, 2 * k + 1] += weights[i] * sensor[2]
+            r, b = 2 * k, 2 * k + 1
+            distance = measurements[k, 0] - errors[r, i]
+            of_range, of_bearing, rr, rb, bb = innovation_of(
+                measurements[k], own[k], sensor, distance, errors[b, i]
+            )
+            if own.shape[1]:
+                errors[r, i], errors[b, i] = of_range, of_bearing
+            S[r, r] += weights[i] * rr
+            S[b, b] += weights[i] * bb
+            S[b, r] += weights[i] * rb
     mean = np.empty(m)
     for j in range(m):
         mean[j] = _centred(errors[j], weights, j % 2 == 1)

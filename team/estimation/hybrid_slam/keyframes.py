@@ -4,13 +4,17 @@ from bisect import insort
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, UInt32
+from jaxtyping import Bool, Float, UInt32
 
 from team.config import MotionModel, Sensor
 from team.estimation import geometry
+from team.estimation.geometry import adjoint, inverse
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
-from team.estimation.hybrid_slam.sensitivity import carried_on, forward_column
-from team.estimation.models import Increment, acceptable, corrected, increment_of, located
+from team.estimation.hybrid_slam.sensitivity import carried_on
+from team.estimation.models import Increment, acceptable, corrected, located
+from team.estimation.mount import of_sensor
+from team.estimation.odometry import STANDING, Interval, Moved
+from team.estimation.scans import Own, calibrated, carried, mean_claim, together, unclaimed
 from team.rejection import Rejection
 
 UNMEASURED = (1.0, 0.5)
@@ -21,8 +25,10 @@ UNMEASURED = (1.0, 0.5)
 class Keyframe:
     """The motion since the last keyframe and what was seen at its end (accepted and calibrated).
 
+    own: the noises that the measurements claim (`team.estimation.scans`); without rows: none do.
+    Poses and motions are those of the sensor, wherever on the base it is mounted.
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
-    forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
+    forward: the motion's shift by an error of the scale of speed (`odometry.forward_column`).
     """
 
     stamp_ns: int
@@ -30,8 +36,23 @@ class Keyframe:
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
+    own: Own = field(default_factory=lambda: unclaimed(0))
     is_node: bool = False
     forward: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        if len(self.own) != len(self.ids):
+            object.__setattr__(self, "own", unclaimed(len(self.ids)))
+
+    def only(self, taken: Bool[np.ndarray, " n"]) -> "Keyframe":
+        """The keyframe with those of its measurements."""
+        return replace(
+            self,
+            ids=self.ids[taken],
+            ranges=self.ranges[taken],
+            bearings=self.bearings[taken],
+            own=self.own[taken],
+        )
 
 
 @dataclass(frozen=True)
@@ -42,6 +63,7 @@ class _Scan:
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
+    own: Own
     pose: Float[np.ndarray, "3"]
 
 
@@ -74,7 +96,9 @@ class Segmenter:
         self._keyframe_start_ns = 0
         self._scan_motion = np.zeros(3)
         self.rest_forward = np.zeros(3)
-        self._speeds = (0.0, 0.0)
+        self._mount = np.array(sensor.mount)
+        self._unmount = adjoint(inverse(self._mount))
+        self._last = STANDING
         self._unmeasured = np.zeros((3, 3))
         self.now_ns: int | None = None
 
@@ -82,7 +106,7 @@ class Segmenter:
         """A stream or a window begins at this team time."""
         self.now_ns = stamp_ns
         self._keyframe_start_ns = stamp_ns
-        self._speeds = (0.0, 0.0)  # what a window says depends on its own measurements alone
+        self._last = STANDING  # what a window says depends on its own measurements alone
         if self._grid is not None:
             self._grid.begin(stamp_ns)
 
@@ -92,6 +116,7 @@ class Segmenter:
         ids: UInt32[np.ndarray, " n"],
         ranges: Float[np.ndarray, " n"],
         bearings: Float[np.ndarray, " n"],
+        own: Own | None = None,
     ) -> Rejection | None:
         """Keep a scan until the odometry covers its time; the reason if it is rejected instead."""
         if self.now_ns is not None and stamp_ns < self.now_ns:
@@ -100,7 +125,8 @@ class Segmenter:
         if len(ids) and not mask.any():
             return Rejection.SENSOR_LIMITS
         r, b = corrected(self._sensor, ranges[mask], bearings[mask])
-        scan = _Scan(stamp_ns, ids[mask], r, b, np.zeros(3))
+        noises = unclaimed(len(r)) if own is None else calibrated(own[mask], self._sensor)
+        scan = _Scan(stamp_ns, ids[mask], r, b, noises, np.zeros(3))
         insort(self._waiting, scan, key=lambda each: each.stamp_ns)
         return None
 
@@ -110,6 +136,7 @@ class Segmenter:
         duration_ns: int,
         forward: float,
         yaw_rate: float,
+        moved: Moved | None = None,
         *,
         measured: bool = True,
     ) -> list[Keyframe]:
@@ -118,25 +145,25 @@ class Segmenter:
         Where its motion was not measured (what came could not be) the last speeds go on, with
         errors of their own size, UNMEASURED at least; a heading's stays within a turn.
         """
+        over = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
         if measured:
-            self._speeds, self._unmeasured = (forward, yaw_rate), np.zeros((3, 3))
+            self._last, self._unmeasured = over, np.zeros((3, 3))
         else:
-            forward, yaw_rate = self._speeds
-            self._unmeasured = _unmeasured(duration_ns * 1e-9, forward, yaw_rate)
+            over = self._last.gone_on(stamp_ns, duration_ns)
+            self._unmeasured = _unmeasured(duration_ns * 1e-9, over.speed, over.yaw_rate)
         keyframes = []
         self._here_ns = stamp_ns - duration_ns
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
             scan = self._waiting.pop(0)
-            keyframes += self._nodes(scan.stamp_ns - 1, forward, yaw_rate)
-            at_ns = self._go_to(scan.stamp_ns, forward, yaw_rate)
+            keyframes += self._nodes(scan.stamp_ns - 1, over)
+            at_ns = self._go_to(scan.stamp_ns, over)
             if self._keyframe_ns:
-                self._keyframe.append(
-                    _Scan(at_ns, scan.ids, scan.ranges, scan.bearings, self._scan_motion)
-                )
+                self._keyframe.append(replace(scan, stamp_ns=at_ns, pose=self._scan_motion))
             else:
-                keyframes.append(self._keyframe_at(at_ns, scan.ids, scan.ranges, scan.bearings))
-        keyframes += self._nodes(stamp_ns, forward, yaw_rate)
-        self._go_to(stamp_ns, forward, yaw_rate)
+                seen = scan.ids, scan.ranges, scan.bearings
+                keyframes.append(self._keyframe_at(at_ns, *seen, scan.own))
+        keyframes += self._nodes(stamp_ns, over)
+        self._go_to(stamp_ns, over)
         self.now_ns = stamp_ns
         if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
             keyframes.append(self._close_keyframe(stamp_ns))
@@ -168,38 +195,42 @@ class Segmenter:
         """Scans that wait for odometry that covers their time."""
         return len(self._waiting)
 
-    def _nodes(self, until_ns: int, forward: float, yaw_rate: float) -> list[Keyframe]:
+    def _nodes(self, until_ns: int, over: Interval) -> list[Keyframe]:
         """The grid times up to until_ns; sightings up to there find their node."""
         keyframes = []
         grid = self._grid
         while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
-            self._go_to(next_ns, forward, yaw_rate)
+            self._go_to(next_ns, over)
             if grid.reach():
                 nothing = np.empty(0)
-                seen = np.empty(0, np.uint32), nothing, nothing
+                seen = np.empty(0, np.uint32), nothing, nothing, unclaimed(0)
                 keyframes.append(replace(self._keyframe_at(next_ns, *seen), is_node=True))
         return keyframes
 
-    def _go_to(self, stamp_ns: int, forward: float, yaw_rate: float) -> int:
+    def _go_to(self, stamp_ns: int, over: Interval) -> int:
         """Integrate up to a stamp; what lies before the interval's start is at its start."""
         at_ns = max(stamp_ns, self._here_ns)
-        self._integrate(at_ns - self._here_ns, forward, yaw_rate)
+        self._integrate(at_ns - self._here_ns, over.end_ns - at_ns, over)
         self._here_ns = at_ns
         return at_ns
 
-    def _integrate(self, duration_ns: int, forward: float, yaw_rate: float) -> None:
+    def _integrate(self, duration_ns: int, rest_ns: int, over: Interval) -> None:
         if duration_ns <= 0:
             return
-        step = increment_of(self._motion, duration_ns * 1e-9, forward, yaw_rate)
+        step = over.part(self._motion, duration_ns, rest_ns)
         if self._unmeasured.any():
             added = step.covariance + duration_ns * 1e-9 * self._unmeasured
             step = Increment(step.mean, added)
-        self._increment = self._increment.then(step)
-        if self._motion.calibrated_speed is not None:
-            column = forward_column(self._motion, duration_ns * 1e-9, forward, yaw_rate)
-            self._forward = carried_on(self._forward, step.mean) + column
         if self._grid is not None:
             self._grid.moved(step)
+        if self._sensor.is_mounted:
+            step = of_sensor(step, self._mount)
+        self._increment = self._increment.then(step)
+        if self._motion.calibrated_speed is not None:
+            column = over.forward_column(self._motion, duration_ns)
+            if self._sensor.is_mounted:
+                column = self._unmount @ column
+            self._forward = carried_on(self._forward, step.mean) + column
         if self._keyframe_ns:
             self._scan_motion = geometry.compose(self._scan_motion, step.mean)
 
@@ -209,28 +240,35 @@ class Segmenter:
         ids: UInt32[np.ndarray, " n"],
         ranges: Float[np.ndarray, " n"],
         bearings: Float[np.ndarray, " n"],
+        own: Own,
     ) -> Keyframe:
-        keyframe = Keyframe(stamp_ns, self._increment, ids, ranges, bearings, forward=self._forward)
+        motion = self._increment
+        keyframe = Keyframe(stamp_ns, motion, ids, ranges, bearings, own, forward=self._forward)
         self._increment = Increment.identity()
         self._forward = np.zeros(3)
         return keyframe
 
     def _close_keyframe(self, stamp_ns: int) -> Keyframe:
         points: dict[int, list[tuple[float, float]]] = {}
+        claims: dict[int, list[Own]] = {}
         for scan in self._keyframe:
             back = geometry.between(self._scan_motion, scan.pose)
-            for landmark, r, b in zip(scan.ids, scan.ranges, scan.bearings, strict=True):
-                x, y = located(back, float(r), float(b))
+            for k, landmark in enumerate(scan.ids):
+                r, b = float(scan.ranges[k]), float(scan.bearings[k])
+                x, y = located(back, r, b)
                 points.setdefault(int(landmark), []).append((np.hypot(x, y), np.arctan2(y, x)))
+                if scan.own.size:
+                    claim = carried(scan.own[k], r, float(back[2]) + b, np.array([x, y]))
+                    claims.setdefault(int(landmark), []).append(claim)
         ids = sorted(points)
         ranges = [float(np.median([r for r, _ in points[i]])) for i in ids]
         bearings = [_median_direction([b for _, b in points[i]]) for i in ids]
         self._keyframe = []
         self._keyframe_start_ns = stamp_ns
         self._scan_motion = np.zeros(3)
-        return self._keyframe_at(
-            stamp_ns, np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
-        )
+        own = together([(1, mean_claim(claims.get(i, []))) for i in ids])
+        seen = np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
+        return self._keyframe_at(stamp_ns, *seen, own)
 
 
 def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most: int) -> Keyframe:
@@ -242,9 +280,7 @@ def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most:
     new, first = np.unique(ids[unknown], return_index=True)
     nearest = new[np.argsort(ranges[unknown][first], kind="stable")[: max(most - len(known), 0)]]
     taken = ~unknown | np.isin(ids, nearest)
-    return replace(
-        keyframe, ids=ids[taken], ranges=ranges[taken], bearings=keyframe.bearings[taken]
-    )
+    return keyframe.only(taken)
 
 
 def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.ndarray, "3 3"]:

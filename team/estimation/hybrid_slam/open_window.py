@@ -15,6 +15,7 @@ from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.models import Increment
+from team.estimation.mount import of_base
 from team.estimation.plausible import submap_beyond
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
@@ -48,7 +49,7 @@ class OpenWindow:
 
     def advance(self, keyframe: Keyframe) -> None:
         """Particles move and weigh, once more: those measurements count that others agree with."""
-        self.motion = self.motion.then(keyframe.increment)
+        self._follow(keyframe.increment)
         self.last_keyframe_ns = keyframe.stamp_ns
         self._try(lambda: self._admit(keyframe))
 
@@ -60,7 +61,7 @@ class OpenWindow:
     def move(self, rest: Increment, forward: np.ndarray) -> None:
         """The motion after the last keyframe; forward: its shift by an error of the speed."""
         if rest.mean.any() or rest.covariance.any():
-            self.motion = self.motion.then(rest)
+            self._follow(rest)
             self._try(lambda: self._go(rest, forward))
 
     def solved(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
@@ -77,6 +78,13 @@ class OpenWindow:
         """Whether a submap is there and within the bounds."""
         return submap is not None and submap_beyond(submap, self._config.bounds) is None
 
+    def _follow(self, motion: Increment) -> None:
+        """The base moves as its sensor does."""
+        sensor = self._config.sensor
+        if sensor.is_mounted:
+            motion = of_base(motion, np.array(sensor.mount))
+        self.motion = self.motion.then(motion)
+
     def _admit(self, keyframe: Keyframe) -> None:
         most = self._config.bounds.submap_landmarks
         bounded = nearest_landmarks(keyframe, self.particles.particles.ids, most)
@@ -91,6 +99,7 @@ class OpenWindow:
             keyframe.bearings,
             self._generator,
             keyframe.forward,
+            own=keyframe.own,
         )
         self.keyframes_ns = (*self.keyframes_ns, keyframe.stamp_ns)
         if keyframe.is_node:

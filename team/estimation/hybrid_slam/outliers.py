@@ -1,15 +1,15 @@
 """The open window's measurements, and which of them the others confirm."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
+from jaxtyping import Float, Int64, UInt32
 
 from team.config import Sensor
 from team.estimation.hybrid_slam.consensus import agreeing, confirmed
 from team.estimation.hybrid_slam.keyframes import Keyframe
 from team.estimation.models import Increment
+from team.estimation.scans import Own, together
 
 
 class OutlierGate:
@@ -44,7 +44,7 @@ class OutlierGate:
         if not len(keyframe.ids):
             return keyframe
         taken = agreeing(*self._all(), self._sensor, self._garbage)
-        return _with(keyframe, taken[-len(keyframe.ids) :])
+        return keyframe.only(taken[-len(keyframe.ids) :])
 
     def settled(self) -> Sequence[Keyframe]:
         """All keyframes of the window with the measurements that are confirmed; counts the
@@ -54,7 +54,7 @@ class OutlierGate:
         self.gated = int(np.count_nonzero(~taken))
         bounds = np.cumsum([0, *(len(keyframe.ids) for keyframe in self._keyframes)])
         return [
-            _with(keyframe, taken[begin:end])
+            keyframe.only(taken[begin:end])
             for keyframe, begin, end in zip(self._keyframes, bounds, bounds[1:], strict=False)
         ]
 
@@ -65,6 +65,7 @@ class OutlierGate:
         Int64[np.ndarray, " N"],
         UInt32[np.ndarray, " N"],
         Float[np.ndarray, "N 2"],
+        Own,
     ]:
         keyframes = self._keyframes
         counts = [len(keyframe.ids) for keyframe in keyframes]
@@ -76,13 +77,5 @@ class OutlierGate:
             np.repeat(np.arange(len(keyframes)), counts),
             np.concatenate([np.empty(0, np.uint32), *(keyframe.ids for keyframe in keyframes)]),
             np.concatenate([np.empty((0, 2)), *measurements]),
+            together([(len(keyframe.ids), keyframe.own) for keyframe in keyframes]),
         )
-
-
-def _with(keyframe: Keyframe, taken: Bool[np.ndarray, " n"]) -> Keyframe:
-    return replace(
-        keyframe,
-        ids=keyframe.ids[taken],
-        ranges=keyframe.ranges[taken],
-        bearings=keyframe.bearings[taken],
-    )

@@ -14,8 +14,6 @@ configuration and (seed, robot, incarnation, sequence) alone. Joining submaps is
 
 from dataclasses import replace
 
-import numpy as np
-
 from team.config import RobotConfig
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
@@ -24,11 +22,10 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.open_window import OpenWindow
 from team.estimation.hybrid_slam.pose_grid import Looks, PoseGrid
 from team.estimation.hybrid_slam.window import Window
+from team.estimation.odometry import Interval, Moved
+from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
 from team.rejection import Rejection
-
-Scan = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Landmark ids, ranges [m] and bearings [rad] of one message."""
 
 
 class HybridSlam:
@@ -79,6 +76,7 @@ class HybridSlam:
         duration_ns: int,
         forward: float,
         yaw_rate: float,
+        moved: Moved | None = None,
         *,
         measured: bool = True,
     ) -> ClosedWindow | None:
@@ -86,8 +84,8 @@ class HybridSlam:
         if self._start_ns is None:
             self._start_ns = stamp_ns - duration_ns
             self._segmenter.begin(self._start_ns)
-        self._driven_m += abs(forward) * duration_ns * 1e-9
-        interval = stamp_ns, duration_ns, forward, yaw_rate
+        interval = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
+        self._driven_m += abs(interval.speed) * duration_ns * 1e-9
         for keyframe in self._segmenter.drive(*interval, measured=measured):
             self._open.advance(keyframe)
         if self._is_full(stamp_ns - self._start_ns):
@@ -142,7 +140,7 @@ class HybridSlam:
                 closed,
                 local=submap,
                 sightings=() if self._grid is None else self._grid.sightings(),
-                window=self.window,
+                window=windows.of_base(self.window),
                 keyframes_ns=self._open.keyframes_ns,
                 innovation=self.window.innovation,
             )

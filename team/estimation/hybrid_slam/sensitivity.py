@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.linalg import cho_solve
 
-from team.config import Bias, MotionModel
+from team.config import Bias
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import adjoint, between
@@ -49,28 +49,6 @@ class Motion(NamedTuple):
     forward: Float[np.ndarray, "3"]
 
 
-def forward_column(
-    motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
-) -> Float[np.ndarray, "3"]:
-    """d/db at 0 of the interval's motion if the logged way is (1 + b) times as long.
-
-    In the tangent space of its end; zero where |forward| lies in `calibrated_speed`, whose scale
-    is known, and without such a range.
-    """
-    column = np.zeros(3)
-    speeds = motion.calibrated_speed
-    if speeds is None or speeds[0] <= abs(forward) <= speeds[1]:
-        return column
-    way = motion.forward_scale * forward * duration_s
-    if motion.kind == "turn-then-drive":
-        column[0] = way
-        return column
-    limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
-    turn = min(max(motion.yaw_scale * yaw_rate, -limit), limit) * duration_s
-    column[0], column[1] = way * math.cos(0.5 * turn), -way * math.sin(0.5 * turn)
-    return column
-
-
 def carried_on(
     column: Float[np.ndarray, "3"], motion: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
@@ -87,21 +65,22 @@ def columns(
     motions: Sequence[Motion],
     landmarks: Float[np.ndarray, "L 2"],
     measurements: tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " N"]],
+    own: Float[np.ndarray, "N own"],
     noise: Noise,
 ) -> tuple[Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"]]:
     """∂/∂b of the path's poses (x, y, theta) and of the landmarks, in the window's frame.
 
     path: the pose at the end of each motion; the first motion begins at zero. measurements: of each
-    the pose (an index into path) and the landmark. The bias b is the error: a bearing reads b too
-    much, a range b too much or (1 + b) times itself, and the way driven is (1 + b) times the
-    odometry's.
+    the pose (an index into path) and the landmark; own: the noises that they claim. The bias b is
+    the error: a bearing reads b too much, a range b too much or (1 + b) times itself, and the way
+    driven is (1 + b) times the odometry's.
     """
     size = 3 * len(path) + 2 * len(landmarks)
     A, right = np.zeros((size, size)), np.zeros((size, len(BIASES)))
     covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 3, 3)
     metrics = np.linalg.inv(covariances + np.diag(MOTION_JITTER)) if len(path) else covariances
     shifts = np.array([motion.forward for motion in motions]).reshape(-1, 3)
-    rows = _measurement_rows(path, landmarks, *measurements, noise)
+    rows = _measurement_rows(path, landmarks, *measurements, own, noise)
     _add_motions(A, right, path, metrics, shifts)
     _add_measurements(A, right, rows, *measurements, 3 * len(path))
     moved = cho_solve((cholesky_factor(A, "the smoother of a window"), True), right).T
@@ -150,12 +129,13 @@ def _measurement_rows(
     landmarks: Float[np.ndarray, "L 2"],
     poses: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
+    own: Float[np.ndarray, "N own"],
     noise: Noise,
-) -> Float[np.ndarray, "N 2 7"]:
-    """Of each measurement, for range and bearing: ∂h by the pose and the landmark, g, the
-    variance.
+) -> Float[np.ndarray, "N 2 8"]:
+    """Of each measurement, for range and bearing: ∂h by the pose and the landmark, g, the variance,
+    and how much of the range's row is taken from the bearing's: its regression on it.
     """
-    rows = np.zeros((len(poses), 2, 7))
+    rows = np.zeros((len(poses), 2, 8))
     for n in range(len(poses)):
         pose = path[poses[n]]
         dx, dy = landmarks[slots[n], 0] - pose[0], landmarks[slots[n], 1] - pose[1]
@@ -173,6 +153,13 @@ def _measurement_rows(
         of_bearing[4] = math.cos(direction) / distance
         of_bearing[5] = 1.0
         of_bearing[6] = noise.bearing_variance
+        if own.shape[1] and own[n, 3] >= 0.0:
+            slope = own[n, 1] / own[n, 0]
+            of_range[6] = own[n, 0]
+            of_bearing[6] = own[n, 2] - slope * own[n, 1]
+            of_bearing[7] = slope
+            for i in range(5):
+                of_bearing[i] -= slope * of_range[i]
     return rows
 
 
@@ -180,7 +167,7 @@ def _measurement_rows(
 def _add_measurements(
     A: Float[np.ndarray, "n n"],
     right: Float[np.ndarray, "n B"],
-    rows: Float[np.ndarray, "N 2 7"],
+    rows: Float[np.ndarray, "N 2 8"],
     poses: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     first: int,
@@ -201,6 +188,9 @@ def _add_measurements(
                 weighted = row[i] / row[6]
                 if kind:
                     right[at[i], BEARING] -= weighted * row[5]
+                    if row[7] != 0.0:
+                        right[at[i], RANGE_OFFSET] += weighted * row[7]
+                        right[at[i], RANGE_SCALE] += weighted * row[7] * rows[n, 0, 5]
                 else:
                     right[at[i], RANGE_OFFSET] -= weighted
                     right[at[i], RANGE_SCALE] -= weighted * row[5]
@@ -212,7 +202,7 @@ def _add_measurements(
 def _add_given_path(
     A: Float[np.ndarray, "2 2"],
     right: Float[np.ndarray, "2 B"],
-    rows: Float[np.ndarray, "n 7"],
+    rows: Float[np.ndarray, "n 8"],
     shifts: Float[np.ndarray, "n B"],
     white: float,
 ) -> None:
@@ -246,7 +236,7 @@ def _add_given_path(
 @compiled
 def _landmarks_given(
     twists: Float[np.ndarray, "B P 3"],
-    rows: Float[np.ndarray, "N 2 7"],
+    rows: Float[np.ndarray, "N 2 8"],
     poses: Int64[np.ndarray, " N"],
     slots: Int64[np.ndarray, " N"],
     count: int,
@@ -264,6 +254,8 @@ def _landmarks_given(
                 row = rows[own[k], kind]
                 if kind:
                     shifts[k, BEARING] = row[5]
+                    shifts[k, RANGE_OFFSET] = -row[7]
+                    shifts[k, RANGE_SCALE] = -row[7] * rows[own[k], 0, 5]
                 else:
                     shifts[k, RANGE_OFFSET], shifts[k, RANGE_SCALE] = 1.0, row[5]
                 for b in range(biases):

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.config import FrontEnd, Sensor
 from team.estimation.gaussian import NotACovarianceError, cholesky_factor
-from team.estimation.geometry import tangent
+from team.estimation.geometry import inverse, tangent
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
@@ -23,6 +23,8 @@ from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_pa
 from team.estimation.hybrid_slam.moments import mean_direction, moments, sample_factor
 from team.estimation.hybrid_slam.sensitivity import Motion, Noise, columns
 from team.estimation.models import Increment
+from team.estimation.mount import base_covariances, base_points, base_poses, base_shifts
+from team.estimation.scans import Own, together, unclaimed
 from team.estimation.submap import NO_NODES, LocalMap
 
 STILL = np.zeros(3)
@@ -37,7 +39,9 @@ class Window:
     paths:    the pose of each particle's line of descent at each of the K keyframes.
     keyframes:   the keyframe of each of the N measurements, in [0, K).
     ids:      the landmark of each measurement.
-    measurements: (range [m], bearing [rad]) with the sensor's calibration applied.
+    measurements: (range [m], bearing [rad]) with the sensor's calibration applied; own: the noises
+              that they claim (`team.estimation.scans`).
+    Poses are the sensor's, in the frame of the window's start of the sensor.
     node_stamps, node_keyframes: team time [ns] of the pose nodes, and the keyframe that each is.
     innovation: of all measurements so far that were predicted.
     motions:  up to each keyframe, and after the last one; kept where biases are asked for.
@@ -52,6 +56,7 @@ class Window:
     measurements: Float[np.ndarray, "N 2"]
     node_stamps: Int64[np.ndarray, " nodes"]
     node_keyframes: Int64[np.ndarray, " nodes"]
+    own: Own
     innovation: Innovation = NOTHING
     motions: tuple[Motion, ...] = ()
 
@@ -87,6 +92,7 @@ def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
         measurements=np.empty((0, 2)),
         node_stamps=NO_NODES,
         node_keyframes=NO_NODES,
+        own=unclaimed(0),
     )
 
 
@@ -98,16 +104,22 @@ def advanced(
     bearings: Float[np.ndarray, " n"],
     generator: np.random.Generator,
     forward: Float[np.ndarray, "3"] = STILL,
+    *,
+    own: Own | None = None,
 ) -> Window:
     """One keyframe: the motion since the last one, then its measurements (there may be
     none).
 
     The measurements are accepted and corrected already (`models.acceptable`, `models.corrected`).
-    forward: the motion's shift by an error of the scale of speed (`sensitivity.forward_column`).
+    forward: the motion's shift by an error of the scale of speed (`odometry.forward_column`).
+    own: the noises that the measurements claim (`team.estimation.scans`).
     """
+    noises = unclaimed(len(ids)) if own is None else own
     expected = NOTHING
     with suppress(NotACovarianceError):  # then it is not known how well they were predicted
-        expected = innovation(window.particles, increment, window.sensor, ids, ranges, bearings)
+        expected = innovation(
+            window.particles, increment, window.sensor, ids, ranges, bearings, noises
+        )
     particles, info = fastslam.propagated_and_updated(
         particles=window.particles,
         increment=increment,
@@ -118,6 +130,7 @@ def advanced(
         proposal=window.front_end.proposal,
         resample_below=window.front_end.resample_below,
         generator=generator,
+        own=noises,
     )
     paths = window.paths if info.parents is None else window.paths[:, info.parents]
     keyframe = np.full(len(ids), len(paths))
@@ -128,6 +141,7 @@ def advanced(
         keyframes=np.concatenate((window.keyframes, keyframe)),
         ids=np.concatenate((window.ids, ids)),
         measurements=np.concatenate((window.measurements, np.column_stack((ranges, bearings)))),
+        own=together([(len(window.ids), window.own), (len(ids), noises)]),
         innovation=window.innovation.plus(expected),
         motions=_with_motion(window, increment, forward),
     )
@@ -198,6 +212,7 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
         bounds,
         window.keyframes[by_slot],
         window.measurements[by_slot],
+        window.own[by_slot],
         noise_of(window.sensor),
     )
     return ParticleLandmarks(ids, means, covariances)
@@ -208,12 +223,19 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
 
     With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
     Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ, headings on the circle (Xu, eq. 4.5-4.6), plus
-    POSE_JITTER. The derivatives by the biases come from `sensitivity.columns`.
+    POSE_JITTER. Poses and landmarks are those of the base, in the frame of its start. The
+    derivatives by the biases come from `sensitivity.columns`.
     Raises NotACovarianceError if P is not finite or not positive definite.
     """
     ids, means, covariances = landmarks
     particles = window.particles
-    poses = np.concatenate((particles.poses, *window.paths[window.node_keyframes]), axis=1)
+    of_nodes = window.paths[window.node_keyframes]
+    if window.sensor.is_mounted:
+        mount = np.array(window.sensor.mount)
+        means, covariances = base_points(means, mount), base_covariances(covariances, mount)
+        particles = replace(particles, poses=base_poses(particles.poses, mount))
+        of_nodes = base_poses(of_nodes, mount)
+    poses = np.concatenate((particles.poses, *of_nodes), axis=1)
     weights = np.exp(particles.log_weights)
     mean, covariance = moments(poses, weights, means, covariances, sample_factor(weights))
     numbers = np.arange(poses.shape[1])
@@ -221,6 +243,20 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
     cholesky_factor(covariance, "the submap of a window")
     local = LocalMap(ids, mean, covariance, window.node_stamps)
     return _with_sensitivity(window, local) if window.front_end.biases else local
+
+
+def of_base(window: Window) -> Window:
+    """The window's particles and paths as those of the base, in the frame of the base's start."""
+    if not window.sensor.is_mounted:
+        return window
+    mount, particles = np.array(window.sensor.mount), window.particles
+    based = replace(
+        particles,
+        poses=base_poses(particles.poses, mount),
+        means=base_points(particles.means, mount),
+        covariances=base_covariances(particles.covariances, mount),
+    )
+    return replace(window, particles=based, paths=base_poses(window.paths, mount))
 
 
 def motion_alone(motion: Increment) -> LocalMap:
@@ -238,17 +274,26 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
     uncalibrated = any(motion.forward.any() for motion in window.motions)
     biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
     weights = np.exp(window.particles.log_weights)
-    path = np.array([*(_mean_pose(poses, weights) for poses in window.paths), local.end_pose])
+    mount = np.array(window.sensor.mount)
+    of_sensor = local.mean[None, :3], local.landmarks
+    if window.sensor.is_mounted:
+        away = inverse(mount)
+        of_sensor = base_poses(of_sensor[0], away), base_points(of_sensor[1], away)
+    path = np.array([*(_mean_pose(poses, weights) for poses in window.paths), of_sensor[0][0]])
     path = path[: len(window.motions)]
     slots = np.searchsorted(local.ids, window.ids)
     poses, landmarks = columns(
         biases,
         path,
         window.motions,
-        local.landmarks,
+        of_sensor[1],
         (window.keyframes, slots),
+        window.own,
         noise_of(window.sensor),
     )
+    if window.sensor.is_mounted:
+        poses = base_shifts(poses, path, mount)
+        landmarks = base_points(landmarks, np.array([0.0, 0.0, mount[2]]))
     end = poses[:, -1:] if len(path) else np.zeros((len(biases), 1, 3))
     kept = np.concatenate((end, poses[:, window.node_keyframes]), axis=1)
     rows = (kept.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))

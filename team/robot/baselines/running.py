@@ -14,11 +14,13 @@ from team.estimation.gaussian import (
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.models import Increment
+from team.estimation.odometry import Moved
 from team.estimation.randomness import generator
+from team.estimation.scans import Scan
 from team.pairs import FEEDBACK
 from team.rejection import Rejection
 from team.robot.baselines.filters import FILTERS, Step
-from team.robot.estimator import Cloud, Estimates, InitialPose, KnownMap, Scan, thinned
+from team.robot.estimator import Cloud, Estimates, InitialPose, KnownMap, thinned
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 """Added to a running pose's covariance [m², m², rad²], which may be singular: an exactly known
@@ -76,6 +78,7 @@ class RunningEstimator:
         duration_ns: int,
         forward: float,
         yaw_rate: float,
+        moved: Moved | None = None,
         *,
         measured: bool = True,
     ) -> Estimates:
@@ -84,7 +87,7 @@ class RunningEstimator:
             self._segmenter.begin(stamp_ns - duration_ns)
             self._map_ns = stamp_ns - duration_ns
         before = self.sequence
-        motion = stamp_ns, duration_ns, forward, yaw_rate
+        motion = stamp_ns, duration_ns, forward, yaw_rate, moved
         for keyframe in self._segmenter.drive(*motion, measured=measured):
             self._advance(
                 keyframe.stamp_ns,

@@ -20,6 +20,7 @@ from team.estimation.hybrid_slam import consensus
 from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.hybrid_slam.consensus import agreeing, confirmed
 from team.estimation.models import Increment, increment_of, predicted
+from team.estimation.scans import unclaimed
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(0.03), turn=MotionNoise(0.02), lateral=MotionNoise(0.01))
@@ -36,7 +37,8 @@ class Drive:
     measurements: np.ndarray
 
     def judged(self, by=confirmed, garbage: float = 0.3) -> np.ndarray:
-        return by(self.motions, self.keyframes, self.ids, self.measurements, SENSOR, garbage)
+        seen = self.ids, self.measurements, unclaimed(len(self.ids))
+        return by(self.motions, self.keyframes, *seen, SENSOR, garbage)
 
 
 def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
@@ -135,7 +137,13 @@ def test_keyframes_without_measurements_change_nothing():
 def smoothed(window: Drive, used: np.ndarray):
     """Path, landmarks and covariance at rest."""
     of = consensus._Measurements(
-        window.motions, window.keyframes, window.ids, window.measurements, SENSOR, 0.3
+        window.motions,
+        window.keyframes,
+        window.ids,
+        window.measurements,
+        unclaimed(len(window.ids)),
+        SENSOR,
+        0.3,
     )
     path = np.zeros((len(of.means), 3))
     for k in range(1, len(path)):
@@ -151,13 +159,14 @@ def test_a_measurement_is_judged_by_what_the_others_predict_of_it():
     window = drive(7)
     used = np.ones(40, dtype=bool)
     of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, used, of.sensor)
-    own = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, ~used, of.sensor)
+    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, of.own, used, of.sensor)
+    own = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, of.own, ~used, of.sensor)
     for n in (0, 9, 22, 39):
         without = used.copy()
         without[n] = False
         _, *other = smoothed(window, without)
-        left = kernel.left_out(*other, of.keyframes, of.slots, of.measurements, without, of.sensor)
+        of_all = of.keyframes, of.slots, of.measurements, of.own
+        left = kernel.left_out(*other, *of_all, without, of.sensor)
         assert logs[n] == pytest.approx(left[n], abs=0.05)
     assert np.abs(own - logs).max() > 0.1, "a measurement that judges itself is another matter"
 
@@ -167,7 +176,7 @@ def test_of_a_landmarks_only_measurement_the_others_say_nothing():
     used = window.ids != 1
     used[0] = True
     of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, used, of.sensor)
+    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, of.own, used, of.sensor)
     assert logs[0] < -3.0
     assert logs[0] < logs[1:].min() - 1.0 or logs[0] == -np.inf
 
@@ -198,7 +207,8 @@ def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
                 strict=True,
             )
             motions = [increment_of(robot.motion, 1.0, *each) for each in odometry]
-            taken = by(motions, keyframes, seen.ids[rows], measurements[rows], robot.sensor, 0.3)
+            of_window = seen.ids[rows], measurements[rows], unclaimed(len(keyframes))
+            taken = by(motions, keyframes, *of_window, robot.sensor, 0.3)
             kept.append(taken[~bad[rows]])
             passed.append(taken[bad[rows]])
     return float(np.concatenate(kept).mean()), float(np.concatenate(passed).mean())
@@ -251,7 +261,8 @@ def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly, monk
     sensor = Sensor(
         range_sigma=1e-10 if exactly else 1e-12, bearing_sigma=0.01 if exactly else 1e-3
     )
-    measurements = (window.motions, window.keyframes, window.ids, window.measurements, sensor, 0.3)
+    seen = window.ids, window.measurements, unclaimed(len(window.ids))
+    measurements = (window.motions, window.keyframes, *seen, sensor, 0.3)
     taken = confirmed(*measurements)
     assert failures[-1] != 0, "the equations have a solution here: nothing is tried"
     assert len([each for each in failures if each]) == 1, "what has failed is not gone on with"

@@ -6,6 +6,7 @@ import pytest
 from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
 from team.estimation.hybrid_slam.sensitivity import Noise
 from team.estimation.models import landmark_jacobian, predicted
+from team.estimation.scans import unclaimed
 
 PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 0.5]])
 LANDMARK = np.array([4.0, 2.5])
@@ -49,6 +50,7 @@ def test_a_constant_error_within_a_window_equals_least_squares_with_its_correlat
         np.array([0, 4]),
         np.arange(4),
         seen,
+        unclaimed(4),
         noise,
     )
     point, covariance = dense(noise, seen)
@@ -67,6 +69,7 @@ def test_repeating_a_measurement_leaves_the_constant_part_of_its_error() -> None
             np.array([0, repeats]),
             np.zeros(repeats, dtype=np.int64),
             np.tile(predicted(PATH[0], LANDMARK), (repeats, 1)),
+            unclaimed(repeats),
             Noise(0.0125, 0.0, 0.2, 5e-4, 0.5),
         )
         xx, xy, yy = covariances[0, 0]

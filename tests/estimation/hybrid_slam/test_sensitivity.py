@@ -16,11 +16,12 @@ from team.estimation import geometry
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.sensitivity import BIASES, carried_on, forward_column
+from team.estimation.hybrid_slam.sensitivity import BIASES, carried_on
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
 from team.estimation.map_joining.submap_factor import biased_normal
 from team.estimation.models import increment_of
+from team.estimation.odometry import forward_column
 from team.estimation.randomness import generator
 from team.robot.node import RobotNode
 from team.wire import channels as ch

@@ -93,7 +93,7 @@ def test_a_batch_spans_no_more_than_it_may():
 def test_every_message_is_on_its_channel_and_passes_the_door():
     node = world()
     for o in [*node.begin(), *all_of(node)]:
-        assert decoded(encoded(o.message), o.channel.message) == o.message
+        assert decoded(encoded(o.message), *o.channel.kinds) == o.message
         assert getattr(o.message, "robot", "") == o.name
 
 

@@ -1,0 +1,83 @@
+"""A sensor that is mounted at a place of its own on the robot's base.
+
+The front end follows the sensor: within a window poses and motions are the sensor's, so that a
+measurement is range and bearing from the pose, whatever its noise. Of a base that moves by T the
+sensor at m moves by m⁻¹ ∘ T ∘ m. At the window's end the poses become the base's again, particle by
+particle: with S the sensor's pose since the window's start, the base's is m ∘ S ∘ m⁻¹, and a point
+p that is seen from the sensor's start is m p from the base's.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.geometry import Pose, adjoint, compose, inverse
+from team.estimation.models import Increment
+
+
+def of_sensor(step: Increment, mount: Pose) -> Increment:
+    """The sensor's motion as the base moves: T Exp(ξ) m = m (m⁻¹ T m) Exp(Ad(m⁻¹) ξ)."""
+    away = inverse(mount)
+    Ad = adjoint(away)
+    C = Ad @ step.covariance @ Ad.T
+    return Increment(compose(compose(away, step.mean), mount), 0.5 * (C + C.T))
+
+
+def of_base(step: Increment, mount: Pose) -> Increment:
+    """The base's motion as the sensor moves: `of_sensor` the other way round."""
+    return of_sensor(step, inverse(mount))
+
+
+def base_poses(poses: Float[np.ndarray, "*n 3"], mount: Pose) -> Float[np.ndarray, "*n 3"]:
+    """Of each sensor's pose S the base's, m ∘ S ∘ m⁻¹."""
+    away = inverse(mount)
+    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    x = poses[..., 0] + c * away[0] - s * away[1]
+    y = poses[..., 1] + s * away[0] + c * away[1]
+    found: Float[np.ndarray, "*n 3"] = np.stack([*_turned(x, y, mount), poses[..., 2]], axis=-1)
+    found += np.array([mount[0], mount[1], 0.0])
+    return found
+
+
+def base_points(points: Float[np.ndarray, "*n 2"], mount: Pose) -> Float[np.ndarray, "*n 2"]:
+    """The mount m applied to points p of the sensor's start: m p."""
+    found: Float[np.ndarray, "*n 2"] = np.stack(
+        _turned(points[..., 0], points[..., 1], mount), axis=-1
+    )
+    found += mount[:2]
+    return found
+
+
+def base_covariances(
+    covariances: Float[np.ndarray, "*n 3"], mount: Pose
+) -> Float[np.ndarray, "*n 3"]:
+    """(xx, xy, yy) of points of the sensor's start, along the axes of the base's."""
+    c, s = math.cos(mount[2]), math.sin(mount[2])
+    xx, xy, yy = np.moveaxis(covariances, -1, 0)
+    return np.stack(
+        [
+            c * c * xx - 2.0 * c * s * xy + s * s * yy,
+            c * s * (xx - yy) + (c * c - s * s) * xy,
+            s * s * xx + 2.0 * c * s * xy + c * c * yy,
+        ],
+        axis=-1,
+    )
+
+
+def base_shifts(
+    shifts: Float[np.ndarray, "*b n 3"], poses: Float[np.ndarray, "n 3"], mount: Pose
+) -> Float[np.ndarray, "*b n 3"]:
+    """What shifts (dx, dy, dθ) of the sensor's poses are of the base's."""
+    away = inverse(mount)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = shifts[..., 0] - (s * away[0] + c * away[1]) * shifts[..., 2]
+    y = shifts[..., 1] + (c * away[0] - s * away[1]) * shifts[..., 2]
+    return np.stack([*_turned(x, y, mount), shifts[..., 2]], axis=-1)
+
+
+def _turned(
+    x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], mount: Pose
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    c, s = math.cos(mount[2]), math.sin(mount[2])
+    return c * x - s * y, s * x + c * y

@@ -1,0 +1,194 @@
+"""What odometry measures of one interval, and any part of it as a Gaussian on SE(2).
+
+Odometry tells mean speeds (`models.increment_of`), a car's wheel speed and steering, or a motion on
+SE(2) with a part to the left, with or without a covariance of its own.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.config import MotionModel
+from team.estimation.compiled import compiled
+from team.estimation.geometry import Pose, adjoint, exponential, logarithm
+from team.estimation.models import Increment, increment_of, motion_variances
+
+
+class Moved(NamedTuple):
+    """A measured motion Exp(twist), twist = (forward [m], left [m], turn [rad]) of the interval.
+
+    covariance: of the error in the tangent space of its end, as its source claims it.
+    """
+
+    twist: Pose
+    covariance: Float[np.ndarray, "3 3"] | None = None
+
+
+class Interval(NamedTuple):
+    """One odometry interval that ends at end_ns: mean forward speed [m/s] and yaw rate [rad/s].
+
+    moved: the motion, where odometry tells it as one; the speeds are then those of its twist.
+    """
+
+    end_ns: int
+    duration_ns: int
+    forward: float
+    yaw_rate: float
+    moved: Moved | None = None
+
+    def part(self, motion: MotionModel, duration_ns: int, rest_ns: int) -> Increment:
+        """The motion of a part of the interval, which is followed by rest_ns of it."""
+        if self.moved is None:
+            return increment_of(motion, duration_ns * 1e-9, self.forward, self.yaw_rate)
+        share, rest = duration_ns / self.duration_ns, rest_ns / self.duration_ns
+        return part_of(motion, self.moved, self.duration_ns * 1e-9, share, rest)
+
+    def gone_on(self, end_ns: int, duration_ns: int) -> "Interval":
+        """A later interval at the same speeds."""
+        if self.moved is None:
+            return self._replace(end_ns=end_ns, duration_ns=duration_ns)
+        twist = self.moved.twist * (duration_ns / self.duration_ns)
+        return self._replace(end_ns=end_ns, duration_ns=duration_ns, moved=Moved(twist))
+
+    @property
+    def speed(self) -> float:
+        """In whichever direction [m/s]."""
+        if self.moved is None:
+            return self.forward
+        return math.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
+
+    def forward_column(self, motion: MotionModel, duration_ns: int) -> Float[np.ndarray, "3"]:
+        """`forward_column` of a part of the interval."""
+        if self.moved is None:
+            return forward_column(motion, duration_ns * 1e-9, self.forward, self.yaw_rate)
+        column, speeds = np.zeros(3), motion.calibrated_speed
+        if speeds is None or speeds[0] <= self.speed <= speeds[1]:
+            return column
+        share = duration_ns / self.duration_ns
+        x, y, turn = share * calibrated(motion, self.moved.twist, self.duration_ns * 1e-9)
+        c, s = math.cos(0.5 * turn), math.sin(0.5 * turn)
+        column[0], column[1] = c * x + s * y, c * y - s * x
+        return column
+
+
+STANDING = Interval(0, 1, 0.0, 0.0)
+"""What was measured before anything was."""
+
+
+def forward_column(
+    motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
+) -> Float[np.ndarray, "3"]:
+    """d/db at 0 of the interval's motion if the logged way is (1 + b) times as long.
+
+    In the tangent space of its end; zero where |forward| lies in `calibrated_speed`, whose scale
+    is known, and without such a range.
+    """
+    column = np.zeros(3)
+    speeds = motion.calibrated_speed
+    if speeds is None or speeds[0] <= abs(forward) <= speeds[1]:
+        return column
+    way = motion.forward_scale * forward * duration_s
+    if motion.kind == "turn-then-drive":
+        column[0] = way
+        return column
+    limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
+    turn = min(max(motion.yaw_scale * yaw_rate, -limit), limit) * duration_s
+    column[0], column[1] = way * math.cos(0.5 * turn), -way * math.sin(0.5 * turn)
+    return column
+
+
+def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[float, float]:
+    """(forward [m/s], yaw rate [rad/s]) of a car, of whose wheel and steering encoders say this.
+
+    With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at
+    (0, h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). Two NaN where the
+    model is no car's, or the wheel stands in the centre of the turn.
+    """
+    if motion.kind != "ackermann" or motion.wheel_base is None:
+        return math.nan, math.nan
+    slope = math.tan(steering + motion.steering_offset)
+    share = 1.0 - slope * motion.wheel_offset / motion.wheel_base
+    if not share > 0.0:
+        return math.nan, math.nan
+    forward = wheel_speed / share
+    return forward, forward * slope / motion.wheel_base
+
+
+def moved(increment: Pose, covariance: Float[np.ndarray, "3 3"] | None) -> Moved:
+    """The motion whose end, seen in its start, is `increment` (x, y, theta), |theta| ≤ π."""
+    return Moved(logarithm(increment), covariance)
+
+
+def calibrated(motion: MotionModel, twist: Pose, duration_s: float) -> Pose:
+    """A measured twist with the model's scales, limit, drag and veer, as `increment_of` has them.
+
+    The scales of speed are of the way, whichever its direction; veer goes by its forward part.
+    """
+    limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
+    turn = motion.yaw_scale * float(twist[2])
+    turn = min(max(turn, -limit * duration_s), limit * duration_s)
+    way = math.hypot(twist[0], twist[1])
+    scale = motion.slow_scale if way < motion.slow_below * duration_s else motion.forward_scale
+    kept = max(scale * way - motion.turn_drag * abs(turn), 0.0)
+    share = kept / way if way > 0.0 else 0.0
+    forward, left = share * float(twist[0]), share * float(twist[1])
+    return np.array([forward, left, turn + motion.veer * forward])
+
+
+def part_of(
+    motion: MotionModel, whole: Moved, duration_s: float, share: float, rest: float
+) -> Increment:
+    """A share of a measured motion at constant twist, which is followed by the share `rest`.
+
+    Without a claimed covariance the noise is the model's over this way, turn and time. A claimed
+    one, C, is of all the interval: a share f of it is f Ad C Adᵀ, with Ad of the motion that
+    follows. Seen from the interval's end the error then grows evenly, so however the interval is
+    split, its parts compose to C: Σ Ad⁻¹ (f Ad C Adᵀ) Ad⁻ᵀ = C.
+    """
+    twist = calibrated(motion, whole.twist, duration_s)
+    xi = share * twist
+    if whole.covariance is None:
+        way = math.copysign(math.hypot(xi[0], xi[1]), xi[0])
+        noises = motion_variances(motion, share * duration_s, way, float(xi[2]))
+        return Increment(exponential(xi), _spread(xi, way, noises))
+    Ad = adjoint(exponential(rest * twist))
+    C = motion.covariance_factor * share * (Ad @ whole.covariance @ Ad.T)
+    return Increment(exponential(xi), 0.5 * (C + C.T))
+
+
+@compiled
+def _spread(
+    xi: Pose, way: float, noises: tuple[float, float, float, float, float]
+) -> Float[np.ndarray, "3 3"]:
+    """The covariance at its end of Exp(ξ + (a u, b)), then l across the way and a final turn c.
+
+    (ξ₀, ξ₁) = d u with the way d, which is negative backwards; u stays the direction of motion in
+    the moving frame. a and b act through Jr (u, 0) and the last column of SE(2)'s right Jacobian
+    Jr at ξ (Solà et al., A micro Lie theory, eq. 163).
+    """
+    forward_var, turn_var, both, final, lateral = noises
+    x, y, turn = xi[0], xi[1], xi[2]
+    if abs(turn) < 1e-3:
+        square = turn * turn
+        sine = 1.0 - square / 6.0
+        cosine = 0.5 - square / 24.0
+        cubic = turn * (1.0 / 6.0 - square / 120.0)
+    else:
+        sine = math.sin(turn) / turn
+        cosine = 2.0 * (math.sin(0.5 * turn) / turn) ** 2
+        cubic = (turn - math.sin(turn)) / (turn * turn)
+    ux, uy = (x / way, y / way) if way != 0.0 else (1.0, 0.0)
+    ax, ay = sine * ux + turn * cosine * uy, -turn * cosine * ux + sine * uy
+    bx, by = x * cubic - y * cosine, x * cosine + y * cubic
+    C = np.empty((3, 3))
+    C[0, 0] = forward_var * ax * ax + turn_var * bx * bx + 2.0 * both * ax * bx + lateral * uy * uy
+    C[0, 1] = forward_var * ax * ay + turn_var * bx * by + both * (ax * by + ay * bx)
+    C[0, 1] -= lateral * ux * uy
+    C[1, 1] = forward_var * ay * ay + turn_var * by * by + 2.0 * both * ay * by + lateral * ux * ux
+    C[0, 2] = turn_var * bx + both * ax
+    C[1, 2] = turn_var * by + both * ay
+    C[2, 2] = turn_var + final
+    C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
+    return C

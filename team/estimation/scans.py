@@ -1,0 +1,137 @@
+"""Scans of landmarks, each measurement with the noise that it claims itself or the sensor's.
+
+`own` holds a row for each measurement: of length 0 where none of them claims a covariance, else
+(rr [m²], rb [m·rad], bb [rad²], form). form POLAR: range and bearing have this covariance.
+form POINT: they are those of a point in the sensor's frame, whose noise is Gaussian in the plane
+with this covariance to first order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured
+bearing, from which S comes back exactly. form SENSOR: the sensor's noise, at the predicted range.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt32
+
+from team.config import Bounds, Sensor
+from team.estimation.models import NEAREST_M
+
+SENSOR, POLAR, POINT = -1.0, 0.0, 1.0
+Own = Float[np.ndarray, "_ _"]
+
+
+def unclaimed(count: int) -> Own:
+    """Of measurements none of which claims a covariance."""
+    return np.empty((count, 0))
+
+
+class Scan(NamedTuple):
+    """Landmark ids, ranges [m] and bearings [rad] of one message, relative to the sensor."""
+
+    ids: UInt32[np.ndarray, " n"]
+    ranges: Float[np.ndarray, " n"]
+    bearings: Float[np.ndarray, " n"]
+    own: Own
+
+    def only(self, taken: Bool[np.ndarray, " n"]) -> "Scan":
+        """Those measurements of it."""
+        return Scan(self.ids[taken], self.ranges[taken], self.bearings[taken], self.own[taken])
+
+
+def polar_scan(
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    covariances: Float[np.ndarray, "n 3"] | None = None,
+) -> Scan:
+    """Ranges and bearings, each with its covariance (rr, rb, bb) if they claim any."""
+    if covariances is None:
+        return Scan(ids, ranges, bearings, unclaimed(len(ids)))
+    form = np.full((len(ids), 1), POLAR)
+    return Scan(ids, ranges, bearings, np.hstack((covariances, form)))
+
+
+def point_scan(
+    ids: UInt32[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 2"],
+    covariances: Float[np.ndarray, "n 3"] | None = None,
+) -> Scan:
+    """Points (x, y) in the sensor's frame, each with its covariance (xx, xy, yy) if they claim any.
+
+    (r, b) = (‖p‖, atan2(y, x)) and J S Jᵀ with J = ∂(r, b)/∂p.
+    """
+    x, y = points[:, 0], points[:, 1]
+    ranges, bearings = np.hypot(x, y), np.arctan2(y, x)
+    if covariances is None:
+        return Scan(ids, ranges, bearings, unclaimed(len(ids)))
+    reach = np.maximum(ranges, NEAREST_M)
+    c, s = np.cos(bearings), np.sin(bearings)
+    xx, xy, yy = covariances.T
+    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
+    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / reach
+    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (reach * reach)
+    return Scan(ids, ranges, bearings, np.column_stack((rr, rb, bb, np.full(len(ids), POINT))))
+
+
+def calibrated(own: Own, sensor: Sensor) -> Own:
+    """What measurements claim, of the measurements that the calibration has corrected."""
+    if not own.size or sensor.range_scale == sensor.covariance_factor == 1.0:
+        return own
+    scale, factor = sensor.range_scale, sensor.covariance_factor
+    scaled: Own = own * np.array([factor / scale**2, factor / scale, factor, 1.0])
+    return scaled
+
+
+def together(parts: list[tuple[int, Own]]) -> Own:
+    """The rows of several scans by count and rows; where only some claim, the others' say so."""
+    if not any(own.size for _, own in parts):
+        return unclaimed(sum(count for count, _ in parts))
+    sensors = np.array([0.0, 0.0, 0.0, SENSOR])
+    return np.concatenate(
+        [np.tile(sensors, (count, 1)) if own.shape[1] == 0 else own for count, own in parts]
+    )
+
+
+def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[np.ndarray, " n"]:
+    """Which measurements claim standard deviations within the bounds, if they claim any."""
+    if not own.size:
+        return np.ones(len(own), dtype=np.bool_)
+    (least_m, most_m), (least_rad, most_rad) = bounds.sigma_m, bounds.sigma_rad
+    r, b = np.sqrt(own[:, 0]), np.sqrt(own[:, 2])
+    point = own[:, 3] == POINT
+    across = np.where(point, b * np.maximum(ranges, NEAREST_M), b)
+    low, high = np.where(point, least_m, least_rad), np.where(point, most_m, most_rad)
+    within: Bool[np.ndarray, " n"] = (
+        (r >= least_m) & (r <= most_m) & (across >= low) & (across <= high)
+    )
+    return within
+
+
+def carried(
+    own: Float[np.ndarray, " own"], distance: float, direction: float, to: Float[np.ndarray, "2"]
+) -> Own:
+    """The row of a measurement that is seen from another pose, as the point `to` there.
+
+    direction: of the measurement's ray, in that pose's frame. Its covariance in the plane, along
+    and across the ray, is turned into the point's own range and bearing.
+    """
+    if own[3] == SENSOR:
+        return own[None]
+    reach, far = max(distance, NEAREST_M), max(float(np.hypot(*to)), NEAREST_M)
+    turn = direction - float(np.arctan2(to[1], to[0]))
+    c, s = np.cos(turn), np.sin(turn)
+    rr, rb, bb = own[0], own[1] * reach, own[2] * reach * reach
+    along = c * c * rr - 2.0 * c * s * rb + s * s * bb
+    both = c * s * (rr - bb) + (c * c - s * s) * rb
+    across = s * s * rr + 2.0 * c * s * rb + c * c * bb
+    return np.array([[along, both / far, across / (far * far), own[3]]])
+
+
+def mean_claim(claims: list[Own]) -> Own:
+    """One row for the median of several looks: the mean of theirs, as of one look.
+
+    What mismeasures a landmark once does so again a moment later.
+    """
+    if not claims:
+        return unclaimed(1)
+    mean: Own = np.mean([each for each in claims if each[0, 3] == claims[0][0, 3]], axis=0)
+    return mean
