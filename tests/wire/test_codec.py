@@ -132,13 +132,13 @@ def test_a_submap_whose_counts_do_not_fit_its_unnamed_landmarks_is_refused(
     assert reason_of(msgpack.packb(fields)) == why
 
 
-def test_a_key_of_two_kinds_takes_both_and_names_both_for_a_third() -> None:
+def test_a_key_of_several_kinds_takes_them_and_names_them_for_another() -> None:
     kinds = OBSERVATIONS.kinds
-    for tag in ("observations/1", "detections/1"):
+    for tag in ("observations/1", "points/1", "detections/1"):
         payload = encoded(EXAMPLES[tag])
         assert decoded(payload, *kinds) == EXAMPLES[tag]
         assert tag_in(payload) == tag
-    with pytest.raises(WireError, match="'observations/1' or 'detections/1' belongs"):
+    with pytest.raises(WireError, match="'observations/1' or 'points/1' or 'detections/1' "):
         decoded(encoded(odometry(0)), *kinds)
     with pytest.raises(WireError, match="wrong version: 'detections/9' where detections/1 is"):
         decoded(msgpack.packb(["detections/9"]), *kinds)
