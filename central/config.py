@@ -6,6 +6,7 @@ import msgspec
 from msgspec import Meta
 
 from team.config import Bounds, FusionRule, NonNegative, Positive
+from team.estimation.map_joining.association.profile import AssociationProfile
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,6 +60,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     withdraw_above: a robot of whose submaps the half and more cost above this per degree of freedom
     is withdrawn if the rest of the team agrees without it; absent: by an operator only.
     bounds: submaps, inter-robot measurements and initial poses beyond them are refused.
+    association: when landmarks without names count as one: a profile for each kind of sensor.
     """
 
     fusion: FusionRule = "join"
@@ -75,3 +77,4 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 1000
     withdraw_above: Annotated[float, Meta(ge=2.0)] | None = 4.0
     bounds: Bounds = Bounds()
+    association: AssociationProfile = AssociationProfile()

@@ -20,6 +20,7 @@ from team import translate
 from team.estimation.contribution import named
 from team.estimation.hybrid_slam.sensitivity import BIASES
 from team.estimation.map_joining import marginals
+from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -27,11 +28,11 @@ from team.estimation.map_joining.joining import (
     InitialPoseFactor,
     JoinSettings,
     Sighting,
+    Tick,
     compacted,
     converged,
 )
 from team.estimation.map_joining.marginals import Agreement
-from team.estimation.map_joining.refusal import Tick, taken
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
 from team.wire.messages import SightingFactor, Submap
 
@@ -55,6 +56,7 @@ def join_settings(config: CentralConfig) -> JoinSettings:
             if (sigma := getattr(config.common_bias_sigma, bias)) > 0.0
         },
         joined_ranges=config.joined_ranges,
+        association=config.association,
     )
 
 

@@ -24,6 +24,7 @@ from team.estimation.gaussian import NotACovarianceError
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
+from team.estimation.map_joining.association.profile import DEFAULT_PROFILE, AssociationProfile
 from team.estimation.map_joining.submap_graph import Graph
 from team.estimation.sparse_cholesky import sparse
 
@@ -60,6 +61,7 @@ class JoinSettings:
         they add to each robot's own.
     joined_ranges: errors of ranges are proportional to the range, and it is taken from the joined
         map (`joining_kernel.with_joined_ranges`).
+    association: when landmarks without names count as one.
     """
 
     iterations_per_tick: int = 2
@@ -75,6 +77,7 @@ class JoinSettings:
     bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
     common_bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
     joined_ranges: bool = False
+    association: AssociationProfile = DEFAULT_PROFILE
 
 
 class NotDeterminedError(ValueError):

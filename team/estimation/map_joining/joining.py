@@ -17,6 +17,13 @@ import numpy as np
 
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.association.landmarks import (
+    NO_LANDMARKS,
+    Landmarks,
+    Opened,
+    Verdict,
+    founded,
+)
 from team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -47,9 +54,11 @@ __all__ = [
     "NotCanonicalError",
     "Sighting",
     "Stream",
+    "Tick",
     "compacted",
     "converged",
     "folded",
+    "merged_islands",
     "started",
 ]
 
@@ -91,6 +100,34 @@ class LateStartError(ValueError):
         self.start = start
 
 
+@dataclass(frozen=True)
+class Tick:
+    """The members that one tick brings, in canonical order.
+
+    contributions: the submaps. sightings: the inter-robot measurements from them.
+    starts: the initial poses of the streams whose first submap is among them.
+    outside: why a submap is refused before it is tried (it lies beyond what is sensible).
+    set_aside: in words, what else was refused before.
+    verdicts: an operator's, on landmarks of these submaps or of earlier ones.
+    """
+
+    contributions: Sequence[Contribution]
+    sightings: Sequence[Sighting] = ()
+    starts: Sequence[InitialPoseFactor] = ()
+    outside: Mapping[Key, str] = field(default_factory=dict)
+    set_aside: tuple[str, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """A closure that may still be undone: the fold before it, and the ticks from its own on."""
+
+    opened: Opened
+    before: "Fold"
+    ticks: tuple[Tick, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Fold:
     """What the submaps taken so far say.
@@ -106,6 +143,8 @@ class Fold:
     refused:    submaps that came and are not in the map, in canonical order, and why (`taken`).
     set_aside:  in words, what else was refused: initial poses, inter-robot measurements, and the
                 landmarks of submaps of which only the motion is in the map.
+    landmarks:  which unnamed landmarks of which submaps are one, and why (`associating`).
+    audits:     closures that may still be undone (`auditing`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -122,6 +161,8 @@ class Fold:
     looked: Mapping[Stream, int] = field(default_factory=dict)
     refused: Mapping[Key, str] = field(default_factory=dict)
     set_aside: tuple[str, ...] = ()
+    landmarks: Landmarks = NO_LANDMARKS
+    audits: tuple[Audit, ...] = ()
 
     @property
     def main_key(self) -> Stream | None:
@@ -186,6 +227,7 @@ def folded(
             home[stream] = common[0] if common and stream in fold.starts else stream
         news.setdefault(home[stream], []).append(contribution)
     waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
+    landmarks, numbers = founded(fold.landmarks, contributions)
     islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
     for key, taken in news.items():
         island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
@@ -196,6 +238,7 @@ def folded(
             fold.starts,
             settings.bias_sigma,
             settings.common_bias_sigma,
+            numbers,
         )
         age = np.concatenate([island.age, ages(len(taken))])
         island, waiting = sighted(replace(island, graph=graph, state=state, age=age), waiting)
@@ -206,6 +249,7 @@ def folded(
         islands=islands,
         home=home,
         waiting=waiting,
+        landmarks=landmarks,
     )
     return _with_merges(_looked(grown))
 
@@ -301,7 +345,9 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
         if before is None or at_last or size >= PATIENCE * before[0]:
             found = merge(main, other, fold.waiting)
             if isinstance(found, Merge):
-                return _with_merges(_merged(replace(fold, judged=judged), key, other_key, found))
+                return _with_merges(
+                    merged_islands(replace(fold, judged=judged), key, other_key, found)
+                )
             why = found.why
             if found.after_search:
                 judged[key, other_key] = (size, why)
@@ -313,7 +359,7 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
     return replace(fold, reasons=reasons, judged=judged)
 
 
-def _merged(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
+def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
     """The fold with one island less; how that came about stands under the frame that is gone."""
     islands = {at: each for at, each in fold.islands.items() if at != other_key}
     islands[key] = found.best.island

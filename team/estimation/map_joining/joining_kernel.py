@@ -369,7 +369,7 @@ def explained(
                 other = offset[nodes[b] + 1] - offset[nodes[b]]
                 if entry[pair] >= 0:
                     base = value_start[entry[pair]]
-                    times = 1.0 if a == b else 2.0
+                    times = 1.0 if nodes[a] == nodes[b] else 2.0
                     for p in range(size):
                         for q in range(other):
                             result[f] += (

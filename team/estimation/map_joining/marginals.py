@@ -128,9 +128,10 @@ def confirmed(fold: Fold, submaps: int) -> list[int]:
     island = fold.main
     if submaps <= 1:
         return sorted(island.graph.landmarks)
-    ids = np.concatenate([each.local.ids for each, *_ in island.graph.submaps])
-    found, counts = np.unique(ids[island.landmark_weight >= BELIEVED], return_counts=True)
-    return [int(id_) for id_ in found[counts >= submaps]]
+    nodes = np.concatenate([each.landmarks for each in island.graph.submaps])
+    found, counts = np.unique(nodes[island.landmark_weight >= BELIEVED], return_counts=True)
+    believed = set(found[counts >= submaps].tolist())
+    return sorted(id_ for id_, node in island.graph.landmarks.items() if node in believed)
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:

@@ -79,9 +79,9 @@ def _merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | 
     why = alignment.refusal(shared, found, main.settings.alignment_heading_sigma)
     if found is None or why is not None:
         return Waits(why or str(shared), after_search=False)
-    both, left = _placed(main, other, found.a_from_b, waiting)
+    both, left = placed(main, other, found.a_from_b, waiting)
     graph = both.graph
-    others = [_placed(main, other, place, ())[0] for place in _places(main, other, tied)]
+    others = [placed(main, other, place, ())[0] for place in _places(main, other, tied)]
     search = searched([both, *(replace(both, state=each.state) for each in others)])
     rise = search.best.cost - minimum(main).cost - minimum(other).cost
     why = alignment.disagreement(shared, rise, main.settings.alignment_confidence)
@@ -94,7 +94,7 @@ def _merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | 
     return Merge(search.best, left, _words(other, shared, search, rise))
 
 
-def _placed(
+def placed(
     main: Island,
     other: Island,
     main_from_other: Float[np.ndarray, "3"],

@@ -177,9 +177,9 @@ def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
     """The pairs of landmarks, as places in the state, that a stream sees one after the other."""
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
-    for contribution, *_ in graph.submaps:
-        seen = {graph.landmarks[id_] for id_ in contribution.local.ids.tolist()}
-        if contribution.stream != stream or not seen:
+    for submap in graph.submaps:
+        seen = set(submap.landmarks.tolist())
+        if submap.contribution.stream != stream or not seen:
             continue
         pairs |= {(min(a, b), max(a, b)) for a in before for b in seen - before if a not in seen}
         before = seen

@@ -12,7 +12,7 @@ taken is taken as unknown; an inter-robot measurement is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -20,26 +20,10 @@ import numpy as np
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
-from team.estimation.map_joining.joining import Fold, folded, started
+from team.estimation.map_joining.joining import Fold, Tick, folded, started
+from team.estimation.map_joining.map_matching import recognised
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Tick:
-    """The members that one tick brings, in canonical order.
-
-    contributions: the submaps. sightings: the inter-robot measurements from them.
-    starts: the initial poses of the streams whose first submap is among them.
-    outside: why a submap is refused before it is tried (it lies beyond what is sensible).
-    set_aside: in words, what else was refused before.
-    """
-
-    contributions: Sequence[Contribution]
-    sightings: Sequence[Sighting] = ()
-    starts: Sequence[InitialPoseFactor] = ()
-    outside: Mapping[Key, str] = field(default_factory=dict)
-    set_aside: tuple[str, ...] = ()
 
 
 def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
@@ -106,7 +90,7 @@ def _attempt(
         fold = started(fold, start)
     try:
         with np.errstate(all="ignore"):
-            after = folded(fold, members, settings, sightings)
+            after = recognised(folded(fold, members, settings, sightings), members)
     except UNSOLVABLE:
         return None
     changed = (

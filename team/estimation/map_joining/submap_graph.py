@@ -5,7 +5,7 @@ value of a node that is added is found by composition from the nodes that are th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import Bias
-from team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
+from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.inter_robot_kernel import Sightings
@@ -27,6 +27,7 @@ Values = Float[np.ndarray, " _"]
 
 
 NONE_IN_COMMON: Mapping[Bias, float] = MappingProxyType({})
+NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
 
 
 class Prior(NamedTuple):
@@ -49,6 +50,13 @@ class Joined(NamedTuple):
     contribution: Contribution
     nodes: Indices
     common: tuple[Bias, ...] = ()
+
+    @property
+    def landmarks(self) -> Indices:
+        """The node of each of the submap's landmarks, in its order."""
+        local = self.contribution.local
+        first = 2 + len(local.node_stamps)
+        return self.nodes[first : first + len(local.ids)]
 
     @property
     def biases(self) -> tuple[Bias, ...]:
@@ -256,12 +264,15 @@ def extended(
     starts: Mapping[Stream, InitialPoseFactor],
     bias_sigma: Mapping[Bias, float],
     common_bias_sigma: Mapping[Bias, float] = NONE_IN_COMMON,
+    numbers: Mapping[Key, Sequence[int]] = NO_NUMBERS,
 ) -> tuple[Graph, Values]:
     """The graph with more submaps, in the given order; a stream without a start begins at 0.
 
     A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
     first submap that sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of
     its frame. A bias is N(0, bias_sigma²), what the team has in common N(0, common_bias_sigma²).
+    numbers: of submaps with unnamed landmarks, the team's number of each of its landmarks; of all
+    others they are those in the submap.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -281,10 +292,11 @@ def extended(
         poses = [growth.add(compose(map_from_start, node), fixed=False) for node in local.nodes]
         for stamp_ns, node in zip(local.node_stamps.tolist(), poses, strict=True):
             growth.poses[stream, stamp_ns] = node
-        for id_, point in zip(local.ids.tolist(), local.landmarks, strict=True):
+        ids = numbers.get(contribution.key) or local.ids.tolist()
+        for id_, point in zip(ids, local.landmarks, strict=True):
             if id_ not in growth.landmarks:
                 growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
-        seen = [growth.landmarks[id_] for id_ in local.ids.tolist()]
+        seen = [growth.landmarks[id_] for id_ in ids]
         for bias in local.biases:
             if (stream, bias) not in growth.biases:
                 growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
@@ -393,6 +405,40 @@ def merged(
         common={**of_team, **main.common},
     )
     return graph, np.concatenate([state, *values])
+
+
+def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:
+    """The graph in which landmarks have become others, or have another number.
+
+    becomes: the new number of each landmark that gets one; those with one number are one node, the
+    first of them, at its value.
+    """
+    first: dict[int, int] = {}
+    kept = np.ones(len(graph.fixed), np.bool_)
+    stands_for = np.arange(len(graph.fixed))
+    for id_, node in sorted(graph.landmarks.items(), key=lambda each: each[1]):
+        number = becomes.get(id_, id_)
+        stands_for[node] = first.setdefault(number, node)
+        kept[node] = stands_for[node] == node
+    node_of = (np.cumsum(kept) - 1)[stands_for]
+    sizes = np.diff(graph.offset)
+    renamed = replace(
+        graph,
+        streams={s: tuple(node_of[list(nodes)].tolist()) for s, nodes in graph.streams.items()},
+        landmarks={number: int(node_of[node]) for number, node in first.items()},
+        poses={key: int(node_of[node]) for key, node in graph.poses.items()},
+        biases={key: int(node_of[node]) for key, node in graph.biases.items()},
+        common={bias: int(node_of[node]) for bias, node in graph.common.items()},
+        offset=_starts(sizes[kept].tolist()),
+        fixed=graph.fixed[kept],
+        submaps=tuple(each._replace(nodes=node_of[each.nodes]) for each in graph.submaps),
+        sightings=tuple(
+            Encounter(seen, int(node_of[observer]), int(node_of[teammate]))
+            for seen, observer, teammate in graph.sightings
+        ),
+        priors=tuple(each._replace(node=int(node_of[each.node])) for each in graph.priors),
+    )
+    return renamed, state[np.repeat(kept, sizes)]
 
 
 def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:

@@ -1,0 +1,197 @@
+"""Data association in the fold: after each tick, which landmarks of its islands are one.
+
+Every submap has founded its unnamed landmarks as nodes of their own; here nodes become one. In the
+order of a tick: tracking (the last submaps of the robot), near ones (older, where the standard
+deviation of the difference is small), sweeping (landmarks that were split), closures (elsewhere in
+the map, by map matching), and merges of islands. Each step is a function of the fold, which is one
+of the set in its canonical order; so are its decisions.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from team.config import UNNAMED
+from team.estimation.contribution import Contribution, Stream
+from team.estimation.map_joining.association.growing import Indices, Joint, Pair, conditioned, grow
+from team.estimation.map_joining.association.landmarks import (
+    Landmarks,
+    Tie,
+    united,
+)
+from team.estimation.map_joining.gauss_newton import (
+    Island,
+    iterated,
+    joint_marginal,
+)
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.submap_graph import Graph, tied
+
+
+class View:
+    """An island's landmarks as a joint Gaussian, and what is merged in it, step by step.
+
+    ids, nodes: of each landmark, by its node. seen_by: of each submap of the graph, the places of
+    its landmarks in `ids`.
+    """
+
+    def __init__(self, island: Island, landmarks: Landmarks) -> None:
+        self.island = island
+        self.profile = island.settings.association
+        graph = island.graph
+        ordered = sorted(graph.landmarks.items(), key=lambda each: each[1])
+        self.ids = [id_ for id_, _ in ordered]
+        nodes = np.array([node for _, node in ordered], np.int64)
+        self.place = np.full(len(graph.fixed), -1, np.int64)
+        self.place[nodes] = np.arange(len(nodes))
+        self.seen_by = [self.place[each.landmarks] for each in graph.submaps]
+        mean, covariance = joint_marginal(island, nodes.tolist())
+        self.place_of = {id_: at for at, id_ in enumerate(self.ids)}
+        apart = _apart(graph, self.seen_by, self.ids, landmarks, self.place_of)
+        self.joint = Joint(mean.reshape(-1, 2), covariance, apart)
+        self.gone = np.zeros(len(nodes), np.bool_)
+        self.ties: list[tuple[int, Tie]] = []
+        self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
+
+    def take(self, pairs: Iterable[Pair], joint: Joint, kind: str) -> None:
+        """Note pairs that have become one."""
+        self.joint = joint
+        for pair in pairs:
+            tie = Tie(kind, self.ids[pair.second], pair.llr, pair.rival, pair.sd, self.stamp_ns)
+            self.ties.append((self.ids[pair.first], tie))
+            self.gone[pair.first] = True
+
+    def step(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
+        """Grow from nothing with the pairs of two lists of landmarks, as far as it is sure."""
+        first, second = first[~self.gone[first]], second[~self.gone[second]]
+        if not len(first) or not len(second):
+            return
+        one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
+        different = one != two
+        self._grow(kind, one[different], two[different], most_sd)
+
+    def _grow(self, kind: str, one: Indices, two: Indices, most_sd: float) -> None:
+        found = grow(
+            self.joint, (one, two), self.profile, most_sd=most_sd, sure_sd=self.profile.near
+        )
+        if found is not None and found.pairs:
+            self.take(found.pairs, found.joint, kind)
+
+    def sweep(self) -> None:
+        """Landmarks at one place that are known well to one another and never seen together."""
+        at = np.flatnonzero(~self.gone)
+        mean = self.joint.mean[at]
+        away = np.abs(mean[:, None] - mean[None]).max(axis=2)
+        later, earlier = np.nonzero(np.tril(away < self.profile.same, -1))
+        if len(later):
+            one, two = at[later], at[earlier]
+            close = np.hypot(*(self.joint.mean[one] - self.joint.mean[two]).T) < self.profile.same
+            self._grow("sweep", one[close], two[close], self.profile.tight)
+
+    def agreed(self, landmarks: Landmarks) -> None:
+        """What an operator has said to be one."""
+        for first, second, same in landmarks.verdicts:
+            one, two = (
+                self.place_of.get(landmarks.identity(each) or -1) for each in (first, second)
+            )
+            if not same or one is None or two is None or one == two or self.gone[[one, two]].any():
+                continue
+            joint = conditioned(self.joint, one, two, self.profile)
+            self.take([Pair(one, two, np.inf, 0.0, -np.inf)], joint, "verdict")
+
+
+def _apart(
+    graph: Graph,
+    seen_by: Sequence[Indices],
+    ids: Sequence[int],
+    landmarks: Landmarks,
+    place_of: Mapping[int, int],
+) -> Bool[np.ndarray, "n n"]:
+    """Which landmarks can not be one: seen by one keyframe, of two names, or said to be two."""
+    named = np.array(ids) < UNNAMED
+    apart = named[:, None] & named[None, :]
+    for submap, places in zip(graph.submaps, seen_by, strict=True):
+        local = submap.contribution.local
+        unnamed = local.ids >= UNNAMED
+        if not unnamed.any():
+            continue
+        together = np.ones((len(places), len(places)), np.bool_)
+        masks = local.unnamed.seen.astype(np.float32)
+        together[np.ix_(unnamed, unnamed)] = masks @ masks.T > 0.0
+        one, two = np.nonzero(together)
+        apart[places[one], places[two]] = True
+    for first, second, same in landmarks.verdicts:
+        here, there = (place_of.get(landmarks.identity(each) or -1) for each in (first, second))
+        if not same and here is not None and there is not None:
+            apart[here, there] = apart[there, here] = True
+    np.fill_diagonal(apart, False)
+    return apart
+
+
+def associated(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
+    """The fold after tracking, near ones and sweeping of a tick's submaps."""
+    news: dict[Stream, list[Contribution]] = {}
+    for contribution in contributions:
+        news.setdefault(fold.home[contribution.stream], []).append(contribution)
+    for key in sorted(news):
+        fold = _followed(fold, key, news[key])
+    return fold
+
+
+def _followed(fold: Fold, key: Stream, news: Sequence[Contribution]) -> Fold:
+    """Tracking, near ones, sweeping: of the news of one island."""
+    island = fold.islands[key]
+    view = View(island, fold.landmarks)
+    order = {id(each.contribution): k for k, each in enumerate(island.graph.submaps)}
+    view.agreed(fold.landmarks)
+    for contribution in news:
+        k = order.get(id(contribution))
+        if k is None or not len(contribution.local.unnamed.counts):
+            continue
+        fresh = _unnamed(view, k)
+        before = recent(
+            island.graph, contribution.stream, contribution.sequence, view.profile.recent
+        )
+        view.step("track", fresh, union(view.seen_by[at] for at in before), np.inf)
+        others = np.setdiff1d(np.arange(len(view.ids)), view.seen_by[k])
+        view.step("near", fresh, others, view.profile.near)
+    view.sweep()
+    return applied(fold, key, view)
+
+
+def applied(fold: Fold, key: Stream, view: View) -> Fold:
+    """The fold with what a view has made one, iterated once more."""
+    if not view.ties:
+        return fold
+    landmarks, becomes = united(fold.landmarks, view.ties)
+    islands = dict(fold.islands)
+    for at, island in fold.islands.items():
+        if at != key and not any(id_ in becomes for id_ in island.graph.landmarks):
+            continue
+        graph, state = tied(island.graph, island.state, becomes)
+        islands[at] = iterated(replace(island, graph=graph, state=state))
+    return replace(fold, islands=islands, landmarks=landmarks)
+
+
+def recent(graph: Graph, stream: Stream, sequence: int, count: int) -> list[int]:
+    """The places in the graph of a stream's last submaps before one."""
+    return [
+        k
+        for k, each in enumerate(graph.submaps)
+        if each.contribution.stream == stream
+        and sequence - count <= each.contribution.sequence < sequence
+    ]
+
+
+def _unnamed(view: View, k: int) -> Int64[np.ndarray, " _"]:
+    ids = view.island.graph.submaps[k].contribution.local.ids
+    places: Int64[np.ndarray, " _"] = view.seen_by[k][ids >= UNNAMED]
+    return places
+
+
+def union(of: Iterable[Indices]) -> Int64[np.ndarray, " _"]:
+    """The places in any of these lists, ascending."""
+    places: Int64[np.ndarray, " _"] = np.unique(np.concatenate([np.zeros(0, np.int64), *of]))
+    return places

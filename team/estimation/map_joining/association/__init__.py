@@ -1,0 +1,1 @@
+"""Which local landmarks of which submaps are one landmark: pure functions on arrays."""

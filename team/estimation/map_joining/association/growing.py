@@ -1,0 +1,184 @@
+"""The one primitive of data association between submaps: pairs of a joint Gaussian become one.
+
+The pair of landmarks with the best log-likelihood ratio of "one landmark" against "two" is taken,
+mean and covariance are conditioned on it, and so on. With the difference d of a pair, its
+covariance S (joint, plus the slack s₀²) and λ landmarks to be expected per square metre
+
+    LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ.
+
+Since each is taken given those before it, their sum is the ratio of all of them together.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation.map_joining.association.profile import AssociationProfile
+
+Indices = Int64[np.ndarray, " _"]
+PREGATE = 4.0
+"""Pairs whose χ² is beyond so many gates at first are left out for good."""
+SURE_AFTER = 3
+"""An alignment of so many pairs goes on only where it leaves a small standard deviation: else it
+ties neighbours that are one spacing off."""
+
+
+class Joint(NamedTuple):
+    """Landmarks with their joint covariance, in one frame.
+
+    mean: [m]. covariance: of (x₁, y₁, x₂, …) [m²]. apart: which two can not be one, symmetric:
+    they were seen in one scan, have different names, or somebody said so.
+    """
+
+    mean: Float[np.ndarray, "n 2"]
+    covariance: Float[np.ndarray, "m m"]
+    apart: Bool[np.ndarray, "n n"]
+
+
+class Pair(NamedTuple):
+    """Two landmarks that are one: the second one stays. rival: the best LLR that excludes it."""
+
+    first: int
+    second: int
+    llr: float
+    sd: float
+    rival: float
+
+
+class Grown(NamedTuple):
+    """Pairs in the order in which they were taken, and what they leave of the joint Gaussian.
+
+    doubtful: pairs that passed their gate and likelihood, and a rival kept them from being taken.
+    """
+
+    pairs: tuple[Pair, ...]
+    joint: Joint
+    doubtful: int
+
+    @property
+    def llr(self) -> float:
+        """Of all pairs together."""
+        return sum(pair.llr for pair in self.pairs)
+
+
+class Likelihoods(NamedTuple):
+    """Of candidates: χ², log-likelihood ratio, largest standard deviation of the difference."""
+
+    chi2: Float[np.ndarray, " k"]
+    llr: Float[np.ndarray, " k"]
+    sd: Float[np.ndarray, " k"]
+
+
+def likelihoods(
+    joint: Joint, first: Indices, second: Indices, profile: AssociationProfile
+) -> Likelihoods:
+    """How likely it is of each candidate pair that it is one landmark."""
+    difference = joint.mean[first] - joint.mean[second]
+    n = len(joint.mean)
+    P = joint.covariance.reshape(n, 2, n, 2)
+    R = P[first, :, first] + P[second, :, second] - P[first, :, second] - P[second, :, first]
+    half = 0.5 * (R[:, 0, 0] + R[:, 1, 1])
+    spread = np.hypot(0.5 * (R[:, 0, 0] - R[:, 1, 1]), R[:, 0, 1])
+    slack = profile.slack**2
+    a, b, c = R[:, 0, 0] + slack, R[:, 0, 1], R[:, 1, 1] + slack
+    determinant = np.maximum(a * c - b * b, 1e-18)
+    x, y = difference.T
+    chi2 = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
+    prior = np.log(2.0 * np.pi * profile.density)
+    llr = -0.5 * chi2 - 0.5 * np.log(determinant) - prior
+    return Likelihoods(chi2, llr, np.sqrt(np.maximum(half + spread, 0.0)))
+
+
+def conditioned(joint: Joint, first: int, second: int, profile: AssociationProfile) -> Joint:
+    """The joint Gaussian given that two landmarks are one; the first keeps apart what both did."""
+    n = len(joint.mean)
+    P = joint.covariance
+    one, two = slice(2 * first, 2 * first + 2), slice(2 * second, 2 * second + 2)
+    gain = P[:, one] - P[:, two]
+    S = gain[one] - gain[two] + profile.slack**2 * np.eye(2)
+    weighted = np.linalg.solve(S, gain.T)
+    difference = joint.mean[first] - joint.mean[second]
+    mean = joint.mean - (weighted.T @ difference).reshape(n, 2)
+    apart = joint.apart.copy()
+    both = apart[first] | apart[second]
+    apart[second], apart[:, second] = both, both
+    return Joint(mean, P - gain @ weighted, apart)
+
+
+def grow(
+    joint: Joint,
+    candidates: Sequence[Indices],
+    profile: AssociationProfile,
+    *,
+    seeds: Sequence[tuple[int, int]] = (),
+    most_sd: float = np.inf,
+    sure_sd: float = np.inf,
+) -> Grown | None:
+    """Pairs taken one after the other, the likeliest first; None where a seed fails its gate.
+
+    candidates: two lists of landmarks, pair by pair; where one is merged, its other pairs are gone.
+    seeds: pairs to begin with, whatever their rivals. most_sd: pairs with a larger standard
+    deviation wait; sure_sd: the same, once SURE_AFTER pairs are taken.
+    """
+    taken: list[Pair] = []
+    for one, two in seeds:
+        if joint.apart[one, two]:
+            return None
+        at = likelihoods(joint, np.array([one]), np.array([two]), profile)
+        if at.chi2[0] > profile.gate:
+            return None
+        taken.append(Pair(one, two, float(at.llr[0]), float(at.sd[0]), -np.inf))
+        joint = conditioned(joint, one, two, profile)
+    first, second = candidates
+    gone = np.isin(first, [pair.first for pair in taken])
+    open_ = ~joint.apart[first, second] & ~gone
+    first, second = first[open_], second[open_]
+    near = likelihoods(joint, first, second, profile).chi2 < PREGATE * profile.gate
+    first, second = first[near], second[near]
+    doubtful = 0
+    while len(first):
+        at = likelihoods(joint, first, second, profile)
+        needed = np.where(at.sd < profile.tight, profile.llr_tight, profile.llr_loose)
+        limit = min(most_sd, sure_sd) if len(taken) >= SURE_AFTER else most_sd
+        fits = (at.chi2 < profile.gate) & (at.llr >= needed) & (at.sd <= limit)
+        if not fits.any():
+            doubtful = 0
+            break
+        rival = _rivals(joint, first, second, at, profile)
+        clear = fits & (at.llr - rival >= profile.odds)
+        doubtful = int((fits & ~clear).sum())
+        if not clear.any():
+            break
+        best = int(np.argmax(np.where(clear, at.llr, -np.inf)))
+        one, two = int(first[best]), int(second[best])
+        taken.append(Pair(one, two, float(at.llr[best]), float(at.sd[best]), float(rival[best])))
+        joint = conditioned(joint, one, two, profile)
+        open_ = (first != one) & (second != one) & ~joint.apart[first, second]
+        first, second = first[open_], second[open_]
+    return Grown(tuple(taken), joint, doubtful)
+
+
+def _rivals(
+    joint: Joint, first: Indices, second: Indices, at: Likelihoods, profile: AssociationProfile
+) -> Float[np.ndarray, " k"]:
+    """The best LLR of each candidate's rivals: another partner of the first, or of the second.
+
+    Another partner that may be the same object as this one (split in two, near, never seen with it)
+    is none: fragments of one landmark would block each other.
+    """
+    rival = np.full(len(first), -np.inf)
+    for mine, other in ((first, second), (second, first)):
+        order = np.argsort(mine, kind="stable")
+        starts = np.flatnonzero(np.diff(mine[order], prepend=-1))
+        for group in np.split(order, starts[1:]):
+            if len(group) < 2:
+                continue
+            partners = other[group]
+            away = np.hypot(*(joint.mean[partners, None] - joint.mean[None, partners]).T)
+            alike = (away < profile.same) & ~joint.apart[np.ix_(partners, partners)]
+            np.fill_diagonal(alike, True)
+            against = np.where(alike, -np.inf, at.llr[group][None, :])
+            rival[group] = np.maximum(rival[group], against.max(axis=1))
+    return rival

@@ -1,0 +1,205 @@
+"""Landmarks as sets of (submap, local landmark), and why each two are one.
+
+A submap founds each of its unnamed landmarks anew, with a number made of its own name; association
+makes sets one. A set is known by the number of its smallest member, so its identity lasts while
+members come; a set with a named landmark has that name. Everything here depends on the order in
+which submaps are taken alone.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+from team.config import UNNAMED
+from team.estimation.contribution import Contribution, Key, Stream, named
+
+OPEN = 2**62
+"""The last submap of a side to which all that come belong."""
+KEPT = 400
+"""So many of the newest decisions are kept."""
+
+
+class Member(NamedTuple):
+    """One local landmark of one submap."""
+
+    robot: str
+    incarnation: int
+    sequence: int
+    local: int
+
+    def __str__(self) -> str:
+        """`r1/1/12/7`: robot, incarnation, sequence of the submap, local landmark."""
+        return f"{self.robot}/{self.incarnation}/{self.sequence}/{self.local}"
+
+
+class Tie(NamedTuple):
+    """Why a set that had this number went into another: by which step and with which figures.
+
+    rival: the best log-likelihood ratio of a pair that excludes it. stamp_ns: the tick's last end.
+    """
+
+    kind: str
+    into: int
+    llr: float
+    rival: float
+    sd: float
+    stamp_ns: int
+
+
+class Decision(NamedTuple):
+    """A closure, or a merge of robots, that was accepted, undone or waits.
+
+    kind: "closure", "merge", "undone", "waits". about: in words, between whom. why: the test that
+    failed; empty where it was accepted.
+    """
+
+    stamp_ns: int
+    kind: str
+    about: str
+    pairs: int
+    llr: float
+    rival_pairs: int
+    rival_llr: float
+    share: float
+    sd: float
+    why: str
+
+
+class Verdict(NamedTuple):
+    """What an operator says of two local landmarks: that they are one landmark, or two."""
+
+    first: Member
+    second: Member
+    same: bool
+
+
+class Opened(NamedTuple):
+    """A closure that was accepted: its pairs by their smallest members, and its newer side.
+
+    newer: the streams of that side, with the first and the last submap of each that belongs to it.
+    """
+
+    decision: Decision
+    pairs: tuple[tuple[Member, Member], ...]
+    newer: tuple[tuple[Stream, int, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """The sets of unnamed landmarks.
+
+    number: of each member, given when its submap came. sets: the members of each identity,
+    ascending. ties: by the number that is gone. waits: the last failed attempt of each stream.
+    opened: the closures of the last tick. undone: those that are not accepted again.
+    """
+
+    number: Mapping[Member, int] = field(default_factory=dict)
+    sets: Mapping[int, tuple[Member, ...]] = field(default_factory=dict)
+    ties: Mapping[int, Tie] = field(default_factory=dict)
+    decisions: tuple[Decision, ...] = ()
+    waits: Mapping[tuple[Stream, Stream], Decision] = field(default_factory=dict)
+    verdicts: tuple[Verdict, ...] = ()
+    opened: tuple[Opened, ...] = ()
+    undone: tuple[Opened, ...] = ()
+
+    def identity(self, member: Member) -> int | None:
+        """The number of the landmark that a member is of; None: there is no such member."""
+        number = self.number.get(member)
+        while number is not None and number in self.ties:
+            number = self.ties[number].into
+        return number
+
+    def decided(self, *decisions: Decision) -> "Landmarks":
+        """With more decisions, of which the newest are kept."""
+        return replace(self, decisions=(*self.decisions, *decisions)[-KEPT:])
+
+    def was_undone(self, pairs: Sequence[tuple[int, int]]) -> bool:
+        """Whether a closure that was undone has a third or more of these pairs of identities."""
+        wanted = {frozenset(pair) for pair in pairs}
+        for each in self.undone:
+            old = {frozenset((self.identity(one), self.identity(two))) for one, two in each.pairs}
+            if 3 * len(wanted & old) >= len(wanted):
+                return True
+        return False
+
+
+NO_LANDMARKS = Landmarks()
+
+
+def members_of(contribution: Contribution) -> list[Member | None]:
+    """The member that each landmark of a submap is; None for one with a name."""
+    of = contribution
+    return [
+        Member(of.robot, of.incarnation, of.sequence, id_ - UNNAMED) if id_ >= UNNAMED else None
+        for id_ in of.local.ids.tolist()
+    ]
+
+
+def founded(
+    landmarks: Landmarks, contributions: Iterable[Contribution]
+) -> tuple[Landmarks, dict[Key, list[int]]]:
+    """Each unnamed landmark of the submaps as a set of its own, and the numbers, per submap."""
+    numbers: dict[Key, list[int]] = {}
+    number, sets = None, None
+    for contribution in contributions:
+        ids = contribution.local.ids
+        if not len(ids) or ids[-1] < UNNAMED:
+            continue
+        if number is None or sets is None:
+            number, sets = dict(landmarks.number), dict(landmarks.sets)
+            used = set(number.values())
+        given = []
+        for id_, member in zip(ids.tolist(), members_of(contribution), strict=True):
+            if member is None:
+                given.append(id_)
+                continue
+            own = number_of(member)
+            while own in used:
+                own = UNNAMED | (own + 1) % UNNAMED
+            used.add(own)
+            number[member] = own
+            sets[own] = (member,)
+            given.append(own)
+        numbers[contribution.key] = given
+    if number is None or sets is None:
+        return landmarks, numbers
+    return replace(landmarks, number=number, sets=sets), numbers
+
+
+def number_of(member: Member) -> int:
+    """2³¹ | 31 bits of the BLAKE2b digest of a member's name."""
+    digest = hashlib.blake2b(str(member).encode(), digest_size=4).digest()
+    return UNNAMED | int.from_bytes(digest, "little") & (UNNAMED - 1)
+
+
+def united(
+    landmarks: Landmarks, ties: Sequence[tuple[int, Tie]]
+) -> tuple[Landmarks, dict[int, int]]:
+    """The sets after some have gone into others, and the new number of each that has got one.
+
+    ties: of each identity into `tie.into`. Of each union the name stays, if it has one, else the
+    number of the smallest member: where that is the one that goes, the tie is told the other way.
+    """
+    sets, told = dict(landmarks.sets), dict(landmarks.ties)
+    becomes: dict[int, int] = {}
+
+    def now(number: int) -> int:
+        while number in becomes:
+            number = becomes[number]
+        return number
+
+    for number, tie in ties:
+        one, two = now(number), now(tie.into)
+        if one == two:
+            continue
+        stays, goes = sorted((one, two), key=lambda each: (each >= UNNAMED, sets.get(each, ())))
+        sets[stays] = tuple(sorted((*sets.get(stays, ()), *sets.pop(goes, ()))))
+        becomes[goes] = stays
+        told[goes] = tie._replace(into=stays)
+    return replace(landmarks, sets=sets, ties=told), {each: now(each) for each in becomes}
+
+
+def between(one: Stream, two: Stream) -> str:
+    """Of whom a decision is, in words."""
+    return named(one) if one == two else f"{named(one)} and {named(two)}"

@@ -1,0 +1,54 @@
+"""The thresholds of data association between submaps: one profile for each kind of sensor."""
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from team.config import NonNegative, Positive, Share
+
+Few = Annotated[int, Meta(ge=1, le=1000)]
+
+
+class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When landmarks without names count as one; lengths in metres.
+
+    gate: χ² (2 numbers) beyond which two are not one. slack: what two submaps' places of one
+    landmark differ by beside their covariance. density: λ, landmarks to be expected per square
+    metre. llr_tight, llr_loose: the log-likelihood ratio that a pair needs where the standard
+    deviation of its difference is below `tight`, and elsewhere. odds: how much more it needs than
+    its best rival. near: up to this standard deviation old landmarks are candidates without a
+    closure. same: two landmarks nearer than this may be one that was split.
+    recent: so many last submaps of a robot are followed by tracking, and are the patch for which a
+    closure is searched. closure_pairs, closure_llr, margin, ratio: what a closure needs: pairs, the
+    sum of their log-likelihood ratios, how much more of it and how many times the pairs of the best
+    other alignment. island_pairs, island_llr: the same between robots with unknown initial poses.
+    context: landmarks outside the matched place, as a part of the pairs, without which it is not
+    known whether the place is unlike any other. share: of the landmarks of either side near the
+    matched places (of the side that has fewer), how many are matched. A closure whose share falls
+    below undone_below within `audited` ticks is undone.
+    """
+
+    gate: Positive = 13.8
+    slack: NonNegative = 0.03
+    density: Positive = 0.5
+    llr_tight: float = 1.0
+    llr_loose: float = 8.0
+    odds: NonNegative = 4.0
+    tight: Positive = 0.15
+    near: Positive = 0.35
+    same: Positive = 0.5
+    recent: Few = 6
+    closure_pairs: Few = 10
+    closure_llr: float = 25.0
+    margin: NonNegative = 10.0
+    ratio: Annotated[float, Meta(ge=1.0)] = 1.5
+    island_pairs: Few = 8
+    island_llr: float = 20.0
+    context: NonNegative = 1.0
+    share: Share = 0.7
+    undone_below: Share = 0.5
+    audited: Annotated[int, Meta(ge=0, le=1000)] = 12
+
+
+DEFAULT_PROFILE = AssociationProfile()

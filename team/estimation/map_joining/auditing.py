@@ -1,0 +1,87 @@
+"""A fold that takes back a closure which what comes later speaks against.
+
+For some ticks after a closure, or a merge of robots, the share of the landmarks near its places
+that both sides have is asked again. Where it falls below the profile's bound the fold goes back to
+before the closure and takes the same ticks again without it: what is left is what there would be
+had it never been accepted. The fold before a closure and the ticks since are part of the fold, so
+this too depends on the set alone.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from team.estimation.map_joining import refusal
+from team.estimation.map_joining.association.closing import overlap_share
+from team.estimation.map_joining.association.landmarks import OPEN, Opened
+from team.estimation.map_joining.gauss_newton import Island, JoinSettings
+from team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
+
+
+def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
+    """The fold with the tick; closures that it speaks against are undone."""
+    if tick.verdicts:
+        verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
+        fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))
+    after = refusal.taken(fold, tick, settings)
+    if not after.landmarks.opened and not fold.audits:
+        return after
+    length = settings.association.audited
+    open_ = [
+        replace(audit, ticks=(*audit.ticks, tick))
+        for audit in fold.audits
+        if len(audit.ticks) < length
+    ]
+    before = compacted(fold)
+    open_ += [Audit(opened, before, (tick,)) for opened in after.landmarks.opened]
+    for audit in open_:
+        share = share_now(after, audit.opened)
+        if share is not None and share < settings.association.undone_below:
+            return _without(audit, after, share, settings)
+    return replace(after, audits=tuple(open_))
+
+
+def _without(audit: Audit, after: Fold, share: float, settings: JoinSettings) -> Fold:
+    """The ticks since a closure, taken again without it."""
+    opened = audit.opened
+    words = f"share {share:.2f} < {settings.association.undone_below:g} after {len(audit.ticks)}"
+    stamp_ns = max((each.end_ns for each in after.contributions[-1:]), default=0)
+    undone = opened.decision._replace(
+        stamp_ns=stamp_ns, kind="undone", share=share, why=f"{words} ticks"
+    )
+    landmarks = audit.before.landmarks.decided(opened.decision, undone)
+    landmarks = replace(landmarks, undone=(*landmarks.undone, opened))
+    again = replace(audit.before, landmarks=landmarks)
+    for tick in audit.ticks:
+        again = taken(again, replace(tick, verdicts=()), settings)
+    return again
+
+
+def share_now(fold: Fold, opened: Opened) -> float | None:
+    """The share of what lies near a closure's places that both sides have; None: there is none."""
+    places = {fold.landmarks.identity(one) for one, _ in opened.pairs}
+    if not places:
+        return None
+    island = fold.islands[fold.home[opened.newer[0][0]]]
+    graph, margin = island.graph, island.settings.association.recent
+    newer = {stream: (first, last) for stream, first, last in opened.newer}
+    sides = np.zeros((2, len(graph.fixed)), np.bool_)
+    for submap in graph.submaps:
+        of = submap.contribution
+        first, last = newer.get(of.stream, (OPEN, -OPEN))
+        if first <= of.sequence <= last:
+            sides[0, submap.landmarks] = True
+        elif not first - margin <= of.sequence <= last + margin:
+            sides[1, submap.landmarks] = True
+    known = [graph.landmarks[id_] for id_ in sorted(graph.landmarks)]
+    both = [node for node in known if sides[:, node].all()]
+    at = _points(island, both)
+    if not len(at):
+        return None
+    one, two = (_points(island, [node for node in known if side[node]]) for side in sides)
+    return overlap_share(one, two, at, island.settings.association)
+
+
+def _points(island: Island, nodes: list[int]) -> np.ndarray:
+    at = island.graph.offset[nodes]
+    return np.column_stack([island.state[at], island.state[at + 1]])

@@ -1,0 +1,299 @@
+"""Closures and merges by map matching: where the last submaps of a robot lie in what is known.
+
+A patch, the landmarks of a stream's last submaps, is compared with all else of its island, and with
+every other island, in which its place is unknown. An alignment that passes all tests makes the
+landmarks one (and the islands); one that does not waits, and its record says which test failed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.contribution import Contribution, Stream
+from team.estimation.geometry import compose, inverse
+from team.estimation.map_joining.associating import View, applied, associated, union
+from team.estimation.map_joining.association.closing import (
+    Closure,
+    Side,
+    Tests,
+    closure,
+    free_joint,
+)
+from team.estimation.map_joining.association.growing import (
+    Indices,
+    Joint,
+    Pair,
+    likelihoods,
+)
+from team.estimation.map_joining.association.landmarks import (
+    OPEN,
+    Decision,
+    Landmarks,
+    Member,
+    Opened,
+    Tie,
+    between,
+    united,
+)
+from team.estimation.map_joining.association.profile import AssociationProfile
+from team.estimation.map_joining.association.voting import Points
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE, is_solvable, settled
+from team.estimation.map_joining.joining import Fold, merged_islands
+from team.estimation.map_joining.merging import Merge, placed
+from team.estimation.map_joining.minima import minimum
+from team.estimation.map_joining.submap_graph import tied
+
+
+def recognised(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
+    """The fold after the association of a tick's submaps; itself where none has unnamed ones."""
+    if not fold.landmarks.sets:
+        return fold
+    fold = replace(fold, landmarks=replace(fold.landmarks, opened=()))
+    return matched(associated(fold, contributions), contributions)
+
+
+def matched(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
+    """The fold after the closures and the merges that a tick's submaps make possible."""
+    last: dict[Stream, int] = {}
+    for each in contributions:
+        if len(each.local.unnamed.counts):
+            last[each.stream] = each.sequence
+    for stream in sorted(last):
+        fold = _closed(fold, stream, last[stream])
+    for stream in sorted(last):
+        for key in sorted(fold.islands):
+            if key in fold.islands and key != fold.home[stream]:
+                fold = _joined(fold, stream, last[stream], key)
+    return fold
+
+
+def _patch(view: View, stream: Stream, last: int) -> Indices:
+    """The places of the landmarks of a stream's submaps up to `last`."""
+    first = last - view.profile.recent
+    return union(
+        places
+        for places, submap in zip(view.seen_by, view.island.graph.submaps, strict=True)
+        if submap.contribution.stream == stream and first < submap.contribution.sequence <= last
+    )
+
+
+def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
+    """A closure of a stream's last submaps inside its island, if there is one."""
+    key = fold.home[stream]
+    view = View(fold.islands[key], fold.landmarks)
+    profile = view.profile
+    patch = _patch(view, stream, last)
+    target = _reachable(view, patch)
+    if min(len(patch), len(target)) < profile.closure_pairs:
+        return fold
+    sides = _side(view, patch), _side(view, target)
+    found = closure(
+        *sides,
+        lambda _: (view.joint, sides[1]),
+        profile,
+        Tests(profile.closure_pairs, profile.closure_llr),
+    )
+    if found is None:
+        return fold
+    pairs = [(view.ids[pair.first], view.ids[pair.second]) for pair in found.pairs]
+    found = _not_undone(found, fold.landmarks, pairs)
+    decision = _decision(view, found, "waits" if found.why else "closure", between(stream, stream))
+    if found.why:
+        return _waiting(fold, (stream, stream), decision)
+    newest = fold.next_sequence(stream) - 1
+    newer = ((stream, last - profile.recent + 1, OPEN if last == newest else last),)
+    fold = _opened(fold, Opened(decision, _by_members(fold.landmarks, pairs), newer))
+    return _made(fold, key, view, found, decision)
+
+
+def _not_undone(found: Closure, landmarks: Landmarks, pairs: Sequence[tuple[int, int]]) -> Closure:
+    """A closure that was undone before is not accepted again."""
+    if found.why or not landmarks.was_undone(pairs):
+        return found
+    return found._replace(why="it was undone before")
+
+
+def _waiting(fold: Fold, of: tuple[Stream, Stream], decision: Decision) -> Fold:
+    waits = {**fold.landmarks.waits, of: decision}
+    return replace(fold, landmarks=replace(fold.landmarks, waits=waits))
+
+
+def _opened(fold: Fold, opened: Opened) -> Fold:
+    """The fold with a closure that is to be audited; nothing of its own waits any more."""
+    waits = {
+        of: each for of, each in fold.landmarks.waits.items() if each.about != opened.decision.about
+    }
+    landmarks = replace(fold.landmarks, waits=waits, opened=(*fold.landmarks.opened, opened))
+    return replace(fold, landmarks=landmarks)
+
+
+def _by_members(
+    landmarks: Landmarks, pairs: Sequence[tuple[int, int]]
+) -> tuple[tuple[Member, Member], ...]:
+    """Pairs of identities by their smallest members; without those of which one has a name only."""
+    sets = landmarks.sets
+    return tuple(
+        (sets[one][0], sets[two][0]) for one, two in pairs if sets.get(one) and sets.get(two)
+    )
+
+
+def _reachable(view: View, patch: Indices) -> Indices:
+    """What else a patch may lie at, by the joint covariance; nothing where all is known well.
+
+    What no landmark of the patch may be is no rival either: `grow` would refuse its seeds.
+    """
+    others = np.setdiff1d(np.arange(len(view.ids)), patch)
+    one, two = (each.ravel() for each in np.meshgrid(patch, others, indexing="ij"))
+    at = likelihoods(view.joint, one, two, view.profile)
+    fits = at.chi2 < view.profile.gate
+    if not (fits & (at.sd > view.profile.near)).any():
+        return others[:0]
+    return np.unique(two[fits])
+
+
+def _made(fold: Fold, key: Stream, view: View, found: Closure, decision: Decision) -> Fold:
+    """The fold with a closure, solved anew, and what is now near to one another made one."""
+    view.take(found.pairs, view.joint, decision.kind)
+    fold = applied(fold, key, view)
+    fold = replace(fold, landmarks=fold.landmarks.decided(decision))
+    return _tidied(_solved(fold, key), key)
+
+
+def _solved(fold: Fold, key: Stream) -> Fold:
+    island, iterations, change = settled(fold.islands[key])
+    islands = {**fold.islands, key: island}
+    return replace(fold, islands=islands, iterations=iterations, change=change)
+
+
+def _tidied(fold: Fold, key: Stream) -> Fold:
+    """What a closure has brought near is made one: all against all."""
+    view = View(fold.islands[key], fold.landmarks)
+    everything = np.arange(len(view.ids))
+    view.step("near", everything, everything, view.profile.near)
+    view.sweep()
+    return applied(fold, key, view)
+
+
+def _side(view: View, at: Indices) -> Side:
+    P = view.joint.covariance.reshape(len(view.ids), 2, len(view.ids), 2)
+    own = P[at, :, at]
+    sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))
+    points = Points(view.joint.mean[at], np.minimum(sd, view.profile.tight))
+    return Side(at, points, at, np.arange(len(at)))
+
+
+def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
+    return Decision(
+        view.stamp_ns,
+        kind,
+        about,
+        len(found.pairs),
+        found.llr,
+        found.rival_pairs,
+        found.rival_llr,
+        found.share,
+        found.sd,
+        found.why,
+    )
+
+
+def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream) -> Fold:
+    """The stream's island and another one as one, if the stream's last submaps are found there."""
+    key = fold.home[stream]
+    mine, theirs = (View(fold.islands[at], fold.landmarks) for at in (key, other_key))
+    profile = mine.profile
+    patch = _patch(mine, stream, last)
+    if min(len(patch), len(theirs.ids)) < profile.island_pairs:
+        return fold
+    n = len(patch)
+    own = Joint(
+        mine.joint.mean[patch],
+        mine.joint.covariance.reshape(len(mine.ids), 2, -1, 2)[patch][:, :, patch].reshape(
+            2 * n, 2 * n
+        ),
+        mine.joint.apart[np.ix_(patch, patch)],
+    )
+    of_patch, of_target = _side(mine, patch), _side(theirs, np.arange(len(theirs.ids)))
+    elsewhere = np.setdiff1d(np.arange(len(mine.ids)), patch)
+    found = closure(
+        of_patch._replace(at=np.arange(n)),
+        of_target,
+        lambda vote: free_joint(own, theirs.joint, of_target, vote, profile),
+        profile,
+        Tests(profile.island_pairs, profile.island_llr, profile.context),
+        [_side(mine, elsewhere).points],
+    )
+    if found is None:
+        return fold
+    about = between(min(mine.island.graph.streams), min(theirs.island.graph.streams))
+    pairs = [
+        pair._replace(first=int(patch[pair.first]), second=pair.second) for pair in found.pairs
+    ]
+    named = [(mine.ids[pair.first], theirs.ids[pair.second]) for pair in pairs]
+    found = _not_undone(found, fold.landmarks, named)
+    decision = _decision(mine, found, "waits" if found.why else "merge", about)
+    if found.why:
+        return _waiting(fold, (stream, other_key), decision)
+    newer = tuple((each, 0, OPEN) for each in sorted(mine.island.graph.streams))
+    fold = _opened(fold, Opened(decision, _by_members(fold.landmarks, named), newer))
+    centroid = own.mean.mean(axis=0)
+    their_from_mine = compose(found.motion, np.array([*-centroid, 0.0]))
+    return _merged(fold, (key, mine), (other_key, theirs), pairs, their_from_mine, decision)
+
+
+def _merged(
+    fold: Fold,
+    one: tuple[Stream, View],
+    two: tuple[Stream, View],
+    pairs: Sequence[Pair],
+    two_from_one: Float[np.ndarray, "3"],
+    decision: Decision,
+) -> Fold:
+    """Two islands as one; the one with the team's frame stays, else that of the smallest stream."""
+    (key, mine), (other_key, theirs) = one, two
+    landmarks, becomes = united(
+        fold.landmarks,
+        [
+            (
+                mine.ids[pair.first],
+                Tie("merge", theirs.ids[pair.second], pair.llr, pair.rival, pair.sd, mine.stamp_ns),
+            )
+            for pair in pairs
+        ],
+    )
+    renamed = {}
+    for at, view in (one, two):
+        graph, state = tied(view.island.graph, view.island.state, becomes)
+        renamed[at] = replace(view.island, graph=graph, state=state)
+    stays, goes = sorted(
+        (key, other_key), key=lambda at: (at != fold.main_key, min(renamed[at].graph.streams))
+    )
+    place = two_from_one if stays == other_key else inverse(two_from_one)
+    both, waiting = placed(renamed[stays], renamed[goes], place, fold.waiting)
+    try:
+        best = minimum(both)
+    except UNSOLVABLE:
+        return fold
+    if not is_solvable(best.island):
+        return fold
+    gone = min(renamed[goes].graph.streams)
+    words = (
+        f"{gone[0]} (incarnation {gone[1]}) joined by its map: {decision.pairs} landmarks, "
+        f"log-likelihood ratio {decision.llr:.0f} against {decision.rival_llr:.0f}, share "
+        f"{decision.share:.2f}"
+    )
+    fold = replace(fold, landmarks=landmarks.decided(decision))
+    streams = sorted(renamed[goes].graph.streams)
+    fold = merged_islands(fold, stays, goes, Merge(best, waiting, words))
+    fold = _tidied(fold, stays)
+    for stream in streams:
+        for last in range(fold.next_sequence(stream) - 1, -1, -max(1, _step(fold, stays))):
+            fold = _closed(fold, stream, last)
+    return fold
+
+
+def _step(fold: Fold, key: Stream) -> int:
+    profile: AssociationProfile = fold.islands[key].settings.association
+    return profile.recent // 2

@@ -1,0 +1,144 @@
+"""The fold of submaps whose landmarks have no names."""
+
+import numpy as np
+import pytest
+
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.association.landmarks import Landmarks, Member, Verdict
+from team.estimation.map_joining.association.profile import AssociationProfile
+from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    Contribution,
+    Fold,
+    JoinSettings,
+    Tick,
+)
+from tests.estimation.map_joining.association.unnamed_worlds import (
+    circle,
+    drive,
+    duplicates,
+    wrong,
+)
+
+SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
+LOOP = circle((0.0, 0.0), 20.0, 24, 1.25)
+
+
+def _world(seed: int) -> np.ndarray:
+    """Landmarks along a ring, none nearer to another than a metre."""
+    rng, kept = np.random.default_rng(seed), []
+    while len(kept) < 90:
+        angle, r = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(16.0, 24.0)
+        point = np.array([r * np.cos(angle), r * np.sin(angle)])
+        if all(np.hypot(*(point - other)) > 1.0 for other in kept):
+            kept.append(point)
+    return np.array(kept)
+
+
+def _folded(
+    submaps: list[Contribution], settings: JoinSettings = SETTINGS, fold: Fold = EMPTY_FOLD
+) -> Fold:
+    for submap in sorted(submaps, key=lambda each: each.key):
+        fold = taken(fold, Tick([submap]), settings)
+    return fold
+
+
+@pytest.fixture(scope="module")
+def loop() -> tuple[list[Contribution], dict[Member, int], Fold]:
+    submaps, truth = drive("r1", LOOP, _world(5), np.random.default_rng(5))
+    return submaps, truth, _folded(submaps)
+
+
+def test_a_loop_without_names_is_the_map_with_names(
+    loop: tuple[list[Contribution], dict[Member, int], Fold],
+) -> None:
+    _, truth, fold = loop
+    assert wrong(fold.landmarks, truth) == duplicates(fold.landmarks, truth) == 0
+    order = np.random.default_rng(5)
+    named, _ = drive("r1", LOOP, _world(5), order, named=True)
+    by_name = _folded(named)
+    found, known = marginals.landmark_map(fold), marginals.landmark_map(by_name)
+    truth_of = {number: truth[members[0]] for number, members in fold.landmarks.sets.items()}
+    at = [known.ids.tolist().index(truth_of[int(id_)]) for id_ in found.ids]
+    sd = np.sqrt(np.diag(found.covariance))
+    assert sd == pytest.approx(
+        np.sqrt(np.diag(known.covariance)).reshape(-1, 2)[at].ravel(), rel=0.2
+    )
+    agreement = marginals.joint_cost(fold)
+    assert 0.7 < agreement.chi2 / agreement.dof < 1.3
+
+
+def test_the_fold_is_the_same_bits_again_and_submaps_with_names_cost_it_nothing(
+    loop: tuple[list[Contribution], dict[Member, int], Fold],
+) -> None:
+    submaps, _, fold = loop
+    again = _folded(submaps)
+    assert again.main.state.tobytes() == fold.main.state.tobytes()
+    assert again.landmarks.sets == fold.landmarks.sets
+    named, _ = drive("r1", LOOP, _world(5), np.random.default_rng(5), named=True)
+    assert _folded(named[:5]).landmarks == Landmarks() or not _folded(named[:5]).landmarks.sets
+
+
+def test_robots_with_unknown_initial_poses_become_one_map_by_what_they_see() -> None:
+    world, rng = _world(5), np.random.default_rng(8)
+    one, first = drive("r1", circle((0.0, 0.0), 20.0, 12, 0.6), world, rng)
+    two, second = drive("r2", circle((0.0, 0.0), 20.0, 12, 0.6, phase=2.0), world, rng)
+    fold = _folded([*one, *two])
+    truth = first | second
+    assert len(fold.islands) == 1
+    assert [each.kind for each in fold.landmarks.decisions][:1] == ["merge"]
+    assert wrong(fold.landmarks, truth) == 0
+    assert duplicates(fold.landmarks, truth) <= 1
+    assert "joined by its map" in fold.joined["r2", 1]
+
+
+def test_in_a_grid_of_equal_rooms_robots_with_unknown_initial_poses_wait() -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        room = rng.uniform(0.5, 7.5, (9, 2))
+        world = np.concatenate([room + 8.0 * np.array([i, j]) for i in range(4) for j in range(4)])
+        submaps = []
+        for robot, row in (("r1", 1), ("r2", 2)):
+            path = np.column_stack(
+                [np.arange(4.0, 29.0, 3.0), np.full(9, 8.0 * row + 4.0), np.zeros(9)]
+            )
+            submaps += drive(robot, path, world, rng)[0]
+        fold = _folded(submaps)
+        assert len(fold.islands) == 2
+        assert all(each.why for each in fold.landmarks.waits.values())
+
+
+def test_a_wrong_closure_is_undone_and_leaves_the_map_as_it_would_be_without_it() -> None:
+    rng = np.random.default_rng(4)
+    room = rng.uniform(-6.0, 6.0, (14, 2))
+    elsewhere = rng.uniform(-6.0, 6.0, (40, 2)) * np.array([3.0, 1.0]) + np.array([24.0, 0.0])
+    world = np.concatenate([room, elsewhere])
+    other = np.concatenate([room, rng.uniform(-6.0, 6.0, (40, 2)) * 1.0 + np.array([12.0, 0.0])])
+    path = np.column_stack([np.arange(0.0, 27.0, 3.0), np.zeros(9), np.zeros(9)])
+    submaps = drive("r1", path, world, rng)[0] + drive("r2", path, other, rng)[0]
+    careful = _folded(submaps, JoinSettings(association=AssociationProfile(recent=4)))
+    hasty = AssociationProfile(recent=4, context=0.0, undone_below=0.6)
+    fold = _folded(submaps, JoinSettings(association=hasty))
+    kinds = [each.kind for each in fold.landmarks.decisions]
+    assert kinds[:2] == ["merge", "undone"]
+    assert len(careful.islands) == len(fold.islands) == 2
+    assert fold.main.state.tobytes() == careful.main.state.tobytes()
+    assert fold.landmarks.sets == careful.landmarks.sets
+
+
+def test_an_operator_says_that_two_are_one_or_two(
+    loop: tuple[list[Contribution], dict[Member, int], Fold],
+) -> None:
+    submaps, _, fold = loop
+    members = next(m for m in fold.landmarks.sets.values() if len(m) > 1)
+    apart = Verdict(members[0], members[1], same=False)
+    until = members[1].sequence
+    before = _folded(submaps[:until])
+    told = taken(before, Tick([submaps[until]], verdicts=(apart,)), SETTINGS)
+    assert told.landmarks.identity(members[0]) != told.landmarks.identity(members[1])
+    single = [m[0] for m in told.landmarks.sets.values() if len(m) == 1 and m[0].sequence == until]
+    other = next(m[0] for m in told.landmarks.sets.values() if m[0].sequence == 0)
+    same = Verdict(single[0], other, same=True)
+    joined = taken(before, Tick([submaps[until]], verdicts=(same,)), SETTINGS)
+    assert joined.landmarks.identity(single[0]) == joined.landmarks.identity(other)
