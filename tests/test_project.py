@@ -47,6 +47,7 @@ WORDED = {
 """What distributions without an SPDX expression say, in SPDX."""
 
 REVIEWED = {
+    "apsw": "any-OSI, any licence that the OSI approves: we take MIT; rosbags reads .db3 by it",
     "eclipse-zenoh": "EPL-2.0 OR Apache-2.0, its NOTICE says; we take Apache-2.0",
     "docutils": "public domain, BSD-2-Clause; GPL only an Emacs mode that we do not use; docs only",
     "certifi": "MPL-2.0, unchanged; only for check-jsonschema, never shipped",
@@ -167,8 +168,9 @@ def test_everything_that_runs_with_us_has_a_permissive_licence() -> None:
     assert unclear == {}
 
 
-def test_only_zenoh_s_licence_needed_reading_among_what_users_install() -> None:
-    assert set(REVIEWED) & set(closure("teamslam[limit,parquet,studies]")) == {"eclipse-zenoh"}
+def test_two_licences_needed_reading_among_what_users_install() -> None:
+    installed = set(closure("teamslam[limit,parquet,studies]"))
+    assert set(REVIEWED) & installed == {"apsw", "eclipse-zenoh"}
     assert set(REVIEWED) <= set(closure("teamslam[dev]"))
 
 

@@ -8,12 +8,14 @@ from central.config import CentralConfig
 from sim.calibration.calibrate import Calibration, nested
 from sim.calibration.figures import Figure
 from sim.scenarios.scenario import Scenario, builtin_names
+from sim.world.config import FolderWorld
 from team.config import MotionModel, Sensor
 
 
 def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
-    """A document with `base`, the scenario's name if it is built in, else "utias"."""
-    base = scenario.name if scenario.name in builtin_names() else "utias"
+    """A document with `base`: the scenario's name if it is built in, else that of its data set."""
+    otherwise = "recorded" if isinstance(scenario.world, FolderWorld) else "utias"
+    base = scenario.name if scenario.name in builtin_names() else otherwise
     how = "ground truth" if calibration.by_truth else "the team's own joined map"
     lines = [
         f"# Learnt from {', '.join(sources)} by `teamslam calibrate`, against {how}.",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sim.cli.importing import imported_into, is_foreign
 from sim.cli.options import (
     ANY_PORT,
     FAILED,
@@ -98,6 +99,9 @@ def launch(
 
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
+    if dataset is not None and is_foreign(dataset):
+        output = output or _new_folder(dataset.stem or "bag")
+        dataset = imported_into(dataset, output / "dataset")
     name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
     resolved = with_options(
         scenario_of(name),
@@ -113,7 +117,7 @@ def launch(
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)
-    folder = output or _new_folder(resolved)
+    folder = output or _new_folder(f"{resolved.name}-{resolved.seed}")
     log = record or folder / "log.mcap"
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
@@ -192,9 +196,9 @@ def _check_writable(path: Path) -> None:
         fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
 
 
-def _new_folder(scenario: Scenario) -> Path:
+def _new_folder(name: str) -> Path:
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
-    base = Path("runs") / f"{scenario.name}-{scenario.seed}-{stamp}"
+    base = Path("runs") / f"{name}-{stamp}"
     folder, number = base, 1
     while folder.exists():
         number += 1

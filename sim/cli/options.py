@@ -58,7 +58,7 @@ FusionOption = Annotated[str | None, typer.Option(help=_either(FusionRule), meta
 Dataset = Annotated[
     Path | None,
     typer.Option(
-        help="A data set: a folder of CSV tables, or a UTIAS set (folder, or zip).", metavar="SET"
+        help="A data set: a folder of CSV tables, a ROS 2 bag, or a UTIAS set.", metavar="SET"
     ),
 ]
 SpeedText = Annotated[

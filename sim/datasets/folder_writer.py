@@ -20,32 +20,32 @@ def write_folder(streams: WorldStreams, directory: Path | str) -> None:
     if streams.landmarks is not None:
         positions = streams.landmarks.tolist()
         rows = zip(streams.landmark_ids.tolist(), positions, strict=True)
-        _write(place / "landmarks.csv", ("landmark", *POINTS), ((i, *p) for i, p in rows))
+        write_table(place / "landmarks.csv", ("landmark", *POINTS), ((i, *p) for i, p in rows))
 
 
 def _write_robot(place: Path, stream: RobotStream) -> None:
     place.mkdir(exist_ok=True)
     odometry = _odometry_rows(stream)
     if odometry:
-        _write(place / "odometry.csv", ("t_s", *SPEEDS), odometry)
+        write_table(place / "odometry.csv", ("t_s", *SPEEDS), odometry)
     ids = stream.landmark_detections.ids.tolist()
     observed = _measured_rows(stream.landmark_detections, ids)
-    _write(place / "observations.csv", ("t_s", "landmark", *POLAR), observed)
+    write_table(place / "observations.csv", ("t_s", "landmark", *POLAR), observed)
     if len(stream.teammate_detections.ids):
         names = [stream.teammates[i] for i in stream.teammate_detections.ids]
         sighted = _measured_rows(stream.teammate_detections, names)
-        _write(place / "sightings.csv", ("t_s", "teammate", *POLAR), sighted)
+        write_table(place / "sightings.csv", ("t_s", "teammate", *POLAR), sighted)
     if stream.start is not None:
         covariance = stream.start.covariance
         columns, row = [*POSES], stream.start.pose.tolist()
         if covariance is not None:
             columns += POSE_COVARIANCE
             row += covariance[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]].tolist()
-        _write(place / "start.csv", columns, [row])
+        write_table(place / "start.csv", columns, [row])
     if stream.truth is not None and stream.truth_ns is not None:
         poses = zip(stream.truth_ns.tolist(), stream.truth.tolist(), strict=True)
         truth = ((seconds(stamp_ns), *pose) for stamp_ns, pose in poses)
-        _write(place / "truth.csv", ("t_s", *POSES), truth)
+        write_table(place / "truth.csv", ("t_s", *POSES), truth)
 
 
 def _odometry_rows(stream: RobotStream) -> list[Row]:
@@ -80,6 +80,7 @@ def seconds(stamp_ns: int) -> str:
     return f"{sign}{whole}.{part:09d}".rstrip("0").removesuffix(".")
 
 
-def _write(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
+    """One table."""
     lines = [",".join(columns), *(",".join(map(str, row)) for row in rows)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

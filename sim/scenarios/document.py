@@ -25,6 +25,8 @@ from team.config import RobotConfig
 
 MAX_ROBOTS = 100
 UTIAS_ROBOTS = 5
+ANY_ROBOT = "any_robot"
+"""Whose models are those of each robot of a data set that is not known yet."""
 
 Fields = dict[str, Any]
 
@@ -98,7 +100,7 @@ def _unnamed(world: Fields, count: object) -> list[Fields]:
         return [{}] * checked_count(count)
     if world.get("kind") == "folder":
         path = world.get("path")
-        named = robots_of(path) if isinstance(path, str) and path else ("r1",)
+        named = robots_of(path) if isinstance(path, str) and path else (ANY_ROBOT,)
         return [{"id": name} for name in named]
     return [{}] * (UTIAS_ROBOTS if world.get("kind") == "utias" else 0)
 

@@ -8,7 +8,7 @@ import tomli_w
 from central.config import CentralConfig
 from sim.scenarios.checks import SAID_ONCE
 from sim.scenarios.scenario import Scenario
-from sim.world.config import UtiasWorld
+from sim.world.config import UtiasWorld, starts_unknown
 from team.config import RobotConfig
 
 
@@ -23,6 +23,22 @@ def data_set_scenario(scenario: Scenario) -> str:
         for i, robot in enumerate(scenario.robots, 1)
     ]
     world = {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ())
+    central = _chosen(scenario.central, CentralConfig, SAID_ONCE)
+    document = head | {"world": world} | ({"central": central} if central else {})
+    return tomli_w.dumps(document | {"robots": robots})
+
+
+def folder_scenario(scenario: Scenario) -> str:
+    """The same robots and centre for the folder of CSV tables where this text lies."""
+    head = {name: getattr(scenario, name) for name in ("name", *SAID_ONCE, "exchange")}
+    robots = [
+        {"id": robot.id} | _chosen(robot, RobotConfig, ("id", *SAID_ONCE))
+        for robot in scenario.robots
+    ]
+    world: dict[str, Any] = {"kind": "folder", "path": "."}
+    unknown = [robot.id for robot in scenario.robots if starts_unknown(scenario.world, robot.id)]
+    if unknown:
+        world["unknown_starts"] = unknown
     central = _chosen(scenario.central, CentralConfig, SAID_ONCE)
     document = head | {"world": world} | ({"central": central} if central else {})
     return tomli_w.dumps(document | {"robots": robots})

@@ -1,0 +1,120 @@
+"""The command `teamslam import`."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim.cli.options import WRONG_USE, counted, fail
+
+app = typer.Typer()
+
+
+@app.command(name="import")
+def import_(
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            help="CSV files of one robot, ROS 2 bags (.mcap, .db3, folders), a team's log, or a "
+            "UTIAS set."
+        ),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the data set.")
+    ] = None,
+    robot: Annotated[str | None, typer.Option(help="The robot's name, if it is one.")] = None,
+    start: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where it started, and how well that is known (m, rad); repeatable.",
+            metavar="[ROBOT:]x,y,theta[,sigma,sigma]",
+        ),
+    ] = None,
+    columns: Annotated[
+        Path | None, typer.Option(help="TOML file: which columns are what.", metavar="FILE")
+    ] = None,
+    ros2: Annotated[
+        Path | None, typer.Option(help="TOML file: which topics are what.", metavar="FILE")
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="The robot's true path: CSV, or TUM's format.", metavar="FILE"),
+    ] = None,
+) -> None:
+    """Turn logs into a data set that launch, calibrate, rerun and batch-reference take."""
+    import re
+
+    from sim.datasets.folder import ROBOT_NAME
+    from sim.importing.source import Request, imported, proposal
+
+    if output is None:
+        fail(proposal(source[0]) + "give the folder for the data set: -o FOLDER", WRONG_USE)
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        fail(f"{output} is not empty: give a new folder", WRONG_USE)
+    if robot is not None and not re.fullmatch(ROBOT_NAME, robot):
+        fail(f"--robot {robot}: a small letter, then small letters, digits and _", WRONG_USE)
+    began = time.monotonic()
+    request = Request(
+        sources=source,
+        robot=robot,
+        starts=dict(map(_start, start or [])),
+        columns=columns,
+        ros2=ros2,
+        truth=truth,
+    )
+    report = imported(request, output)
+    elapsed_s = time.monotonic() - began
+    for note in [*report.said, *_as_read(output)]:
+        typer.echo(note)
+    if report.messages:
+        rate = report.messages / elapsed_s
+        typer.echo(f"{counted(report.messages, 'message')}, {rate:,.0f} a second")
+    typer.echo(f"wrote {output}: `teamslam launch --dataset {output}` runs the team on it")
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a data set is to be imported before a team can run on it: a ROS 2 bag or a log."""
+    return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+def imported_into(path: Path, folder: Path) -> Path:
+    """The folder with what was imported from a bag or a log; what became of it is said."""
+    from sim.importing.source import Request, imported
+
+    if folder.exists() and any(folder.iterdir()):
+        fail(f"{folder} is not empty: give another --output", WRONG_USE)
+    for note in imported(Request(sources=[path]), folder).said:
+        typer.echo(note, err=True)
+    typer.echo(f"imported {path} into {folder}", err=True)
+    return folder
+
+
+def _start(text: str) -> tuple[str, tuple[float, ...]]:
+    robot, colon, numbers = text.rpartition(":")
+    try:
+        pose = tuple(float(part) for part in numbers.split(","))
+    except ValueError:
+        pose = ()
+    if len(pose) not in (3, 5) or (colon and not robot):
+        fail(f"--start {text}: give x,y,theta in m and rad, as 0,0,1.57 or r1:0,0,1.57", WRONG_USE)
+    return robot, pose
+
+
+def _as_read(folder: Path) -> list[str]:
+    """What there is of each robot, and what its tables say that can not be used."""
+    from sim.scenarios.scenario import load, with_options
+    from sim.scenarios.source import scenario_beside, streams_of
+
+    streams = streams_of(with_options(load(scenario_beside(folder)), dataset=folder))
+    lines = list(streams.notes)
+    for stream in streams.streams:
+        seen, met = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)
+        driven = counted(len(stream.intervals.end_ns), "odometry interval")
+        told = "known" if stream.start is not None else "not known"
+        lines.append(
+            f"{stream.robot}: {driven}, {counted(seen, 'measurement')}, {counted(met, 'sighting')}"
+            f", initial pose {told}"
+        )
+        lines += [f"{stream.robot}: {note}" for note in stream.notes]
+    return lines

@@ -1,0 +1,1 @@
+"""Other people's logs → data sets in folders of CSV tables."""

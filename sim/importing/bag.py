@@ -1,0 +1,254 @@
+"""ROS 2 bags → tables: which topics are what, and what of them is used."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sim.datasets.tables import DatasetError
+from sim.importing.tables import RobotTables
+from team.ros2.bags import Bag, Topic, opened_bag
+from team.ros2.decoding import READERS, DamagedError, Record, TransformsRecord, decode
+from team.ros2.frames import Frames
+from team.ros2.topics import RobotTopics, Topics
+from team.ros2.translator import TAG, Translator
+
+ODOMETRY = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
+POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+STATIC = "tf_static"
+TRUTH_WORDS = ("truth", "gt", "mocap", "vicon", "vrpn", "optitrack")
+LOOKED_AT = 2000
+"""Messages of /tf that are looked at for tags."""
+
+
+class UndecidedError(DatasetError):
+    """A bag whose topics do not say by themselves what they are; the text says what to type."""
+
+
+@dataclass
+class Imported:
+    """A bag's robots; said: in words, what was taken and what was left out, and why."""
+
+    robots: list[RobotTables]
+    said: list[str] = field(default_factory=list)
+    messages: int = 0
+
+
+def imported_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
+    """The tables of a bag; raises BagError, UndecidedError.
+
+    topics: which are what; None: as they propose themselves, if there is one way only. robot: the
+    name of its only robot.
+    """
+    with opened_bag(path) as bag:
+        chosen = topics or decided(bag, path, robot)
+        _check_present(chosen, bag, path)
+        return _translated(bag, chosen)
+
+
+def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
+    present = {topic.name for topic in bag.topics}
+    for name, robot in topics.robots.items():
+        for topic in (robot.odometry, *robot.detections, robot.truth):
+            if topic and topic not in present:
+                raise UndecidedError(
+                    f"{path}: no topic {topic}, which {name} is to have; there are:\n"
+                    + listing(bag.topics)
+                )
+
+
+def _translated(bag: Bag, topics: Topics) -> Imported:
+    frames = _static_frames(bag)
+    translators = {name: Translator(each, frames) for name, each in topics.robots.items()}
+    tables = {name: RobotTables(name) for name in topics.robots}
+    wanted: dict[str, list[str]] = {}
+    for name, robot in topics.robots.items():
+        for topic in {robot.odometry, *robot.detections, robot.truth} - {""}:
+            wanted.setdefault(topic, []).append(name)
+    damaged: Counter[str] = Counter()
+    first: dict[str, str] = {}
+    unstamped: Counter[str] = Counter()
+    seen: Counter[str] = Counter()
+    for raw in bag.messages(list(wanted)):
+        seen[raw.topic] += 1
+        try:
+            record = decode(raw.kind, raw.data, bag.store)
+        except (DamagedError, KeyError) as error:
+            damaged[raw.topic] += 1
+            first.setdefault(raw.topic, f"message {seen[raw.topic]}: {error}")
+            continue
+        if getattr(record, "stamp_ns", 1) == 0:
+            record = _stamped(record, raw.arrival_ns)
+            unstamped[raw.topic] += 1
+        for name in wanted[raw.topic]:
+            for measured in translators[name].take(raw.topic, record):
+                tables[name].take(measured)
+    said = [
+        f"{topic}: {count} of {seen[topic]} messages dropped: damaged (first: {first[topic]})"
+        for topic, count in sorted(damaged.items())
+    ]
+    said += [
+        f"{topic}: {count} messages without a stamp: their time of arrival is taken"
+        for topic, count in sorted(unstamped.items())
+    ]
+    for name, translator in translators.items():
+        said += [f"{name}: {note}" for note in translator.said]
+        said += [f"{name}: {count} dropped: {why}" for why, count in translator.dropped.items()]
+        said += _mounted(translator, tables[name])
+    return Imported(list(tables.values()), said, sum(seen.values()))
+
+
+def _stamped(record: Record, arrival_ns: int) -> Record:
+    return record if isinstance(record, TransformsRecord) else record._replace(stamp_ns=arrival_ns)
+
+
+def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
+    """The one place of the robot's sensor; that of most frames, if there are several."""
+    poses = list(dict.fromkeys(mount.pose for mount in translator.mounts.values()))
+    if not poses:
+        return []
+    tables.mount = poses[0]
+    if len(poses) == 1:
+        return []
+    return [f"{tables.robot}: sensors at {len(poses)} places; all are taken to be at {poses[0]}"]
+
+
+def _static_frames(bag: Bag) -> Frames:
+    frames = Frames()
+    static = [topic.name for topic in bag.topics if topic.name.rpartition("/")[2] == STATIC]
+    for raw in bag.messages(static):
+        try:
+            record = decode(raw.kind, raw.data, bag.store)
+        except (DamagedError, KeyError):
+            continue
+        if isinstance(record, TransformsRecord):
+            for transform in record.transforms:
+                frames.take(transform)
+    return frames
+
+
+def proposed_topics(path: Path) -> str:
+    """A bag's topics, and a file that says which are what; raises BagError."""
+    with opened_bag(path) as bag:
+        robots, doubts = _proposed(bag, None)
+        return _question(path, bag, robots, doubts)
+
+
+def decided(bag: Bag, path: Path, robot: str | None) -> Topics:
+    """The topics of each robot, if they say so themselves; raises UndecidedError."""
+    robots, doubts = _proposed(bag, robot)
+    if doubts:
+        raise UndecidedError(_question(path, bag, robots, doubts))
+    return Topics(robots=robots)
+
+
+def _question(path: Path, bag: Bag, robots: dict[str, RobotTopics], doubts: list[str]) -> str:
+    return (
+        f"{path}: which topics are what?\n{listing(bag.topics)}\n"
+        + "".join(f"{doubt}\n" for doubt in doubts)
+        + "Write it into a file, as topics.toml, beginning with this:\n\n"
+        + as_toml(robots)
+        + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml\n"
+    )
+
+
+def _proposed(bag: Bag, robot: str | None) -> tuple[dict[str, RobotTopics], list[str]]:
+    """The topics of each robot as their names and types have it, and what is not clear."""
+    found = bag.topics
+    tagged = _tags_in(bag)
+    robots: dict[str, RobotTopics] = {}
+    doubts: list[str] = []
+    spaces = sorted({_namespace(topic.name) for topic in found if topic.kind in ODOMETRY})
+    for space in spaces:
+        odometry, detections, truth = _candidates(found, tagged, space, alone=len(spaces) == 1)
+        name = _robot_name(space, robot if len(spaces) == 1 else None)
+        if len(odometry) != 1:
+            doubts.append(f"{name}: {len(odometry)} topics may be its odometry")
+        if not detections:
+            doubts.append(f"{name}: no topic with detections of landmarks")
+        if len(truth) > 1:
+            doubts.append(f"{name}: {len(truth)} topics may be its truth")
+        robots[name] = RobotTopics(
+            odometry=odometry[0] if odometry else "/odom",
+            detections=tuple(detections),
+            truth=truth[0] if truth else "",
+        )
+    if not spaces:
+        doubts.append("no topic with odometry")
+        robots[robot or "r1"] = RobotTopics(odometry="/odom", detections=("/detections",))
+    return robots, doubts
+
+
+def _candidates(
+    topics: list[Topic], tagged: set[str], space: str, *, alone: bool
+) -> tuple[list[str], list[str], list[str]]:
+    """Odometry, detections and truth of one namespace."""
+    here = [topic for topic in topics if alone or _namespace(topic.name) == space]
+    true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
+    odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
+    other = (*ODOMETRY, *POSES, TRANSFORMS, "geometry_msgs/msg/TransformStamped")
+    detections = [t.name for t in here if t.kind in READERS and t.kind not in other]
+    detections += [t.name for t in here if t.name in tagged]
+    return odometry, detections, true
+
+
+def _is_truth(topic: Topic) -> bool:
+    words = topic.name.lower().replace("/", "_").split("_")
+    return any(word in words for word in TRUTH_WORDS)
+
+
+def _namespace(topic: str) -> str:
+    """The first part of /r1/odom; empty for /odom and /odometry/filtered."""
+    parts = topic.strip("/").split("/")
+    return parts[0] if len(parts) > 1 and not parts[0].startswith("odom") else ""
+
+
+def _robot_name(space: str, robot: str | None) -> str:
+    cleaned = "".join(c if c.isalnum() else "_" for c in space.lower())[:32]
+    usable = cleaned and cleaned[0].isalpha() and cleaned.isascii()
+    return robot or (cleaned if usable else "r1")
+
+
+def _tags_in(bag: Bag) -> set[str]:
+    """The topics of transforms in which there are tags."""
+    found = set()
+    for topic in bag.topics:
+        if topic.kind != TRANSFORMS or topic.name.rpartition("/")[2] == STATIC:
+            continue
+        for number, raw in enumerate(bag.messages([topic.name])):
+            if number == LOOKED_AT:
+                break
+            try:
+                record = decode(raw.kind, raw.data, bag.store)
+            except DamagedError:
+                continue
+            assert isinstance(record, TransformsRecord)
+            if any(TAG.match(transform.child) for transform in record.transforms):
+                found.add(topic.name)
+                break
+    return found
+
+
+def listing(topics: list[Topic]) -> str:
+    """A bag's topics, one a line; what can not be used says so."""
+    lines = []
+    for topic in topics:
+        used = "" if topic.kind in READERS else "   (not read here)"
+        lines.append(f"  {topic.name}   {topic.kind}   {topic.messages} messages{used}")
+    return "\n".join(lines)
+
+
+def as_toml(robots: dict[str, RobotTopics]) -> str:
+    """A file of topics."""
+    lines = []
+    for name, topics in robots.items():
+        detections = ", ".join(f'"{topic}"' for topic in topics.detections)
+        lines += [
+            f"[robots.{name}]",
+            f'odometry = "{topics.odometry}"',
+            'use = "pose"           # or "twist": speeds that hold until the next message',
+            f"detections = [{detections}]",
+        ]
+        lines += [f'truth = "{topics.truth}"'] if topics.truth else []
+        lines += ['base_frame = "base_link"', ""]
+    return "\n".join(lines)

@@ -1,0 +1,158 @@
+"""Maps of columns: which of a user's columns are ours, and proposals for it."""
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from pathlib import Path
+
+import msgspec
+
+from sim.datasets.csv_table import CsvTable
+from sim.datasets.folder import REQUIRED, TABLES
+from sim.datasets.tables import DatasetError
+
+
+class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One column: scale · (the number in it) + offset. Without both its text is taken as it is."""
+
+    column: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One table: the files that lie side by side in it (the names' ends), and its columns.
+
+    drop: rows with one of these texts in a (user's) column are no measurements.
+    """
+
+    files: tuple[str, ...]
+    columns: dict[str, str | Column]
+    drop: dict[str, tuple[str, ...]] = {}
+
+
+Map = dict[str, Table]
+
+SYNONYMS: Mapping[str, Sequence[str]] = {
+    "t_s": ("t", "time", "times", "timestamp", "stamp", "sec", "secs", "seconds"),
+    "forward_m_s": ("v", "vx", "speed", "velocity", "forward", "linear", "linear_x"),
+    "yaw_rate_rad_s": ("w", "omega", "wz", "yaw_rate", "yawrate", "angular", "angular_z", "gyro_z"),
+    "x_m": ("x", "pos_x", "px", "easting"),
+    "y_m": ("y", "pos_y", "py", "northing"),
+    "theta_rad": ("theta", "yaw", "heading", "phi", "orientation"),
+    "dx_m": ("dx", "delta_x"),
+    "dy_m": ("dy", "delta_y"),
+    "dtheta_rad": ("dtheta", "dyaw", "delta_theta", "delta_yaw"),
+    "wheel_speed_m_s": ("rear_wheel_speed", "wheel_speed"),
+    "steering_rad": ("steering", "steering_angle", "steer"),
+    "landmark": ("id", "tag", "tag_id", "marker", "marker_id", "barcode", "landmark_id", "subject"),
+    "teammate": ("robot", "robot_id", "other"),
+    "range_m": ("range", "r", "distance", "dist", "rho"),
+    "bearing_rad": ("bearing", "beta", "angle", "azimuth"),
+}
+UNITS = {
+    "s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9",
+    "m": "1", "mm": "1e-3", "cm": "1e-2", "rad": "1", "deg": "0.017453292519943295",
+    "m_s": "1", "rad_s": "1", "deg_s": "0.017453292519943295", "mps": "1", "rps": "1",
+}  # fmt: skip
+"""A unit at a name's end, and what one of it is in ours."""
+KINDS = ("odometry", "observations", "sightings", "truth", "landmarks", "start")
+
+
+def load_map(path: Path) -> Map:
+    """A map in TOML; raises DatasetError."""
+    try:
+        found = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Map)
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: can not be read: {error}") from None
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise DatasetError(
+            f"{path}: no map of columns: {error}; docs/your_data.md has one"
+        ) from None
+    for kind, table in found.items():
+        if kind not in TABLES:
+            raise DatasetError(f"{path}: no table {kind}; known: {', '.join(KINDS)}")
+        for ours in table.columns:
+            if ours not in TABLES[kind]:
+                known = ", ".join(TABLES[kind])
+                raise DatasetError(f"{path}: {kind} has no column {ours}; known: {known}")
+    return found
+
+
+def mapped(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, list[str]]:
+    """Our columns as text; raises DatasetError."""
+    found = {}
+    for ours, theirs in columns.items():
+        told = Column(theirs) if isinstance(theirs, str) else theirs
+        if told.column not in table.columns:
+            raise table.fault(f"no column {told.column!r}, which the map has for {ours}")
+        cells = table.columns[told.column]
+        if told.scale == 1.0 and told.offset == 0.0:
+            found[ours] = cells
+        elif ours == "t_s":
+            table.stamps(told.column)
+            scale, offset = Decimal(repr(told.scale)), Decimal(repr(told.offset))
+            found[ours] = [f"{Decimal(cell) * scale + offset:f}" for cell in cells]
+        else:
+            numbers = table.numbers(told.column)[:, 0] * told.scale + told.offset
+            found[ours] = [repr(number) for number in numbers.tolist()]
+    return found
+
+
+def proposed(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
+    """A map in TOML for these files as far as their columns' names tell; and what it lacks."""
+    lines: list[str] = []
+    lacking: list[str] = []
+    for name, table in files.items():
+        kind, columns = _kind(name, list(table.columns))
+        if kind is None:
+            lacking.append(f"{name}: no table of ours: it has {', '.join(table.columns)}")
+            continue
+        lines += [f"[{kind}]", f'files = ["{name}"]', f"[{kind}.columns]"]
+        lines += [f"{ours} = {text}" for ours, text in columns.items()] + [""]
+        lacking += [f"{name}: nothing for {ours}" for ours in REQUIRED[kind] if ours not in columns]
+    return "\n".join(lines), lacking
+
+
+def _kind(name: str, header: Sequence[str]) -> tuple[str | None, dict[str, str]]:
+    """The table that most columns are of; a file's name decides between equals."""
+    best: tuple[int, int, str, dict[str, str]] | None = None
+    for kind in KINDS:
+        columns = {}
+        for ours in TABLES[kind]:
+            found = _near(ours, header)
+            if found is not None:
+                columns[ours] = found
+        if kind == "odometry" and "forward_m_s" in columns:
+            columns = {
+                key: columns[key] for key in columns if key not in ("x_m", "y_m", "theta_rad")
+            }
+        if "range_m" in columns:
+            columns = {key: columns[key] for key in columns if key not in ("x_m", "y_m")}
+        complete = all(ours in columns for ours in REQUIRED[kind]) and len(columns) > 2
+        named = kind[:5] in name.lower()
+        score = (2 * complete + 2 * named, len(columns), kind, columns)
+        if complete and (best is None or score[:2] > best[:2]):
+            best = score
+    return (None, {}) if best is None else (best[2], best[3])
+
+
+def _near(ours: str, header: Sequence[str]) -> str | None:
+    """The text for our column: one of these, if its name is near."""
+    for theirs in header:
+        bare, scale = _without_unit(theirs)
+        if theirs == ours or bare in SYNONYMS.get(ours, ()) or bare == _without_unit(ours)[0]:
+            if scale == "1" or theirs == ours:
+                return f'"{theirs}"'
+            return f'{{ column = "{theirs}", scale = {scale} }}'
+    return None
+
+
+def _without_unit(name: str) -> tuple[str, str]:
+    """A column's name in small letters without its unit, and what the unit is in ours."""
+    plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    for unit in sorted(UNITS, key=len, reverse=True):
+        if plain.endswith(f"_{unit}"):
+            return plain.removesuffix(f"_{unit}"), UNITS[unit]
+    return plain, "1"

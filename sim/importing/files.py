@@ -1,0 +1,126 @@
+"""CSV files with columns of their own names, and trajectories, → tables."""
+
+from collections.abc import Sequence
+from math import atan2
+from pathlib import Path
+
+from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.folder import REQUIRED, TABLES
+from sim.datasets.folder_tables import POSES
+from sim.datasets.tables import DatasetError
+from sim.importing.columns import Map, Table, mapped, proposed
+from sim.importing.tables import RobotTables
+
+QUATERNION = 8
+"""Columns of a trajectory in TUM's format: t x y z qx qy qz qw."""
+
+
+def imported_files(
+    paths: Sequence[Path], columns: Map | None, robot: str
+) -> tuple[RobotTables, list[str]]:
+    """One robot's tables from CSV files; what was taken and left out, in words.
+
+    Raises DatasetError; without a map it proposes one, unless every name is ours.
+    """
+    files = {path.name: read_table(path, str(path)) for path in paths}
+    if len(files) < len(paths):
+        raise DatasetError("two files have the same name: import them for one robot each")
+    chosen = _by_names(files) if columns is None else columns
+    tables = RobotTables(robot)
+    said: list[str] = []
+    used: set[str] = set()
+    for kind, table in chosen.items():
+        said += _take(kind, table, files, tables, used)
+    said += [f"{name}: not used: the map does not name it" for name in files if name not in used]
+    return tables, said
+
+
+def _by_names(files: dict[str, CsvTable]) -> Map:
+    """The map of files whose columns are ours; raises DatasetError with a proposal."""
+    found: Map = {}
+    for name, table in files.items():
+        kind = Path(name).stem
+        ours = kind in TABLES and set(table.columns) <= set(TABLES[kind])
+        if not ours or not all(table.has(each) for each in REQUIRED[kind]):
+            text, lacking = proposed(files)
+            raise DatasetError(
+                f"{name}: its columns are {', '.join(table.columns)}. Which are what? "
+                "Write it into a file, as columns.toml, beginning with this:\n\n"
+                + text
+                + "".join(f"# {line}\n" for line in lacking)
+                + "\nand type: teamslam import "
+                + " ".join(each.name for each in files.values())
+                + " -o FOLDER --columns columns.toml"
+            )
+        found[kind] = Table((name,), {column: column for column in table.columns})
+    return found
+
+
+def _take(
+    kind: str, table: Table, files: dict[str, CsvTable], tables: RobotTables, used: set[str]
+) -> list[str]:
+    side_by_side: list[CsvTable] = []
+    for wanted in table.files:
+        named = [name for name in files if name.endswith(wanted)]
+        if len(named) != 1:
+            raise DatasetError(
+                f"{kind}: {len(named)} files end in {wanted!r}; there are {', '.join(files)}"
+            )
+        used.add(named[0])
+        side_by_side.append(files[named[0]])
+    whole = _joined(side_by_side)
+    said: list[str] = []
+    for column, texts in table.drop.items():
+        if column not in whole.columns:
+            raise whole.fault(f"no column {column!r}, which `drop` names")
+        kept = [cell not in texts for cell in whole.columns[column]]
+        first = kept.index(False) if False in kept else None
+        if first is not None:
+            count = kept.count(False)
+            said.append(
+                f"{count} rows dropped: {column} is {' or '.join(texts)} "
+                f"({whole.name}, first at line {whole.lines[first]})"
+            )
+            whole = whole.rows(kept)
+    found = mapped(whole, table.columns)
+    tables.columns[kind] = list(found)
+    tables.rows[kind] = [*zip(*found.values(), strict=True)]
+    return said
+
+
+def _joined(tables: Sequence[CsvTable]) -> CsvTable:
+    """Tables side by side, row by row."""
+    first = tables[0]
+    columns = dict(first.columns)
+    for other in tables[1:]:
+        if len(other) != len(first):
+            raise other.fault(f"{len(other)} rows, and {first.name} beside it has {len(first)}")
+        columns = other.columns | columns
+    return CsvTable(first.name, columns, first.lines)
+
+
+def trajectory(path: Path) -> list[tuple[str, object, object, object]]:
+    """(t, x, y, θ) of a CSV file with t_s,x_m,y_m,theta_rad or of TUM's format; DatasetError."""
+    lines = path.read_text("utf-8", errors="replace").splitlines()
+    rows = [line for line in lines if line.strip() and not line.startswith("#")]
+    if not rows:
+        raise DatasetError(f"{path}: no pose in it")
+    if len(rows[0].split()) != QUATERNION:
+        table = read_table(path, str(path), ("t_s", *POSES))
+        if not table.has("t_s", *POSES):
+            raise table.fault("expected the columns t_s,x_m,y_m,theta_rad, or TUM's format")
+        return list(zip(*(table.columns[name] for name in ("t_s", *POSES)), strict=True))
+    found: list[tuple[str, object, object, object]] = []
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            x, y, _, qx, qy, qz, qw = (float(word) for word in words[1:])
+        except ValueError:
+            raise DatasetError(
+                f"{path}, line {number}: expected t x y z qx qy qz qw: `{line.strip()[:60]}`"
+            ) from None
+        theta = atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+        found.append((words[0], x, y, theta))
+    return found

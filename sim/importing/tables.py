@@ -1,0 +1,62 @@
+"""One robot's tables on their way into a data set's folder."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sim.datasets.folder_tables import POINTS, POSE_COVARIANCE, POSES, SPEEDS
+from sim.datasets.folder_writer import Row, seconds, write_table
+from team.ros2.translator import Measured, Pose, Seen, Speeds
+
+
+@dataclass
+class RobotTables:
+    """Rows by table; a table with columns of its own choice is in `columns`.
+
+    mount: the pose (x, y, yaw) of the sensor on the base.
+    """
+
+    robot: str
+    rows: dict[str, list[Row]] = field(default_factory=dict)
+    columns: dict[str, Sequence[str]] = field(default_factory=dict)
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def add(self, table: str, columns: Sequence[str], row: Row) -> None:
+        """Append a row."""
+        self.columns.setdefault(table, columns)
+        self.rows.setdefault(table, []).append(row)
+
+    def take(self, measured: Measured) -> None:
+        """Append what a message of a robot says."""
+        time = seconds(measured.stamp_ns)
+        match measured:
+            case Pose():
+                table = "truth" if measured.truth else "odometry"
+                self.add(table, ("t_s", *POSES), (time, measured.x, measured.y, measured.theta))
+            case Speeds():
+                row = (time, measured.forward, measured.yaw_rate)
+                self.add("odometry", ("t_s", *SPEEDS), row)
+            case Seen(names=()):
+                self.add("observations", ("t_s", "landmark", *POINTS), (time, "", "", ""))
+            case Seen():
+                mates = isinstance(measured.names[0], str)
+                table, column = ("sightings", "teammate") if mates else ("observations", "landmark")
+                for name, point in zip(measured.names, measured.points, strict=True):
+                    self.add(table, ("t_s", column, *POINTS), (time, name, *point))
+
+    def start(self, pose: Sequence[float], sigmas: Sequence[float] = ()) -> None:
+        """The initial pose; sigmas: its standard deviations (position [m], heading [rad])."""
+        row: list[object] = list(pose)
+        columns = [*POSES]
+        if sigmas:
+            position, turned = sigmas[0] ** 2, sigmas[1] ** 2
+            row += [position, 0.0, position, 0.0, 0.0, turned]
+            columns += POSE_COVARIANCE
+        self.columns["start"], self.rows["start"] = columns, [row]
+
+    def write(self, folder: Path) -> None:
+        """The tables in a folder of the robot's name."""
+        place = folder / self.robot
+        place.mkdir(parents=True, exist_ok=True)
+        for table, rows in self.rows.items():
+            write_table(place / f"{table}.csv", self.columns[table], rows)

@@ -1,0 +1,87 @@
+"""ROS 2 bags: .mcap and .db3 files, and folders with a metadata.yaml."""
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.typesys.store import Typestore
+
+from team.ros2.definitions import types
+
+SUFFIXES = (".mcap", ".db3")
+
+
+class BagError(ValueError):
+    """A bag that can not be read; the text names it and the remedy."""
+
+
+class Topic(NamedTuple):
+    """A topic of a bag: its type, and how many messages it has."""
+
+    name: str
+    kind: str
+    messages: int
+
+
+class RawMessage(NamedTuple):
+    """One message as it lies in the bag."""
+
+    topic: str
+    kind: str
+    arrival_ns: int
+    data: bytes
+
+
+class Bag:
+    """An open bag."""
+
+    def __init__(self, reader: AnyReader) -> None:
+        self._reader = reader
+
+    @property
+    def store(self) -> Typestore:
+        """The types' definitions: the bag's own, if it has some."""
+        return self._reader.typestore
+
+    @property
+    def topics(self) -> list[Topic]:
+        """All topics by name."""
+        found = [Topic(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections]
+        return sorted(found)
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """The messages of these topics in order of arrival; raises BagError for a damaged bag."""
+        chosen = [c for c in self._reader.connections if c.topic in topics]
+        if not chosen:
+            return
+        try:
+            for connection, arrival_ns, data in self._reader.messages(chosen):
+                yield RawMessage(connection.topic, connection.msgtype, arrival_ns, data)
+        except _FAULTS as error:
+            raise BagError(f"damaged: {error}; `ros2 bag reindex` may repair it") from None
+
+
+_FAULTS = (AnyReaderError, OSError, ValueError, KeyError, AssertionError)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether the name says that it is one."""
+    return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
+
+
+@contextmanager
+def opened_bag(path: Path) -> Iterator[Bag]:
+    """The bag; raises BagError."""
+    try:
+        reader = AnyReader([path], default_typestore=types())
+        reader.open()
+    except Exception as error:  # the library and what it reads with raise all there is
+        raise BagError(f"{path}: no ROS 2 bag, or a damaged one ({error})") from None
+    try:
+        yield Bag(reader)
+    except BagError as error:
+        raise BagError(f"{path}: {error}") from None
+    finally:
+        reader.close()

@@ -1,0 +1,223 @@
+"""From (type, CDR bytes) to what a message says, as frozen values; a pure function.
+
+What can not be decoded, or has numbers that are not finite, raises `DamagedError`.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from math import isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys.store import Typestore
+
+from team.ros2.definitions import types
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""x, y, z, w."""
+
+
+class DamagedError(ValueError):
+    """Bytes that are not such a message, or one whose numbers can not be."""
+
+
+class OdometryRecord(NamedTuple):
+    """nav_msgs/Odometry: the pose of `child` in `frame`, and its speeds."""
+
+    stamp_ns: int
+    frame: str
+    child: str
+    position: Vector
+    rotation: Quaternion
+    forward: float
+    left: float
+    yaw_rate: float
+
+
+class SpeedRecord(NamedTuple):
+    """geometry_msgs/TwistStamped: speeds that hold until the next."""
+
+    stamp_ns: int
+    frame: str
+    forward: float
+    yaw_rate: float
+
+
+class PoseRecord(NamedTuple):
+    """A pose in `frame`."""
+
+    stamp_ns: int
+    frame: str
+    position: Vector
+    rotation: Quaternion
+
+
+class Transform(NamedTuple):
+    """The pose of `child` in `parent`."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    position: Vector
+    rotation: Quaternion
+
+
+class Tag(NamedTuple):
+    """One detection: what it is called, where it is; covariance: of x, y, z, row by row."""
+
+    name: str
+    position: Vector
+    covariance: tuple[float, ...] | None
+
+
+class TagsRecord(NamedTuple):
+    """What a detector saw at one time, in `frame`."""
+
+    stamp_ns: int
+    frame: str
+    tags: tuple[Tag, ...]
+
+
+class TransformsRecord(NamedTuple):
+    """tf2_msgs/TFMessage."""
+
+    transforms: tuple[Transform, ...]
+
+
+Record = OdometryRecord | SpeedRecord | PoseRecord | TagsRecord | TransformsRecord
+
+FAULTS = (SerdeError, ValueError, IndexError, KeyError, OverflowError, MemoryError, TypeError,
+          AssertionError, AttributeError)  # fmt: skip
+"""What the library raises for bytes that are no message."""
+
+
+def decode(kind: str, data: bytes | memoryview, store: Typestore | None = None) -> Record:
+    """What a message of this type (`nav_msgs/msg/Odometry`) says; raises DamagedError.
+
+    store: the types' definitions, if they are not ours. A type that READERS lacks is a KeyError.
+    """
+    reader = READERS[kind]
+    try:
+        return reader((types() if store is None else store).deserialize_cdr(data, kind))
+    except FAULTS as error:
+        raise DamagedError(f"no sound {kind}: {error}") from None
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def _finite(numbers: Iterable[float]) -> tuple[float, ...]:
+    taken = tuple(float(each) for each in numbers)
+    if not all(map(isfinite, taken)):
+        raise DamagedError("a number that is not finite")
+    return taken
+
+
+def _vector(point: Any) -> Vector:
+    x, y, z = _finite((point.x, point.y, point.z))
+    return x, y, z
+
+
+def _rotation(quaternion: Any) -> Quaternion:
+    x, y, z, w = _finite((quaternion.x, quaternion.y, quaternion.z, quaternion.w))
+    if not 0.5 < x * x + y * y + z * z + w * w < 2.0:
+        raise DamagedError("a rotation whose quaternion has not the length 1")
+    return x, y, z, w
+
+
+def _odometry(message: Any) -> OdometryRecord:
+    pose, twist = message.pose.pose, message.twist.twist
+    forward, left, yaw_rate = _finite((twist.linear.x, twist.linear.y, twist.angular.z))
+    return OdometryRecord(
+        _stamp_ns(message.header),
+        message.header.frame_id,
+        message.child_frame_id,
+        _vector(pose.position),
+        _rotation(pose.orientation),
+        forward,
+        left,
+        yaw_rate,
+    )
+
+
+def _speeds(message: Any) -> SpeedRecord:
+    forward, yaw_rate = _finite((message.twist.linear.x, message.twist.angular.z))
+    return SpeedRecord(_stamp_ns(message.header), message.header.frame_id, forward, yaw_rate)
+
+
+def _pose(message: Any, pose: Any) -> PoseRecord:
+    return PoseRecord(
+        _stamp_ns(message.header),
+        message.header.frame_id,
+        _vector(pose.position),
+        _rotation(pose.orientation),
+    )
+
+
+def _transform(message: Any) -> Transform:
+    return Transform(
+        _stamp_ns(message.header),
+        message.header.frame_id.lstrip("/"),
+        message.child_frame_id.lstrip("/"),
+        _vector(message.transform.translation),
+        _rotation(message.transform.rotation),
+    )
+
+
+def _tags(message: Any, tags: Iterable[Tag], frame: str = "") -> TagsRecord:
+    found = tuple(tags)
+    header = message.header
+    return TagsRecord(_stamp_ns(header), (frame or header.frame_id).lstrip("/"), found)
+
+
+def _tag(name: object, pose: Any, covariance: Any = None) -> Tag:
+    """covariance: 36 numbers of (x, y, z, three angles); all 0: none is claimed."""
+    block = None
+    if covariance is not None:
+        block = _finite(np.asarray(covariance).reshape(6, 6)[:3, :3].ravel())
+    return Tag(str(name), _vector(pose.position), block if block and any(block) else None)
+
+
+def _vision(message: Any) -> TagsRecord:
+    """vision_msgs: a detection's id, else the class of its best hypothesis."""
+    tags = []
+    for each in message.detections:
+        best = max(each.results, key=lambda r: r.hypothesis.score, default=None)
+        if best is None:
+            tags.append(_tag(each.id, each.bbox.center))
+        else:
+            name = each.id or best.hypothesis.class_id
+            tags.append(_tag(name, best.pose.pose, best.pose.covariance))
+    return _tags(message, tags)
+
+
+def _isaac(message: Any) -> TagsRecord:
+    tags = [_tag(d.id, d.pose.pose.pose, d.pose.pose.covariance) for d in message.detections]
+    frames = {d.pose.header.frame_id for d in message.detections} - {""}
+    if len(frames) > 1:
+        raise DamagedError("tags in several frames")
+    return _tags(message, tags, next(iter(frames), ""))
+
+
+READERS: Mapping[str, Callable[[Any], Record]] = {
+    "nav_msgs/msg/Odometry": _odometry,
+    "geometry_msgs/msg/TwistStamped": _speeds,
+    "geometry_msgs/msg/PoseStamped": lambda m: _pose(m, m.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _pose(m, m.pose.pose),
+    "geometry_msgs/msg/TransformStamped": lambda m: TransformsRecord((_transform(m),)),
+    "tf2_msgs/msg/TFMessage": lambda m: TransformsRecord(tuple(map(_transform, m.transforms))),
+    "vision_msgs/msg/Detection3DArray": _vision,
+    "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": _isaac,
+    "aruco_opencv_msgs/msg/ArucoDetection": lambda m: _tags(
+        m, [_tag(each.marker_id, each.pose) for each in m.markers]
+    ),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": lambda m: _tags(
+        m, [_tag(int(i), p) for i, p in zip(m.marker_ids, m.poses, strict=True)]
+    ),
+    "aruco_msgs/msg/MarkerArray": lambda m: _tags(
+        m, [_tag(each.id, each.pose.pose, each.pose.covariance) for each in m.markers]
+    ),
+}
+"""What is understood, by type."""

@@ -1,0 +1,100 @@
+"""Where a sensor sits on its robot: static transforms, and detections in the plane."""
+
+from dataclasses import dataclass, field
+from math import atan2
+
+import numpy as np
+from jaxtyping import Float
+
+from team.ros2.decoding import Quaternion, Transform, Vector
+
+DEEPEST = 32
+"""Transforms between a sensor and its base at the most."""
+
+
+def rotation_matrix(q: Quaternion) -> Float[np.ndarray, "3 3"]:
+    """Of a quaternion (x, y, z, w) of any length above 0."""
+    x, y, z, w = np.array(q) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def heading(q: Quaternion) -> float:
+    """The yaw of a rotation, in (−π, π]."""
+    x, y, z, w = q
+    if x == 0.0 and y == 0.0:
+        turned = 2.0 * atan2(z, w)
+        return atan2(np.sin(turned), np.cos(turned)) if abs(turned) > np.pi else turned
+    return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A sensor's pose (x, y, yaw) on the base, and its frame → its plane: ahead and left, 2 × 3."""
+
+    pose: tuple[float, float, float]
+    plane: Float[np.ndarray, "2 3"]
+
+    def point(self, position: Vector) -> tuple[float, float]:
+        """(ahead, left) of a position in the sensor's frame."""
+        if self.plane is BODY:
+            return position[0], position[1]
+        ahead, left = self.plane @ np.array(position)
+        return float(ahead), float(left)
+
+    def covariance(self, block: tuple[float, ...]) -> tuple[float, float, float]:
+        """(xx, xy, yy) in the plane of a covariance of x, y, z."""
+        c = self.plane @ np.array(block).reshape(3, 3) @ self.plane.T
+        return float(c[0, 0]), float(c[0, 1]), float(c[1, 1])
+
+
+BODY = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""A frame with x ahead and y left."""
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+"""A camera's, with z ahead and x right."""
+
+
+@dataclass
+class Frames:
+    """The transforms that do not change: each frame's pose in its parent."""
+
+    parents: dict[str, Transform] = field(default_factory=dict)
+
+    def take(self, transform: Transform) -> None:
+        """Remember one."""
+        self.parents[transform.child] = transform
+
+    def base_from(
+        self, frame: str, base: str
+    ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
+        """Rotation and translation from a frame to the base; None where no chain leads there."""
+        rotation, moved = np.eye(3), np.zeros(3)
+        for _ in range(DEEPEST):
+            if frame == base:
+                return rotation, moved
+            if frame not in self.parents:
+                return None
+            step = self.parents[frame]
+            turn = rotation_matrix(step.rotation)
+            rotation, moved = turn @ rotation, turn @ moved + np.array(step.position)
+            frame = step.parent
+        return None
+
+    def mount(self, frame: str, base: str) -> Mount | None:
+        """How the sensor of this frame sits on the base; a frame whose z is level is a camera's."""
+        found = self.base_from(frame, base)
+        if found is None:
+            return None
+        rotation, moved = found
+        level = np.hypot(*rotation[:2, 2]) > abs(rotation[2, 2])
+        ahead = rotation[:2, 2] if level else rotation[:2, 0]
+        yaw = float(atan2(ahead[1], ahead[0]))
+        c, s = np.cos(yaw), np.sin(yaw)
+        plane = np.array([[c, s], [-s, c]]) @ rotation[:2]
+        exact = np.abs(plane - BODY).max() < 1e-12
+        return Mount((float(moved[0]), float(moved[1]), yaw), BODY if exact else plane)

@@ -1,0 +1,60 @@
+"""Which topics are a robot's odometry, detections and truth: a table of a TOML file."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+RobotName = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
+
+
+class TopicsError(ValueError):
+    """A file of topics that can not be used; the text names file, place and remedy."""
+
+
+class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The topics of one robot.
+
+    odometry: nav_msgs/Odometry, of which `use` takes the pose or the speeds (twist), which hold
+    until the next message; geometry_msgs/TwistStamped; or tf2_msgs/TFMessage with the transform
+    odometry_frame → base_frame. detections: messages of a detector, or tf2_msgs/TFMessage whose
+    child frames are tags. truth: nav_msgs/Odometry or a pose, for the evaluation.
+    teammates: the tags that robots carry, by the tag's number; landmarks: numbers of tags that are
+    called otherwise. mount: the sensor's pose (x, y, yaw) on the base and
+    optical: whether its frame is a camera's (z ahead, x right); both are of tf_static if absent.
+    """
+
+    odometry: str = ""
+    use: Literal["pose", "twist"] = "pose"
+    detections: tuple[str, ...] = ()
+    truth: str = ""
+    base_frame: str = "base_link"
+    odometry_frame: str = "odom"
+    teammates: dict[str, RobotName] = {}
+    landmarks: dict[str, Annotated[int, Meta(ge=0, lt=2**31)]] = {}
+    mount: tuple[float, float, float] | None = None
+    optical: bool | None = None
+
+
+class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The topics of each robot. domain: of ROS, for live robots."""
+
+    robots: dict[RobotName, RobotTopics]
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0
+
+
+def load_topics(path: Path) -> Topics:
+    """Read a file; raises TopicsError."""
+    try:
+        found = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Topics)
+    except (OSError, UnicodeDecodeError) as error:
+        raise TopicsError(f"{path}: can not be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise TopicsError(f"{path}: not valid TOML: {error}") from None
+    except msgspec.ValidationError as error:
+        raise TopicsError(f"{path}: {error}; docs/your_ros2_robot.md has an example") from None
+    if not found.robots:
+        raise TopicsError(f"{path}: no robot; give [robots.r1] with odometry and detections")
+    return found

@@ -1,0 +1,180 @@
+"""What a robot's messages say → its measurements; the same for a bag and for a live robot."""
+
+import re
+from collections import Counter
+from typing import NamedTuple
+
+from team.ros2.decoding import (
+    OdometryRecord,
+    PoseRecord,
+    Record,
+    SpeedRecord,
+    TagsRecord,
+    Transform,
+    TransformsRecord,
+)
+from team.ros2.frames import BODY, OPTICAL, Frames, Mount, heading
+from team.ros2.topics import RobotTopics
+
+TAG = re.compile(r"^(?:[^:]*:)?(\d{1,10})$")
+"""A tag's name: its number, with its family before it (tag36h11:7) or alone."""
+
+
+class Pose(NamedTuple):
+    """Odometry (or truth, if so) that adds up to this pose (x, y, θ)."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    theta: float
+    truth: bool = False
+
+
+class Speeds(NamedTuple):
+    """Odometry whose speeds hold until the next."""
+
+    stamp_ns: int
+    forward: float
+    yaw_rate: float
+
+
+class Seen(NamedTuple):
+    """Landmarks (numbers) or teammates (names) at points (ahead, left) of the sensor.
+
+    covariances: (xx, xy, yy) of each; empty where the detector claims none.
+    """
+
+    stamp_ns: int
+    names: tuple[int, ...] | tuple[str, ...]
+    points: tuple[tuple[float, float], ...]
+    covariances: tuple[tuple[float, float, float], ...] = ()
+
+
+Measured = Pose | Speeds | Seen
+
+
+class Translator:
+    """One robot's messages in order of arrival; `dropped` counts what is left out, by reason.
+
+    mounts: the sensors by frame, once something was seen in them.
+    """
+
+    def __init__(self, topics: RobotTopics, frames: Frames | None = None) -> None:
+        self.topics = topics
+        self.frames = Frames() if frames is None else frames
+        self.dropped: Counter[str] = Counter()
+        self.mounts: dict[str, Mount] = {}
+        self.said: list[str] = []
+
+    def take(self, topic: str, record: Record) -> list[Measured]:
+        """The measurements of one message of a topic."""
+        topics = self.topics
+        found: list[Measured] = []
+        if topic == topics.odometry:
+            found += self._odometry(record)
+        if topic in topics.detections:
+            found += self._detections(record)
+        if topic == topics.truth:
+            found += self._truth(record)
+        return found
+
+    def _odometry(self, record: Record) -> list[Measured]:
+        match record:
+            case OdometryRecord() if self.topics.use == "pose":
+                x, y, _ = record.position
+                return [Pose(record.stamp_ns, x, y, heading(record.rotation))]
+            case OdometryRecord() | SpeedRecord():
+                return [Speeds(record.stamp_ns, record.forward, record.yaw_rate)]
+            case TransformsRecord():
+                ours = (self.topics.odometry_frame, self.topics.base_frame)
+                return [_pose(t) for t in record.transforms if (t.parent, t.child) == ours]
+            case _:
+                self.dropped["no odometry in a message of the odometry topic"] += 1
+                return []
+
+    def _truth(self, record: Record) -> list[Measured]:
+        match record:
+            case OdometryRecord() | PoseRecord():
+                x, y, _ = record.position
+                return [Pose(record.stamp_ns, x, y, heading(record.rotation), truth=True)]
+            case TransformsRecord():
+                base = self.topics.base_frame
+                return [_pose(t)._replace(truth=True) for t in record.transforms if t.child == base]
+            case _:
+                self.dropped["no pose in a message of the truth topic"] += 1
+                return []
+
+    def _detections(self, record: Record) -> list[Measured]:
+        match record:
+            case TagsRecord():
+                tags = [(tag.name, tag.position, tag.covariance) for tag in record.tags]
+                return self._seen(record.stamp_ns, record.frame, tags)
+            case TransformsRecord():
+                found = []
+                for t in record.transforms:
+                    if t.child in self.topics.landmarks or TAG.match(t.child):
+                        found += self._seen(t.stamp_ns, t.parent, [(t.child, t.position, None)])
+                return found
+            case _:
+                self.dropped["no detection in a message of a detections topic"] += 1
+                return []
+
+    def _seen(self, stamp_ns: int, frame: str, tags: list[tuple]) -> list[Measured]:  # type: ignore[type-arg]
+        mount = self._mount(frame)
+        landmarks: list[tuple[int, tuple[float, float], tuple[float, float, float] | None]] = []
+        teammates: list[tuple[str, tuple[float, float]]] = []
+        for name, position, block in tags:
+            number = self._number(name)
+            if number is None:
+                self.dropped["a detection whose name is no number and not in `landmarks`"] += 1
+            elif str(number) in self.topics.teammates:
+                mate = self.topics.teammates[str(number)]
+                teammates.append((mate, mount.point(position)))
+            else:
+                covariance = None if block is None else mount.covariance(block)
+                landmarks.append((number, mount.point(position), covariance))
+        found: list[Measured] = []
+        if landmarks or not teammates:
+            claimed = [c for _, _, c in landmarks if c is not None]
+            found.append(
+                Seen(
+                    stamp_ns,
+                    tuple(number for number, _, _ in landmarks),
+                    tuple(point for _, point, _ in landmarks),
+                    tuple(claimed) if len(claimed) == len(landmarks) else (),
+                )
+            )
+        if teammates:
+            names = tuple(name for name, _ in teammates)
+            found.append(Seen(stamp_ns, names, tuple(point for _, point in teammates)))
+        return found
+
+    def _number(self, name: str) -> int | None:
+        if name in self.topics.landmarks:
+            return self.topics.landmarks[name]
+        match = TAG.match(name)
+        return int(match[1]) if match and int(match[1]) < 2**31 else None
+
+    def _mount(self, frame: str) -> Mount:
+        if frame in self.mounts:
+            return self.mounts[frame]
+        topics = self.topics
+        found = None if topics.mount or topics.optical is not None else self.frames.mount(
+            frame, topics.base_frame
+        )  # fmt: skip
+        if found is None:
+            optical = "optical" in frame if topics.optical is None else topics.optical
+            found = Mount(topics.mount or (0.0, 0.0, 0.0), OPTICAL if optical else BODY)
+            if topics.mount is None and frame != topics.base_frame:
+                axes = "z ahead" if optical else "x ahead"
+                self.said.append(
+                    f"no transform from {frame or 'the frame without a name'} to "
+                    f"{topics.base_frame}: the sensor is taken to be at the base with {axes}; "
+                    "give `mount` (and `optical`) if it is not"
+                )
+        self.mounts[frame] = found
+        return found
+
+
+def _pose(t: Transform) -> Pose:
+    return Pose(t.stamp_ns, t.position[0], t.position[1], heading(t.rotation))

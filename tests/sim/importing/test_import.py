@@ -1,0 +1,260 @@
+"""`teamslam import`: bags, CSV files with names of their own and logs become the same tables."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from sim.cli.main import app
+from sim.datasets.folder_writer import write_folder
+from sim.datasets.tables import DatasetError
+from sim.datasets.utias_writer import write_utias
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import scenario_beside, streams_of
+from sim.world.streams import WorldStreams
+from tests import teams
+from tests.ros2 import messages as ros
+from tests.sim.datasets.test_folder import same
+
+S = 10**9
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)
+ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["import", *map(str, arguments)])
+
+
+def read(path: Path) -> WorldStreams:
+    return streams_of(with_options(load(scenario_beside(path)), dataset=path))
+
+
+def drive(robot: str = "") -> list[ros.Message]:
+    """Three poses, two scans and the truth."""
+    at = f"/{robot}" if robot else ""
+    poses = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.1), (2.0, 0.25, 0.2)]
+    drove: list[ros.Message] = [
+        (k * S, f"{at}/odom", ODOMETRY, ros.odometry(k * S, ros.pose(x, y, yaw=t), 1.0, 0.1))
+        for k, (x, y, t) in enumerate(poses)
+    ]
+    seen = [("7", ros.pose(3.0, 4.0)), ("5", ros.pose(1.0, 1.0))]
+    drove += [(k * S, f"{at}/tags", TAGS, ros.detections(k * S, "base_link", seen)) for k in (1, 2)]
+    true = ros.odometry(S, ros.pose(1.0, 0.0, yaw=0.1))
+    return [*drove, (S, f"{at}/ground_truth", ODOMETRY, true)]
+
+
+@pytest.mark.parametrize("db3", [False, True])
+def test_a_bag_becomes_tables(tmp_path: Path, db3: bool) -> None:
+    bag = ros.write_bag(tmp_path / "bag", drive(), db3=db3)
+    result = run(bag, "-o", tmp_path / "set", "--start", "1,2,0.5")
+    assert result.exit_code == 0, result.output
+    assert "6 messages" in result.output
+    (stream,) = read(tmp_path / "set").streams
+    assert stream.robot == "r1"
+    assert stream.start is not None
+    assert stream.start.pose.tolist() == [1.0, 2.0, 0.5]
+    assert stream.intervals.end_ns.tolist() == [S, 2 * S]
+    assert stream.landmark_detections.ids.tolist() == [5, 7, 5, 7] or (
+        stream.landmark_detections.ids.tolist() == [7, 5, 7, 5]
+    )
+    assert sorted(stream.landmark_detections.ranges.tolist()) == pytest.approx(
+        [2**0.5, 2**0.5, 5, 5]
+    )
+    assert stream.truth is not None
+    np.testing.assert_allclose(stream.truth, [[1.0, 0.0, 0.1]], atol=1e-15)
+
+
+def test_the_file_of_a_bag_is_a_bag_too(tmp_path: Path) -> None:
+    bag = ros.write_bag(tmp_path / "bag", drive())
+    file = next(bag.glob("*.mcap"))
+    assert run(file, "-o", tmp_path / "a").exit_code == 0
+    assert run(bag, "-o", tmp_path / "b").exit_code == 0
+    tables = [(tmp_path / each / "r1" / "odometry.csv").read_bytes() for each in "ab"]
+    assert tables[0] == tables[1]
+
+
+def test_robots_are_the_namespaces_and_see_each_other_by_their_tags(tmp_path: Path) -> None:
+    bag = ros.write_bag(tmp_path / "bag", [*drive("ann"), *drive("bob")])
+    topics = tmp_path / "topics.toml"
+    topics.write_text(
+        '[robots.ann]\nodometry = "/ann/odom"\nuse = "twist"\ndetections = ["/ann/tags"]\n'
+        'teammates = { 5 = "bob" }\n'
+        '[robots.bob]\nodometry = "/bob/odom"\ndetections = ["/bob/tags"]\n'
+    )
+    assert run(bag, "-o", tmp_path / "set", "--ros2", topics).exit_code == 0
+    ann, bob = read(tmp_path / "set").streams
+    assert (ann.robot, bob.robot) == ("ann", "bob")
+    assert ann.intervals.forward.tolist() == [1.0, 1.0]
+    assert [ann.sightings(k).teammates for k in np.flatnonzero(ann.kinds == 2).tolist()] == [
+        ("bob",)
+    ] * 2
+    assert run(bag, "-o", tmp_path / "own").exit_code == 0
+    assert [each.robot for each in read(tmp_path / "own").streams] == ["ann", "bob"]
+
+
+def test_tags_on_tf_are_seen_from_where_the_camera_sits(tmp_path: Path) -> None:
+    camera = (0, "base_link", "cam_optical", ros.vector(0.3, 0.1, 0.5), OPTICAL)
+    tag = (S, "cam_optical", "tag36h11:7", ros.vector(-1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
+    still = [m for m in drive() if m[1] == "/odom"]
+    messages = [
+        (0, "/tf_static", "tf2_msgs/msg/TFMessage", ros.transforms(camera)),
+        *still,
+        (S, "/tf", "tf2_msgs/msg/TFMessage", ros.transforms(tag)),
+    ]
+    result = run(ros.write_bag(tmp_path / "bag", messages), "-o", tmp_path / "set")
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "set" / "r1" / "observations.csv").read_text().splitlines()
+    assert text[0] == "t_s,landmark,x_m,y_m"
+    np.testing.assert_allclose([float(cell) for cell in text[1].split(",")], [1, 7, 2, 1])
+    scenario = load(scenario_beside(tmp_path / "set"))
+    np.testing.assert_allclose(scenario.robots[0].sensor.mount, [0.3, 0.1, 0.0], atol=1e-12)
+
+
+def test_damage_is_counted_with_the_first_message(tmp_path: Path) -> None:
+    bad: Any = ros.cdr(ODOMETRY, drive()[0][3])[:-9]
+    bag = ros.write_bag(tmp_path / "bag", [*drive(), (3 * S, "/odom", ODOMETRY, bad)])
+    result = run(bag, "-o", tmp_path / "set")
+    assert "/odom: 1 of 4 messages dropped: damaged (first: message 4: no sound" in result.output
+
+
+def test_a_bag_that_does_not_say_what_is_what_is_listed_with_what_to_type(tmp_path: Path) -> None:
+    other = [(at, "/wheels", kind, m) for at, topic, kind, m in drive() if topic == "/odom"]
+    bag = ros.write_bag(tmp_path / "bag", [*drive(), *other])
+    for arguments in ((bag,), (bag, "-o", tmp_path / "set")):
+        result = run(*arguments)
+        assert result.exit_code == 2 or isinstance(result.exception, DatasetError)
+        said = result.output + str(result.exception)
+        assert "/tags   vision_msgs/msg/Detection3DArray   2 messages" in said
+        assert "[robots.r1]" in said
+        assert f"teamslam import {bag} -o FOLDER --ros2 topics.toml" in said
+    assert "2 topics may be its odometry" in said
+
+
+def test_launch_takes_a_bag_and_says_what_is_wrong_with_it(tmp_path: Path) -> None:
+    (tmp_path / "bag.mcap").write_bytes(b"not a bag")
+    result = CliRunner().invoke(
+        app, ["launch", "--dataset", str(tmp_path / "bag.mcap"), "-o", str(tmp_path / "run")]
+    )
+    assert isinstance(result.exception, DatasetError)
+    assert "no ROS 2 bag, or a damaged one" in str(result.exception)
+
+
+WHEELS = "stamp_ns,speed,yaw_rate_deg_s,note\n0,1,90,a\n1000000001,2,0,b\n2000000000,0,0,c\n"
+TREES = "stamp_ns,dist_cm,angle\n1000000001,250,1.0\n1500000000,100,2.0\n"
+LABELS = "tree\n7\n-1\n"
+MAP = """
+[odometry]
+files = ["wheels.csv"]
+[odometry.columns]
+t_s = { column = "stamp_ns", scale = 1e-9 }
+forward_m_s = "speed"
+yaw_rate_rad_s = { column = "yaw_rate_deg_s", scale = 0.017453292519943295 }
+[observations]
+files = ["trees.csv", "labels.csv"]
+drop = { tree = ["-1"] }
+[observations.columns]
+t_s = { column = "stamp_ns", scale = 1e-9 }
+landmark = "tree"
+range_m = { column = "dist_cm", scale = 0.01 }
+bearing_rad = { column = "angle", offset = -1.5 }
+"""
+
+
+def files(path: Path) -> list[Path]:
+    texts = {"wheels.csv": WHEELS, "trees.csv": TREES, "labels.csv": LABELS}
+    for name, text in texts.items():
+        (path / name).write_text(text)
+    return [path / name for name in texts]
+
+
+def test_csv_files_with_other_names_come_by_a_map(tmp_path: Path) -> None:
+    (tmp_path / "columns.toml").write_text(MAP)
+    to = tmp_path / "set"
+    result = run(
+        *files(tmp_path), "-o", to, "--columns", tmp_path / "columns.toml", "--robot", "ann"
+    )
+    assert result.exit_code == 0, result.output
+    assert "1 rows dropped: tree is -1" in result.output
+    assert "trees.csv, first at line 3" in result.output
+    (stream,) = read(to).streams
+    assert stream.robot == "ann"
+    assert stream.intervals.end_ns.tolist() == [1000000001, 2 * S]
+    assert stream.intervals.yaw_rate.tolist() == pytest.approx([np.pi / 2, 0.0])
+    seen = stream.landmark_detections
+    assert (seen.ids.tolist(), seen.ranges.tolist(), seen.bearings.tolist()) == ([7], [2.5], [-0.5])
+
+
+def test_a_map_is_proposed_from_the_columns_names(tmp_path: Path) -> None:
+    wheels, *_ = files(tmp_path)
+    tags = tmp_path / "tags.csv"
+    tags.write_text("time,tag_id,range,bearing_deg\n1,7,2,90\n")
+    result = run(wheels, tags, "-o", tmp_path / "set")
+    assert isinstance(result.exception, DatasetError)
+    proposal = str(result.exception).partition("with this:\n\n")[2].partition("\nand type")[0]
+    assert 't_s = { column = "stamp_ns", scale = 1e-9 }' in proposal
+    columns = tmp_path / "columns.toml"
+    columns.write_text(proposal)
+    assert run(wheels, tags, "-o", tmp_path / "set", "--columns", columns).exit_code == 0
+    assert read(tmp_path / "set").streams[0].landmark_detections.bearings.tolist() == [np.pi / 2]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"speed"', '"velocity"', "no column 'velocity', which the map has for forward_m_s"),
+        ("forward_m_s", "speed", "odometry has no column speed; known: t_s"),
+        ("[odometry", "[wheels", "no table wheels; known: odometry"),
+        ('"wheels.csv"', '"w.csv"', "odometry: 0 files end in 'w.csv'"),
+        ("tree = [", "bush = [", "no column 'bush', which `drop` names"),
+        ("[odometry]", "[odometry", "no map of columns"),
+    ],
+)
+def test_a_mistake_in_a_map_is_named(tmp_path: Path, old: str, new: str, words: str) -> None:
+    (tmp_path / "columns.toml").write_text(MAP.replace(old, new))
+    result = run(*files(tmp_path), "-o", tmp_path / "set", "--columns", tmp_path / "columns.toml")
+    assert isinstance(result.exception, DatasetError)
+    assert words in str(result.exception)
+
+
+def test_truth_comes_from_a_trajectory_of_tum(tmp_path: Path) -> None:
+    bag = ros.write_bag(tmp_path / "bag", [m for m in drive() if "truth" not in m[1]])
+    tum = tmp_path / "truth.txt"
+    tum.write_text("# t x y z qx qy qz qw\n0.5 1 2 0 0 0 0 1\n1.5 2 2 0 0 0 1 0\n")
+    assert run(bag, "-o", tmp_path / "set", "--truth", tum).exit_code == 0
+    (stream,) = read(tmp_path / "set").streams
+    assert stream.truth is not None
+    assert stream.truth.tolist() == [[1, 2, 0], [2, 2, np.pi]]
+    tum.write_text("0.5 1 2 0 0 0 0 1\n1.5 2 2 0 0 0 x 0\n")
+    result = run(bag, "-o", tmp_path / "bad", "--truth", tum)
+    assert "truth.txt, line 2: expected t x y z qx qy qz qw" in str(result.exception)
+
+
+def test_a_utias_set_becomes_tables_with_the_scenario_that_runs_it(tmp_path: Path) -> None:
+    streams = [replace(teams.stream(name, 9), teammates=("r2", "r1")) for name in ("r1", "r2")]
+    write_utias(teams.world_of(*streams), tmp_path / "utias")
+    result = run(tmp_path / "utias", "-o", tmp_path / "set")
+    assert result.exit_code == 0, result.output
+    scenario = with_options(load("utias"), dataset=tmp_path / "utias", robots=2)
+    again = load(scenario_beside(tmp_path / "set"))
+    assert again.robots == scenario.robots
+    assert again.central == scenario.central
+    assert same(read(tmp_path / "set"), streams_of(scenario))
+
+
+def test_wrong_use_is_said(tmp_path: Path) -> None:
+    write_folder(teams.world_of(teams.stream("r1", 3)), tmp_path / "set")
+    bag = ros.write_bag(tmp_path / "bag", drive())
+    for arguments, words in (
+        ((bag, "-o", tmp_path / "set"), "is not empty: give a new folder"),
+        ((bag, "-o", tmp_path / "a", "--robot", "R1"), "--robot R1: a small letter"),
+        ((bag, "-o", tmp_path / "a", "--start", "1,2"), "--start 1,2: give x,y,theta"),
+        ((bag, "-o", tmp_path / "a", "--start", "r9:1,2,3"), "--start: which robot's?"),
+        ((tmp_path / "none", "-o", tmp_path / "a"), "none: no such file or folder"),
+        ((bag, "-o", tmp_path / "a", "--ros2", tmp_path / "x.toml"), "x.toml: can not be read"),
+    ):
+        result = run(*arguments)
+        assert result.exit_code == 2 or isinstance(result.exception, DatasetError)
+        assert words in result.output + str(result.exception)
