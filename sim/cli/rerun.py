@@ -25,7 +25,7 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures
 
 @app.command()
 def rerun(
-    log: LogArgument,
+    log: Annotated[Path, typer.Argument(help="An MCAP log of a team, or a data set.")],
     verify: Annotated[
         bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
     ] = False,
@@ -72,7 +72,8 @@ def rerun(
 
     With --verify every message is computed again from the inputs that it names. Otherwise the
     recorded measurements run once more through the same nodes, with the changes asked for; without
-    any change, as they would have run with every message arriving at once.
+    any change, as they would have run with every message arriving at once. Of a data set the run
+    that is compared with is computed, too: no process is started.
     """
     changes = Changes(
         without=tuple(without or ()),
@@ -162,9 +163,9 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     )
     from central.desk.verification.recorded import RerunError
     from sim.recorded.changed_run import changed_run
-    from team.recording.reader import open_log
+    from sim.recorded.data_set import log_or_run
 
-    log = open_log(path)
+    log = log_or_run(path)
     recorded = evaluate(log.samples())
     try:
         changed = evaluate(changed_run(log, changes))

@@ -9,16 +9,15 @@ from sim.in_memory.team import run_nodes
 from sim.recorded.changes import Changes, Span
 from sim.recorded.noise import with_noise
 from sim.recorded.unsafe import UnsafeRobot
-from sim.recorded.world import RecordedWorld
+from sim.recorded.world import RecordedWorld, Samples
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario, with_options
 from team.pairs import FEEDBACK
-from team.recording.reader import Log
 from team.robot.node import RobotNode
 from team.wire.bus import Sample
 
 
-def changed_run(log: Log, changes: Changes) -> list[Sample]:
+def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     """The samples of the changed run, as a recorder would have taken them.
 
     Raises ScenarioError for a change that has no meaning, RerunError for a log that lacks

@@ -1,23 +1,30 @@
 """The world of a log: its measurements and its truth once more, second by second of team time."""
 
 from collections import deque
-from collections.abc import Collection
-from typing import ClassVar
+from collections.abc import Collection, Iterable
+from typing import ClassVar, Protocol, runtime_checkable
 
 from central.desk.verification.recorded import RerunError
 from sim.scenarios.scenario import Scenario, loads
 from team import translate
 from team.pairs import NEEDS_MAP
-from team.recording.reader import Log
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Outgoing, opened
+from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import WireError
 
 STEP_NS = 1_000_000_000
 """Team time between two looks at what became of the messages."""
 _TRUTH = (ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS)
 _SOURCE = (*ch.SENSORS, *_TRUTH, ch.WORLD_CONFIG, ch.END)
+
+
+@runtime_checkable
+class Samples(Protocol):
+    """Whatever says what a run said: a log, or a run in memory."""
+
+    def samples(self, channels: Collection[ch.Channel] | None = None) -> Iterable[Sample]:
+        """What was said on these channels; on all without."""
 
 
 class RecordedWorld:
@@ -29,7 +36,7 @@ class RecordedWorld:
 
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
 
-    def __init__(self, log: Log, without: Collection[str] = ()) -> None:
+    def __init__(self, log: Samples, without: Collection[str] = ()) -> None:
         self._configured: m.Configuration | None = None
         self._said: list[Outgoing] = []
         self._notes: tuple[str, ...] = ()

@@ -1,0 +1,38 @@
+"""A team on a data set, computed in memory: read as a log of such a run would be."""
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from sim.in_memory.team import run_team
+from sim.recorded.world import Samples
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from team.recording.reader import open_log
+from team.wire.bus import Sample
+from team.wire.channels import Channel, channel_of
+
+
+class DataSetRun:
+    """All that the team says on a data set, with the data set's own scenario.
+
+    Raises DatasetError, ScenarioError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        scenario, _ = with_present_robots(with_options(load(scenario_beside(path)), dataset=path))
+        self.path = path
+        self._samples = list(run_team(scenario, streams_of(scenario)))
+
+    def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
+        """What was said on these channels; on all without."""
+        for sample in self._samples:
+            found = channel_of(sample.key)
+            if channels is None or (found is not None and found[0] in channels):
+                yield sample
+
+
+def log_or_run(path: Path) -> Samples:
+    """A log, or the run on a data set; raises LogError, DatasetError, ScenarioError."""
+    if path.suffix == ".mcap" or (path.is_file() and path.suffix != ".zip"):
+        return open_log(path)
+    return DataSetRun(path)
