@@ -1,8 +1,10 @@
 """A data set in a folder (or zip) of CSV tables: a sub-folder for each robot.
 
 r1/odometry.csv       t_s with forward_m_s,yaw_rate_rad_s or x_m,y_m,theta_rad or
-                      dx_m,dy_m,dtheta_rad
-r1/observations.csv   t_s,landmark with range_m,bearing_rad or x_m,y_m
+                      dx_m,dy_m,dtheta_rad (with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt) or
+                      wheel_speed_m_s,steering_rad
+r1/observations.csv   t_s,landmark with range_m,bearing_rad (with c_rr,c_rb,c_bb) or
+                      x_m,y_m (with c_xx,c_xy,c_yy)
 r1/sightings.csv      t_s,teammate with range_m,bearing_rad or x_m,y_m    (optional)
 r1/start.csv          x_m,y_m,theta_rad, with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt  (optional)
 r1/truth.csv          t_s,x_m,y_m,theta_rad                               (optional)
@@ -23,7 +25,6 @@ from jaxtyping import Float, Int64
 from sim.datasets import folder_tables as rows
 from sim.datasets.csv_table import CsvTable, read_table
 from sim.datasets.tables import DatasetError, File
-from sim.datasets.utias_rows import Measurements
 from sim.world.config import FolderWorld, starts_unknown
 from sim.world.streams import (
     Detections,
@@ -31,7 +32,6 @@ from sim.world.streams import (
     RobotStream,
     StartPose,
     WorldStreams,
-    grouped,
     robot_stream,
 )
 from team.config import RobotConfig
@@ -48,13 +48,19 @@ EXPECTED = (
 )
 COVARIANCE = rows.POSE_COVARIANCE
 TABLES = {
-    "odometry": ("t_s", "duration_s", *rows.SPEEDS, *rows.POSES, *rows.INCREMENTS, *COVARIANCE),
-    "observations": ("t_s", "landmark", *rows.POLAR, *rows.POINTS),
+    "odometry": (
+        "t_s", "duration_s", *rows.SPEEDS, *rows.POSES, *rows.INCREMENTS, *rows.STEERED,
+        *COVARIANCE,
+    ),
+    "observations": (
+        "t_s", "landmark", *rows.POLAR, *rows.POINTS, *rows.POLAR_COVARIANCE,
+        *rows.POINT_COVARIANCE,
+    ),
     "sightings": ("t_s", "teammate", *rows.POLAR, *rows.POINTS),
     "start": (*rows.POSES, *COVARIANCE),
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
-}
+}  # fmt: skip
 """The columns that a table may have."""
 REQUIRED = {
     "odometry": ("t_s",),
@@ -164,9 +170,9 @@ class RobotRows:
     robot: str
     start: StartPose | None
     intervals: Intervals
-    seen: Measurements
+    seen: rows.Scans
     looked: Int64[np.ndarray, " E"]
-    met: Measurements
+    met: rows.Scans
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]
@@ -244,15 +250,14 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
 
 
 def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
-    seen, met, known = read.seen, read.met, len(read.truth) > 0
-    observations = grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings)
+    known = len(read.truth) > 0
     return robot_stream(
         robot=read.robot,
         start_ns=read.start_ns,
         start=None if starts_unknown(world, read.robot) else read.start,
         intervals=read.intervals,
-        observations=_with_empty(observations, read.looked),
-        sightings=grouped(met.stamps_ns, met.subjects, met.ranges, met.bearings),
+        observations=_with_empty(read.seen.grouped(), read.looked),
+        sightings=read.met.grouped(),
         teammates=tuple(clocks),
         truth_ns=read.truth_ns if known else None,
         truth=read.truth if known else None,

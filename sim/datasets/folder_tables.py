@@ -4,21 +4,27 @@ What is not handed out is dropped, and a note counts it with its reason and firs
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable
-from sim.datasets.utias_rows import Measurements, counted, first_of_each, on_circle
-from sim.world.streams import Intervals, StartPose
+from sim.datasets.utias_rows import counted, first_of_each, on_circle
+from sim.world.streams import Detections, Intervals, StartPose, grouped, moved
 
 SPEEDS = ("forward_m_s", "yaw_rate_rad_s")
 POSES = ("x_m", "y_m", "theta_rad")
 INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
-ODOMETRY_FORMS = (SPEEDS, POSES, INCREMENTS)
+STEERED = ("wheel_speed_m_s", "steering_rad")
+ODOMETRY_FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
 POLAR = ("range_m", "bearing_rad")
 POINTS = ("x_m", "y_m")
 POSE_COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
+POINT_COVARIANCE = ("c_xx", "c_xy", "c_yy")
+POLAR_COVARIANCE = ("c_rr", "c_rb", "c_bb")
+NOT_A_COVARIANCE = "its covariance is not positive definite"
+LATE = "after its last odometry, where its motion is not known"
 LONG_GAP_NS = 2_000_000_000
 
 
@@ -72,7 +78,8 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
     Speeds hold from t_s to the next row's, and the last row only ends the last interval; with a
     column duration_s they are the means over the time that ends at t_s. Poses are of t_s; an
-    increment ends at t_s and begins at the row before.
+    increment ends at t_s and begins at the row before; its covariance is of an error in the frame
+    of its end. A car's wheel speed and steering hold as speeds do.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -89,7 +96,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     if form == POSES:
         steps = between(numbers)
         ends = stamps[1:]
-    elif form == SPEEDS and not table.has("duration_s"):
+    elif form in (SPEEDS, STEERED) and not table.has("duration_s"):
         steps, ends = numbers[:-1], stamps[1:]
     else:
         steps, ends = numbers, stamps
@@ -97,11 +104,32 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     if len(duration) and duration.max() > LONG_GAP_NS:
         seconds = duration.max() * 1e-9
         rows.notes.append(f"odometry has a gap of {seconds:.1f} s: one interval lasts as long")
-    if form == SPEEDS:
+    if form in (SPEEDS, STEERED):
         forward, yaw_rate = steps.T.copy() if len(steps) else np.zeros((2, 0))
+        intervals = Intervals(ends, duration, forward, yaw_rate, steered=form == STEERED)
     else:
-        forward, yaw_rate = _speeds(steps, duration)
-    return Intervals(ends, duration, forward, yaw_rate), rows.notes
+        intervals = moved(ends, duration, steps, _claimed(rows, form))
+    return intervals, rows.notes
+
+
+def _claimed(rows: Rows, form: tuple[str, ...]) -> Float[np.ndarray, "N 3 3"] | None:
+    """The increments' own covariances; None where they claim none."""
+    table = rows.table
+    if not any(table.has(column) for column in POSE_COVARIANCE):
+        return None
+    if form != INCREMENTS or not table.has(*POSE_COVARIANCE):
+        raise table.fault(
+            f"covariances ({','.join(POSE_COVARIANCE)}) come with {','.join(INCREMENTS)}, all six"
+        )
+    covariances = matrices(table.numbers(*POSE_COVARIANCE))
+    for row in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0.0)[:1].tolist():
+        raise table.error(row, "c_xx", NOT_A_COVARIANCE)
+    return covariances
+
+
+def matrices(packed: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 3 3"]:
+    """Of (xx, xy, yy, xt, yt, tt)."""
+    return packed[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
 
 
 def _form(table: CsvTable) -> tuple[str, ...]:
@@ -131,15 +159,33 @@ def between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, on_circle(turn)])
 
 
-def _speeds(
-    steps: Float[np.ndarray, "N 3"], duration_ns: Int64[np.ndarray, " N"]
-) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
-    """The arc of each increment: what is lateral to it is left out."""
-    x, y, turn = steps.T
-    seconds = duration_ns * 1e-9
-    half = 0.5 * turn
-    chord = np.cos(half) * x + np.sin(half) * y
-    return chord / np.sinc(half / np.pi) / seconds, turn / seconds
+@dataclass(frozen=True)
+class Scans:
+    """Measurements of landmarks, or of teammates by index, in order of time."""
+
+    stamps_ns: Int64[np.ndarray, " R"]
+    ids: UInt32[np.ndarray, " R"]
+    ranges: Float[np.ndarray, " R"]
+    bearings: Float[np.ndarray, " R"]
+    points: Float[np.ndarray, "R 2"] | None = None
+    covariances: Float[np.ndarray, "R 3"] | None = None
+
+    def where(self, chosen: Bool[np.ndarray, " R"]) -> "Scans":
+        """The chosen ones."""
+        return Scans(
+            self.stamps_ns[chosen],
+            self.ids[chosen],
+            self.ranges[chosen],
+            self.bearings[chosen],
+            None if self.points is None else self.points[chosen],
+            None if self.covariances is None else self.covariances[chosen],
+        )
+
+    def grouped(self) -> Detections:
+        """One message per stamp."""
+        return grouped(
+            self.stamps_ns, self.ids, self.ranges, self.bearings, self.points, self.covariances
+        )
 
 
 def measurements_of(
@@ -147,14 +193,14 @@ def measurements_of(
     thing: str,
     team: tuple[str, Sequence[str]] | None,
     end_ns: int | None,
-) -> tuple[Measurements, Int64[np.ndarray, " E"], list[str]]:
+) -> tuple[Scans, Int64[np.ndarray, " E"], list[str]]:
     """Measurements up to end_ns of landmarks, or of teammates as indices into the team's names
     (team: the robot itself, and all of them); and when the robot looked and saw nothing, which a
     row says that has a time alone.
     """
     if table is None:
         none = np.empty(0, np.int64)
-        empty = Measurements(none, none.astype(np.uint32), np.empty(0), np.empty(0))
+        empty = Scans(none, none.astype(np.uint32), np.empty(0), np.empty(0))
         return empty, none, []
     rows = Rows(table, thing)
     looked = rows.take_out(
@@ -169,17 +215,21 @@ def measurements_of(
         ids = np.array([places[name] for name in rows.table.columns[column]], dtype=np.uint32)
     else:
         ids = rows.table.names(column)
-    ranges, bearings = _polar(rows.table)
-    kept = ranges > 0.0
-    rows.drop(~kept, "range not above 0")
-    found = Measurements(rows.stamps_ns, ids[kept], ranges[kept], bearings[kept])
-    kept = first_of_each(found.stamps_ns, found.subjects, np.ones(len(rows.table), np.bool_))
-    rows.drop(~kept, f"a second one of the same {column} at the same time")
-    found = found.where(kept)
+    found = _scans(rows, ids, claims=team is None)
+
+    def keep(kept: Bool[np.ndarray, " rows"], otherwise: str) -> Scans:
+        rows.drop(~kept, otherwise)
+        return found.where(kept)
+
+    found = keep(found.ranges > 0.0, "range not above 0")
+    if found.covariances is not None:
+        aa, ab, bb = found.covariances.T
+        found = keep((aa > 0.0) & (aa * bb > ab * ab), NOT_A_COVARIANCE)
+    single = first_of_each(found.stamps_ns, found.ids, np.ones(len(found.ids), np.bool_))
+    found = keep(single, f"a second one of the same {column} at the same time")
     if end_ns is not None:
-        kept = found.stamps_ns <= end_ns
-        rows.drop(~kept, "after its last odometry, where its motion is not known")
-        found, looked = found.where(kept), looked[looked <= end_ns]
+        found = keep(found.stamps_ns <= end_ns, LATE)
+        looked = looked[looked <= end_ns]
     return found, looked, rows.notes
 
 
@@ -189,16 +239,30 @@ def _cells(table: CsvTable) -> list[tuple[str, ...]]:
     return list(zip(*columns, strict=True))
 
 
-def _polar(table: CsvTable) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
+def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
+    """Ranges and bearings or points, with what the detector claims of them if it may."""
+    table, stamps = rows.table, rows.stamps_ns
     if table.has(*POLAR):
-        numbers = table.numbers(*POLAR)
-        return numbers[:, 0].copy(), on_circle(numbers[:, 1])
-    if table.has(*POINTS):
-        x, y = table.numbers(*POINTS).T
-        return np.hypot(x, y), on_circle(np.arctan2(y, x))
-    raise table.fault(
-        f"no measurement in its columns; give {','.join(POLAR)} or {','.join(POINTS)}"
-    )
+        ranges, bearings = table.numbers(*POLAR).T
+        claimed = _own(table, POLAR_COVARIANCE) if claims else None
+        return Scans(stamps, ids, ranges.copy(), on_circle(bearings), None, claimed)
+    if not table.has(*POINTS):
+        raise table.fault(
+            f"no measurement in its columns; give {','.join(POLAR)} or {','.join(POINTS)}"
+        )
+    points = table.numbers(*POINTS)
+    x, y = points.T
+    ranges, bearings = np.hypot(x, y), on_circle(np.arctan2(y, x))
+    claimed = _own(table, POINT_COVARIANCE) if claims else None
+    return Scans(stamps, ids, ranges, bearings, points if claims else None, claimed)
+
+
+def _own(table: CsvTable, columns: tuple[str, ...]) -> Float[np.ndarray, "R 3"] | None:
+    other = {*POLAR_COVARIANCE, *POINT_COVARIANCE} - {*columns}
+    wrong = [column for column in other if table.has(column)]
+    if wrong or any(table.has(c) for c in columns) != table.has(*columns):
+        raise table.fault(f"a covariance here has the columns {','.join(columns)}, all three")
+    return table.numbers(*columns) if table.has(*columns) else None
 
 
 def truth_of(
@@ -220,10 +284,9 @@ def start_of(table: CsvTable) -> StartPose | None:
     pose = table.numbers(*POSES)[0]
     if not table.has(*POSE_COVARIANCE):
         return StartPose(pose, None)
-    xx, xy, yy, xt, yt, tt = table.numbers(*POSE_COVARIANCE)[0]
-    covariance = np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+    covariance = matrices(table.numbers(*POSE_COVARIANCE))[0]
     if np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        raise table.error(0, "c_xx", "the covariance is not positive definite")
+        raise table.error(0, "c_xx", NOT_A_COVARIANCE)
     return StartPose(pose, covariance)
 
 

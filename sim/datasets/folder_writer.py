@@ -3,7 +3,19 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from sim.datasets.folder_tables import POINTS, POLAR, POSE_COVARIANCE, POSES, SPEEDS
+import numpy as np
+
+from sim.datasets.folder_tables import (
+    INCREMENTS,
+    POINT_COVARIANCE,
+    POINTS,
+    POLAR,
+    POLAR_COVARIANCE,
+    POSE_COVARIANCE,
+    POSES,
+    SPEEDS,
+    STEERED,
+)
 from sim.world.streams import Detections, RobotStream, WorldStreams
 
 Row = Sequence[object]
@@ -25,16 +37,13 @@ def write_folder(streams: WorldStreams, directory: Path | str) -> None:
 
 def _write_robot(place: Path, stream: RobotStream) -> None:
     place.mkdir(exist_ok=True)
-    odometry = _odometry_rows(stream)
-    if odometry:
-        write_table(place / "odometry.csv", ("t_s", *SPEEDS), odometry)
-    ids = stream.landmark_detections.ids.tolist()
-    observed = _measured_rows(stream.landmark_detections, ids)
-    write_table(place / "observations.csv", ("t_s", "landmark", *POLAR), observed)
-    if len(stream.teammate_detections.ids):
-        names = [stream.teammates[i] for i in stream.teammate_detections.ids]
-        sighted = _measured_rows(stream.teammate_detections, names)
-        write_table(place / "sightings.csv", ("t_s", "teammate", *POLAR), sighted)
+    if len(stream.intervals.end_ns):
+        write_table(place / "odometry.csv", *_odometry(stream))
+    seen, met = stream.landmark_detections, stream.teammate_detections
+    write_table(place / "observations.csv", *_measured(seen, "landmark", seen.ids.tolist()))
+    if len(met.ids):
+        names = [stream.teammates[i] for i in met.ids]
+        write_table(place / "sightings.csv", *_measured(met, "teammate", names))
     if stream.start is not None:
         covariance = stream.start.covariance
         columns, row = [*POSES], stream.start.pose.tolist()
@@ -48,29 +57,53 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
         write_table(place / "truth.csv", ("t_s", *POSES), truth)
 
 
-def _odometry_rows(stream: RobotStream) -> list[Row]:
-    """A row where each interval begins, and one that ends the last, by the odometry's own clock."""
+def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
+    """Columns and rows, by the odometry's own clock: a row where each interval begins and one that
+    ends the last; of increments one where each ends.
+    """
     intervals = stream.intervals
-    if not len(intervals.end_ns):
-        return []
     ends_ns = intervals.end_ns - stream.clock_offset_ns
+    if intervals.increments is not None:
+        columns = ["t_s", "duration_s", *INCREMENTS]
+        numbers = intervals.increments
+        if intervals.covariances is not None:
+            columns += POSE_COVARIANCE
+            packed = intervals.covariances[:, [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
+            numbers = np.hstack((numbers, packed))
+        times = zip(ends_ns.tolist(), intervals.duration_ns.tolist(), strict=True)
+        told = zip(times, numbers.tolist(), strict=True)
+        return columns, [(seconds(end), seconds(length), *row) for (end, length), row in told]
     begins = (ends_ns - intervals.duration_ns).tolist()
-    columns = zip(begins, intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
-    rows: list[Row] = [(seconds(begin_ns), v, w) for begin_ns, v, w in columns]
-    return [*rows, (seconds(int(ends_ns[-1])), 0.0, 0.0)]
+    pairs = zip(begins, intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
+    rows: list[Row] = [(seconds(begin_ns), v, w) for begin_ns, v, w in pairs]
+    columns = ["t_s", *(STEERED if intervals.steered else SPEEDS)]
+    return columns, [*rows, (seconds(int(ends_ns[-1])), 0.0, 0.0)]
 
 
-def _measured_rows(seen: Detections, names: Sequence[object]) -> Iterable[Row]:
-    """Message by message; one that is empty as a time alone."""
-    ranges, bearings = seen.ranges.tolist(), seen.bearings.tolist()
+def _measured(
+    seen: Detections, name: str, names: Sequence[object]
+) -> tuple[Sequence[str], Iterable[Row]]:
+    """Columns and rows, message by message; one that is empty as a time alone."""
+    columns = ["t_s", name, *(POLAR if seen.points is None else POINTS)]
+    numbers = np.column_stack((seen.ranges, seen.bearings)) if seen.points is None else seen.points
+    if seen.covariances is not None:
+        columns += POLAR_COVARIANCE if seen.points is None else POINT_COVARIANCE
+        numbers = np.hstack((numbers, seen.covariances))
+    return columns, _measured_rows(seen, names, numbers.tolist())
+
+
+def _measured_rows(
+    seen: Detections, names: Sequence[object], numbers: Sequence[Sequence[float]]
+) -> Iterable[Row]:
+    width = 2 if seen.covariances is None else 5
     offsets = seen.offsets.tolist()
     for message, stamp_ns in enumerate(seen.stamps_ns.tolist()):
         time = seconds(stamp_ns)
         first, last = offsets[message : message + 2]
         if first == last:
-            yield (time, "", "", "")
+            yield (time, *[""] * (width + 1))
         for i in range(first, last):
-            yield (time, names[i], ranges[i], bearings[i])
+            yield (time, names[i], *numbers[i])
 
 
 def seconds(stamp_ns: int) -> str:

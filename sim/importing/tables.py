@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.datasets.folder_tables import POINTS, POSE_COVARIANCE, POSES, SPEEDS
+from sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POSE_COVARIANCE, POSES, SPEEDS
 from sim.datasets.folder_writer import Row, seconds, write_table
 from team.ros2.translator import Measured, Pose, Seen, Speeds
 
@@ -22,8 +22,10 @@ class RobotTables:
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def add(self, table: str, columns: Sequence[str], row: Row) -> None:
-        """Append a row."""
-        self.columns.setdefault(table, columns)
+        """Append a row; columns that only some rows have are left out at the end."""
+        known = self.columns.setdefault(table, columns)
+        if len(columns) < len(known):
+            self.columns[table] = columns
         self.rows.setdefault(table, []).append(row)
 
     def take(self, measured: Measured) -> None:
@@ -38,6 +40,11 @@ class RobotTables:
                 self.add("odometry", ("t_s", *SPEEDS), row)
             case Seen(names=()):
                 self.add("observations", ("t_s", "landmark", *POINTS), (time, "", "", ""))
+            case Seen(covariances=(_, *_)):
+                columns = ("t_s", "landmark", *POINTS, *POINT_COVARIANCE)
+                told = zip(measured.names, measured.points, measured.covariances, strict=True)
+                for name, point, covariance in told:
+                    self.add("observations", columns, (time, name, *point, *covariance))
             case Seen():
                 mates = isinstance(measured.names[0], str)
                 table, column = ("sightings", "teammate") if mates else ("observations", "landmark")
@@ -59,4 +66,12 @@ class RobotTables:
         place = folder / self.robot
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():
-            write_table(place / f"{table}.csv", self.columns[table], rows)
+            columns = self.columns[table]
+            write_table(
+                place / f"{table}.csv", columns, (_fitted(row, len(columns)) for row in rows)
+            )
+
+
+def _fitted(row: Row, width: int) -> Row:
+    """The row's first cells; empty ones behind a row that is a time alone."""
+    return [*row, *[""] * width][:width]

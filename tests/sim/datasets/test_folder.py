@@ -16,7 +16,7 @@ from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from sim.world.config import FolderWorld
-from sim.world.streams import RobotStream, StartPose, WorldStreams
+from sim.world.streams import RobotStream, StartPose, WorldStreams, moved
 from team.config import RobotConfig
 from tests import teams
 
@@ -102,23 +102,80 @@ def test_speeds_hold_until_the_next_row_or_for_a_duration(tmp_path: Path) -> Non
     assert means.duration_ns.tolist() == [5 * 10**8, 2 * 10**9]
 
 
-@pytest.mark.parametrize("form", ["poses", "increments"])
-def test_poses_and_increments_are_the_arcs_between_them(tmp_path: Path, form: str) -> None:
-    quarter = "t_s,x_m,y_m,theta_rad\n0,5,5,3\n2,{},{},{}\n"
+def test_poses_are_taken_as_the_increments_between_them(tmp_path: Path) -> None:
     x, y = 5 + np.cos(3) - np.sin(3), 5 + np.sin(3) + np.cos(3)
-    text = quarter.format(x, y, 3 + np.pi / 2 - 2 * np.pi)
-    if form == "increments":
-        text = f"t_s,duration_s,dx_m,dy_m,dtheta_rad\n2,2,1,1,{np.pi / 2}\n"
+    text = f"t_s,x_m,y_m,theta_rad\n0,5,5,3\n2,{x},{y},{3 + np.pi / 2 - 2 * np.pi}\n"
     driven = only(data_set(tmp_path, odometry=text)).intervals
-    np.testing.assert_allclose(driven.forward, [np.pi / 4], rtol=1e-14)
-    np.testing.assert_allclose(driven.yaw_rate, [np.pi / 4], rtol=1e-14)
+    assert (driven.end_ns.tolist(), driven.duration_ns.tolist()) == ([2 * 10**9], [2 * 10**9])
+    assert driven.increments is not None
+    np.testing.assert_allclose(driven.increments, [[1.0, 1.0, np.pi / 2]], rtol=1e-14)
 
 
-def test_points_are_taken_as_range_and_bearing(tmp_path: Path) -> None:
-    text = "t_s,landmark,x_m,y_m\n1,7,3,4\n1,8,-1,0\n"
-    seen = only(data_set(tmp_path, observations=text)).landmark_detections
-    assert seen.ranges.tolist() == [5.0, 1.0]
-    assert seen.bearings.tolist() == [np.arctan2(4.0, 3.0), np.pi]
+INCREMENTS = "t_s,dx_m,dy_m,dtheta_rad,c_xx,c_xy,c_yy,c_xt,c_yt,c_tt\n"
+
+
+def test_increments_come_with_their_covariances(tmp_path: Path) -> None:
+    text = INCREMENTS + "1,1,0.5,0.1,4,1,5,2,3,6\n3,2,0,0,1,0,1,0,0,1\n"
+    stream = only(data_set(tmp_path, odometry=text))
+    driven = stream.intervals
+    assert driven.increments is not None
+    assert driven.covariances is not None
+    assert driven.increments.tolist() == [[1, 0.5, 0.1], [2, 0, 0]]
+    assert driven.covariances[0].tolist() == [[4, 1, 2], [1, 5, 3], [2, 3, 6]]
+    assert driven.duration_ns.tolist() == [2 * 10**9, 2 * 10**9]
+    assert stream.notes[0] == "the first increment is taken to last as long as the second"
+
+
+def test_a_car_s_wheel_and_steering_hold_until_the_next_row(tmp_path: Path) -> None:
+    text = "t_s,wheel_speed_m_s,steering_rad\n0,1,0.1\n1,0,0\n"
+    driven = only(data_set(tmp_path, odometry=text)).intervals
+    assert (driven.steered, driven.forward.tolist(), driven.yaw_rate.tolist()) == (True, [1], [0.1])
+
+
+def test_points_stay_points_and_have_their_range_and_bearing(tmp_path: Path) -> None:
+    text = "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,7,3,4,2,0.5,1\n1,8,-1,0,1,0,1\n1,9,1,1,1,2,1\n"
+    stream = only(data_set(tmp_path, observations=text))
+    seen = stream.landmark_detections
+    assert (seen.ranges.tolist(), seen.bearings.tolist()) == ([5, 1], [np.arctan2(4, 3), np.pi])
+    assert seen.points is not None
+    assert seen.covariances is not None
+    assert seen.points.tolist() == [[3, 4], [-1, 0]]
+    assert seen.covariances.tolist() == [[2, 0.5, 1], [1, 0, 1]]
+    assert "1 measurement dropped: its covariance is not positive definite" in stream.notes[1]
+
+
+def general(robot: RobotStream, form: str) -> RobotStream:
+    """The robot with measurements in a general form."""
+    intervals, seen = robot.intervals, robot.landmark_detections
+    ends, durations, count = intervals.end_ns, intervals.duration_ns, len(intervals.end_ns)
+    steps = np.column_stack([intervals.forward, 0.1 * intervals.forward, intervals.yaw_rate])
+    claims = np.tile([0.1, 1e-3, 1 / 3], (len(seen.ids), 1))
+    if form == "steered":
+        return dataclasses.replace(
+            robot,
+            intervals=dataclasses.replace(intervals, steered=True),
+            landmark_detections=dataclasses.replace(seen, covariances=claims),
+        )
+    points = seen.ranges[:, np.newaxis] * np.column_stack([np.cos(seen.bearings)] * 2)
+    taken = dataclasses.replace(
+        seen,
+        points=points,
+        ranges=np.hypot(*points.T),
+        bearings=np.arctan2(points[:, 1], points[:, 0]),
+        covariances=claims if form == "claimed" else None,
+    )
+    own = np.tile(np.diag([0.1, 0.2, 1 / 3]), (count, 1, 1)) if form == "claimed" else None
+    moves = moved(ends, durations, steps, own)
+    return dataclasses.replace(robot, intervals=moves, landmark_detections=taken)
+
+
+@pytest.mark.parametrize("form", ["steered", "plain", "claimed"])
+def test_general_measurements_keep_their_bits(tmp_path: Path, form: str) -> None:
+    robot = dataclasses.replace(general(teams.stream("r9", 9), form), teammates=("r1", "r9"))
+    other = dataclasses.replace(teams.stream("r1", 9), teammates=("r1", "r9"))
+    world = WorldStreams((other, robot), np.empty(0, np.uint32), None, "test")
+    write_folder(world, tmp_path)
+    assert same(read(tmp_path, "r1", "r9").streams[1], robot)
 
 
 def test_tables_of_one_robot_may_lie_in_the_folder_itself(tmp_path: Path) -> None:
@@ -175,6 +232,17 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
         ("observations", "t_s,landmark\n1,1\n", "line 1: no measurement in its columns"),
         ("observations", SEEN + "3,tag7,1,0\n", "line 5, column landmark: 'tag7' is not a whole"),
         ("observations", SEEN + "3,-1,1,0\n", "column landmark: -1 is out of bounds"),
+        (
+            "odometry",
+            INCREMENTS + "1,1,0,0,1,2,1,0,0,1\n",
+            "line 2, column c_xx: its covariance is",
+        ),
+        ("odometry", "t_s,x_m,y_m,theta_rad,c_xx\n0,0,0,0,1\n", "come with dx_m,dy_m,dtheta_rad"),
+        (
+            "observations",
+            "t_s,landmark,x_m,y_m,c_rr\n1,1,1,1,1\n",
+            "has the columns c_xx,c_xy,c_yy",
+        ),
         ("start", "x_m,y_m,theta_rad\n0,0,0\n1,1,1\n", "2 rows: one pose is where"),
         ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),
     ],
