@@ -18,7 +18,8 @@ import numpy as np
 
 from team.config import Bias
 from team.estimation.consistency import Scale, chi2_quantile, covariance_scale
-from team.estimation.map_joining.marginals import Agreement, BiasEstimate, SubmapCost
+from team.estimation.map_joining.condensed_factor import SubmapCost
+from team.estimation.map_joining.marginals import Agreement, BiasEstimate
 
 WARN = 1.1
 FAIL = 1.3

@@ -7,20 +7,26 @@ Who contradicts the rest beyond doubt is withdrawn by the fold itself: it is ask
 tick of each broadcast's time and of the full solution, never when a broadcast happens to be due,
 and begins again without the robot. So who is withdrawn depends on the set alone, whenever and in
 whichever order it came.
+
+The running fold is bounded (`condensing`): what is old of it is condensed before each tick. The
+full solution is one of the raw set: it takes the ticks again that were condensed.
 """
 
 import math
+from bisect import insort
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from central.config import CentralConfig
 from central.withdrawal import convicted, suspects
 from team import translate
+from team.config import UNNAMED
 from team.estimation.contribution import named
 from team.estimation.hybrid_slam.sensitivity import BIASES
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -33,6 +39,8 @@ from team.estimation.map_joining.joining import (
     converged,
 )
 from team.estimation.map_joining.marginals import Agreement
+from team.estimation.map_joining.relinearising import is_due, relinearised
+from team.estimation.map_joining.submap_graph import CondensedError
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
 from team.wire.messages import SightingFactor, Submap
 
@@ -41,6 +49,9 @@ Key = tuple[int, str, int, int]
 
 GROWTH = 1.25
 """Suspects whom nothing convicted are tried again when there are so many times the submaps."""
+KEPT_DIGESTS = 4
+NEWEST = 8
+"""So many checkpoints are kept of the newest ticks, and of each time as long again before."""
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
@@ -61,22 +72,49 @@ def join_settings(config: CentralConfig) -> JoinSettings:
 
 
 @dataclass
-class _Taken:
-    """The fold after a tick; tried: its submaps when suspects were last tried in vain."""
+class Checkpoint:
+    """The fold after a tick; tried: its submaps when suspects were last tried in vain.
+
+    number: of the ticks that were taken, this one included.
+    """
 
     tick: int
     fold: Fold
     tried: int
+    number: int
+
+
+def thinned(taken: list[Checkpoint]) -> list[Checkpoint]:
+    """The checkpoints to keep: the newest, then ever fewer, and the last one of a raw fold.
+
+    Of those that are n to 2n ticks old a quarter and more of every n: what comes late is taken from
+    a checkpoint that is not much older than it, and there are no more than a few tens.
+    """
+    last = taken[-1].number
+    raw = max((each.number for each in taken if not each.fold.departed), default=0)
+    return [
+        each
+        for each in taken
+        if each.number == raw or each.number % _spacing(last - each.number) == 0
+    ]
+
+
+def _spacing(age: int) -> int:
+    return 1 << max(0, (age // NEWEST).bit_length())
 
 
 class TickFold:
     """Holds the contributions by tick and the fold after each tick that has been taken.
 
     convicted: whom the fold found to be wrong, with the reason in words; nobody, unless `convicts`.
+    bounded: what is old is condensed, but for the ticks up to `_raw_until`, behind which an island
+    whose frame had to turn was found to be condensed.
     """
 
-    def __init__(self, config: CentralConfig) -> None:
+    def __init__(self, config: CentralConfig, bounded: bool = True) -> None:
         self._config = config
+        self._bounded = bounded
+        self._raw_until = -math.inf
         self.settings = join_settings(config)
         self.convicts = config.withdraw_above is not None
         self._ordered: set[str] = set()
@@ -88,8 +126,10 @@ class TickFold:
         self._sightings: dict[Key, list[Sighting]] = {}
         self._digests: dict[Key, bytes] = {}
         self._starts: dict[Stream, InitialPoseFactor] = {}
-        self._taken: list[_Taken] = []
+        self._taken: list[Checkpoint] = []
         self._agreed: tuple[Fold, Agreement] | None = None
+        self._order: list[int] = []
+        self._named: dict[tuple[bytes, ...], tuple[float, translate.Digest]] = {}
 
     def know_start(self, start: InitialPoseFactor) -> None:
         """Where a stream starts; to be told before its first submap is added."""
@@ -102,6 +142,9 @@ class TickFold:
         """
         contribution = translate.contribution_of(submap)
         tick = self._tick_of(submap.stamp_ns)
+        if tick not in self._ticks:
+            insort(self._order, tick)
+        self._named = {at: each for at, each in self._named.items() if each[0] < tick}
         self._ticks[tick][contribution.key] = contribution
         self._sightings[contribution.key] = [translate.sighting_of(each) for each in sightings]
         self._digests[contribution.key] = digest
@@ -135,12 +178,26 @@ class TickFold:
 
         It convicts nobody.
         """
-        other = TickFold(self._config)
+        other = self._other(self._bounded)
         other.convicts = False
-        other._ticks = defaultdict(dict, {t: dict(found) for t, found in self._ticks.items()})
-        other._sightings, other._digests = dict(self._sightings), dict(self._digests)
-        other._starts, other._ordered = dict(self._starts), self._gone | set(robots)
+        other._ordered = self._gone | set(robots)
         other.take_until(self._until_ns)
+        return other
+
+    def _other(self, bounded: bool) -> "TickFold":
+        """Another one of the same members that has taken nothing yet."""
+        other = TickFold(self._config, bounded)
+        other._ticks, other._order, other._sightings = self._ticks, self._order, self._sightings
+        other._digests, other._starts = self._digests, self._starts
+        return other
+
+    def _full(self) -> "TickFold":
+        """Another one of the same members that condenses nothing, from the last raw checkpoint."""
+        other = self._other(bounded=False)
+        other.convicts, other._ordered = self.convicts, set(self._ordered)
+        raw = [each for each in self._taken if not each.fold.departed]
+        if raw and not self.convicted:
+            other._taken = [replace(raw[-1])]
         return other
 
     @property
@@ -165,6 +222,9 @@ class TickFold:
         if tick <= self._convicted_at:
             self.convicted, self._convicted_at = {}, -math.inf
             self._taken = []
+        if tick <= self._raw_until:
+            self._raw_until = -math.inf
+            self._taken = [each for each in self._taken if not each.fold.departed]
         while self._taken and self._taken[-1].tick >= tick:
             self._taken.pop()
 
@@ -185,24 +245,34 @@ class TickFold:
                 if (tick + 1) * self._tick_ns > watermark_ns:
                     break
                 taken = True
-                self._take(tick)
-                again = not self._taken
+                again = not self._take(tick)
                 if again:
                     break
         return taken
 
-    def _take(self, tick: int) -> None:
-        """Take a tick; if it convicts a robot there is none that is taken any more."""
+    def _take(self, tick: int) -> bool:
+        """Take a tick; False if ticks before it are to be taken again.
+
+        If it convicts a robot there is none that is taken any more; if it has to move an island
+        that is condensed, none since then.
+        """
         before = self._taken[-1] if self._taken else None
-        taken = _Taken(
-            tick, self._with_tick(self.fold, tick), 0 if before is None else before.tried
+        try:
+            fold = self._with_tick(self.fold, tick)
+        except CondensedError:
+            self._raw_until = tick
+            self._taken = [each for each in self._taken if not each.fold.departed]
+            return False
+        taken = Checkpoint(
+            tick, fold, *((0, 1) if before is None else (before.tried, before.number + 1))
         )
         if before is not None:
             before.fold = compacted(before.fold)
-        self._taken.append(taken)
+        self._taken = thinned([*self._taken, taken])
         asked = before is None or before.tick // self._period < tick // self._period
-        if asked and len(taken.fold.contributions) >= GROWTH * taken.tried:
-            self._convict(taken.fold, tick)
+        if asked and taken.fold.size >= GROWTH * taken.tried:
+            return not self._convict(taken.fold, tick)
+        return True
 
     def _convict(self, fold: Fold, at: float) -> bool:
         """Whether somebody is wrong beyond doubt; he is left out from the first tick on."""
@@ -212,7 +282,7 @@ class TickFold:
         agreement = self.agreement(fold)
         if not suspects(agreement, limit):
             return False
-        self._taken[-1].tried = len(fold.contributions)
+        self._taken[-1].tried = fold.size
         found = convicted(agreement, limit, self._agreement_without)
         if found is None:
             return False
@@ -230,10 +300,20 @@ class TickFold:
 
     def _agreement_without(self, robots: Collection[str]) -> Agreement | None:
         fold = self.without(robots).fold
-        return marginals.joint_cost(converged(fold, self.settings)) if fold.home else None
+        if not fold.home:
+            return None
+        return marginals.joint_cost(fold if fold.departed else converged(fold, self.settings))
 
     def solved(self) -> Fold:
         """The full solution of everything that is there, without whom it convicts."""
+        self.take_until(math.inf)
+        if self.fold.departed:
+            full = self._full()
+            fold = full.solved()
+            if full.convicted != self.convicted:
+                self.convicted, self._convicted_at = full.convicted, full._convicted_at
+                self._taken, self._raw_until = [], -math.inf
+            return fold
         while True:
             self.take_until(math.inf)
             if not self.fold.contributions:
@@ -246,23 +326,37 @@ class TickFold:
         """The fold over everything that is there, ahead of the watermark too."""
         fold = self.fold
         for tick in self._open_ticks():
-            fold = self._with_tick(fold, tick)
+            try:
+                fold = self._with_tick(fold, tick)
+            except CondensedError:
+                whole = self.without(())
+                whole.take_until(math.inf)
+                return whole.fold
         return fold
 
     def _open_ticks(self) -> list[int]:
         """The ticks that are not taken yet and have a submap of a robot that is not withdrawn."""
         last, gone = self._taken[-1].tick if self._taken else -math.inf, self._gone
-        return sorted(
+        return [
             tick
-            for tick, members in self._ticks.items()
-            if tick > last and any(key[1] not in gone for key in members)
-        )
+            for tick in self._ticks_behind(last)
+            if any(key[1] not in gone for key in self._ticks[tick])
+        ]
 
     def _with_tick(self, fold: Fold, tick: int) -> Fold:
-        """The fold with all of a tick; members beyond the bounds are refused before the others."""
+        """The fold with all of a tick; members beyond the bounds are refused before the others.
+
+        Raises CondensedError where an island would have to be moved that is condensed, or comes to
+        have unnamed landmarks.
+        """
+        if self._bounded and tick > self._raw_until:
+            fold = self._condensed(fold, tick)
         gone = self._gone
         order = sorted(key for key in self._ticks[tick] if key[1] not in gone)
         members = [self._ticks[tick][key] for key in order]
+        unnamed = (each.stream for each in members if (each.local.ids >= UNNAMED).any())
+        if fold.departed and (stream := next(unnamed, None)) is not None:
+            raise CondensedError(stream)
         outside = {}
         for each in members:
             why = submap_beyond(each.local, self._config.bounds)
@@ -290,6 +384,27 @@ class TickFold:
         news = Tick(members, sightings, starts, outside, tuple(set_aside))
         return taken(fold, news, self.settings)
 
+    def _condensed(self, fold: Fold, tick: int) -> Fold:
+        """The fold that a tick is put on; linearised again where that is due."""
+        coming = sum(key[1] not in self._gone for key in self._ticks[tick])
+        if fold.departed and is_due(fold.size, fold.size + coming):
+            keys = sorted(
+                key
+                for at, members in self._ticks.items()
+                if at < tick
+                for key in members
+                if key[1] not in self._gone and fold.home.get(key[1:3]) == fold.main_key
+            )
+            contributions = [self._ticks[self._tick_of(key[0])][key] for key in keys]
+            sightings = [
+                each
+                for key in keys
+                for each in self._sightings[key]
+                if each.teammate not in self._gone
+            ]
+            fold = relinearised(fold, contributions, sightings)
+        return condensed(fold)
+
     def digest(self, fold: Fold, *more: bytes) -> bytes:
         """The name of the fold's set: starts and submaps in canonical order, and `more`."""
         starts = [
@@ -302,10 +417,52 @@ class TickFold:
             for (robot, incarnation), start in sorted(self._starts.items())
             if (robot, incarnation) in fold.home
         ]
-        keys = [*(c.key for c in fold.contributions), *fold.refused]
-        members = [self._digests[key] for key in sorted(keys)]
         gone = [f"without {robot}".encode() for robot in self.withdrawn]
-        return translate.digest_of(*more, *gone, *starts, *members)
+        return self._digest_of_ticks((*more, *gone, *starts), self._last_tick(fold))
+
+    def _last_tick(self, fold: Fold) -> float:
+        keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
+        return max((self._tick_of(key[0]) for key in keys), default=-math.inf)
+
+    def _digest_of_ticks(self, before: tuple[bytes, ...], last: float) -> bytes:
+        """The digest of these parts and of the members up to a tick, in canonical order.
+
+        That of the ticks that have been taken is kept, by what stands before them.
+        """
+        closed = min(last, self._taken[-1].tick if self._taken else -math.inf)
+        until, digest = self._named.pop(before, (-math.inf, translate.Digest()))
+        if until > closed:
+            until, digest = -math.inf, translate.Digest()
+        if until == -math.inf:
+            digest.update(*before)
+        digest.update(*self._digests_between(until, closed))
+        if closed > -math.inf:
+            self._named[before] = closed, digest
+        for oldest in list(self._named)[:-KEPT_DIGESTS]:
+            del self._named[oldest]
+        whole = digest.copy()
+        whole.update(*self._digests_between(closed, last))
+        return whole.value
+
+    def _digests_between(self, after: float, last: float) -> list[bytes]:
+        """Of the members of the ticks behind `after` up to `last`."""
+        gone = self._gone
+        return [
+            self._digests[key]
+            for tick in self._ticks_behind(after)
+            if tick <= last
+            for key in sorted(self._ticks[tick])
+            if key[1] not in gone
+        ]
+
+    def _ticks_behind(self, after: float) -> list[int]:
+        """The ticks with members behind this one, ascending."""
+        behind = []
+        for tick in reversed(self._order):
+            if tick <= after:
+                break
+            behind.append(tick)
+        return behind[::-1]
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """The version vector: the last sequence of each stream that was taken or refused."""

@@ -23,13 +23,35 @@ NO_MAP = bytes(8)
 """The digest that stands for no map."""
 
 
+class Digest:
+    """A digest that goes on: of all parts that it was given so far."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.blake2b(digest_size=8)
+
+    def update(self, *parts: bytes) -> None:
+        """Take more parts."""
+        for part in parts:
+            self._hash.update(len(part).to_bytes(8, "little"))
+            self._hash.update(part)
+
+    def copy(self) -> "Digest":
+        """Another one of the same parts."""
+        other = Digest()
+        other._hash = self._hash.copy()
+        return other
+
+    @property
+    def value(self) -> bytes:
+        """8 bytes."""
+        return self._hash.digest()
+
+
 def digest_of(*parts: bytes) -> bytes:
     """The 8-byte BLAKE2b digest by which messages name a configuration or a set."""
-    digest = hashlib.blake2b(digest_size=8)
-    for part in parts:
-        digest.update(len(part).to_bytes(8, "little"))
-        digest.update(part)
-    return digest.digest()
+    digest = Digest()
+    digest.update(*parts)
+    return digest.value
 
 
 def configured(

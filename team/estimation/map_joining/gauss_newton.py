@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 
 from team.config import Bias
 from team.estimation.gaussian import NotACovarianceError
@@ -204,7 +204,7 @@ class Island:
     @cached_property
     def prior_chi2(self) -> Float[np.ndarray, " priors"]:
         """χ² of each prior on a start."""
-        return np.array([_prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
+        return np.array([prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
 
     @cached_property
     def prior_weight(self) -> Float[np.ndarray, " priors"]:
@@ -228,29 +228,46 @@ class Island:
         factor, offset = self.settings.covariance_factor, self.graph.offset
         chi2 = float((self.weight * kernel.costs(state, offset, self.factors, factor)).sum())
         seen = float((self.sighting_weight * other.sighting_chi2).sum())
-        return chi2 + seen + float((self.prior_weight * other.prior_chi2).sum())
+        seen += float((self.prior_weight * other.prior_chi2).sum())
+        old = self.graph.condensed
+        return chi2 + seen if old is None else chi2 + seen + old.cost_at(state, offset)
 
     @cached_property
     def cost(self) -> float:
         """What is minimised, at the present scales."""
-        if self.settings.robust_c is None:
-            chi2 = float(self.chi2.sum() + self.prior_chi2.sum())
-            return chi2 + float(self.sighting_chi2.sum())
-        scale = self.scale**2 * self.graph.dimensions
-        cost = float((scale * np.log1p(self.chi2 / scale)).sum()) + self._prior_cost
-        own, gate = self._landmark_chi2_and_gate
-        beyond = own > gate
-        cost += float((gate[beyond] * np.log(own[beyond] / gate[beyond])).sum())
-        scale = 2.0 * self.sighting_scale**2
-        return cost + float((scale * np.log1p(self.sighting_chi2 / scale)).sum())
+        graph = self.graph
+        sizes = len(self.age), len(self.sighting_age), len(graph.priors)
+        submaps, seen, priors = (np.ones(size, np.bool_) for size in sizes)
+        cost = self.cost_of(submaps, seen, priors)
+        old = graph.condensed
+        return cost if old is None else cost + old.cost_at(self.state, graph.offset)
 
-    @property
-    def _prior_cost(self) -> float:
+    def cost_of(
+        self,
+        submaps: Bool[np.ndarray, " F"],
+        sightings: Bool[np.ndarray, " S"],
+        priors: Bool[np.ndarray, " priors"],
+    ) -> float:
+        """The cost of some of the factors."""
+        if self.settings.robust_c is None:
+            chi2 = float(self.chi2[submaps].sum() + self.prior_chi2[priors].sum())
+            return chi2 + float(self.sighting_chi2[sightings].sum())
+        scale = (self.scale**2 * self.graph.dimensions)[submaps]
+        cost = float((scale * np.log1p(self.chi2[submaps] / scale)).sum())
+        cost += self._prior_cost(priors)
+        own, gate = self._landmark_chi2_and_gate
+        of = np.repeat(submaps, np.diff(self.graph.factors.block_start))
+        beyond = (own > gate) & of
+        cost += float((gate[beyond] * np.log(own[beyond] / gate[beyond])).sum())
+        scale = 2.0 * self.sighting_scale[sightings] ** 2
+        return cost + float((scale * np.log1p(self.sighting_chi2[sightings] / scale)).sum())
+
+    def _prior_cost(self, chosen: Bool[np.ndarray, " priors"]) -> float:
         """Cauchy's loss of the biases' priors, χ² of the others."""
         c2 = 1.0 if self.settings.robust_c is None else self.settings.robust_c**2
-        of_bias = self.prior_weight < 1.0
+        of_bias = (self.prior_weight < 1.0) & chosen
         robust = float((c2 * np.log1p(self.prior_chi2[of_bias] / c2)).sum())
-        return robust + float(self.prior_chi2[~of_bias].sum())
+        return robust + float(self.prior_chi2[chosen & ~of_bias].sum())
 
     @cached_property
     def normal_equations(self) -> tuple[Values, Values]:
@@ -278,8 +295,14 @@ class Island:
             graph.entry,
             pattern.value_start,
         )
+        if graph.condensed is not None:
+            first = graph.sighting_factors.first_pair + 4 * len(graph.sightings)
+            entry = graph.entry[first:]
+            graph.condensed.add(
+                values, gradient, self.state, graph.offset, entry, pattern.value_start
+            )
         for k, prior in enumerate(graph.priors):
-            slope, hessian, _ = _prior_terms(self, k)
+            slope, hessian, _ = prior_terms(self, k)
             begin = graph.offset[prior.node]
             weight = self.prior_weight[k]
             gradient[begin : begin + len(slope)] += weight * slope
@@ -334,9 +357,10 @@ def is_solvable(island: Island) -> bool:
     )
 
 
-def _prior_terms(
+def prior_terms(
     island: Island, k: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], float]:
+    """P⁻¹r, P⁻¹ and χ² of a prior."""
     node, mean, information = island.graph.priors[k]
     begin = island.graph.offset[node]
     residual = island.state[begin : begin + len(mean)] - mean

@@ -145,6 +145,7 @@ class Fold:
                 landmarks of submaps of which only the motion is in the map.
     landmarks:  which unnamed landmarks of which submaps are one, and why (`associating`).
     audits:     closures that may still be undone (`auditing`).
+    departed:   submaps that are condensed (`condensing`), no more among `contributions`.
     """
 
     contributions: tuple[Contribution, ...]
@@ -163,6 +164,12 @@ class Fold:
     set_aside: tuple[str, ...] = ()
     landmarks: Landmarks = NO_LANDMARKS
     audits: tuple[Audit, ...] = ()
+    departed: int = 0
+
+    @property
+    def size(self) -> int:
+        """How many submaps it has."""
+        return self.departed + len(self.contributions)
 
     @property
     def main_key(self) -> Stream | None:
@@ -191,7 +198,7 @@ class Fold:
         """Sequence of the submap that the fold takes next from a stream."""
         if stream not in self.home:
             return 0
-        return len(self.islands[self.home[stream]].graph.streams[stream]) - 1
+        return self.islands[self.home[stream]].graph.next_sequence(stream)
 
 
 EMPTY_FOLD = Fold((), {}, {}, {}, {})
@@ -382,7 +389,9 @@ def _looked(fold: Fold) -> Fold:
     islands, looked = dict(fold.islands), dict(fold.looked)
     for key, island in fold.islands.items():
         size = len(island.graph.submaps)
-        if size < PATIENCE * looked.get(key, 0) or not suspicious(island, final_cost(island)):
+        if size < PATIENCE * looked.get(key, 0) or island.graph.condensed is not None:
+            continue
+        if not suspicious(island, final_cost(island)):
             continue
         looked[key] = size
         islands[key] = _search(island).best.island

@@ -252,7 +252,7 @@ def _sensitivity(factors: Factors, f: int, n: int) -> Float[np.ndarray, "B n"]:
 
 
 @compiled
-def _submap(
+def submap_of(
     offset: Indices, factors: Factors, f: int
 ) -> tuple[Indices, Indices, Values, Float[np.ndarray, "n n"], Float[np.ndarray, "B n"]]:
     """A submap's nodes, their places in the state, its mean, its P⁻¹ and its sensitivity."""
@@ -268,7 +268,7 @@ def costs(state: Values, offset: Indices, factors: Factors, covariance_factor: f
     """χ² of each submap in the metric (covariance_factor · P)⁻¹."""
     result = np.empty(len(factors.member_start) - 1)
     for f in range(len(result)):
-        _, at, mean, information, sensitivity = _submap(offset, factors, f)
+        _, at, mean, information, sensitivity = submap_of(offset, factors, f)
         n = len(mean)
         members = at[: len(at) - len(sensitivity)]
         residual, _ = submap_residual(state, members, shifted_mean(state, at, mean, sensitivity))
@@ -317,7 +317,7 @@ def normal_equations(
                 values[value_start[column_start[node]] + p * size + p] = 1.0
     pair = 0
     for f in range(len(chi2)):
-        nodes, at, mean, information, sensitivity = _submap(offset, factors, f)
+        nodes, at, mean, information, sensitivity = submap_of(offset, factors, f)
         hessian, slope, raw = biased_normal(state, at, mean, information, sensitivity)
         chi2[f] = raw / covariance_factor
         weight = robust_weight(chi2[f], len(mean), scale[f]) / covariance_factor
@@ -359,7 +359,7 @@ def explained(
     result = np.zeros(len(factors.member_start) - 1)
     pair = 0
     for f in range(len(result)):
-        nodes, at, mean, information, sensitivity = _submap(offset, factors, f)
+        nodes, at, mean, information, sensitivity = submap_of(offset, factors, f)
         hessian, _, _ = biased_normal(state, at, mean, information, sensitivity)
         row = 0
         for a in range(len(nodes)):

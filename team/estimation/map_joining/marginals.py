@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt32
 from team.config import Bias
 from team.estimation.contribution import Stream
 from team.estimation.map_joining import joining_kernel as kernel
+from team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from team.estimation.map_joining.inter_robot_kernel import explained_by_sightings
@@ -68,21 +69,6 @@ class BiasEstimate(NamedTuple):
     sigma: float
 
 
-class SubmapCost(NamedTuple):
-    """How one submap agrees with the rest: χ² should be near dof.
-
-    chi2 is unweighted, nothing discounted; dof = dim − w tr(JᵀP⁻¹J Σ) is the part of its dimension
-    that the solution does not take up (its redundancy, Baarda 1968); weight w is robust, 1 without
-    a robust loss.
-    """
-
-    stream: Stream
-    sequence: int
-    chi2: float
-    dof: float
-    weight: float
-
-
 class Agreement(NamedTuple):
     """Joint cost Σ w χ² and its degrees of freedom, in all, per robot and per submap.
 
@@ -130,8 +116,14 @@ def confirmed(fold: Fold, submaps: int) -> list[int]:
         return sorted(island.graph.landmarks)
     nodes = np.concatenate([each.landmarks for each in island.graph.submaps])
     found, counts = np.unique(nodes[island.landmark_weight >= BELIEVED], return_counts=True)
-    believed = set(found[counts >= submaps].tolist())
-    return sorted(id_ for id_, node in island.graph.landmarks.items() if node in believed)
+    count_of = dict(zip(found.tolist(), counts.tolist(), strict=True))
+    old = island.graph.condensed
+    before = {} if old is None else old.departed.believed
+    return sorted(
+        id_
+        for id_, node in island.graph.landmarks.items()
+        if count_of.get(node, 0) + before.get(id_, 0) >= submaps
+    )
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
@@ -231,9 +223,20 @@ def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
     return island.graph.pattern.block(island.selected_covariance, row, column)
 
 
-def joint_cost(fold: Fold) -> Agreement:
-    """The agreement of the main island's submaps, at the present estimate."""
-    island = fold.main
+class Terms(NamedTuple):
+    """The agreement factor by factor, in the graph's order.
+
+    submaps: nothing discounted. counted, priors, sightings: (robot, w χ², dof) as they count.
+    """
+
+    submaps: list[SubmapCost]
+    counted: list[tuple[str, float, float]]
+    priors: list[tuple[str, float, float]]
+    sightings: list[tuple[str, float, float]]
+
+
+def terms(island: Island) -> Terms:
+    """How each factor of an island agrees with the rest."""
     graph = island.graph
     explained = kernel.explained(
         island.state,
@@ -246,25 +249,35 @@ def joint_cost(fold: Fold) -> Agreement:
     )
     weight = island.weight
     taken = weight * explained
-    submaps = tuple(
-        SubmapCost(of.stream, of.sequence, float(chi2), float(own), float(w))
-        for (of, *_), chi2, own, w in zip(
-            graph.submaps, island.whole_chi2, graph.dimensions - taken, weight, strict=True
-        )
+    of = [each.contribution for each in graph.submaps]
+    whole, left = island.whole_chi2.tolist(), (graph.dimensions - taken).tolist()
+    counted = (weight * island.counted_chi2).tolist(), (island.dimensions - taken).tolist()
+    return Terms(
+        [
+            SubmapCost(each.stream, each.sequence, *rest)
+            for each, *rest in zip(of, whole, left, weight.tolist(), strict=True)
+        ],
+        [(each.robot, *rest) for each, *rest in zip(of, *counted, strict=True)],
+        _priors(island),
+        _sightings(island),
     )
-    counted = zip(
-        graph.submaps, weight * island.counted_chi2, island.dimensions - taken, strict=True
-    )
-    robots: dict[str, tuple[float, float]] = {}
-    for robot, chi2, own in [
-        *((of.robot, float(chi2), float(own)) for (of, *_), chi2, own in counted),
-        *_priors(island),
-        *_sightings(island),
-    ]:
+
+
+def joint_cost(fold: Fold) -> Agreement:
+    """The agreement of the main island's submaps, at the present estimate.
+
+    What is condensed counts as it agreed when that was done; of its submaps the newest are told.
+    """
+    found = terms(fold.main)
+    old = fold.main.graph.condensed
+    departed = NOBODY if old is None else old.departed
+    robots = dict(departed.robots)
+    for robot, chi2, own in (*found.counted, *found.priors, *found.sightings):
         before = robots.get(robot, (0.0, 0.0))
         robots[robot] = (before[0] + chi2, before[1] + own)
     chi2 = sum(robots[robot][0] for robot in sorted(robots))
     total = sum(robots[robot][1] for robot in sorted(robots))
+    submaps = (*departed.submaps, *found.submaps)
     return Agreement(chi2, total, {robot: robots[robot] for robot in sorted(robots)}, submaps)
 
 

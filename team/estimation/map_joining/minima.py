@@ -82,7 +82,8 @@ def degrees_of_freedom(island: Island) -> int:
     graph = island.graph
     priors = sum(len(prior.mean) for prior in graph.priors)
     measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
-    return measured - graph.unknowns
+    old = graph.condensed
+    return measured - graph.unknowns + (0 if old is None else old.redundancy)
 
 
 def suspicious(island: Island, cost: float) -> bool:
@@ -195,8 +196,13 @@ def _lowest(found: Sequence[Minimum]) -> Search:
 
 
 def _further(island: Island) -> Iterator[Island]:
-    """Starts that owe nothing to the island's state, the most promising first."""
+    """Starts that owe nothing to the island's state, the most promising first.
+
+    What is condensed owes everything to it: then there are none.
+    """
     graph = island.graph
+    if graph.condensed is not None:
+        return
     guess = relaxed(graph, island.state)
     if guess is not None:
         yield replace(island, state=guess)

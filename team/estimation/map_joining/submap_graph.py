@@ -17,6 +17,7 @@ from team.config import Bias
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.condensed_factor import Condensed
 from team.estimation.map_joining.inter_robot_kernel import Sightings
 from team.estimation.map_joining.joining_kernel import Factors, block_pattern
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
@@ -92,6 +93,8 @@ class Graph:
     offset:    first number of each node in the state; the last is the state's length.
     fixed:     nodes that are constants (exact starts, the gauge).
     submaps, sightings: in the order in which they were taken.
+    condensed: what older ones say, if some are condensed (`condensing`).
+    gone:      how many of a stream's submaps are in `condensed`; `streams` begins behind them.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -104,6 +107,8 @@ class Graph:
     sightings: tuple[Encounter, ...]
     priors: tuple[Prior, ...]
     common: Mapping[Bias, int] = field(default_factory=dict)
+    condensed: Condensed | None = None
+    gone: Mapping[Stream, int] = field(default_factory=dict)
 
     @cached_property
     def factors(self) -> Factors:
@@ -144,10 +149,12 @@ class Graph:
     def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
         factors, pairs = self.factors, self.sighting_factors.nodes
         members = factors.member_start[-1] + 2 * np.arange(1, len(pairs) + 1)
+        old = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
+        ends = np.concatenate([factors.member_start, members])
         column_start, rows, entry = block_pattern(
             self.fixed,
-            np.concatenate([factors.member, pairs.ravel()]),
-            np.concatenate([factors.member_start, members]),
+            np.concatenate([factors.member, pairs.ravel(), old]),
+            np.concatenate([ends, ends[-1:] + len(old)]) if len(old) else ends,
         )
         return Pattern(np.diff(self.offset), column_start, rows), entry
 
@@ -178,6 +185,10 @@ class Graph:
         headings: Indices = self.offset[:-1][np.diff(self.offset) == 3] + 2
         return headings
 
+    def next_sequence(self, stream: Stream) -> int:
+        """Sequence of the submap that comes next of a stream."""
+        return self.gone.get(stream, 0) + len(self.streams[stream]) - 1
+
     @property
     def unknowns(self) -> int:
         """Numbers to be estimated."""
@@ -189,7 +200,8 @@ class Graph:
             if node == nodes[0]:
                 return f"the start of {named(stream)}"
             if node in nodes:
-                return f"the end of submap {nodes.index(node) - 1} of {named(stream)}"
+                sequence = self.gone.get(stream, 0) + nodes.index(node) - 1
+                return f"the end of submap {sequence} of {named(stream)}"
         for (stream, stamp_ns), at in self.poses.items():
             if node == at:
                 return f"the pose of {named(stream)} at {stamp_ns * 1e-9:g} s"
@@ -323,8 +335,63 @@ def extended(
         sightings=graph.sightings,
         priors=tuple(priors),
         common=growth.common,
+        condensed=graph.condensed,
+        gone=graph.gone,
     )
     return grown, np.concatenate([state, *growth.values])
+
+
+class CondensedError(ValueError):
+    """An island whose old submaps are condensed would have to be moved into another frame."""
+
+    def __init__(self, stream: Stream) -> None:
+        super().__init__(f"the island of {named(stream)} is condensed in a frame of its own")
+        self.stream = stream
+
+
+def without_nodes(
+    graph: Graph,
+    eliminated: Bool[np.ndarray, " _"],
+    submaps: Bool[np.ndarray, " F"],
+    sightings: Bool[np.ndarray, " S"],
+    priors: Bool[np.ndarray, " _"],
+) -> tuple[Graph, Indices]:
+    """The graph without some poses, with the factors that stay, and each node's new number.
+
+    What is eliminated of a stream is its first poses. What is condensed is left out.
+    """
+    node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
+    streams, gone = {}, dict(graph.gone)
+    for stream, nodes in graph.streams.items():
+        first = int(eliminated[list(nodes)].sum())
+        streams[stream] = tuple(node_of[list(nodes[first:])].tolist())
+        gone[stream] = gone.get(stream, 0) + first
+    left = Graph(
+        streams=streams,
+        landmarks={id_: int(node_of[node]) for id_, node in graph.landmarks.items()},
+        poses={at: int(node_of[n]) for at, n in graph.poses.items() if not eliminated[n]},
+        biases={at: int(node_of[node]) for at, node in graph.biases.items()},
+        offset=_starts(np.diff(graph.offset)[~eliminated].tolist()),
+        fixed=graph.fixed[~eliminated],
+        submaps=tuple(
+            each._replace(nodes=node_of[each.nodes])
+            for each, stays in zip(graph.submaps, submaps.tolist(), strict=True)
+            if stays
+        ),
+        sightings=tuple(
+            Encounter(each.sighting, int(node_of[each.observer]), int(node_of[each.teammate]))
+            for each, stays in zip(graph.sightings, sightings.tolist(), strict=True)
+            if stays
+        ),
+        priors=tuple(
+            each._replace(node=int(node_of[each.node]))
+            for each, stays in zip(graph.priors, priors.tolist(), strict=True)
+            if stays
+        ),
+        common={bias: int(node_of[node]) for bias, node in graph.common.items()},
+        gone=gone,
+    )
+    return left, node_of
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
@@ -356,8 +423,11 @@ def merged(
 ) -> tuple[Graph, Values]:
     """Both graphs in the main frame; landmarks with equal ids become one, at the main's value.
 
-    What was fixed in the other frame (its gauge) becomes free.
+    What was fixed in the other frame (its gauge) becomes free. Raises CondensedError where old
+    submaps of the other graph are condensed, in a frame that would have to turn.
     """
+    if other.condensed is not None:
+        raise CondensedError(min(other.streams))
     common = {
         node: main.landmarks[id_] for id_, node in other.landmarks.items() if id_ in main.landmarks
     }
@@ -403,6 +473,8 @@ def merged(
         sightings=(*main.sightings, *sightings),
         priors=(*main.priors, *priors),
         common={**of_team, **main.common},
+        condensed=main.condensed,
+        gone={**main.gone, **other.gone},
     )
     return graph, np.concatenate([state, *values])
 

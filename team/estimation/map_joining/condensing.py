@@ -1,0 +1,293 @@
+"""The bounded fold: what is old is condensed once, by rules on sequence numbers only.
+
+The last LAG submaps of each stream of the main island stay as they are. Older ones are linearised
+at the state that the fold has when they leave, with the robust weights that they have there, and
+become one quadratic over landmarks, biases and the pose at each stream's boundary
+(`condensed_factor`); their poses are eliminated. So the cost of a tick depends on the landmarks and
+the robots, not on how long the team has been at work. A fold stays a pure function of its ticks.
+
+Nothing leaves before the fold has BEGIN submaps, nor before the robust scale of a submap has come
+to its end. Islands that wait for a place stay raw, since their frame is to turn.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from scipy.linalg import cho_factor, cho_solve
+
+from team.estimation.contribution import Stream
+from team.estimation.map_joining.condensed_factor import (
+    NOBODY,
+    Condensed,
+    Departed,
+    Path,
+    SubmapCost,
+    places,
+)
+from team.estimation.map_joining.condensing_kernel import add_submaps
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island, prior_terms
+from team.estimation.map_joining.inter_robot_kernel import sighting_residual
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
+from team.estimation.map_joining.submap_graph import Graph, without_nodes
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "n n"]
+T = TypeVar("T")
+
+LAG = 8
+"""So many submaps of each stream stay raw."""
+BEGIN = 128
+"""A fold of fewer submaps is taken in full."""
+SETTLED = 1000
+"""A fold of more submaps than this is not linearised again."""
+HISTORY = 100
+"""Of each stream the costs of so many departed submaps are kept."""
+
+
+def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN) -> Fold:
+    """The fold with what is old of its main island condensed; itself where nothing is.
+
+    What can not be eliminated stays raw, and so does a team with unnamed landmarks: which of them
+    are one is asked of the submaps themselves, again and again.
+    """
+    key = fold.main_key
+    if key is None or fold.size <= begin or fold.landmarks.number:
+        return fold
+    island = fold.islands[key]
+    leaving = _leaving(island, lag)
+    if not leaving.any():
+        return fold
+    try:
+        smaller = _condensed(island, leaving)
+    except UNSOLVABLE:
+        return fold
+    gone = smaller.graph.gone
+    return replace(
+        fold,
+        islands={**fold.islands, key: smaller},
+        contributions=tuple(
+            each for each in fold.contributions if each.sequence >= gone.get(each.stream, 0)
+        ),
+        waiting=tuple(each for each in fold.waiting if each.sequence >= gone.get(each.stream, 0)),
+        departed=fold.departed + int(leaving.sum()),
+    )
+
+
+def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
+    """Which submaps are old: more than `lag` behind their stream's last, at their final scale."""
+    graph, c = island.graph, island.settings.robust_c
+    last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
+    narrow = np.ones(len(graph.submaps), np.bool_) if c is None else island.scale <= c
+    leaving = np.zeros(len(graph.submaps), np.bool_)
+    held = set[Stream]()
+    for f, (contribution, *_) in enumerate(graph.submaps):
+        stream = contribution.stream
+        if contribution.sequence < last[stream] and narrow[f] and stream not in held:
+            leaving[f] = True
+        else:
+            held.add(stream)
+    return leaving
+
+
+def _condensed(island: Island, leaving: Bool[np.ndarray, " F"]) -> Island:
+    graph, before = island.graph, island.graph.condensed
+    eliminated = _eliminated(graph, leaving)
+    seen = np.array(
+        [eliminated[each.observer] or eliminated[each.teammate] for each in graph.sightings],
+        np.bool_,
+    )
+    prior = np.array([eliminated[each.node] for each in graph.priors], np.bool_)
+    touched = [graph.submaps[f].nodes for f in np.flatnonzero(leaving)]
+    touched += [np.array(graph.sightings[s][1:]) for s in np.flatnonzero(seen)]
+    touched += [np.array([graph.priors[k].node]) for k in np.flatnonzero(prior)]
+    touched += [] if before is None else [before.nodes]
+    union = np.unique(np.concatenate(touched))
+    union = union[~graph.fixed[union]]
+    H, g, cost = _quadratic(island, union, leaving, seen, prior)
+    out = np.repeat(eliminated[union], np.diff(graph.offset)[union])
+    gain, slope, information = _schur(H, g, out)
+    left, node_of = without_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
+    kept = union[~eliminated[union]]
+    numbers = places(graph.offset, kept)
+    measured = int(graph.dimensions[leaving].sum()) + 2 * int(seen.sum())
+    measured += sum(len(graph.priors[k].mean) for k in np.flatnonzero(prior))
+    made = Condensed(
+        nodes=node_of[kept],
+        at=island.state[numbers],
+        headings=np.isin(numbers, graph.headings),
+        information=information,
+        slope=slope,
+        cost=cost - gain,
+        submaps=int(leaving.sum()) + (0 if before is None else before.submaps),
+        redundancy=measured - int(out.sum()) + (0 if before is None else before.redundancy),
+        departed=_departed(island, leaving, seen, prior),
+    )
+    stays = np.repeat(~eliminated, np.diff(graph.offset))
+    return Island(
+        replace(left, condensed=made),
+        island.state[stays],
+        island.age[~leaving],
+        island.sighting_age[~seen],
+        island.settings,
+    )
+
+
+def _eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " _"]:
+    """The nodes that nothing will be said of any more: poses of old submaps but the last."""
+    eliminated = np.zeros(len(graph.fixed), np.bool_)
+    for f in np.flatnonzero(leaving):
+        contribution, nodes, _ = graph.submaps[f]
+        eliminated[nodes[0]] = True
+        eliminated[nodes[2 : 2 + len(contribution.local.node_stamps)]] = True
+    return eliminated
+
+
+def _quadratic(
+    island: Island,
+    union: Indices,
+    leaving: Bool[np.ndarray, " F"],
+    seen: Bool[np.ndarray, " S"],
+    prior: Bool[np.ndarray, " priors"],
+) -> tuple[Matrix, Values, float]:
+    """A and half the gradient over the union of nodes, and the cost, of what leaves."""
+    graph, state = island.graph, island.state
+    sizes = np.diff(graph.offset)[union]
+    place = np.full(len(graph.fixed), -1, np.int64)
+    place[union] = np.cumsum(sizes) - sizes
+    total = int(sizes.sum())
+    H, g, cost = np.zeros((total, total)), np.zeros(total), 0.0
+    before = graph.condensed
+    if before is not None:
+        within = places(
+            np.concatenate([place[union], [total]]), np.searchsorted(union, before.nodes)
+        )
+        H[np.ix_(within, within)] += before.information
+        g[within] += before.gradient_at(state, graph.offset)
+        cost = before.cost_at(state, graph.offset)
+    weights = island.weight / island.settings.covariance_factor
+    at_work = np.flatnonzero(leaving)
+    add_submaps(H, g, place, state, graph.offset, island.factors, at_work, weights)
+    cost += island.cost_of(leaving, seen, prior)
+    for s in np.flatnonzero(seen):
+        _add_sighting(H, g, place, island, int(s))
+    for k in np.flatnonzero(prior):
+        slope, hessian, _ = prior_terms(island, int(k))
+        begin, weight = place[graph.priors[k].node], island.prior_weight[k]
+        end = begin + len(slope)
+        g[begin:end] += weight * slope
+        H[begin:end, begin:end] += weight * hessian
+    return H, g, cost
+
+
+def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) -> None:
+    graph, state = island.graph, island.state
+    sighting, *nodes = graph.sightings[s]
+    a, b = (int(graph.offset[node]) for node in nodes)
+    r, jacobian = sighting_residual(state[a : a + 3], state[b : b + 3], sighting.measurement)
+    weighted = island.sighting_weight[s] * sighting.information
+    blocks = [(place[node], jacobian[:, 3 * i : 3 * i + 3]) for i, node in enumerate(nodes)]
+    for row, left in blocks:
+        if row < 0:
+            continue
+        g[row : row + 3] += left.T @ (weighted @ r)
+        for column, right in blocks:
+            if column >= 0:
+                H[row : row + 3, column : column + 3] += left.T @ weighted @ right
+
+
+def _schur(
+    H: Matrix, g: Values, out: Bool[np.ndarray, " n"]
+) -> tuple[float, Values, Float[np.ndarray, "m m"]]:
+    """The quadratic without some of its numbers: gᵀA⁻¹g over them, slope and matrix of the rest."""
+    if not out.any():
+        return 0.0, g, H
+    kept = ~out
+    cross = H[np.ix_(out, kept)]
+    right = np.column_stack([cross, g[out]])
+    solved = cho_solve(cho_factor(H[np.ix_(out, out)], lower=True), right)
+    information = H[np.ix_(kept, kept)] - cross.T @ solved[:, :-1]
+    slope: Values = g[kept] - cross.T @ solved[:, -1]
+    return float(g[out] @ solved[:, -1]), slope, 0.5 * (information + information.T)
+
+
+def _departed(
+    island: Island,
+    leaving: Bool[np.ndarray, " F"],
+    seen: Bool[np.ndarray, " S"],
+    prior: Bool[np.ndarray, " priors"],
+) -> Departed:
+    graph = island.graph
+    before = NOBODY if graph.condensed is None else graph.condensed.departed
+    now = terms(island)
+    believed = dict(before.believed)
+    for f in np.flatnonzero(leaving):
+        begin, end = graph.factors.block_start[f : f + 2]
+        for id_ in (
+            graph.submaps[f]
+            .contribution.local.ids[island.landmark_weight[begin:end] >= BELIEVED]
+            .tolist()
+        ):
+            believed[id_] = believed.get(id_, 0) + 1
+    submaps = (*before.submaps, *_chosen(now.submaps, leaving))
+    robots = _sums(before, now, leaving, seen, prior)
+    return Departed(robots, _newest(submaps), believed, _paths(island, before, leaving))
+
+
+def _paths(
+    island: Island, before: Departed, leaving: Bool[np.ndarray, " F"]
+) -> Mapping[Stream, Path]:
+    graph = island.graph
+    if len(graph.submaps) + (graph.condensed.submaps if graph.condensed else 0) > SETTLED:
+        return {}
+    counts: dict[Stream, int] = defaultdict(int)
+    for f in np.flatnonzero(leaving):
+        counts[graph.submaps[f].contribution.stream] += 1
+    paths = dict(before.paths)
+    for stream, count in counts.items():
+        nodes = graph.streams[stream][:count]
+        poses = np.array([island.state[graph.offset[n] : graph.offset[n] + 3] for n in nodes])
+        old = paths.get(stream)
+        if old is None:
+            paths[stream] = Path(poses, bool(graph.fixed[nodes[0]]))
+        else:
+            paths[stream] = old._replace(poses=np.vstack([old.poses, poses]))
+    return paths
+
+
+def _sums(
+    before: Departed,
+    now: Terms,
+    leaving: Bool[np.ndarray, " F"],
+    seen: Bool[np.ndarray, " S"],
+    prior: Bool[np.ndarray, " priors"],
+) -> dict[str, tuple[float, float]]:
+    robots = dict(before.robots)
+    for robot, chi2, dof in (
+        *_chosen(now.counted, leaving),
+        *_chosen(now.priors, prior),
+        *_chosen(now.sightings, seen),
+    ):
+        sums = robots.get(robot, (0.0, 0.0))
+        robots[robot] = (sums[0] + chi2, sums[1] + dof)
+    return robots
+
+
+def _chosen(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
+    return (items[k] for k in np.flatnonzero(which).tolist())
+
+
+def _newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
+    """The last HISTORY of each stream, in their order."""
+    counts: dict[Stream, int] = defaultdict(int)
+    kept = []
+    for each in reversed(submaps):
+        counts[each.stream] += 1
+        if counts[each.stream] <= HISTORY:
+            kept.append(each)
+    return tuple(reversed(kept))

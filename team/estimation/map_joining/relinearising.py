@@ -1,0 +1,119 @@
+"""What is condensed is linearised again, at a few sizes of the fold.
+
+While a team knows little of where it is, headings still move, and what was linearised at different
+ones contradicts itself: it claims too much. So at BEGIN · GROWTH^k submaps, up to SETTLED of them,
+all that is condensed is taken raw again, solved, and condensed anew where it then is.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.contribution import Contribution, Stream
+from team.estimation.geometry import compose
+from team.estimation.inter_robot import Sighting
+from team.estimation.map_joining.condensed_factor import Path
+from team.estimation.map_joining.condensing import BEGIN, SETTLED
+from team.estimation.map_joining.gauss_newton import (
+    FULL_AGE,
+    UNSOLVABLE,
+    Island,
+    is_solvable,
+    iterated,
+)
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.merging import ages, sighted
+from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+
+Values = Float[np.ndarray, " _"]
+
+GROWTH = 1.5
+"""Of the sizes at which the fold is linearised again."""
+SOLVED = 3
+"""So many times the iterations of a tick solve what is linearised again."""
+
+
+def is_due(before: int, after: int, begin: int = BEGIN) -> bool:
+    """Whether the fold has passed a size at which all of it is linearised again."""
+    size = begin * GROWTH
+    while size <= min(after, SETTLED):
+        if before < size:
+            return True
+        size *= GROWTH
+    return False
+
+
+def relinearised(
+    fold: Fold, contributions: Sequence[Contribution], sightings: Sequence[Sighting]
+) -> Fold:
+    """The fold with nothing condensed: its main island solved again from where it is.
+
+    contributions, sightings: all of the island's, in canonical order. Itself where what it has is
+    not what they say (a refused one among them), or where they allow no solution.
+    """
+    key = fold.main_key
+    old = None if key is None else fold.islands[key].graph.condensed
+    if key is None or old is None or fold.refused or fold.set_aside:
+        return fold
+    island = fold.islands[key]
+    try:
+        with np.errstate(all="ignore"):
+            raw = _raw(island, fold, contributions, old.departed.paths)
+            raw, waiting = sighted(raw, sightings)
+            for _ in range(SOLVED):
+                raw = iterated(raw)
+    except UNSOLVABLE:
+        return fold
+    if not is_solvable(raw):
+        return fold
+    others = [each for each in fold.waiting if fold.home.get(each.stream) != key]
+    active = [each for each in fold.contributions if fold.home[each.stream] != key]
+    return replace(
+        fold,
+        islands={**fold.islands, key: raw},
+        contributions=tuple(sorted([*active, *contributions], key=lambda each: each.key)),
+        waiting=tuple(sorted([*others, *waiting], key=lambda each: each.key)),
+        departed=0,
+    )
+
+
+def _raw(
+    island: Island, fold: Fold, contributions: Sequence[Contribution], paths: Mapping[Stream, Path]
+) -> Island:
+    """The graph of all submaps, each node where the island has it or where it was when it left."""
+    graph, settings = island.graph, island.settings
+    full, state = extended(
+        EMPTY_GRAPH,
+        np.zeros(0),
+        contributions,
+        fold.starts,
+        settings.bias_sigma,
+        settings.common_bias_sigma,
+    )
+    state, fixed = state.copy(), full.fixed.copy()
+
+    def put(node: int, value: Values) -> None:
+        state[full.offset[node] : full.offset[node + 1]] = value
+
+    def value(node: int) -> Values:
+        return island.state[graph.offset[node] : graph.offset[node + 1]]
+
+    for stream, nodes in graph.streams.items():
+        left = paths.get(stream, Path(np.zeros((0, 3)), bool(graph.fixed[nodes[0]])))
+        fixed[full.streams[stream][0]] = left.is_fixed
+        known = [*left.poses, *(value(node) for node in nodes)]
+        for node, pose in zip(full.streams[stream], known, strict=True):
+            put(node, pose)
+    for contribution, members, _ in full.submaps:
+        start = state[full.offset[members[0]] : full.offset[members[0]] + 3]
+        for at, local in zip(members[2:].tolist(), contribution.local.nodes, strict=False):
+            put(at, compose(start, local))
+    pairs = [(full.landmarks[id_], node) for id_, node in graph.landmarks.items()]
+    pairs += [(full.biases[of], node) for of, node in graph.biases.items()]
+    pairs += [(full.common[bias], node) for bias, node in graph.common.items()]
+    for node, own in pairs:
+        put(node, value(own))
+    age = np.full(len(full.submaps), FULL_AGE)
+    return Island(replace(full, fixed=fixed), state, age, ages(0), settings)

@@ -1,0 +1,113 @@
+"""The running fold of a long run: bounded, a pure function of the set, and the final map is not."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central import tick_fold
+from central.config import CentralConfig
+from central.tick_fold import Checkpoint, TickFold, thinned
+from team import translate
+from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining.joining import EMPTY_FOLD
+from team.estimation.map_joining.relinearising import is_due
+from team.wire.codec import encoded
+from tests.teams import stream, submaps_of
+
+CONFIG = CentralConfig(tick_s=4.0)
+SUBMAPS = {name: submaps_of(stream(name, 40, y=y)) for name, y in (("r1", 0.0), ("r2", 1.0))}
+ALL = [each for submaps in SUBMAPS.values() for each in submaps]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small():
+    """Two submaps of each stream stay raw, and it begins with five; at 9 and at 13 it is again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tick_fold, "condensed", partial(condensed, lag=2, begin=5))
+        patch.setattr(tick_fold, "is_due", partial(is_due, begin=6))
+        yield
+
+
+def fresh(bounded=True):
+    ticks = TickFold(CONFIG, bounded)
+    for name, y in (("r1", 0.0), ("r2", 1.0)):
+        ticks.know_start(translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None))
+    return ticks
+
+
+def add(ticks, submap):
+    ticks.add(submap, translate.digest_of(encoded(submap)))
+
+
+def bits(fold):
+    old = fold.main.graph.condensed
+    parts = [fold.main.state.tobytes(), *(str(c.key).encode() for c in fold.contributions)]
+    return b"".join(parts) + (b"" if old is None else old.information.tobytes())
+
+
+def straight(bounded=True):
+    ticks = fresh(bounded)
+    for each in ALL:
+        add(ticks, each)
+    ticks.take_until(float("inf"))
+    return ticks
+
+
+@pytest.fixture(scope="module")
+def expected():
+    fold = straight().fold
+    assert fold.departed > 0.5 * len(ALL)
+    return bits(fold)
+
+
+@settings(deadline=None, max_examples=6)
+@given(st.randoms(use_true_random=False))
+def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(expected, random):
+    ticks = fresh()
+    waiting = {name: list(submaps) for name, submaps in SUBMAPS.items()}
+    order = [each.robot for each in ALL]
+    random.shuffle(order)
+    for robot in order:
+        add(ticks, waiting[robot].pop(0))
+        if random.random() < 0.3:
+            ticks.take_until(random.choice([8e9, 16e9, 24e9, float("inf")]))
+    assert bits(ticks.provisional()) == expected
+    ticks.take_until(float("inf"))
+    assert bits(ticks.fold) == expected
+
+
+def test_the_full_solution_is_that_of_the_raw_set_to_the_bit():
+    bounded, full = straight(), straight(bounded=False)
+    assert bounded.fold.departed > full.fold.departed == 0
+    assert bits(bounded.solved()) == bits(full.solved())
+    assert bounded.digest(bounded.fold) == full.digest(full.fold)
+    assert bounded.members(bounded.fold) == full.members(full.fold)
+
+
+def test_a_withdrawal_gives_the_fold_without_the_robot():
+    ticks, without = straight(), fresh()
+    for each in SUBMAPS["r1"]:
+        add(without, each)
+    without.take_until(float("inf"))
+    ticks.withdraw("r2")
+    ticks.take_until(float("inf"))
+    assert bits(ticks.fold) == bits(without.fold)
+
+
+def test_checkpoints_are_few_and_spaced_by_their_age():
+    raw, late = EMPTY_FOLD, replace(EMPTY_FOLD, departed=1)
+    kept = []
+    for number in range(1, 5001):
+        fold = raw if number <= 20 else late
+        kept = thinned([*kept, Checkpoint(number, fold, 0, number)])
+    numbers = [each.number for each in kept]
+    assert len(numbers) < 90
+    assert numbers[-8:] == list(range(4993, 5001))
+    assert 20 in numbers, "the last raw one stays"
+    for age in range(1, 4900):
+        before = max(number for number in numbers if number <= 5000 - age)
+        assert 5000 - before <= 1.5 * age + 8

@@ -1,0 +1,107 @@
+"""The bounded fold: close to the full one, consistent, and a pure function of its ticks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining.gauss_newton import final_cost
+from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
+from team.estimation.map_joining.minima import degrees_of_freedom
+from team.estimation.map_joining.relinearising import is_due, relinearised
+from tests.estimation.submap_world import team
+
+LAG = 3
+ROBUST = JoinSettings(robust_c=2.0)
+
+
+def ticks_of(world):
+    """The submaps by tick: one of each robot."""
+    ends = sorted({each.end_ns for each in world.submaps})
+    return [[each for each in world.submaps if each.end_ns == end] for end in ends]
+
+
+def begun(world):
+    fold = EMPTY_FOLD
+    for start in world.starts:
+        fold = started(fold, start)
+    return fold
+
+
+def both(world, settings):
+    """The full fold and the bounded one."""
+    full = bounded = begun(world)
+    for tick in ticks_of(world):
+        full = folded(full, tick, settings)
+        bounded = folded(condensed(bounded, LAG, begin=0), tick, settings)
+    return full, bounded
+
+
+def apart(one, other):
+    """How far two maps are apart, in sigmas squared per degree of freedom of the first."""
+    a, b = marginals.landmark_map(one), marginals.landmark_map(other)
+    assert a.ids.tolist() == b.ids.tolist()
+    difference = (a.means - b.means).ravel()
+    return difference @ np.linalg.solve(a.covariance, difference) / len(difference)
+
+
+@pytest.mark.parametrize("settings", [JoinSettings(), ROBUST], ids=["squares", "robust"])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_bounded_fold_is_close_to_the_full_one(seed, settings):
+    full, bounded = both(team(seed, submaps=20), settings)
+    island = bounded.main
+    assert bounded.size == full.size == 40
+    assert len(island.graph.submaps) <= 2 * (LAG + 6)
+    assert bounded.departed + len(bounded.contributions) == 40
+    assert bounded.next_sequence(("r0", 0)) == 20
+    assert apart(full, bounded) < 1e-3
+    variances = [np.diag(marginals.landmark_map(each).covariance) for each in (full, bounded)]
+    assert np.allclose(*variances, rtol=0.05)
+    mine, theirs = marginals.joint_cost(full), marginals.joint_cost(bounded)
+    assert theirs.dof == pytest.approx(mine.dof, rel=0.08)
+    assert theirs.chi2 / theirs.dof == pytest.approx(mine.chi2 / mine.dof, rel=0.05)
+    assert {each.stream for each in theirs.submaps} == {("r0", 0), ("r1", 0)}
+    assert marginals.confirmed(bounded, 3) == marginals.confirmed(full, 3)
+
+
+def test_without_noise_of_linearisation_nothing_is_lost():
+    """Nearly exact submaps: the full fold's map, covariance, cost and degrees of freedom."""
+    full, bounded = both(team(3, submaps=12, sigmas=(1e-4, 1e-5, 1e-4)), JoinSettings())
+    a, b = marginals.landmark_map(full), marginals.landmark_map(bounded)
+    assert np.allclose(a.means, b.means, atol=1e-7)
+    assert np.allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)
+    assert final_cost(bounded.main) == pytest.approx(final_cost(full.main), rel=1e-4)
+    assert degrees_of_freedom(bounded.main) == degrees_of_freedom(full.main)
+
+
+def test_a_submap_that_is_condensed_twice_is_not_consistent():
+    """The mutant: what counts a factor twice claims too much, and the test above would see it."""
+    world = team(1, submaps=20)
+    full, bounded = both(world, JoinSettings())
+    island = bounded.main
+    old = island.graph.condensed
+    twice = replace(old, information=2.0 * old.information, slope=2.0 * old.slope)
+    wrong = replace(island, graph=replace(island.graph, condensed=twice))
+    claimed = replace(bounded, islands={bounded.main_key: wrong})
+    variances = [np.diag(marginals.landmark_map(each).covariance) for each in (full, claimed)]
+    assert not np.allclose(*variances, rtol=0.05)
+
+
+def test_what_is_linearised_again_is_the_full_solution():
+    world = team(2, submaps=20)
+    full, bounded = both(world, JoinSettings())
+    again = relinearised(bounded, world.submaps, [])
+    assert again.departed == 0
+    assert len(again.contributions) == again.size == full.size
+    assert apart(full, again) < 1e-6 <= apart(full, bounded) * 1e3
+    smaller = condensed(again, LAG, begin=0)
+    assert smaller.departed == 2 * (20 - LAG)
+    assert apart(full, smaller) < 1e-6
+
+
+def test_it_is_due_when_a_size_is_passed_and_not_again():
+    passed = [size for size in range(2, 3000, 2) if is_due(size - 2, size)]
+    assert passed == [192, 288, 432, 648, 972]
+    assert is_due(100, 700)
