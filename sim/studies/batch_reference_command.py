@@ -21,11 +21,28 @@ app = typer.Typer()
 
 
 @app.command(name="batch-reference")
-def batch_reference(log: Source, noise: Noise = "white", json_file: JsonFile = None) -> None:
+def batch_reference(
+    log: Source,
+    noise: Noise = "white",
+    json_file: JsonFile = None,
+    g2o: Annotated[
+        Path | None,
+        typer.Option(help="Write the problem for other optimisers here, and solve nothing."),
+    ] = None,
+) -> None:
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
     from sim.recorded.data_set import log_or_run
+    from sim.studies.batch_reference.g2o import g2o_lines
     from sim.studies.batch_reference.reference import LimitError, batch_map
 
+    if g2o is not None:
+        try:
+            lines = list(g2o_lines(log_or_run(log).samples()))
+        except LimitError as error:
+            fail(str(error), FAILED)
+        g2o.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
+        typer.echo(f"wrote {g2o}: {len(lines)} lines")
+        return
     try:
         result = batch_map(log_or_run(log).samples(), noise)
     except LimitError as error:

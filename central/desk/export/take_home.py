@@ -44,7 +44,7 @@ def taken_home(found: Recorded) -> TakenHome:
     counts = Counter[int]()
     for stream in found.measurements.values():
         for message in stream.values():
-            if isinstance(message, m.Observations):
+            if isinstance(message, m.Observations | m.Points):
                 counts.update(ids(message.ids, "ids").tolist())
     return TakenHome(smoothed_paths(found), counts)
 

@@ -126,7 +126,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
     run = evaluate(kept)
     if run.scenario is None or run.map is None:
         raise LimitError("the log has no scenario or no final map: record a run to its end")
-    chains, anchors, left_out = _placed(
+    chains, anchors, left_out = placed(
         chains_of(kept, run.scenario, sightings=noise == "profile"), run
     )
     if not chains:
@@ -208,11 +208,11 @@ def _gtsam() -> Any:
     return gtsam
 
 
-def _placed(
+def placed(
     chains: Sequence[Chain], run: Evaluation
 ) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
     """The chains whose place is known, with the joined poses (and the start) that say it."""
-    placed, anchors, left_out = [], [], []
+    known, anchors, left_out = [], [], []
     for chain in chains:
         robot = chain.config.id
         path = run.robots[robot].smoothed_path
@@ -224,9 +224,9 @@ def _placed(
         if chain.start is not None:
             stamps = np.concatenate((chain.stamps_ns[:1], stamps))
             poses = np.concatenate((chain.start[np.newaxis], poses))
-        placed.append(chain)
+        known.append(chain)
         anchors.append(Path(stamps, poses))
-    return placed, anchors, tuple(left_out)
+    return known, anchors, tuple(left_out)
 
 
 def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:

@@ -1,0 +1,86 @@
+"""The batch problem of a log as a file of g2o, for other optimisers to start from and to beat.
+
+VERTEX_SE2 are the robots' poses at their keyframes, VERTEX_XY the landmarks, both where the joined
+map and the odometry between have them; FIX holds the first pose of each robot whose initial pose is
+exactly known. EDGE_SE2 is the odometry, EDGE_SE2_XY a measurement as the point that it says, in the
+robot's frame, with the first-order covariance of range and bearing at the joined map's range. So it
+is the problem of `factor_graph` but for that linearisation.
+https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-2D
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from central.desk.evaluation.evaluation import evaluate
+from sim.studies.batch_reference.graph import landmark_starts
+from sim.studies.batch_reference.measurements import Chain, anchored, chains_of
+from sim.studies.batch_reference.reference import LimitError, placed
+from team.estimation.baselines.batch import FLOOR_SIGMAS
+from team.estimation.gaussian import Matrix
+from team.estimation.geometry import Point
+from team.estimation.models import noise, predicted
+from team.wire.bus import Sample
+
+Poses = Float[np.ndarray, "K 3"]
+
+
+def g2o_lines(samples: Iterable[Sample]) -> Iterator[str]:
+    """The lines of the file; raises LimitError for a log without a scenario or a joined map."""
+    kept = list(samples)
+    run = evaluate(kept)
+    if run.scenario is None or run.map is None:
+        raise LimitError("the log has no scenario or no final map: record a run to its end")
+    chains, anchors, _ = placed(chains_of(kept, run.scenario), run)
+    paths = [anchored(chain, anchor)[2] for chain, anchor in zip(chains, anchors, strict=True)]
+    landmarks = landmark_starts(chains, paths, run.map)
+    vertex = {landmark: k for k, landmark in enumerate(sorted(landmarks))}
+    for landmark, k in vertex.items():
+        yield f"# landmark {landmark}"
+        yield f"VERTEX_XY {k} {_numbers(landmarks[landmark])}"
+    first = len(vertex)
+    for chain, path in zip(chains, paths, strict=True):
+        yield f"# robot {chain.config.id}, incarnation {chain.incarnation}"
+        for k, pose in enumerate(path):
+            yield f"VERTEX_SE2 {first + k} {_numbers(pose)}"
+        if chain.start is not None and chain.start_covariance is None:
+            yield f"FIX {first}"
+        yield from _odometry(chain, first)
+        yield from _measurements(chain, path, first, landmarks, vertex)
+        first += len(path)
+
+
+def _odometry(chain: Chain, first: int) -> Iterator[str]:
+    floor = np.diag(FLOOR_SIGMAS) ** 2
+    for k, increment in enumerate(chain.increments):
+        information = np.linalg.inv(increment.covariance + floor)
+        yield (
+            f"EDGE_SE2 {first + k} {first + k + 1} {_numbers(increment.mean)} {_upper(information)}"
+        )
+
+
+def _measurements(
+    chain: Chain,
+    path: Poses,
+    first: int,
+    landmarks: dict[int, Point],
+    vertex: dict[int, int],
+) -> Iterator[str]:
+    for k, scan in enumerate(chain.scans, 1):
+        for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+            distance, _ = predicted(path[k], landmarks[landmark])
+            c, s = np.cos(b), np.sin(b)
+            J = np.array([[c, -r * s], [s, r * c]])
+            R = np.diag(noise(chain.config.sensor, distance))
+            information = np.linalg.inv(J @ R @ J.T)
+            point = _numbers((r * c, r * s))
+            yield f"EDGE_SE2_XY {first + k} {vertex[landmark]} {point} {_upper(information)}"
+
+
+def _upper(information: Matrix) -> str:
+    return _numbers(information[np.triu_indices(len(information))])
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(f"{value:.17g}" for value in values)
