@@ -23,6 +23,10 @@ class Hearsay:
         self._robots = frozenset(robots)
         self._said: dict[str, dict[str, m.WithdrawalHeard]] = {}
 
+    def admit(self, robot: str) -> None:
+        """From now on the robot is in the team."""
+        self._robots |= {robot}
+
     def take(self, heard: m.WithdrawalHeard) -> m.Withdrawal | None:
         """The order, once it is to be believed; strangers are not listened to."""
         if not {heard.robot, heard.withdrawn} <= self._robots:

@@ -29,6 +29,7 @@ class CentralShell:
     """The centre's process: subscribe, answer for its set, run, leave last.
 
     patience_s: a robot that is lost for so long is given up; None: nobody is, unless by an order.
+    admit: robots that are not named are taken into the team.
     """
 
     def __init__(
@@ -38,9 +39,11 @@ class CentralShell:
         robots: Sequence[str],
         stop: threading.Event,
         patience_s: float | None = None,
+        *,
+        admit: bool = False,
     ) -> None:
         self._bus = bus
-        self.node = CentralNode(config, robots)
+        self.node = CentralNode(config, robots, admit=admit)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
         self._shell.notes = self._awaited
@@ -185,5 +188,5 @@ class CentralShell:
         deadline = time.monotonic() + FAREWELL_S
         while not self._stop.is_set() and time.monotonic() < deadline:
             self._shell.note(self._patient(self._bus.receive(WAIT_S)))
-            if not any(n == "world" or n.startswith("robot/") for n in self._alive):
+            if not any(n.startswith(("world", "robot/", "source/")) for n in self._alive):
                 return

@@ -20,12 +20,22 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
 
+MOST_ROBOTS = 100
+"""A team has at most so many, admitted ones among them."""
+
 
 class CentralNode:
-    """One centre for the robots of a team: `begin`, then `handle`, until `finished`."""
+    """One centre for the robots of a team: `begin`, then `handle`, until `finished`.
 
-    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
+    admit: a robot that nobody has named is taken into the team when it, or its driver, comes.
+    """
+
+    def __init__(
+        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    ) -> None:
         self.config = config
+        self._admits = admit
+        self._admitted: list[str] = []
         self._announcement = translate.configured("central", 0, 0, config)
         self._door = Door(robots)
         self._roll = Roll.of(robots)
@@ -40,7 +50,9 @@ class CentralNode:
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
         """The channels to subscribe to."""
-        return (*self._rule.listens, ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.GIVEN_UP)
+        own = (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.GIVEN_UP, ch.HEAD, ch.END_ORDER)
+        others = (ch.ROBOT_CONFIG,) if self._admits else ()
+        return tuple(dict.fromkeys((*self._rule.listens, *own, *others)))
 
     @property
     def warnings(self) -> list[str]:
@@ -53,17 +65,34 @@ class CentralNode:
 
     def refusal(self, message: m.Message) -> str | None:
         """Why a message can not be true of this team: its robots, counters, stamps, or its end."""
+        self._admit(message)
         refused = self._door.refusal(message)
         if refused is None and isinstance(message, m.End):
             return self._roll.contradicts(message)
         return refused
+
+    def _admit(self, message: m.Message) -> None:
+        """A robot that announces itself, or whose driver begins its stream, joins the team."""
+        robot = message.robot if isinstance(message, m.InitialPose) else None
+        if isinstance(message, m.Configuration):
+            robot = ch.robot_of(message.node)
+        if not self._admits or robot is None or robot in self._roll.robots:
+            return
+        if len(self._roll.robots) < MOST_ROBOTS:
+            for admits in (self._door, self._roll, self._rule):
+                admits.admit(robot)
+            self._admitted.append(robot)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
         if isinstance(message, m.FusedMap):
             return self._take_final(message)
         self._credit = None
+        known = self._roll.ordered
         self._roll.take(message)
+        if isinstance(message, m.TeamEnd):  # who comes later hears of it from the centre
+            repeated = [] if known else [Outgoing(ch.TEAM_END, "", message)]
+            return repeated + self._advance()
         self._credit = self._rule.take(message, self._roll.now_ns)
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
@@ -93,7 +122,7 @@ class CentralNode:
 
     @property
     def ends(self) -> bool:
-        """Whether the world has said that it has published everything."""
+        """Whether all streams have ended, by the word of the world or of their drivers."""
         return self._roll.end is not None
 
     def _advance(self) -> list[Outgoing]:
@@ -169,7 +198,12 @@ class CentralNode:
             f"{robot} is given up: nobody waits for it, and the final map will be provisional"
             for robot in self._roll.given_up
         ]
-        warnings = (*given_up, *self._rule.findings, *self.warnings[-3:])
+        admitted = (
+            (f"admitted, though not in the scenario: {', '.join(self._admitted)}",)
+            if self._admitted
+            else ()
+        )
+        warnings = (*given_up, *admitted, *self._rule.findings, *self.warnings[-3:])
         now_ns = self._roll.now_ns
         return m.Status(
             stamp_ns=now_ns,

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from team.wire import messages as m
-from team.wire.newer import further, later_end
+from team.wire.newer import further, later_end, later_head
 
 Dealt = Callable[[m.Done], bool]
 """True once all messages announced in a robot's `Done` have been dealt with."""
@@ -12,18 +12,43 @@ Dealt = Callable[[m.Done], bool]
 
 @dataclass
 class Attendance:
-    """What the centre knows of one robot."""
+    """What the centre knows of one robot.
+
+    began: the latest incarnation that has begun; 0: none. head: its driver's last word, of a live
+    team. driver: whether its driver is there; None: nobody has said.
+    """
 
     alive: bool = False
     seen: bool = False
     given_up: bool = False
     progress: m.Progress | None = None
     done: m.Done | None = None
+    began: int = 0
+    head: m.StreamHead | None = None
+    driver: bool | None = None
 
     @property
     def lost(self) -> bool:
         """It was there and is not any more."""
         return self.seen and not self.alive
+
+    @property
+    def stream_end(self) -> m.StreamEnd | None:
+        """Where its driver has ended the stream, unless it has begun anew since."""
+        head = self.head
+        if head is None or head.state != "ended" or head.incarnation < self.began:
+            return None
+        return m.StreamEnd(
+            robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
+        )
+
+    @property
+    def has_all(self) -> bool:
+        """The robot is done with all that its driver has numbered, and the driver left nothing."""
+        head, done = self.head, self.done
+        if head is None or done is None or head.state == "open":
+            return False
+        return (done.incarnation, done.measurements) >= (head.incarnation, head.measurements)
 
 
 @dataclass
@@ -31,18 +56,24 @@ class Roll:
     """The team's robots by name; `now_ns` is the newest team time that anyone has spoken of.
 
     withdrawn: the robots that the team goes on without; nobody waits for one that has left.
+    world_end: the end that a world has said. ordered: a live team was told to end.
     """
 
     robots: dict[str, Attendance]
-    end: m.End | None = None
+    world_end: m.End | None = None
     now_ns: int = 0
     withdrawn: frozenset[str] = frozenset()
+    ordered: bool = False
     _names: tuple[str, ...] = field(default=(), init=False)
 
     @classmethod
     def of(cls, robots: Sequence[str]) -> "Roll":
         """A team of which nobody has been heard of."""
         return cls({robot: Attendance() for robot in sorted(robots)})
+
+    def admit(self, robot: str) -> None:
+        """From now on the robot is in the team."""
+        self.robots = dict(sorted({**self.robots, robot: Attendance()}.items()))
 
     def take(self, message: m.Message) -> None:
         """Note what a message says of its sender; of strangers nothing."""
@@ -59,7 +90,21 @@ class Roll:
                 if robot.done is None or robot.done.incarnation <= message.incarnation:
                     robot.done = message
             case m.End():
-                self.end = later_end(message, self.end)
+                self.world_end = later_end(message, self.world_end)
+            case m.InitialPose() if message.robot in self.robots:
+                robot = self.robots[message.robot]
+                robot.began = max(robot.began, message.incarnation)
+            case m.StreamHead() if message.robot in self.robots:
+                robot = self.robots[message.robot]
+                robot.head = later_head(message, robot.head)
+                robot.began = max(robot.began, message.incarnation)
+                self.now_ns = max(self.now_ns, message.stamp_ns)
+            case m.TeamEnd():
+                self.ordered = True
+            case m.Liveliness() if message.node.startswith("source/"):
+                name = message.node.removeprefix("source/")
+                if name in self.robots:
+                    self.robots[name].driver = message.alive
             case m.Liveliness():
                 found = self._named(message.node)
                 if found is not None:
@@ -75,6 +120,38 @@ class Roll:
     def _named(self, node: str) -> Attendance | None:
         kind, _, name = node.partition("/")
         return self.robots.get(name) if kind == "robot" else None
+
+    @property
+    def is_live(self) -> bool:
+        """The robots are measured by drivers, each with its own end, and by no world."""
+        return self.ordered or any(robot.head is not None for robot in self.robots.values())
+
+    @property
+    def end(self) -> m.End | None:
+        """The last counters of all streams: a world's, or those of every driver; None: not yet.
+
+        Where a live team was told to end, a robot whose driver is away ends where it is done.
+        """
+        if self.world_end is not None or not self.is_live:
+            return self.world_end
+        streams = []
+        for name, robot in self.robots.items():
+            last = robot.stream_end
+            if last is None and self.ordered and robot.done is not None:
+                last = m.StreamEnd(
+                    robot=name,
+                    incarnation=robot.done.incarnation,
+                    measurements=robot.done.measurements,
+                )
+            if last is not None:
+                streams.append(last)
+            elif not (robot.given_up or name in self.withdrawn or self._never_measured(name)):
+                return None
+        return m.End(stamp_ns=self.now_ns, streams=tuple(streams))
+
+    def _never_measured(self, name: str) -> bool:
+        """A live team was told to end before this robot had begun: there is nothing to wait for."""
+        return self.ordered and not self.robots[name].began
 
     def whole(self, name: str, dealt: Dealt) -> bool:
         """The robot is done, and all of it is here."""
@@ -106,7 +183,7 @@ class Roll:
         """
         robot = self.robots[name]
         gone = name in self.withdrawn and not robot.alive
-        return robot.given_up or gone or self.whole(name, dealt)
+        return robot.given_up or gone or self._never_measured(name) or self.whole(name, dealt)
 
     @property
     def given_up(self) -> list[str]:
@@ -114,17 +191,27 @@ class Roll:
         return [robot for robot, attendance in self.robots.items() if attendance.given_up]
 
     def missing(self, dealt: Dealt) -> list[str]:
-        """The robots that the team was to have and whose streams are not wholly here."""
-        return [r for r in self.robots if r not in self.withdrawn and not self.whole(r, dealt)]
+        """The robots that the team was to have and whose streams are not wholly here.
+
+        Of a live team that was told to end, those whose drivers may have had more.
+        """
+        return [
+            name
+            for name, robot in self.robots.items()
+            if name not in self.withdrawn
+            and not self._never_measured(name)
+            and not (self.whole(name, dealt) and (robot.has_all or not self.ordered))
+        ]
 
     def awaited(self, dealt: Dealt) -> list[str]:
         """The robots that are not there, were or not, and that are waited for."""
         return [r for r, a in self.robots.items() if not (a.alive or self.settled(r, dealt))]
 
     def _is_last_incarnation(self, name: str, incarnation: int) -> bool:
-        if self.end is None:
+        end = self.end
+        if end is None:
             return False
-        ends = [s for s in self.end.streams if s.robot == name]
+        ends = [s for s in end.streams if s.robot == name]
         return not ends or incarnation >= ends[0].incarnation
 
     def concluded(self, dealt: Dealt) -> bool:
@@ -143,10 +230,20 @@ class Roll:
         """
         least = float("inf")
         for name, robot in self.robots.items():
-            if robot.lost or self.settled(name, dealt):
+            if robot.lost or self._is_away(robot) or self.settled(name, dealt):
                 continue
             progress = robot.progress
             if progress is None or count((name, progress.incarnation)) < progress.submaps:
                 return float("-inf")
             least = min(least, progress.stamp_ns)
         return least
+
+    def _is_away(self, robot: Attendance) -> bool:
+        """Of a live team: it has not begun, or its driver is not there, so nothing waits for it.
+
+        What it sends when it comes rolls the fold back.
+        """
+        if not self.is_live:
+            return False
+        head = robot.head
+        return not robot.began or robot.driver is False or (head is not None and head.state == "left")

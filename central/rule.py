@@ -65,6 +65,10 @@ class FusionRule(ABC):
         self.landmarks = 0
         self.warnings: list[str] = []
 
+    def admit(self, robot: str) -> None:
+        """From now on the robot is in the team."""
+        self._team = tuple(sorted({*self._team, robot}))
+
     @abstractmethod
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
         """The map of these inputs, and what goes out with it; inputs that grow are cheap."""

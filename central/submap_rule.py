@@ -22,6 +22,11 @@ class SubmapRule(FusionRule):
         self._hearsay = Hearsay(robots)
         self._begin()
 
+    def admit(self, robot: str) -> None:
+        """From now on the robot is in the team, and may be heard of others."""
+        super().admit(robot)
+        self._hearsay.admit(robot)
+
     def _begin(self) -> None:
         """Nothing is here."""
         self._set = SubmapSet()

@@ -19,7 +19,7 @@ LATE_NS = 400 * EARLY_NS
 """A stream's messages lie within a day before and 400 days after its initial pose's stamp."""
 OF_ROBOTS = (
     m.Measurement, m.Submap, m.SightingFactor, m.MapEstimate, m.Progress, m.Done, m.Rendezvous,
-    m.Innovation, m.Association,
+    m.Innovation, m.Association, m.StreamHead,
 )  # fmt: skip
 """Messages about a stream: they carry its robot and its incarnation."""
 
@@ -30,6 +30,10 @@ class Door:
     def __init__(self, robots: Iterable[str]) -> None:
         self._robots = frozenset(robots)
         self._began: dict[tuple[str, int], int] = {}
+
+    def admit(self, robot: str) -> None:
+        """From now on the robot is in the team."""
+        self._robots |= {robot}
 
     def refusal(self, message: m.Message) -> str | None:
         """Why the message can not be true of this team, in words; None: it can."""
@@ -99,6 +103,8 @@ def _counts(message: m.Message) -> Iterator[int]:
             yield from (message.sequence, *message.measurements)
         case m.Progress():
             yield from (message.measurements, message.submaps)
+        case m.StreamHead():
+            yield message.measurements
         case m.Done():
             yield from (message.measurements, message.submaps, message.steps)
         case m.MapEstimate():

@@ -1,7 +1,7 @@
 """What a log has of each numbered stream, and what is known that it lacks.
 
 A robot's measurements are numbered by its source across all sensor channels, its submaps by itself;
-`world/end` says how many measurements there are, `progress` and `done` how many there are at least.
+`world/end`, or each driver's head, says how many measurements there are, `progress` and `done` how many there are at least.
 So what is missing at the end or altogether is known, too.
 """
 
@@ -119,7 +119,7 @@ class Inventory:
                 return True
             kind: Kind = "submaps" if channel is ch.SUBMAP else "measurements"
             return self._of(kind, robot, named[0]).take(named[1], sample.payload)
-        if channel in (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END):
+        if channel in (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.HEAD):
             self._hear(sample)
         return True
 
@@ -137,6 +137,10 @@ class Inventory:
                     message.measurements - 1
                 )
                 self._of("submaps", message.robot, message.incarnation).know(message.submaps - 1)
+            case m.StreamHead():
+                self._of("measurements", message.robot, message.incarnation).know(
+                    message.measurements - 1
+                )
             case m.End():
                 for end in message.streams:
                     self._of("measurements", end.robot, end.incarnation).know(end.measurements - 1)

@@ -61,10 +61,18 @@ class RobotShell:
         self._shell.look_for_the_end()
         if not self.node.finished and self._resume():
             self._catch_up()
+        self._look_for_driver()
         self._shell.run(self._mend)
         _LOG.info("%d submaps from %d measurements", self.node.submaps, self.node.next_measurement)
         self._await_recorder()
         self._shell.end(self.node.final)
+
+    def _look_for_driver(self) -> None:
+        """Whether the robot's driver is there is known before anything else is heard."""
+        driver = ch.source_node(self.node.robot)
+        there = m.Liveliness(stamp_ns=0, node=driver, alive=self._bus.is_alive(driver))
+        self.node.handle(there, 0)
+        self._bus.watch_alive(driver)
 
     def _await_recorder(self) -> None:
         """Stay until who records has every submap: it can ask nobody else for them."""

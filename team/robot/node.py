@@ -47,7 +47,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded, unsound
-from team.wire.newer import is_newer_prior, later_end
+from team.wire.newer import is_newer_prior, later_end, later_head
 
 AHEAD = 64
 """Submaps of an earlier life that the centre may have taken since it was asked for them."""
@@ -69,8 +69,10 @@ class RobotNode:
 
     listens = (
         *ch.SENSORS,
+        ch.HEAD,
         ch.KNOWN_MAP,
         ch.END,
+        ch.TEAM_END,
         ch.PRIOR,
         ch.FUSED_MAP,
         ch.FINAL_MAP,
@@ -106,6 +108,9 @@ class RobotNode:
         self._ended: list[m.Done] = []
         self._end: m.StreamEnd | None = None
         self._world_end: m.End | None = None
+        self._head: m.StreamHead | None = None
+        self._driver_is_there: bool | None = None
+        self._is_to_end = False
         self._exchange_ns: int | None = None
         self._map_ns: int | None = None
         self._pose_ns: int | None = None
@@ -150,7 +155,7 @@ class RobotNode:
 
     def wanted(self) -> m.MeasurementsRequest | None:
         """The measurements that are missing and must be asked for at their source."""
-        missing = self._inbox.missing(self._end)
+        missing = None if self.waits_for_driver else self._inbox.missing(self._known_end)
         if missing is None:
             return None
         incarnation, first, last = missing
@@ -160,6 +165,21 @@ class RobotNode:
             incarnation=incarnation,
             first=first,
             last=last,
+        )
+
+    @property
+    def waits_for_driver(self) -> bool:
+        """Its measurements come from a driver, and that is not there to be asked."""
+        return self._head is not None and self._driver_is_there is False
+
+    @property
+    def _known_end(self) -> m.StreamEnd | None:
+        """The stream's last counter that anybody has told, whether it has ended or not."""
+        head = self._head
+        if self._end is not None or head is None:
+            return self._end
+        return m.StreamEnd(
+            robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
         )
 
     def begin(self) -> list[Outgoing]:
@@ -225,6 +245,10 @@ class RobotNode:
                     return f"acknowledges {message.submaps} submaps of {self.submaps}"
             case m.End():
                 return self._inbox.contradicts(message, self.robot)
+            case m.StreamHead() if message.robot != self.robot:
+                return f"how far {message.robot} is"
+            case m.StreamHead() if message.state == "ended":
+                return self._inbox.contradicts(_end_at(message), self.robot)
             case _:
                 pass
         return None
@@ -262,8 +286,14 @@ class RobotNode:
             case m.Liveliness():
                 if message.node == "central":
                     self._pace.centre_alive = message.alive
+                elif message.node == ch.source_node(self.robot):
+                    self._driver_is_there = message.alive
             case m.End():
                 self._take_end(message)
+            case m.StreamHead():
+                self._take_head(message)
+            case m.TeamEnd():
+                self._is_to_end = True
             case m.Rendezvous():
                 return self._met(message) + self._go_on()
             case m.Withdrawal():
@@ -298,6 +328,11 @@ class RobotNode:
         state = "done" if self._done else "mapping" if self._inbox.next_measurement else "waiting"
         node = ch.robot_node(self.robot)
         waiting = ("no measurements of this team yet",) if state == "waiting" else ()
+        if self.waits_for_driver and not self._done:
+            waiting = (
+                f"its driver is away after measurement {self._inbox.next_measurement - 1}: start "
+                "it again, or end the team by `teamslam end`",
+            )
         doubt = (self._team_map.doubt,) if self._team_map.doubt else ()
         warnings = (*waiting, *doubt, *self._unexpected(nis), *self.warnings[-3:])
         told = {name: value for name, value in figures.items() if abs(value) <= 1e300}
@@ -373,6 +408,7 @@ class RobotNode:
             if measurement is None:
                 break
             self._pending += self._take(measurement)
+        self._end_without_driver()
         if not self._done and not self._blocked and self._complete:
             self._pending += self._finish()
         self._pending += self._credit()
@@ -778,6 +814,23 @@ class RobotNode:
             else m.StreamEnd(robot=self.robot, incarnation=self.incarnation, measurements=0)
         )
 
+    def _take_head(self, head: m.StreamHead) -> None:
+        """A driver's stream ends when it says so, unless a later incarnation begins after that."""
+        self._head = head = later_head(head, self._head)
+        if head.state == "ended":
+            self._take_end(_end_at(head))
+        elif self._end is not None and head.incarnation > self._end.incarnation:
+            self._end = None
+        if self._consumed:
+            self._pending.append(self._progress())
+
+    def _end_without_driver(self) -> None:
+        """A live team is to end and the driver is not there: the stream ends where it has come."""
+        if self._is_to_end and self._end is None and not self._driver_is_there:
+            self._end = m.StreamEnd(
+                robot=self.robot, incarnation=self.incarnation, measurements=self._inbox.received
+            )
+
     def _close_incarnation(self) -> list[Outgoing]:
         driven, uncovered = self._estimator.finish()
         out = self._told(driven)
@@ -793,6 +846,10 @@ class RobotNode:
         if not self._consumed:
             return []
         self._passed_ns = self._now_ns
+        if self._done:  # the driver had ended, and has come back: its last word is not the last
+            self._done = self._said_done = False
+            self._ended.append(self._incarnation_done())
+            return []
         out = self._close_incarnation()
         out += self._release(())
         self._ended.append(self._incarnation_done())
@@ -829,3 +886,11 @@ class RobotNode:
             ),
             last_map=self._last_map,
         )
+
+
+def _end_at(head: m.StreamHead) -> m.End:
+    """The end of one robot's stream, as a world would say it."""
+    last = m.StreamEnd(
+        robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
+    )
+    return m.End(stamp_ns=head.stamp_ns, streams=(last,))

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from team.wire.channels import ALIVE, ORDER, REPLIES, VIEW, Channel, channel_of
+from team.wire.channels import ALIVE, END_ORDER, ORDER, REPLIES, VIEW, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
     Configuration,
@@ -27,6 +27,7 @@ from team.wire.messages import (
     Progress,
     SetSummary,
     Status,
+    TeamEnd,
     Withdrawal,
 )
 
@@ -144,6 +145,8 @@ def _said_by(channel: Channel, message: Message) -> str | None:
         case SetSummary() | Members():
             return message.node
         case Withdrawal() if channel is ORDER:
+            return message.by
+        case TeamEnd() if channel is END_ORDER:
             return message.by
         case _:
             return None

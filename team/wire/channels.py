@@ -5,8 +5,8 @@ the key's prefix: a robot's process `robot/{robot}/…`, its driver `source/{rob
 `operator/…`, the others those of their name. So a certificate for a prefix is one for a voice. The
 world is the source of every robot, and the truth is its own too.
 
-`{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer` or
-`robot/<name>`, `{view}` for a view (`team.wire.views`). In the rates an incarnation is one life of
+`{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer`,
+`robot/<name>` or `source/<name>`, `{view}` for a view (`team.wire.views`). In the rates an incarnation is one life of
 a robot's stream (the messages' `incarnation`), a keyframe one incarnation of observation.
 """
 
@@ -66,7 +66,7 @@ class Channel:
         first, _, rest = self.template.partition("/")
         if first == "{node}":
             return name
-        return f"robot/{name}" if first == "robot" and rest.startswith("{robot}") else first
+        return f"{first}/{name}" if first == "robot" and rest.startswith("{robot}") else first
 
     def owner(self, key: str) -> str | None:
         """The robot or node that `key` belongs to on this channel; None when it is another's."""
@@ -89,6 +89,8 @@ OBSERVATIONS = Channel(name="observations", template="source/{robot}/observation
 SIGHTINGS = Channel(name="sightings", template="source/{robot}/sightings", message=m.Sightings, rate="0-10 Hz", delivery="stream", recorded=True,
                     recomputable=False, meaning="teammates seen")  # fmt: skip
 SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)
+HEAD = Channel(name="head", template="source/{robot}/head", message=m.StreamHead, rate="1 Hz while it measures", delivery="latest", recorded=True, recomputable=False,
+               meaning="how far a robot's driver is, and whether its stream has ended; a world says `end` instead")  # fmt: skip
 
 TRUTH = Channel(name="truth", template="truth/{robot}", message=m.Truth, rate="1 Hz, batched", delivery="all", recorded=True, recomputable=False,
                 meaning="true poses; the evaluator's only")  # fmt: skip
@@ -142,6 +144,10 @@ WITHDRAWALS_HEARD = Channel(name="withdrawals_heard", template="robot/{robot}/wi
                             meaning="an order that the robot has heard, for a centre that is started again")  # fmt: skip
 GIVEN_UP = Channel(name="given_up", template="operator/given_up/{node}", message=m.GivenUp, rate="once", delivery="all", recorded=True, recomputable=False,
                    meaning="an order: nobody waits for the node any more")  # fmt: skip
+END_ORDER = Channel(name="end_order", template="operator/end", message=m.TeamEnd, rate="once", delivery="all", recorded=True, recomputable=False,
+                    meaning="an operator's order: a live team ends now")  # fmt: skip
+TEAM_END = Channel(name="team_end", template="central/end", message=m.TeamEnd, rate="once", delivery="latest", recorded=True, recomputable=False,
+                   meaning="the order to end, repeated by the centre for who comes later")  # fmt: skip
 FINAL_MAP = Channel(name="final_map", template="central/final", message=m.FusedMap, rate="once", delivery="latest", recorded=True, recomputable=True,
                     meaning="the team's map with its joint covariance")  # fmt: skip
 TRAJECTORY = Channel(name="trajectory", template="central/trajectory/{robot}", message=m.Trajectory, rate="once per incarnation",
@@ -221,6 +227,11 @@ EVERYTHING = "**"
 def robot_node(robot: str) -> str:
     """The node name of a robot, as liveliness tokens and status carry it."""
     return f"robot/{robot}"
+
+
+def source_node(robot: str) -> str:
+    """The node name of a robot's driver, as liveliness tokens and status carry it."""
+    return f"source/{robot}"
 
 
 def robot_of(node: str) -> str | None:

@@ -741,6 +741,32 @@ class End(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="en
     notes: tuple[Text, ...] = ()
 
 
+class StreamHead(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="stream_head/1"
+):
+    """How far a robot's own source is: it has numbered 0 … measurements − 1; stamp_ns is the last
+    one's.
+
+    state: "open" while more is measured; "left" when the driver has stopped and may come back;
+    "ended" when this incarnation has no more.
+    """
+
+    robot: Name
+    incarnation: Count
+    measurements: Count
+    state: Literal["open", "left", "ended"]
+
+
+class TeamEnd(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="team_end/1"):
+    """An operator's order to a live team: whoever measures ends now.
+
+    by: who ordered it. reason: in words.
+    """
+
+    by: Text
+    reason: Text
+
+
 class Status(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="status/1"):
     """What a node is doing, for people: a state word, figures by name, warnings in words."""
 

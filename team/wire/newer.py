@@ -76,3 +76,12 @@ def later_end(new: m.End, held: m.End | None) -> m.End:
             streams[each.robot] = each
     ordered = tuple(streams[robot] for robot in sorted(streams))
     return m.End(stamp_ns=max(new.stamp_ns, held.stamp_ns), streams=ordered, notes=new.notes)
+
+
+def later_head(new: m.StreamHead, held: m.StreamHead | None) -> m.StreamHead:
+    """Whichever says more of the stream; of equals the newer word on whether it goes on."""
+
+    def order(head: m.StreamHead) -> tuple[int, int, bool]:
+        return head.incarnation, head.measurements, head.state == "ended"
+
+    return new if held is None or order(new) >= order(held) else held

@@ -81,6 +81,8 @@ class Recorded:
                 self.known_map = message
             case m.Withdrawal():
                 self.withdrawals.setdefault(message.robot, message)
+            case m.StreamHead():
+                self._count(message)
             case m.End():
                 self.published |= {
                     (s.robot, s.incarnation): s.measurements for s in message.streams
@@ -89,6 +91,10 @@ class Recorded:
                 self.said.append(Said(sample, channel, message))
             case _:
                 pass
+
+    def _count(self, head: m.StreamHead) -> None:
+        stream = (head.robot, head.incarnation)
+        self.published[stream] = max(self.published.get(stream, 0), head.measurements)
 
     def of(self, channel: ch.Channel) -> list[m.Message]:
         """The recorded messages of a channel, in the order of the log."""
@@ -149,7 +155,7 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
         raise RerunError(f"{what} is not one of this version: {error}") from None
 
 
-_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END, ch.ORDER,
+_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END, ch.HEAD, ch.ORDER,
          ch.WITHDRAWAL)  # fmt: skip
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_TOLD))
 """The channels whose samples are filed."""

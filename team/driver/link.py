@@ -1,0 +1,197 @@
+"""The thread on which a driver speaks: it connects, and connects again, until it is to leave."""
+
+import logging
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+
+from team.driver.node import SourceNode
+from team.keys.credentials import credentials_of
+from team.keys.roster import KeysError
+from team.shell import Shell
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import BusError
+from team.wire.zenoh_bus import ZenohBus
+
+HEAD_S = 1.0
+"""Wall time between two words on how far the stream is."""
+PACE_S = 0.01
+"""Wait when there is nothing to publish."""
+AGAIN_S = 2.0
+"""Wait before another attempt to reach the router."""
+SECOND_PATIENCE_S = 6.0
+"""The token of a driver that was cut off is there for the lease of its link: 5 s of silence."""
+HEAR_S = 0.5
+"""The robot's process says within this how far it is, if it is there."""
+LAST_S = 5.0
+"""What is left to say takes no longer."""
+_LOG = logging.getLogger("teamslam")
+
+
+class Link:
+    """Runs a source's node on a bus of its own, through whatever the network does.
+
+    lock: held by whoever writes to the journal.
+    """
+
+    def __init__(
+        self,
+        node: SourceNode,
+        *,
+        team: str,
+        connect: str,
+        keys: Path | str | None,
+        lock: threading.Lock,
+    ) -> None:
+        self._node = node
+        self._name = ch.source_node(node.journal.robot)
+        self._team, self._connect = team, connect
+        self._keys = None if keys is None else Path(keys)
+        self._lock = lock
+        self._leaving = threading.Event()
+        self._up = threading.Event()
+        self._moved = threading.Condition()
+        self._trouble: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+
+    def open(self, patience_s: float) -> None:
+        """Begin; returns when the team's router is reached, raises the reason if it is not."""
+        self._patience_s = patience_s
+        self._thread.start()
+        until = time.monotonic() + patience_s + SECOND_PATIENCE_S
+        while patience_s and not self._up.is_set():
+            if self._trouble is not None or time.monotonic() >= until:
+                self.close()
+                raise self._trouble or BusError(f"no router answers at {self._connect}")
+            self._up.wait(0.02)
+
+    def close(self) -> None:
+        """Say the last word and leave."""
+        self._leaving.set()
+        self._thread.join(3.0 * LAST_S)
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when something may have changed."""
+        with self._moved:
+            self._moved.wait(timeout_s)
+
+    def status(self) -> m.Status:
+        """The node's, with what is wrong with the link."""
+        status = self._node.status()
+        if self._trouble is None:
+            return status
+        warnings = (str(self._trouble), *status.warnings)
+        return msgspec.structs.replace(status, warnings=warnings)
+
+    def why_it_waits(self) -> str:
+        """What an end waits for, and what to do."""
+        if self._trouble is not None:
+            return str(self._trouble)
+        robot = self._node.journal.robot
+        if ch.robot_node(robot) not in self._node.alive:
+            return (
+                f"{robot} waits for its process, which is not there: start `teamslam robot`; "
+                f"{self._node.journal.path} keeps what was measured"
+            )
+        return f"{robot} has {self._node.delivered[1]} measurements by now"
+
+    def _run(self) -> None:
+        while not self._leaving.is_set() and not self._node.finished:
+            try:
+                self._connected()
+                self._trouble = None
+            except (BusError, KeysError) as error:
+                if self._up.is_set():
+                    _LOG.warning("%s", error)
+                self._trouble = error
+                self._leaving.wait(AGAIN_S)
+
+    def _connected(self) -> None:
+        own = None
+        if self._keys is not None:
+            own = credentials_of(self._keys, f"source-{self._node.journal.robot}", self._team)
+        connect = self._connect.replace("tcp/", "tls/", 1) if own else self._connect
+        with ExitStack() as stack:
+            bus = stack.enter_context(
+                ZenohBus(self._team, connect, max(self._patience_s, AGAIN_S), own)
+            )
+            self._be_the_only_one(bus)
+            shell = Shell(bus, self._node, self._name, self._leaving)
+            self._node.alive.clear()
+            for channel in self._node.listens:
+                bus.subscribe(channel, self._node.journal.robot)
+            bus.subscribe(ch.HEAD)
+            bus.watch_alive()
+            shell.answer(ch.MEASUREMENTS, self._node.journal.robot, self._node.measurements)
+            self._hear(shell, bus)
+            shell.begin()
+            self._up.set()
+            self._trouble = None
+            self._serve(shell, bus)
+
+    def _be_the_only_one(self, bus: ZenohBus) -> None:
+        deadline = time.monotonic() + SECOND_PATIENCE_S
+        while bus.is_alive(self._name):
+            if time.monotonic() >= deadline or self._leaving.wait(0.5):
+                raise BusError(
+                    f"another process is {self._name} in this team already: stop that one first"
+                )
+
+    def _hear(self, shell: Shell, bus: ZenohBus) -> None:
+        """How far the robot's process is: measurements that this file has not are another's."""
+        until = time.monotonic() + HEAR_S
+        journal = self._node.journal
+        while time.monotonic() < until:
+            shell.take(bus.receive(0.05))
+        incarnation, measurements = self._node.delivered
+        mine = journal.count(incarnation)
+        if incarnation <= journal.incarnation and measurements <= mine:
+            return
+        if incarnation < journal.first_incarnation:
+            return
+        if not journal.incarnation:
+            with self._lock:
+                journal.mark("open", incarnation=incarnation + 1)
+            self._node.warnings.append(
+                f"{journal.robot} had measured before, into another file: its stream begins anew"
+            )
+        else:
+            self._node.warnings.append(
+                f"the team has measurements of {journal.robot} that {journal.path} has not: stop, "
+                "and start with the file that has them, or with an empty one"
+            )
+        _LOG.warning("%s", self._node.warnings[-1])
+
+    def _serve(self, shell: Shell, bus: ZenohBus) -> None:
+        head_due, last, said = 0.0, 0.0, 0
+        while True:
+            out = self._node.publish()
+            now = time.monotonic()
+            if not out and (now >= head_due or self._node.is_news):
+                out = self._node.head()
+                head_due = now + HEAD_S
+            shell.publish(out)
+            shell.take(bus.receive(0.0 if out else PACE_S))
+            if self._node.told_to_end and self._node.journal.state == "open":
+                with self._lock:
+                    self._node.journal.mark("ended")
+            shell.look_for_the_end()
+            shell.report()
+            for warning in self._node.warnings[said:]:
+                _LOG.warning("%s", warning)
+            said = len(self._node.warnings)
+            with self._moved:
+                self._moved.notify_all()
+            if self._leaving.is_set() or self._node.finished:
+                last = last or now + LAST_S
+                settled = not self._node.has_more and not (
+                    self._node.finished and self._node.recorder_lacks
+                )
+                if settled or now >= last:
+                    break
+        shell.publish(self._node.head())
+        shell.report(last=True)

@@ -1,0 +1,213 @@
+"""The driver's node: publishes what the file has, answers for what was missed, knows who waits.
+
+It is the source of one robot's stream, as a world is of all (`sim.publisher`). It reads no clock.
+"""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from team.driver.journal import Journal
+from team.driver.source import BATCH, CREDIT_MEASUREMENTS, CREDIT_RECORDER, answered, channel_of
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded
+
+DAY_NS = 86_400 * 10**9
+Stream = tuple[int, int]
+"""(incarnation, measurements): how far somebody is."""
+
+
+@dataclass
+class SourceNode:
+    """`begin`, then `publish` and `handle` again and again, until `finished`.
+
+    An incarnation begins on the wire when the robot has had all of the one before: it would drop
+    the rest of that. delivered, recorded: how far the robot and a recorder are by their own word.
+    """
+
+    journal: Journal
+    finished: bool = field(default=False, init=False)
+    told_to_end: bool = field(default=False, init=False)
+    delivered: Stream = field(default=(0, 0), init=False)
+    recorded: Stream = field(default=(0, 0), init=False)
+    pose: m.PoseEstimate | None = field(default=None, init=False)
+    warnings: list[str] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        self._robot = self.journal.robot
+        self.alive: set[str] = set()
+        """The nodes of the team that are there."""
+        begun = self.journal.incarnations
+        self._incarnation = begun[0] if begun else 0
+        self._published = self.journal.count(self._incarnation)
+        self._said: m.StreamHead | None = None
+        self._others: set[str] = set()
+
+    listens: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.ROBOT_PROGRESS,
+        ch.RECORDER_PROGRESS,
+        ch.TEAM_POSE,
+        ch.TEAM_END,
+        ch.FINAL_MAP,
+    )
+    """Of this robot or of the team; beside them the heads of all drivers."""
+
+    def begin(self) -> list[Outgoing]:
+        """The beginning of the stream for whoever missed it, and how far it is."""
+        if not self._incarnation:
+            return []
+        start = self.journal.message(self._incarnation, 0)
+        return [Outgoing(ch.START, self._robot, start), *self.head(again=True)]
+
+    def publish(self) -> list[Outgoing]:
+        """The next measurements, BATCH at most: as many as credit allows."""
+        out: list[Outgoing] = []
+        while len(out) < BATCH and self._has_credit and (number := self._next()) is not None:
+            message = self.journal.message(self._incarnation, number)
+            out.append(Outgoing(channel_of(message), self._robot, message))
+            self._published = number + 1
+        return out
+
+    def _next(self) -> int | None:
+        """The number of the next measurement; a later incarnation begins when its turn has come."""
+        if self._published < self.journal.count(self._incarnation):
+            return self._published
+        if self._incarnation == self.journal.incarnation:
+            return None
+        if self._incarnation and self.delivered < (self._incarnation, self._published):
+            return None
+        self._incarnation = min(i for i in self.journal.incarnations if i > self._incarnation)
+        self._published = 0
+        return self._next()
+
+    @property
+    def _has_credit(self) -> bool:
+        consumed = self.delivered[1] if self.delivered[0] == self._incarnation else 0
+        if ch.robot_node(self._robot) in self.alive:
+            if self._published - consumed >= CREDIT_MEASUREMENTS:
+                return False
+        recorded = self.recorded[1] if self.recorded[0] == self._incarnation else 0
+        return "recorder" not in self.alive or self._published - recorded < CREDIT_RECORDER
+
+    def head(self, *, again: bool = False) -> list[Outgoing]:
+        """How far the stream is, if that is news; again: in any case."""
+        if not self._incarnation:
+            return []
+        last = self._incarnation == self.journal.incarnation
+        count = self.journal.count(self._incarnation)
+        newest = self.journal.message(self._incarnation, count - 1)
+        said = m.StreamHead(
+            stamp_ns=newest.stamp_ns,
+            robot=self._robot,
+            incarnation=self._incarnation,
+            measurements=count,
+            state=self.journal.state if last else "open",
+        )
+        if said == self._said and not again:
+            return []
+        self._said = said
+        return [Outgoing(ch.HEAD, self._robot, said)]
+
+    @property
+    def is_news(self) -> bool:
+        """The stream has ended, or its driver leaves, and nobody has been told."""
+        return self._said is not None and self._said.state != self.journal.state
+
+    @property
+    def has_more(self) -> bool:
+        """There is something to be published, and whoever takes it has credit."""
+        return self._has_credit and self._published < self.journal.count(self._incarnation)
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """Take progress, liveliness, orders, the final map; the answer is mostly empty."""
+        match message:
+            case m.Progress() if message.robot != self._robot:
+                pass
+            case m.Progress() if message.node == "recorder":
+                self.recorded = max(self.recorded, (message.incarnation, message.measurements))
+            case m.Progress():
+                self.delivered = max(self.delivered, (message.incarnation, message.measurements))
+            case m.Liveliness():
+                (self.alive.add if message.alive else self.alive.discard)(message.node)
+            case m.TeamEnd():
+                self.told_to_end = True
+            case m.FusedMap() if message.final:
+                self.finished = True
+            case m.PoseEstimate():
+                self.pose = message
+            case m.StreamHead() if message.robot != self._robot:
+                self._compare(message)
+            case _:
+                pass
+        return []
+
+    def _compare(self, head: m.StreamHead) -> None:
+        """One clock for the team: a day between two drivers is no delay."""
+        if not self.journal.incarnation or head.robot in self._others:
+            return
+        apart_ns = self.journal.newest_ns - head.stamp_ns
+        if abs(apart_ns) > DAY_NS:
+            self._others.add(head.robot)
+            years = apart_ns / (365.25 * DAY_NS)
+            way = "ahead of" if apart_ns > 0 else "behind"
+            self.warnings.append(
+                f"the clock of {self._robot} is {abs(years):.2f} years {way} that of {head.robot}: "
+                "all robots of a team stamp with one clock; Unix time will do"
+            )
+
+    def measurements(self, request: bytes) -> list[bytes]:
+        """The answer to `MeasurementsRequest`."""
+        wanted = decoded(request, m.MeasurementsRequest)
+        incarnation = wanted.incarnation or self._incarnation
+        if wanted.robot != self._robot or incarnation not in self.journal.incarnations:
+            return []
+        count = self.journal.count(incarnation)
+        return answered(wanted, count, lambda number: self.journal.message(incarnation, number))
+
+    @property
+    def is_delivered(self) -> bool:
+        """The robot has all that there is, and so has a recorder that is there."""
+        newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
+        return self.delivered >= newest and not self.recorder_lacks
+
+    @property
+    def recorder_lacks(self) -> bool:
+        """A recorder is there and has not everything."""
+        newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
+        return "recorder" in self.alive and self.recorded < newest
+
+    @property
+    def waits_for(self) -> str:
+        """Who is not there that is needed, in words; empty: nobody."""
+        missing = [n for n in (ch.robot_node(self._robot), "central") if n not in self.alive]
+        return " and ".join(missing)
+
+    def status(self) -> m.Status:
+        """How far the driver is, for people."""
+        figures = {
+            "measurements": float(self.journal.count(self.journal.incarnation)),
+            "incarnation": float(self.journal.incarnation),
+            "published": float(self._published),
+            "delivered": float(self.delivered[1]),
+            "team_time_s": 1e-9 * self.journal.newest_ns if self.journal.incarnation else 0.0,
+        }
+        state = self.journal.state if self.journal.incarnation else "waiting"
+        waits = (f"waiting for {self.waits_for}",) if self.waits_for else ()
+        idle = () if self.journal.incarnation else ("nothing measured yet",)
+        return m.Status(
+            stamp_ns=max(self.journal.newest_ns, 0),
+            node=ch.source_node(self._robot),
+            state="measuring" if state == "open" else state,
+            figures=figures,
+            warnings=(*waits, *idle, *self.warnings[-3:]),
+        )
+
+    @property
+    def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
+        """When [s] and where the robot was in the team's frame by its own last word."""
+        if self.pose is None:
+            return None
+        x, y, theta = (float(v) for v in floats(self.pose.pose, "pose"))
+        return 1e-9 * self.pose.stamp_ns, (x, y, theta)

@@ -1,0 +1,42 @@
+"""The order that a source owes: by stamp, and what was seen at a stamp before the odometry to it.
+
+A camera's frame may come tens of milliseconds after the odometry of its time. So what is measured
+waits until something newer by `latency_ns` has come; then its place is known. Which number a
+measurement gets depends on the order of the calls alone, so it can be found again from a file.
+"""
+
+from heapq import heappop, heappush
+
+Place = tuple[int, int]
+"""(stamp [ns], kind): of a smaller kind is what is seen, of the largest the odometry."""
+
+
+class Sorter:
+    """Takes items with their places; gives them back in order."""
+
+    def __init__(self, latency_ns: int) -> None:
+        self.latency_ns = latency_ns
+        self._waiting: list[tuple[Place, int, int]] = []
+        self._arrived = 0
+        self._newest_ns: int | None = None
+        self.released: Place | None = None
+        """The place of the last that was given back: nothing may come before it any more."""
+
+    def put(self, place: Place, item: int) -> list[int]:
+        """Take an item; those whose turn has come."""
+        heappush(self._waiting, (place, self._arrived, item))
+        self._arrived += 1
+        newest_ns = place[0] if self._newest_ns is None else max(self._newest_ns, place[0])
+        self._newest_ns = newest_ns
+        return self._until(newest_ns - self.latency_ns)
+
+    def flush(self) -> list[int]:
+        """All that wait."""
+        return [] if self._newest_ns is None else self._until(self._newest_ns + 1)
+
+    def _until(self, until_ns: int) -> list[int]:
+        out = []
+        while self._waiting and self._waiting[0][0][0] < until_ns:
+            self.released, _, item = heappop(self._waiting)
+            out.append(item)
+        return out

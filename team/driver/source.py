@@ -1,0 +1,34 @@
+"""The source of a stream: what whoever publishes measurements owes, a world or a robot's driver."""
+
+from collections.abc import Callable
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import encoded
+
+CREDIT_MEASUREMENTS = 4096
+"""A source is at most this many measurements ahead of its living robot."""
+CREDIT_RECORDER = 16384
+"""… and this many, of all robots of a world together, ahead of a living recorder."""
+BATCH = 256
+"""Measurements between two looks at what has come in."""
+ANSWER = 8192
+"""Measurements in one answer to a query; who wants more asks again."""
+FIRST_INCARNATION = 1
+
+
+def channel_of(measurement: m.Measurement) -> ch.Channel:
+    """The channel on which a measurement is published."""
+    return next(row for row in ch.SENSORS if isinstance(measurement, row.message))
+
+
+def answered(
+    wanted: m.MeasurementsRequest, count: int, measurement: Callable[[int], m.Measurement]
+) -> list[bytes]:
+    """The answer to a query: of the `count` measurements that there are those asked for.
+
+    ANSWER at most; measurement: gives one by its number.
+    """
+    last = count - 1 if wanted.last < 0 else min(wanted.last, count - 1)
+    last = min(last, wanted.first + ANSWER - 1)
+    return [encoded(measurement(number)) for number in range(wanted.first, last + 1)]
