@@ -91,20 +91,13 @@ class Roll:
                     robot.done = message
             case m.End():
                 self.world_end = later_end(message, self.world_end)
-            case m.InitialPose() if message.robot in self.robots:
-                robot = self.robots[message.robot]
-                robot.began = max(robot.began, message.incarnation)
-            case m.StreamHead() if message.robot in self.robots:
-                robot = self.robots[message.robot]
-                robot.head = later_head(message, robot.head)
-                robot.began = max(robot.began, message.incarnation)
-                self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.TeamEnd():
                 self.ordered = True
+            case m.InitialPose() | m.StreamHead() if message.robot in self.robots:
+                self._take_of_driver(message, self.robots[message.robot])
             case m.Liveliness() if message.node.startswith("source/"):
-                name = message.node.removeprefix("source/")
-                if name in self.robots:
-                    self.robots[name].driver = message.alive
+                robot = self.robots.get(message.node.removeprefix("source/"), Attendance())
+                robot.driver = message.alive
             case m.Liveliness():
                 found = self._named(message.node)
                 if found is not None:
@@ -116,6 +109,12 @@ class Roll:
                     found.given_up = True
             case _:
                 pass
+
+    def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
+        robot.began = max(robot.began, message.incarnation)
+        if isinstance(message, m.StreamHead):
+            robot.head = later_head(message, robot.head)
+            self.now_ns = max(self.now_ns, message.stamp_ns)
 
     def _named(self, node: str) -> Attendance | None:
         kind, _, name = node.partition("/")
@@ -246,4 +245,6 @@ class Roll:
         if not self.is_live:
             return False
         head = robot.head
-        return not robot.began or robot.driver is False or (head is not None and head.state == "left")
+        return (
+            not robot.began or robot.driver is False or (head is not None and head.state == "left")
+        )

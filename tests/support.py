@@ -420,9 +420,7 @@ def examples() -> Iterator[m.Message]:
         streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=200),),
         notes=("gap of 3 s",),
     )
-    yield m.StreamHead(
-        stamp_ns=9_000, robot="alpha", incarnation=1, measurements=200, state="open"
-    )
+    yield m.StreamHead(stamp_ns=9_000, robot="alpha", incarnation=1, measurements=200, state="open")
     yield m.TeamEnd(stamp_ns=0, by="operator", reason="the batteries are empty")
     yield m.Status(
         stamp_ns=9_000,

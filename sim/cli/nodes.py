@@ -34,6 +34,8 @@ from sim.cli.options import (
 from sim.scenarios.scenario import Scenario, doubts, with_options
 from team.wire.arrays import ids
 
+NAME = "[a-z][a-z0-9_]{0,31}"
+"""A robot's name."""
 _LOG = logging.getLogger("teamslam")
 
 app = typer.Typer()
@@ -138,12 +140,12 @@ def robot(
     resolved = with_options(
         scenario_of(scenario), robots=robots, seed=seed, estimator=estimator, fusion=fusion
     )
-    configs = {config.id: config for config in resolved.robots}
-    if name not in configs:
-        fail(
-            f"{scenario} has no robot {name!r}; its robots: {', '.join(configs)}",
-            WRONG_USE,
-        )
+    config = resolved.config_of(name)
+    if config is None:
+        known = ", ".join(each.id for each in resolved.robots)
+        fail(f"{scenario} has no robot {name!r}; its robots: {known}", WRONG_USE)
+    if not re.fullmatch(NAME, name):
+        fail(f"{name!r} is no robot's name", WRONG_USE)
     with (
         process(f"robot-{name}") as stop,
         nullcontext() if log is None else own_log(log, resolved.team) as tap,
@@ -151,7 +153,7 @@ def robot(
     ):
         bus.tap = tap
         _connected(resolved, connect)
-        RobotShell(bus, configs[name], stop, exchange=resolved.exchange).run()
+        RobotShell(bus, config, stop, exchange=resolved.exchange).run()
 
 
 @app.command()
@@ -182,7 +184,7 @@ def central(
     names = [config.id for config in resolved.robots]
     with process("central") as stop, connected(resolved.team, connect, keys, "central") as bus:
         _connected(resolved, connect)
-        CentralShell(bus, resolved.central, names, stop, patience).run()
+        CentralShell(bus, resolved.central, names, stop, patience, admit=resolved.admits).run()
 
 
 @app.command()
@@ -198,6 +200,7 @@ def record(
     missed; at the end the parts are joined.
     """
     from sim.scenarios.scenario import dumps
+    from team import translate
     from team.recording.parts import check_continues, join, next_part
     from team.recording.provenance import provenance
     from team.recording.reader import LogError
@@ -220,7 +223,9 @@ def record(
             check_continues(output, resolved.team, metadata)
     except LogError as error:
         fail(str(error), WRONG_USE)
-    expected = ["world", "central", *(robot_node(r.id) for r in resolved.robots)]
+    expected = ["central", *(robot_node(r.id) for r in resolved.robots)]
+    expected += [] if resolved.is_live else ["world"]
+    told = [translate.configured("world", 0, 0, resolved)] if resolved.is_live else []
     with (
         process("recorder", endless=True) as stop,
         connected(resolved.team, connect, keys, "recorder") as bus,
@@ -237,6 +242,7 @@ def record(
                 inventory,
                 lambda: next_part(output, resolved.team, metadata),
                 stop=stop,
+                scenario=told,
             )
             _LOG.info("wrote %s, %d messages", recorder.path, written)
         finally:
@@ -285,7 +291,7 @@ def withdraw(
     from sim.launch.withdraw import WithdrawError
     from sim.launch.withdraw import withdraw as order
 
-    if not re.fullmatch("[a-z][a-z0-9_]{0,31}", robot):
+    if not re.fullmatch(NAME, robot):
         fail(f"{robot!r} is no robot's name", WRONG_USE)
     if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
         fail(f"{team!r} is no team's name", WRONG_USE)
@@ -300,8 +306,10 @@ def withdraw(
 
 @app.command()
 def end(
-    without: Annotated[str, typer.Option(help="The robot that nobody is to wait for any more.")],
     team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    without: Annotated[
+        str | None, typer.Option(help="The robot that nobody is to wait for any more.")
+    ] = None,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
@@ -309,20 +317,25 @@ def end(
         float, typer.Option(help="Seconds to wait for the centre to follow.", min=0.0)
     ] = 60.0,
 ) -> None:
-    """Let a running team end without a robot that is lost: what has come of it stays in the map.
+    """End a live team: every driver ends its stream, and the centre says the final map.
 
-    The final map names it as lost and is provisional, and every process ends with 1. The router
-    keeps the order for a centre that is started again, until the run is over.
+    With --without: let a running team end without a robot that is lost. What has come of it stays
+    in the map, which names it as lost and is provisional, and every process ends with 1. The router
+    keeps that order for a centre that is started again, until the run is over.
     """
-    from sim.launch.withdraw import WithdrawError, give_up
+    from sim.launch.withdraw import WithdrawError, end_team, give_up
 
-    if not re.fullmatch("[a-z][a-z0-9_]{0,31}", without):
+    if without is not None and not re.fullmatch(NAME, without):
         fail(f"{without!r} is no robot's name", WRONG_USE)
     if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
         fail(f"{team!r} is no team's name", WRONG_USE)
     with connected(team, connect, keys, "operator") as bus:
         try:
-            give_up(bus, without, reason, patience)
+            if without is None:
+                end_team(bus, reason, patience)
+            else:
+                give_up(bus, without, reason, patience)
         except WithdrawError as error:
             fail(str(error), FAILED)
-    typer.echo(f"nobody waits for {without} any more")
+    said = f"nobody waits for {without} any more" if without else "the team ends"
+    typer.echo(said)

@@ -65,6 +65,37 @@ def give_up(bus: Bus, robot: str, reason: str, patience_s: float) -> None:
     raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
 
 
+def end_team(bus: Bus, reason: str, patience_s: float) -> None:
+    """Order a live team to end, and wait until the centre repeats the order.
+
+    Raises WithdrawError where there is no centre, the team has a world, or no such word within the
+    time.
+    """
+    for channel in (ch.TEAM_END, ch.FINAL_MAP):
+        bus.subscribe(channel)
+    bus.watch_alive()
+    until = time.monotonic() + CENTRE_S
+    while not bus.is_alive("central"):
+        if time.monotonic() > until:
+            raise WithdrawError(
+                "no centre answers; is the team running there? see --team, --connect"
+            )
+        bus.receive(LOOK_S)
+    if bus.is_alive("world"):
+        raise WithdrawError(
+            "this team has a world, which ends by itself; `teamslam end --without ROBOT` lets it "
+            "end without a robot that is lost"
+        )
+    order = m.TeamEnd(stamp_ns=0, by="operator", reason=reason)
+    bus.publish(Outgoing(ch.END_ORDER, "", order))
+    until = time.monotonic() + patience_s
+    while time.monotonic() < until:
+        for sample in bus.receive(LOOK_S):
+            if sample.key in (ch.TEAM_END.key(), ch.FINAL_MAP.key()):
+                return
+    raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
+
+
 def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
     until = time.monotonic() + CENTRE_S
     while time.monotonic() < until:

@@ -9,31 +9,30 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+import msgspec
 import numpy as np
 
 from sim.publisher.configurations import Configurations
 from sim.world import streams as s
 from sim.world.streams import RobotStream, WorldStreams
+from team.driver.source import (
+    BATCH,
+    CREDIT_MEASUREMENTS,
+    CREDIT_RECORDER,
+    FIRST_INCARNATION,
+    answered,
+)
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
+from team.wire.codec import decoded
 
-CREDIT_MEASUREMENTS = 4096
-"""The world is at most this many measurements ahead of the slowest living robot."""
-CREDIT_RECORDER = 16384
-"""… and this many, of all robots together, ahead of a living recorder."""
-BATCH = 256
-"""Measurements between two looks at what has come in."""
-ANSWER = 8192
-"""Measurements in one answer to a query; who wants more asks again."""
 TRUTH_BATCH_NS = 1_000_000_000
 HELD_UP_S = 5.0
 """A node without whose progress the world can not go on is named after so long."""
 RESUME_S = 2.0
 """A world that is started again waits so long for everyone to say how far he is."""
-FIRST_INCARNATION = 1
 
 
 @dataclass
@@ -467,9 +466,8 @@ class WorldNode:
                 self._begin_incarnation(source)
                 return []
             first = source.counter - self.cache
-        last = source.counter - 1 if wanted.last < 0 else min(wanted.last, source.counter - 1)
-        last = min(last, first + ANSWER - 1)
-        return [encoded(source.message(source.base + i)) for i in range(first, last + 1)]
+        kept = msgspec.structs.replace(wanted, first=first)
+        return answered(kept, source.counter, lambda n: source.message(source.base + n))
 
     def _begin_incarnation(self, source: _Source) -> None:
         """The stream can not be continued where the robot is: it begins anew at a free pose."""

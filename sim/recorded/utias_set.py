@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sim.datasets.utias_writer import write_utias
-from sim.publisher.node import FIRST_INCARNATION
 from sim.recorded.streams import recorded_streams
+from team.driver.source import FIRST_INCARNATION
 from team.recording.reader import Log, LogError
 from team.wire import channels as ch
 from team.wire import messages as m

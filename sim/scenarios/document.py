@@ -81,6 +81,8 @@ def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
     if count is not None and "robots" in fields:
         raise ScenarioError("robot_count and [[robots]] exclude each other: leave one away")
     world = checked_table(fields.get("world", {}), "world")
+    if world.get("kind") == "live" and world.get("admit"):
+        fields["world"] = {"newcomer": {"id": "newcomer"} | defaults} | world
     robots = fields.get("robots", _unnamed(world, count))
     if not isinstance(robots, list):
         raise ScenarioError("expected [[robots]], an array of tables, at robots")

@@ -25,8 +25,8 @@ from sim.scenarios.document import (
     named_document,
     resolved,
 )
-from sim.world.config import FolderWorld, SimulatedWorld, UtiasWorld, World
-from team.config import Estimator, Exchange, FusionRule
+from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UtiasWorld, World
+from team.config import Estimator, Exchange, FusionRule, RobotConfig
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from team.registry import absence
 
@@ -37,6 +37,7 @@ WORLDS: dict[str, type[World]] = {
     "simulated": SimulatedWorld,
     "utias": UtiasWorld,
     "folder": FolderWorld,
+    "live": LiveWorld,
 }
 
 
@@ -44,6 +45,26 @@ class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True
     """A resolved scenario: what the team is told, and its world."""
 
     world: World
+
+    def config_of(self, robot: str) -> RobotConfig | None:
+        """The configuration of a robot; of one that is not named that of newcomers, if any."""
+        named = next((config for config in self.robots if config.id == robot), None)
+        if named is not None or not isinstance(self.world, LiveWorld) or not self.world.admit:
+            return named
+        newcomer = self.world.newcomer or RobotConfig("newcomer")
+        return msgspec.structs.replace(
+            newcomer, id=robot, seed=self.seed, estimator=self.estimator, fusion=self.fusion
+        )
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there is no world, and each robot has a driver."""
+        return isinstance(self.world, LiveWorld)
+
+    @property
+    def admits(self) -> bool:
+        """Whether robots that are not named may join the team."""
+        return isinstance(self.world, LiveWorld) and self.world.admit
 
 
 def load(name_or_path: str | Path) -> Scenario:
@@ -191,6 +212,11 @@ def _filled(scenario: Scenario) -> Scenario:
             f"the rule {scenario.fusion} needs a continuous exchange: at a rendezvous submaps are "
             'sent, which the rule "join" takes'
         )
+    if scenario.is_live and PAIRS[scenario.estimator, scenario.fusion] != "submap":
+        raise ScenarioError(
+            f"the rule {scenario.fusion} can not serve a live team, whose robots come and go: "
+            'world.kind = "live" needs a rule on submaps, as "join"'
+        )
     _check_team([robot.id for robot in scenario.robots], scenario.world)
     robots = tuple(
         msgspec.structs.replace(
@@ -215,6 +241,8 @@ def _check_way_points(robots: int, world: SimulatedWorld) -> None:
 
 
 def _check_team(ids: list[str], world: World) -> None:
+    if not ids and isinstance(world, LiveWorld) and world.admit:
+        return
     if not ids:
         raise ScenarioError("no robots: give robot_count, [[robots]], or a base that has some")
     checked_count(len(ids))
@@ -228,7 +256,7 @@ def _check_team(ids: list[str], world: World) -> None:
             )
     if isinstance(world, SimulatedWorld):
         _check_way_points(len(ids), world)
-    for named in world.unknown_starts:
+    for named in () if isinstance(world, LiveWorld) else world.unknown_starts:
         if named != "*" and named.removeprefix("!") not in ids:
             raise ScenarioError(
                 f"world.unknown_starts names {named}, no such robot; known: {', '.join(ids)}, "

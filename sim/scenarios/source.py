@@ -12,7 +12,7 @@ from sim.datasets.utias import utias
 from sim.datasets.utias_log import present_robots
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario
-from sim.world.config import FolderWorld, SimulatedWorld
+from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
 from team.pairs import NEEDS_MAP
@@ -24,6 +24,11 @@ def streams_of(scenario: Scenario) -> WorldStreams:
         return simulated(scenario.world, scenario.robots, noise_seed(scenario))
     if isinstance(scenario.world, FolderWorld):
         return folder(scenario.world, scenario.robots)
+    if isinstance(scenario.world, LiveWorld):
+        raise ScenarioError(
+            f"{scenario.name}: a live team has no world: its robots' drivers say what they "
+            "measure (docs/your_robot.md); for recorded data give --dataset"
+        )
     return utias(scenario.world, scenario.robots)
 
 
@@ -42,7 +47,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     Raises DatasetError.
     """
     world = scenario.world
-    if isinstance(world, SimulatedWorld) or not world.path:
+    if isinstance(world, SimulatedWorld | LiveWorld) or not world.path:
         return scenario, None
     if isinstance(world, FolderWorld):
         present = set(robots_of(world.path))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from team.config import Fraction, NonNegative, Positive
+from team.config import Fraction, NonNegative, Positive, RobotConfig
 
 GarbageKind = Literal["reading", "identity", "drop"]
 Steering = Literal["together", "turn-first"]
@@ -103,10 +103,23 @@ class FolderWorld(
     duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
 
 
+class LiveWorld(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="live"
+):
+    """No world: each robot has a driver that says what it measures, and ends its own stream.
+
+    admit: robots that the scenario does not name are taken into the team. newcomer: what such a
+    robot is unless its own process says otherwise; the scenario's [defaults].
+    """
+
+    admit: bool = False
+    newcomer: RobotConfig | None = None
+
+
 def starts_unknown(world: SimulatedWorld | UtiasWorld | FolderWorld, robot: str) -> bool:
     """Whether the team is not told where this robot starts."""
     named = world.unknown_starts
     return robot in named or ("*" in named and f"!{robot}" not in named)
 
 
-World = SimulatedWorld | UtiasWorld | FolderWorld
+World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld

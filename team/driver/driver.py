@@ -190,7 +190,7 @@ class Driver:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """(t, (x, y, theta)): where the robot was in the team's frame by its process's last word."""
+        """(t, (x, y, theta)): where the robot was in the team's frame, as its process said last."""
         return self._node.team_pose
 
     def status(self) -> m.Status:
@@ -351,7 +351,9 @@ class Driver:
     def _judge_ids(self, ids: np.ndarray) -> None:
         unknown = [] if self._known is None else sorted({int(i) for i in ids} - self._known)
         for each in unknown:
-            self._warn(f"id{each}", f"{self.robot} saw landmark {each}, which is not in `landmarks`")
+            self._warn(
+                f"id{each}", f"{self.robot} saw landmark {each}, which is not in `landmarks`"
+            )
         if len(ids) > 1 and not (ids[1:] > ids[:-1]).all():
             self._warn(
                 "order",

@@ -1,7 +1,7 @@
 """A driver's file: every measurement before it goes anywhere, in the order in which it came.
 
 The file only grows. It begins with a head (MessagePack); a record is `<IBq`: the payload's length,
-its kind, its stamp [ns]; then the payload, an encoded measurement with the number 0, and its CRC-32.
+its kind, its stamp [ns]; then the payload, an encoded measurement with number 0, and its CRC-32.
 A record that a crash has cut off is left out. The numbers follow from the records by `Sorter`, so a
 driver that is started again goes on where it was.
 """
@@ -15,7 +15,7 @@ import zlib
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgpack
 import msgspec
@@ -29,6 +29,7 @@ START, OBSERVATIONS, SIGHTINGS, ODOMETRY, MARK, POSE = range(6)
 """Kinds of records; of equal stamps the smaller one comes first. The last two are no measurements:
 whether the stream goes on, and a pose in the odometry's frame, three floats.
 """
+State = Literal["open", "left", "ended"]
 MAGIC = b"teamslam stream 1\n"
 OLD_S = 3600.0
 """A stream that has not grown for so long, and was not ended, is another day's."""
@@ -54,7 +55,7 @@ class Journal:
     robot: str
     first_incarnation: int = FIRST_INCARNATION
     incarnation: int = 0
-    state: str = "open"
+    state: State = "open"
     newest_ns: int = -(2**62)
     driven_ns: int | None = None
     pose: tuple[float, float, float] | None = None
@@ -105,14 +106,16 @@ class Journal:
         try:
             written = os.pwrite(self._file, record, at)
         except OSError as error:
-            raise JournalError(f"{self.path}: {error.strerror}; make room and start again") from None
+            raise JournalError(
+                f"{self.path}: {error.strerror}; make room and start again"
+            ) from None
         if written != len(record):
             raise JournalError(f"{self.path}: the disk is full; make room and start again")
         self._size += written
         self._take(at, kind, stamp_ns, payload)
 
     def mark(
-        self, state: str, *, latency_ns: int | None = None, incarnation: int | None = None
+        self, state: State, *, latency_ns: int | None = None, incarnation: int | None = None
     ) -> None:
         """Say whether the stream goes on; all that waits for its turn is numbered.
 
@@ -120,7 +123,6 @@ class Journal:
         """
         said = {"state": state, "latency_ns": latency_ns, "incarnation": incarnation}
         self.append(MARK, 0, msgpack.packb(said))
-
 
     def _take(self, at: int, kind: int, stamp_ns: int, payload: bytes) -> None:
         with self._lock:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import unsound
 
+M = TypeVar("M", bound=m.Measurement)
 UNNAMED = 2**31
 """Numbers from here on are for landmarks without names."""
 
@@ -67,8 +69,9 @@ def observations(
     """Landmarks seen: numbers below 2³¹, ranges [m], bearings [rad], which are wrapped."""
     what = f"observe at {1e-9 * stamp_ns:.3f} s"
     numbers = _numbers(ids, what)
-    far, angles = _row(ranges, "ranges", what, len(numbers)), _row(
-        bearings, "bearings", what, len(numbers)
+    far, angles = (
+        _row(ranges, "ranges", what, len(numbers)),
+        _row(bearings, "bearings", what, len(numbers)),
     )
     return _sound(
         m.Observations(
@@ -92,8 +95,9 @@ def sightings(
     names = tuple(teammates)
     if robot in names:
         raise MeasurementError(f"{what}: {robot} can not see itself; name its teammates")
-    far, angles = _row(ranges, "ranges", what, len(names)), _row(
-        bearings, "bearings", what, len(names)
+    far, angles = (
+        _row(ranges, "ranges", what, len(names)),
+        _row(bearings, "bearings", what, len(names)),
     )
     return _sound(
         m.Sightings(
@@ -121,7 +125,7 @@ def range_bearing_of(xy: ArrayLike, what: str) -> tuple[np.ndarray, np.ndarray]:
     return np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
 
 
-def _sound(message: m.Measurement, what: str) -> m.Measurement:  # type: ignore[type-var]
+def _sound(message: M, what: str) -> M:
     why = unsound(message)
     if why is not None:
         raise MeasurementError(f"{what}: {why.detail}")

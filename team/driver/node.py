@@ -85,9 +85,9 @@ class SourceNode:
     @property
     def _has_credit(self) -> bool:
         consumed = self.delivered[1] if self.delivered[0] == self._incarnation else 0
-        if ch.robot_node(self._robot) in self.alive:
-            if self._published - consumed >= CREDIT_MEASUREMENTS:
-                return False
+        is_there = ch.robot_node(self._robot) in self.alive
+        if is_there and self._published - consumed >= CREDIT_MEASUREMENTS:
+            return False
         recorded = self.recorded[1] if self.recorded[0] == self._incarnation else 0
         return "recorder" not in self.alive or self._published - recorded < CREDIT_RECORDER
 

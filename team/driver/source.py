@@ -19,7 +19,7 @@ FIRST_INCARNATION = 1
 
 def channel_of(measurement: m.Measurement) -> ch.Channel:
     """The channel on which a measurement is published."""
-    return next(row for row in ch.SENSORS if isinstance(measurement, row.message))
+    return next(row for row in ch.SENSORS if isinstance(measurement, row.kinds))
 
 
 def answered(

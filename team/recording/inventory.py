@@ -1,8 +1,8 @@
 """What a log has of each numbered stream, and what is known that it lacks.
 
 A robot's measurements are numbered by its source across all sensor channels, its submaps by itself;
-`world/end`, or each driver's head, says how many measurements there are, `progress` and `done` how many there are at least.
-So what is missing at the end or altogether is known, too.
+`world/end`, or each driver's head, says how many measurements there are, `progress` and `done` how
+many there are at least. So what is missing at the end or altogether is known, too.
 """
 
 import zlib

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 
@@ -23,10 +23,12 @@ from team.wire.channels import (
     SENT,
     STATUS,
     SUBMAP,
+    WORLD_CONFIG,
     channel_of,
 )
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
+    Configuration,
     Liveliness,
     MeasurementsRequest,
     Message,
@@ -157,6 +159,11 @@ class RecordLoop:
         self._bus.again()
         _LOG.warning("recording goes on in %s", self._recorder.path)
 
+    def tell(self, scenario: Sequence[Configuration]) -> None:
+        """Write what a world would have said, where there is none."""
+        said = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
+        self._write([each for each in said if self._inventory.news(each)])
+
     def close(self) -> None:
         """Complete the log; raises `RecorderError` if it can not be written."""
         try:
@@ -263,17 +270,20 @@ def record(
     more: More | None = None,
     on_status: Callable[[Status], None] | None = None,
     stop: threading.Event | None = None,
+    scenario: Sequence[Configuration] = (),
 ) -> int:
     """Record until the final map is there and all other nodes have gone, or until `stop`; close.
 
     Returns how many messages were written.
     `expected`: nodes whose absence is a warning in the status. `inventory`, `more`: what earlier
-    parts of the log have, and what opens the next one when this one can not be written. Raises
+    parts of the log have, and what opens the next one when this one can not be written. scenario:
+    of a team without a world, whose place it takes in the log. Raises
     `RecorderError` when the log can not be written: at once without `more`, else at the end.
     """
     stop = threading.Event() if stop is None else stop
     loop = RecordLoop(bus, recorder, expected, inventory, more)
     with closing(loop):
+        loop.tell(scenario)
         due = time.monotonic()
         remind_due = due + _REMIND_S
         end = TheEnd(bus, NODE)

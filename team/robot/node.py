@@ -283,24 +283,30 @@ class RobotNode:
                 if message.incarnation == self._incarnation:
                     acknowledged = max(self._pace.acknowledged, message.submaps)
                     self._pace.acknowledged = acknowledged
+            case m.Rendezvous():
+                return self._met(message) + self._go_on()
+            case m.Withdrawal():
+                return self._kept(message) + self._go_on()
+            case _:
+                self._hear(message)
+        return self._go_on()
+
+    def _hear(self, message: m.Message) -> None:
+        """Who is there, and where the stream ends."""
+        match message:
+            case m.Liveliness() if message.node == ch.source_node(self.robot):
+                self._driver_is_there = message.alive
             case m.Liveliness():
                 if message.node == "central":
                     self._pace.centre_alive = message.alive
-                elif message.node == ch.source_node(self.robot):
-                    self._driver_is_there = message.alive
             case m.End():
                 self._take_end(message)
             case m.StreamHead():
                 self._take_head(message)
             case m.TeamEnd():
                 self._is_to_end = True
-            case m.Rendezvous():
-                return self._met(message) + self._go_on()
-            case m.Withdrawal():
-                return self._kept(message) + self._go_on()
             case _:
                 self.warnings.append(f"no use for a {type(message).__name__}")
-        return self._go_on()
 
     def window_closed(self, closed: ClosedWindow) -> None:
         """A window has become a submap: what else is made of it is not the robot's task."""

@@ -6,8 +6,9 @@ the key's prefix: a robot's process `robot/{robot}/…`, its driver `source/{rob
 world is the source of every robot, and the truth is its own too.
 
 `{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer`,
-`robot/<name>` or `source/<name>`, `{view}` for a view (`team.wire.views`). In the rates an incarnation is one life of
-a robot's stream (the messages' `incarnation`), a keyframe one incarnation of observation.
+`robot/<name>` or `source/<name>`, `{view}` for a view (`team.wire.views`). In the rates an
+incarnation is one life of a robot's stream (the messages' `incarnation`), a keyframe one
+incarnation of observation.
 """
 
 import re

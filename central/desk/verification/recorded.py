@@ -155,8 +155,8 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
         raise RerunError(f"{what} is not one of this version: {error}") from None
 
 
-_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END, ch.HEAD, ch.ORDER,
-         ch.WITHDRAWAL)  # fmt: skip
+_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END, ch.HEAD,
+         ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_TOLD))
 """The channels whose samples are filed."""
 
