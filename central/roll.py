@@ -103,10 +103,8 @@ class Roll:
                 if found is not None:
                     found.alive = message.alive
                     found.seen = found.seen or message.alive
-            case m.GivenUp():
-                found = self._named(message.node)
-                if found is not None:
-                    found.given_up = True
+            case m.GivenUp() if (found := self._named(message.node)) is not None:
+                found.given_up = True
             case _:
                 pass
 

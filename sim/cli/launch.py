@@ -14,6 +14,7 @@ from sim.cli.importing import imported_into, is_foreign
 from sim.cli.options import (
     ANY_PORT,
     FAILED,
+    LOOPBACK,
     WRONG_USE,
     Dataset,
     EstimatorOption,
@@ -113,6 +114,8 @@ def launch(
     )
     resolved, missing = with_present_robots(resolved)
     _check_world(resolved)
+    if resolved.is_live and listen == ANY_PORT:
+        listen = LOOPBACK  # drivers have to find it
     for text in (*doubts(resolved), *([missing] if missing else [])):
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:

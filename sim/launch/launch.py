@@ -58,7 +58,9 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
     resolved.write_text(dumps(plan.scenario))
     with _interruptible(), _services() as services:
         router = _start_router(plan, services, starter)
-        watch = Watch(began=began, robots=len(plan.scenario.robots))
+        ids = tuple(robot.id for robot in plan.scenario.robots)
+        drivers = ids if plan.scenario.is_live else None
+        watch = Watch(began=began, robots=len(ids), drivers=drivers)
         team = plan.scenario.team
         own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
         door = "".join(f" {word}" for word in plan.door)
@@ -151,5 +153,5 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
         ("central", ["central", *common]),
         *robots,
         *([("viewer", ["viewer", *common])] if plan.views else []),
-        ("world", ["world", *common, "--speed", speed]),
+        *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),
     ]

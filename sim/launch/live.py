@@ -67,12 +67,12 @@ class _Lines:
                 self._said.add(words)
                 self._print(watch, words)
         now = time.monotonic()
-        if now < self._due or "world" not in watch.statuses:
+        if now < self._due or watch.world is None:
             return
         self._due = now + LINE_S
-        world = watch.statuses["world"].figures
+        world = watch.world.figures
         robots = [s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")]
-        if watch.statuses["world"].state == "waiting":
+        if watch.world.state == "waiting":
             self._print(watch, f"waiting: {len(robots)} of {watch.robots} robots")
             return
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
@@ -112,7 +112,7 @@ def _done(watch: Watch) -> float:
     """The share of the world's measurements that the robots have taken; it may be far ahead of
     them.
     """
-    total = watch.statuses["world"].figures.get("of", 0.0)
+    total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
     robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
     taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
     return min(taken / total, 1.0) if total else 0.0
@@ -125,21 +125,22 @@ def _warnings(watch: Watch) -> list[str]:
     """
     if time.monotonic() - watch.began <= PATIENCE_S:
         return list(watch.failures)
-    world = watch.statuses.get("world")
+    world = watch.world
     said = sorted(watch.statuses.items())
     if world is None:
         said = [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
         texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in said if s.warnings]
     elif world.state == "waiting":
-        texts = [f"world: {w}" for w in world.warnings]
+        texts = [f"{world.node}: {w}" for w in world.warnings]
     else:
+        said += [(world.node, world)] if watch.drivers else []
         texts = [f"{node}: {w}" for node, status in said for w in status.warnings]
     return [*watch.failures, *texts]
 
 
 def _view(title: str, watch: Watch) -> Group:
     elapsed = time.monotonic() - watch.began
-    world = watch.statuses.get("world")
+    world = watch.world
     parts: list[Text | Table] = [Text(f"{title}   {elapsed:.1f} s", style="bold")]
     if watch.place:
         parts.append(Text(f"other commands reach the team by {watch.place}", style="dim"))
@@ -151,7 +152,7 @@ def _view(title: str, watch: Watch) -> Group:
         bar.add_row(
             ProgressBar(total=1.0, completed=_done(watch), width=36),
             f"{_done(watch):.0%}",
-            f"team time {world.figures.get('team_time_s', 0.0):,.0f} s, world {world.state}",
+            f"team time {world.figures.get('team_time_s', 0.0):,.0f} s, {world.node} {world.state}",
         )
         parts.append(bar)
     if robots:
@@ -202,7 +203,7 @@ def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
 
 def _map_lines(watch: Watch) -> list[str]:
     """What the team's map is made of, and whether it can be believed."""
-    fused, central, world = watch.fused, watch.statuses.get("central"), watch.statuses.get("world")
+    fused, central, world = watch.fused, watch.statuses.get("central"), watch.world
     if fused is None:
         return ["no fused map yet"]
     figures = {} if central is None else central.figures

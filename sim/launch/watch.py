@@ -29,9 +29,10 @@ def _no_errors() -> "LiveErrors":
 class Watch:
     """What is known of the team while it runs: the last status of each node, and the last map.
 
-    robots: how many there are to be. errors: against the truth, where there is one. place: by what
-    other commands reach the team. notes: what became of processes, in words. restarts: how often
-    each was started again. given_up: those that were. heard: when each node's last status came.
+    robots: how many there are to be. drivers: of a live team, whose drivers are waited for. errors:
+    against the truth, where there is one. place: by what other commands reach the team. notes: what
+    became of processes, in words. restarts: how often each was started again. given_up: those that
+    were. heard: when each node's last status came.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -45,6 +46,29 @@ class Watch:
     restarts: dict[str, int] = field(default_factory=dict)
     given_up: list[str] = field(default_factory=list)
     heard: dict[str, float] = field(default_factory=dict)
+    drivers: tuple[str, ...] | None = None
+
+    @property
+    def world(self) -> m.Status | None:
+        """The world's status; of a live team that of all its drivers together."""
+        if self.drivers is None:
+            return self.statuses.get("world")
+        there = [s for node, s in self.statuses.items() if node.startswith("source/")]
+        named = {status.node.removeprefix("source/") for status in there}
+        missing = sorted(set(self.drivers) - named)
+        figures = {
+            "of": sum(status.figures.get("measurements", 0.0) for status in there),
+            "team_time_s": max((s.figures.get("team_time_s", 0.0) for s in there), default=0.0),
+        }
+        waiting = (f"waiting for the drivers of {', '.join(missing)}",) if missing else ()
+        states = {status.state for status in there}
+        return m.Status(
+            stamp_ns=max((status.stamp_ns for status in there), default=0),
+            node="drivers",
+            state=states.pop() if len(states) == 1 else "measuring" if states else "waiting",
+            figures=figures,
+            warnings=waiting,
+        )
 
     def take(self, bus: Bus) -> None:
         """Take what has come since."""

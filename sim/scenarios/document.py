@@ -146,6 +146,9 @@ def _based(document: Fields) -> Fields:
         known = ", ".join(builtin_names())
         raise ScenarioError(f"expected a built-in scenario, got {base!r} at base; known: {known}")
     below = _builtin(base)
+    kind = own["world"].get("kind") if isinstance(own.get("world"), dict) else None
+    if kind is not None and kind != below.get("world", {}).get("kind"):
+        below.pop("world", None)  # its fields are another world's
     if "robot_count" in own:
         below.pop("robots", None)
     return _merged(below, own)

@@ -219,6 +219,7 @@ class Driver:
             if now >= remind:
                 remind = now + REMIND_S
                 _LOG.info("%s", self._link.why_it_waits())
+            self._check_open()
             self._link.wait(0.05)
         self.close()
         return True
@@ -239,6 +240,11 @@ class Driver:
     def _check_open(self) -> None:
         if self._closed:
             raise DriverError(f"the driver of {self.robot} is closed: make another one")
+        if self._link.failure is not None:
+            raise DriverError(
+                f"the driver of {self.robot} says nothing any more, {self._link.failure}: start it "
+                f"again; {self._journal.path} has what was measured"
+            )
 
     def _resume(self, stamp_ns: int) -> None:
         """At the first call after a start with an old file: the same once more, or what follows."""

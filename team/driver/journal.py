@@ -74,7 +74,8 @@ class Journal:
     @property
     def incarnations(self) -> list[int]:
         """Those that the file has, in order."""
-        return sorted(self._numbered)
+        with self._lock:
+            return sorted(self._numbered)
 
     def count(self, incarnation: int) -> int:
         """How many measurements of an incarnation have their number."""
@@ -85,7 +86,8 @@ class Journal:
         """A measurement that has its number."""
         with self._lock:
             at = self._numbered[incarnation][number]
-        message = decoded(self.payload(at), m.Measurement)
+        message: m.Message = decoded(self.payload(at))
+        assert isinstance(message, m.Measurement)
         return msgspec.structs.replace(message, number=number)
 
     def payload(self, at: int) -> bytes:

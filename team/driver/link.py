@@ -56,6 +56,7 @@ class Link:
         self._up = threading.Event()
         self._moved = threading.Condition()
         self._trouble: Exception | None = None
+        self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
 
     def open(self, patience_s: float) -> None:
@@ -73,6 +74,12 @@ class Link:
         """Say the last word and leave."""
         self._leaving.set()
         self._thread.join(3.0 * LAST_S)
+
+    @property
+    def failure(self) -> str | None:
+        """What ended the thread that should not have; None: nothing did."""
+        failed = self._failure
+        return None if failed is None else f"{type(failed).__name__}: {failed}"
 
     def wait(self, timeout_s: float) -> None:
         """Return when something may have changed."""
@@ -109,6 +116,9 @@ class Link:
                     _LOG.warning("%s", error)
                 self._trouble = error
                 self._leaving.wait(AGAIN_S)
+            except Exception as error:  # whoever hands over the next measurement is told
+                self._trouble = self._failure = error
+                raise
 
     def _connected(self) -> None:
         own = None

@@ -1,0 +1,28 @@
+"""A robot whose measurements stand in CSV tables: python robot.py r1 data/r1 lab ENDPOINT."""
+
+import csv
+import sys
+from decimal import Decimal
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from team import Driver
+
+name, folder, team, endpoint = sys.argv[1:]
+events = []
+for kind in ("observations", "odometry"):
+    rows = list(csv.reader((Path(folder) / f"{kind}.csv").open()))[1:]
+    for t, group in groupby(rows, lambda row: row[0]):
+        events.append((Decimal(t), kind, [float(x) for row in group for x in row[1:] if x]))
+start = [float(x) for x in (Path(folder) / "start.csv").read_text().split()[1].split(",")]
+
+speed = [0.0, 0.0]
+with Driver(name, team=team, connect=endpoint, start=start) as robot:
+    for t, kind, numbers in sorted(events):  # what is seen at a time, then how it has moved
+        if kind == "odometry":
+            robot.odometry(t, *speed)  # until t, since the last call
+            speed = numbers
+        else:
+            robot.observe(t, *np.reshape(numbers, (-1, 3)).T)
