@@ -26,8 +26,10 @@ from team.driver.link import Link
 from team.driver.measured import DriverWarning, MeasurementError
 from team.driver.motion import Interval, Odometer
 from team.driver.node import SourceNode
+from team.keys.roster import KeysError
 from team.wire import messages as m
 from team.wire.arrays import from_floats
+from team.wire.bus import BusError
 from team.wire.codec import encoded
 
 CONNECT = "tcp/127.0.0.1:7447"
@@ -96,9 +98,9 @@ class Driver:
         self._link = Link(self._node, team=team, connect=connect, keys=keys, lock=self._lock)
         try:
             self._link.open(patience_s)
-        except BaseException:
+        except (BusError, KeysError) as error:
             self._journal.close()
-            raise
+            raise DriverError(str(error)) from None
         self._closed = False
 
     def __enter__(self) -> Self:
@@ -221,6 +223,8 @@ class Driver:
                 _LOG.info("%s", self._link.why_it_waits())
             self._check_open()
             self._link.wait(0.05)
+        with self._lock:
+            self._journal.mark("ended", delivered=True)
         self.close()
         return True
 
@@ -249,7 +253,7 @@ class Driver:
     def _resume(self, stamp_ns: int) -> None:
         """At the first call after a start with an old file: the same once more, or what follows."""
         self._check_open()
-        if self.team_has_ended or self._journal.state == "ended":
+        if self.team_has_ended:
             raise DriverError(
                 f"{self.robot}: the team has ended, so nothing more is measured; for another run "
                 "start its processes and a driver"
@@ -261,6 +265,10 @@ class Driver:
             return
         self._again = -1
         self._incarnation = self._journal.incarnation
+        if self._journal.state == "ended":  # it comes back before anybody had the end
+            self._journal.mark("open")
+            self._begin(stamp_ns, known=False)
+            return
         self._odometer.end_ns = self._journal.driven_ns
         self._odometer.pose = self._journal.pose
 
@@ -278,6 +286,11 @@ class Driver:
                 self._again += 1
                 return
             self._again = -1
+        if self._journal.state == "ended":
+            raise DriverError(
+                f"{self._journal.path}: {self.robot} has ended its stream at "
+                f"{self.last_time:.3f} s: give another file"
+            )
         if kind in (j.OBSERVATIONS, j.SIGHTINGS, j.ODOMETRY) and self._journal.too_late(
             stamp_ns, kind
         ):

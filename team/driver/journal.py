@@ -47,8 +47,8 @@ class Journal:
     """One robot's file, open for appending; `opened` makes it. Any thread may read.
 
     incarnation: the one in progress; 0 before anything was measured. state: of the stream, as its
-    head says it. calls: where each record but marks begins, as they came. driven_ns, pose: where
-    the odometry has come to.
+    head says it; delivered: and nobody needs anything of it any more. calls: where each record but
+    marks begins, as they came. driven_ns, pose: where the odometry has come to.
     """
 
     path: Path
@@ -56,6 +56,7 @@ class Journal:
     first_incarnation: int = FIRST_INCARNATION
     incarnation: int = 0
     state: State = "open"
+    delivered: bool = False
     newest_ns: int = -(2**62)
     driven_ns: int | None = None
     pose: tuple[float, float, float] | None = None
@@ -117,20 +118,31 @@ class Journal:
         self._take(at, kind, stamp_ns, payload)
 
     def mark(
-        self, state: State, *, latency_ns: int | None = None, incarnation: int | None = None
+        self,
+        state: State,
+        *,
+        latency_ns: int | None = None,
+        incarnation: int | None = None,
+        delivered: bool = False,
     ) -> None:
         """Say whether the stream goes on; all that waits for its turn is numbered.
 
-        incarnation: of the first that will be in a file that has none yet.
+        incarnation: of the first that will be in a file that has none yet. delivered: who needs the
+        stream has all of it.
         """
-        said = {"state": state, "latency_ns": latency_ns, "incarnation": incarnation}
+        said = {
+            "state": state,
+            "latency_ns": latency_ns,
+            "incarnation": incarnation,
+            "delivered": delivered,
+        }
         self.append(MARK, 0, msgpack.packb(said))
 
     def _take(self, at: int, kind: int, stamp_ns: int, payload: bytes) -> None:
         with self._lock:
             if kind == MARK:
                 said = msgpack.unpackb(payload)
-                self.state = said["state"]
+                self.state, self.delivered = said["state"], said["delivered"]
                 if self.incarnation:
                     self._numbered[self.incarnation].extend(self._sorter.flush())
                 if said["latency_ns"] is not None:
@@ -185,18 +197,21 @@ def pose_payload(pose: tuple[float, float, float]) -> bytes:
 def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
     """The robot's file to go on in, and in words what was found there.
 
-    A stream that has ended, or has not grown for OLD_S, steps aside; the new one begins with the
-    next incarnation, so that nobody takes it for the same. Raises JournalError for a file of
-    another robot or of no driver, or one that another driver has open.
+    A stream that has ended and is with the robot's process, or has not grown for OLD_S, steps
+    aside; the new one begins with the next incarnation, so that nobody takes it for the same.
+    Raises JournalError for a file of another robot or of no driver, or one that another driver has
+    open.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    journal = _existing(path, robot) if path.exists() and path.stat().st_size else None
+    found = path.stat() if path.exists() else None
+    journal = _existing(path, robot) if found is not None and found.st_size else None
     said = ""
     first = FIRST_INCARNATION
-    if journal is not None:
-        age_s = time.time() - path.stat().st_mtime
-        if journal.state != "ended" and age_s < OLD_S:
-            if journal._sorter.latency_ns != latency_ns or journal.state != "open":
+    if journal is not None and found is not None:
+        age_s = time.time() - found.st_mtime
+        if not journal.delivered and age_s < OLD_S:
+            other = journal._sorter.latency_ns != latency_ns
+            if other or journal.state == "left":
                 journal.mark("open", latency_ns=latency_ns)
             count = journal.count(journal.incarnation)
             said = f"{path}: goes on after measurement {count - 1}, {age_s:.0f} s old"
@@ -207,7 +222,7 @@ def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
         first = journal.next_incarnation
         journal.close()
         aside = _set_aside(path)
-        why = "has ended" if journal.state == "ended" else f"is {age_s / 3600.0:.1f} h old"
+        why = "has ended" if journal.delivered else f"is {age_s / 3600.0:.1f} h old"
         said = f"{path}: its stream {why}: it is now {aside}, and a new one begins"
     journal = Journal(path, robot, first)
     _open(journal, os.O_CREAT | os.O_EXCL)

@@ -21,6 +21,8 @@ HEAD_S = 1.0
 """Wall time between two words on how far the stream is."""
 PACE_S = 0.01
 """Wait when there is nothing to publish."""
+ATTEMPT_S = 0.3
+"""An attempt to reach the router takes so long, where there is none."""
 AGAIN_S = 2.0
 """Wait before another attempt to reach the router."""
 SECOND_PATIENCE_S = 6.0
@@ -57,11 +59,12 @@ class Link:
         self._moved = threading.Condition()
         self._trouble: Exception | None = None
         self._failure: Exception | None = None
+        self._attempt_s = ATTEMPT_S
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
 
     def open(self, patience_s: float) -> None:
         """Begin; returns when the team's router is reached, raises the reason if it is not."""
-        self._patience_s = patience_s
+        self._attempt_s = patience_s or ATTEMPT_S
         self._thread.start()
         until = time.monotonic() + patience_s + SECOND_PATIENCE_S
         while patience_s and not self._up.is_set():
@@ -126,9 +129,7 @@ class Link:
             own = credentials_of(self._keys, f"source-{self._node.journal.robot}", self._team)
         connect = self._connect.replace("tcp/", "tls/", 1) if own else self._connect
         with ExitStack() as stack:
-            bus = stack.enter_context(
-                ZenohBus(self._team, connect, max(self._patience_s, AGAIN_S), own)
-            )
+            bus = stack.enter_context(ZenohBus(self._team, connect, self._attempt_s, own))
             self._be_the_only_one(bus)
             shell = Shell(bus, self._node, self._name, self._leaving)
             self._node.alive.clear()
@@ -140,7 +141,7 @@ class Link:
             self._hear(shell, bus)
             shell.begin()
             self._up.set()
-            self._trouble = None
+            self._trouble, self._attempt_s = None, ATTEMPT_S
             self._serve(shell, bus)
 
     def _be_the_only_one(self, bus: ZenohBus) -> None:

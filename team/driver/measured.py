@@ -1,5 +1,6 @@
 """What a program hands to its driver, judged at once, as messages without a number."""
 
+import re
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from typing import TypeVar
@@ -13,6 +14,7 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import unsound
 
 M = TypeVar("M", bound=m.Measurement)
+NAME = "[a-z][a-z0-9_]{0,31}"
 UNNAMED = 2**31
 """Numbers from here on are for landmarks without names."""
 
@@ -93,6 +95,12 @@ def sightings(
     """Teammates seen: their names, ranges [m], bearings [rad]."""
     what = f"sight at {1e-9 * stamp_ns:.3f} s"
     names = tuple(teammates)
+    for name in names:
+        if not re.fullmatch(NAME, name):
+            raise MeasurementError(
+                f"{what}: {name!r} is no robot's name: a small letter, then small letters, digits "
+                "and _; a string alone is taken letter by letter"
+            )
     if robot in names:
         raise MeasurementError(f"{what}: {robot} can not see itself; name its teammates")
     far, angles = (

@@ -1,0 +1,272 @@
+"""The driver: what it refuses, what it keeps, and what the wire says of it."""
+
+import warnings
+from decimal import Decimal
+from itertools import count
+
+import numpy as np
+import pytest
+
+from team import Driver, DriverError, DriverWarning, MeasurementError
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats, ids
+from team.wire.bus import Outgoing, opened
+from team.wire.codec import decoded, encoded
+from team.wire.zenoh_bus import ZenohBus, router
+from tests.support import wait_until
+
+
+@pytest.fixture
+def alone(tmp_path):
+    """A driver that nobody hears; its network never comes."""
+    robots = []
+
+    def make(**options):
+        options = {"file": tmp_path / "r1.stream", "latency_s": 0.0} | options
+        robot = Driver("r1", team="lab", connect="tcp/127.0.0.1:1", patience_s=0.0, **options)
+        robots.append(robot)
+        return robot
+
+    yield make
+    for robot in robots:
+        robot.close()
+
+
+def messages(robot):
+    journal = robot._journal
+    with robot._lock:
+        journal.mark("open")
+    return [
+        journal.message(incarnation, number)
+        for incarnation in journal.incarnations
+        for number in range(journal.count(incarnation))
+    ]
+
+
+def test_speeds_and_what_is_seen_become_the_messages_of_the_wire(alone):
+    robot = alone(start=(1.0, 2.0, 0.5))
+    robot.odometry(Decimal("1700000000.123456789"), 0.0, 0.0)
+    robot.observe(Decimal("1700000000.2"), [4, 7], [2.0, 3.0], [0.5, 4.0])
+    robot.odometry(Decimal("1700000000.223456789"), 0.5, 0.1)
+    start, seen, driven = messages(robot)
+    assert start.stamp_ns == 1_700_000_000_123_456_789
+    assert floats(start.pose, "pose").tolist() == [1.0, 2.0, 0.5]
+    assert ids(seen.ids, "ids").tolist() == [4, 7]
+    assert floats(seen.bearings, "bearings") == pytest.approx([0.5, 4.0 - 2 * np.pi])
+    assert (driven.duration_ns, driven.forward, driven.yaw_rate) == (100_000_000, 0.5, 0.1)
+    assert [each.number for each in (start, seen, driven)] == [0, 1, 2]
+
+
+def test_points_are_ranges_and_bearings_from_the_robot(alone):
+    robot = alone()
+    robot.observe_points(1.0, [3], [[0.0, 2.0]])
+    _, seen = messages(robot)
+    assert floats(seen.ranges, "ranges").tolist() == [2.0]
+    assert floats(seen.bearings, "bearings") == pytest.approx([np.pi / 2])
+
+
+REFUSED = [
+    (lambda r: r.odometry(9.0, 0.1, 0.0), "time goes back by 1.000 s"),
+    (lambda r: r.odometry(10.1, float("nan"), 0.0), r"forward of odometry.* is nan"),
+    (lambda r: r.odometry(10.1, 500.0, 0.0), "500 m/s, 300 at most"),
+    (lambda r: r.odometry(10.1, 0.1, 180.0), "not in degrees"),
+    (lambda r: r.odometry(10.5, 0.1, 0.0, duration=0.9), "before the last interval has ended"),
+    (lambda r: r.odometry(1.7e18, 0.1, 0.0), "divide nanoseconds by 1e9"),
+    (lambda r: r.observe(10.1, [1.5], [1.0], [0.0]), "ids are whole numbers"),
+    (lambda r: r.observe(10.1, [-1], [1.0], [0.0]), "the id -1 is not in"),
+    (lambda r: r.observe(10.1, [1, 2], [1.0], [0.0, 0.0]), "1 ranges of 2 seen"),
+    (lambda r: r.observe(10.1, [1], [-1.0], [0.0]), "a range of -1 m"),
+    (lambda r: r.observe(10.1, [1], [1.0], [90.0]), "bearings are in radians"),
+    (lambda r: r.observe(10.1, [1], [float("inf")], [0.0]), "ranges have inf"),
+    (lambda r: r.observe(1.7e9, [1], [1.0], [0.0]), "both need one clock"),
+    (lambda r: r.observe(9.5, [1], [1.0], [0.0]), "give a latency_s above 0.50"),
+    (lambda r: r.sight(10.1, ["r1"], [1.0], [0.0]), "can not see itself"),
+    (lambda r: r.sight(10.1, ["R 2"], [1.0], [0.0]), "is no robot's name"),
+    (lambda r: r.odometry_pose(9.5, 0.0, 0.0, 0.0), "time goes back"),
+]
+
+
+def test_what_can_not_be_is_refused_at_once_by_name_and_nothing_of_it_is_kept(alone):
+    robot = alone()
+    robot.odometry(9.9, 0.0, 0.0)
+    robot.odometry(10.0, 0.1, 0.0)
+    before = len(robot._journal.calls)
+    for call, words in REFUSED:
+        with pytest.raises(MeasurementError, match=words):
+            call(robot)
+        assert len(robot._journal.calls) == before
+    robot.odometry(10.1, 0.1, 0.0)
+
+
+def test_what_is_hardly_meant_is_warned_of_once(alone):
+    robot = alone(landmarks=[1, 2])
+    with pytest.warns(DriverWarning, match="saw landmark 9, which is not in `landmarks`"):
+        robot.observe(1.0, [9], [1.0], [0.0])
+    with pytest.warns(DriverWarning, match="ids are not ascending"):
+        robot.observe(1.1, [2, 1], [1.0, 1.0], [0.0, 0.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        robot.observe(1.2, [9], [1.0], [0.0])
+        robot.observe(1.3, [2, 1], [1.0, 1.0], [0.0, 0.0])
+
+
+def test_behind_a_gap_in_the_odometry_the_stream_begins_anew_at_an_unknown_pose(alone):
+    robot = alone(start=(0.0, 0.0, 0.0))
+    robot.odometry(1.0, 0.0, 0.0)
+    robot.odometry(1.1, 0.5, 0.0)
+    with pytest.warns(DriverWarning, match=r"no odometry from 1\.100 to 8\.900 s"):
+        robot.odometry(9.0, 0.5, 0.0, duration=0.1)
+    robot.odometry(9.1, 0.5, 0.0)
+    found = messages(robot)
+    starts = [each for each in found if isinstance(each, m.InitialPose)]
+    assert [(s.incarnation, s.stamp_ns, bool(s.pose)) for s in starts] == [
+        (1, 1_000_000_000, True),
+        (2, 8_900_000_000, False),
+    ]
+    assert [each.incarnation for each in found] == [1, 1, 2, 2, 2]
+
+
+def drive(robot, ticks, *, poses=False):
+    for k in ticks:
+        t = Decimal(k) / 10
+        if poses:
+            robot.odometry_pose(t, 0.05 * k, 0.01 * k, 0.02 * k)
+        else:
+            robot.odometry(t, 0.5, 0.1)
+        if k % 3 == 0:
+            robot.observe(t, [k], [1.0], [0.0])
+
+
+@pytest.mark.parametrize("poses", [False, True])
+@pytest.mark.parametrize("died_at", [1, 2, 6, 11])
+def test_a_program_that_is_killed_may_hand_over_all_once_more(tmp_path, alone, poses, died_at):
+    whole = alone(file=tmp_path / "whole.stream", latency_s=0.2)
+    drive(whole, range(12), poses=poses)
+    killed = alone(latency_s=0.2)
+    drive(killed, range(died_at), poses=poses)
+    killed._journal.close()  # as the kernel does
+    killed._closed = True
+    again = alone(latency_s=0.2)
+    drive(again, range(12), poses=poses)
+    assert [encoded(each) for each in messages(again)] == [encoded(e) for e in messages(whole)]
+
+
+def test_what_differs_from_the_file_is_time_that_goes_back(alone):
+    robot = alone()
+    drive(robot, range(5))
+    robot.close()
+    again = alone()
+    again.odometry(Decimal(0), 0.5, 0.1)
+    with pytest.raises(MeasurementError, match=r"time goes back.*go on behind `last_time`"):
+        again.odometry(Decimal("0.1"), 0.7, 0.1)
+    assert again.last_time == pytest.approx(0.4)
+
+
+def test_a_difference_of_poses_covers_the_time_in_which_a_driver_was_away(alone):
+    robot = alone()
+    drive(robot, range(3), poses=True)
+    robot.close()
+    again = alone()
+    again.odometry_pose(4.2, 2.1, 0.0, 0.0)
+    *_, last = messages(again)
+    assert isinstance(last, m.Odometry)
+    assert last.duration_ns == 4_000_000_000
+    assert last.forward * 4.0 == pytest.approx(2.0, rel=0.01)
+
+
+class Listener:
+    """A robot's process as a driver sees it: it takes what comes and says how far it is."""
+
+    def __init__(self, endpoint):
+        self.bus = ZenohBus("lab", endpoint)
+        for channel in ch.SENSORS:
+            self.bus.subscribe(channel, "r1")
+        self.bus.subscribe(ch.HEAD, "r1")
+        self.bus.declare_alive("robot/r1")
+        self.got, self.heads = {}, []
+
+    def take(self, payload):
+        message = decoded(payload)
+        self.got[message.incarnation, message.number] = message
+
+    def look(self):
+        for sample in self.bus.receive(0.02):
+            _, _, message = opened(sample)
+            if isinstance(message, m.StreamHead):
+                self.heads.append(message)
+            else:
+                self.got[message.incarnation, message.number] = message
+
+    def ask(self, first, last=-1):
+        wanted = m.MeasurementsRequest(
+            stamp_ns=0, robot="r1", incarnation=1, first=first, last=last
+        )
+        for reply in self.bus.ask(ch.MEASUREMENTS, "r1", wanted, 5.0):
+            self.take(reply)
+
+    def say(self):
+        numbers = {n for i, n in self.got if i == 1}
+        whole = next(n for n in count() if n not in numbers)
+        progress = m.Progress(
+            stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=whole, submaps=0
+        )
+        self.bus.publish(Outgoing(ch.ROBOT_PROGRESS, "r1", progress))
+
+
+def test_a_robot_gets_all_from_a_driver_that_was_killed_and_the_driver_waits_for_that(tmp_path):
+    file = tmp_path / "r1.stream"
+    with router() as endpoint:
+        first = Driver("r1", team="lab", connect=endpoint, file=file)
+        drive(first, range(20))
+        wait_until(lambda: first._node.status().figures["published"] > 15)
+        first._link._leaving.set()  # no last word: it is killed
+        first._link._thread.join()
+        first._journal.close()
+        robot = Listener(endpoint)
+        again = Driver("r1", team="lab", connect=endpoint, file=file)
+        drive(again, range(30))
+        assert again.end(patience_s=0.05) is False  # nobody has it yet
+        assert again._closed
+        wait_until(lambda: robot.look() or any(h.state == "ended" for h in robot.heads))
+        last = Driver("r1", team="lab", connect=endpoint, file=file)  # it delivers
+
+        def delivered():
+            robot.ask(0)
+            robot.say()
+            return last.end(patience_s=0.3) if len(robot.got) == 40 else False
+
+        wait_until(delivered)
+        assert sorted(robot.got) == [(1, n) for n in range(40)]
+        robot.bus.close()
+
+
+def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path):
+    with router() as endpoint:
+        driver = Driver("r1", team="lab", connect=endpoint, file=tmp_path / "r1.stream")
+        drive(driver, range(30))
+        wait_until(lambda: driver._node.status().figures["published"] > 20)
+        robot = Listener(endpoint)  # too late for what was published
+        wait_until(lambda: robot.look() or robot.heads)
+        robot.ask(0)
+        robot.say()
+        drive(driver, range(30, 40))
+
+        def complete():
+            robot.look()
+            robot.say()
+            return len(robot.got) == driver._journal.count(1)
+
+        with driver._lock:
+            driver._journal.mark("ended")
+        wait_until(complete)
+        assert driver.end(patience_s=5.0)
+        assert {n for _, n in robot.got} == set(range(1 + 39 + 14))
+        with pytest.raises(DriverError, match="is closed"):
+            driver.odometry(9.0, 0.0, 0.0)
+        robot.bus.close()
+
+
+def test_a_router_that_is_not_there_are_named(tmp_path):
+    with pytest.raises(DriverError, match=r"no router answers at tcp/127\.0\.0\.1:1"):
+        Driver("r1", team="lab", connect="tcp/127.0.0.1:1", file=tmp_path / "a", patience_s=0.5)

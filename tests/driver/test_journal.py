@@ -1,0 +1,112 @@
+"""A driver's file: what was measured is there after any death, with the same numbers."""
+
+import os
+
+import pytest
+
+from team.driver import journal as j
+from team.driver.journal import JournalError, opened
+from team.driver.order import Sorter
+from team.wire import messages as m
+from team.wire.codec import encoded
+
+LATENCY_NS = 200_000_000
+
+
+def measured(journal, kind, stamp_ns):
+    common = {"stamp_ns": stamp_ns, "robot": "r1", "incarnation": 1, "number": 0}
+    message = {
+        j.START: lambda: m.InitialPose(pose=b"", covariance=b"", **common),
+        j.ODOMETRY: lambda: m.Odometry(duration_ns=1, forward=0.0, yaw_rate=0.0, **common),
+        j.OBSERVATIONS: lambda: m.Observations(ids=b"", ranges=b"", bearings=b"", **common),
+    }[kind]()
+    journal.append(kind, stamp_ns, encoded(message))
+
+
+def numbered(journal, incarnation=1):
+    messages = [journal.message(incarnation, n) for n in range(journal.count(incarnation))]
+    assert [each.number for each in messages] == list(range(len(messages)))
+    return [(each.stamp_ns // 10**8, type(each).__name__) for each in messages]
+
+
+def filled(path):
+    journal, _ = opened(path, "r1", LATENCY_NS)
+    measured(journal, j.START, 0)
+    for tenth in range(1, 8):
+        measured(journal, j.ODOMETRY, tenth * 10**8)
+        if tenth in (2, 5):
+            measured(journal, j.OBSERVATIONS, (tenth - 1) * 10**8)  # as late as a camera's frame
+    return journal
+
+
+def test_what_is_seen_at_a_time_is_numbered_before_the_odometry_to_it(tmp_path):
+    found = numbered(filled(tmp_path / "r1.stream"))
+    assert found[:4] == [(0, "InitialPose"), (1, "Observations"), (1, "Odometry"), (2, "Odometry")]
+    assert found.index((4, "Observations")) == found.index((4, "Odometry")) - 1
+
+
+def test_the_newest_wait_until_their_place_is_known_and_a_mark_ends_that(tmp_path):
+    journal = filled(tmp_path / "r1.stream")
+    assert numbered(journal)[-1] == (4, "Odometry")
+    journal.mark("ended")
+    assert numbered(journal)[-1] == (7, "Odometry")
+
+
+@pytest.mark.parametrize("lost", [0, 1, 7])
+def test_a_driver_that_is_killed_goes_on_with_the_same_numbers(tmp_path, lost):
+    path = tmp_path / "r1.stream"
+    journal = filled(path)
+    before, size = numbered(journal), path.stat().st_size
+    journal.close()
+    os.truncate(path, size - lost)
+    again, said = opened(path, "r1", LATENCY_NS)
+    assert "goes on after measurement" in said
+    assert ("cut off" in said) == (lost in (1, 7))
+    found = numbered(again)
+    assert found == before[: len(found)]
+    assert len(found) >= len(before) - 2
+    for tenth in range(8, 12):
+        measured(again, j.ODOMETRY, tenth * 10**8)
+    assert (8, "Odometry") in numbered(again)
+
+
+def test_a_stream_that_has_ended_or_is_old_steps_aside_and_the_next_one_counts_on(tmp_path):
+    path = tmp_path / "r1.stream"
+    journal = filled(path)
+    journal.mark("ended", delivered=True)
+    journal.close()
+    second, said = opened(path, "r1", LATENCY_NS)
+    assert "has ended: it is now" in said
+    assert (tmp_path / "r1.stream.1").exists()
+    assert second.next_incarnation == 2
+    measured(second, j.START, 0)
+    assert second.incarnation == 2
+    second.close()
+    os.utime(path, (0, 0))
+    third, said = opened(path, "r1", LATENCY_NS)
+    assert "h old" in said
+    assert third.next_incarnation == 3
+
+
+def test_a_file_has_one_driver_and_one_robot(tmp_path):
+    path = tmp_path / "r1.stream"
+    journal = filled(path)
+    with pytest.raises(JournalError, match="another driver has it open: end that one"):
+        opened(path, "r1", LATENCY_NS)
+    journal.close()
+    with pytest.raises(JournalError, match="a file of r1, not of r2"):
+        opened(path, "r2", LATENCY_NS)
+    other = tmp_path / "notes.txt"
+    other.write_text("t,v\n")
+    with pytest.raises(JournalError, match="no driver's"):
+        opened(other, "r1", LATENCY_NS)
+
+
+def test_a_sorter_gives_back_nothing_that_something_may_still_come_before():
+    sorter = Sorter(latency_ns=10)
+    assert sorter.put((100, j.ODOMETRY), 1) == []
+    assert sorter.put((105, j.ODOMETRY), 2) == []
+    assert sorter.put((99, j.OBSERVATIONS), 3) == []
+    assert sorter.put((111, j.ODOMETRY), 4) == [3, 1]
+    assert sorter.released == (100, j.ODOMETRY)
+    assert sorter.flush() == [2, 4]
