@@ -9,6 +9,7 @@ import pytest
 
 from sim.publisher import node as world_node
 from sim.publisher.node import WorldNode, expected_nodes
+from team.driver import source
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats, stamps
@@ -235,7 +236,7 @@ def test_what_is_asked_for_is_answered_with_the_bytes_that_were_published():
 
 def test_only_what_was_published_is_answered_and_in_portions(monkeypatch):
     monkeypatch.setattr(world_node, "BATCH", 7)
-    monkeypatch.setattr(world_node, "ANSWER", 3)
+    monkeypatch.setattr(source, "ANSWER", 3)
     node = world()
     assert wanted(node) == []
     out = [encoded(r) for r in measurements(node.publish(0.0)) if r.robot == "r2"]

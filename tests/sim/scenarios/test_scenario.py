@@ -203,7 +203,10 @@ UTIAS = 'world = { kind = "utias" }\n'
         ),
         ("name = 'a b'\nrobot_count = 1\n" + SMALL, "expected letters, digits, _, . and -"),
         (SMALL + "[defaults]\nid = 'a'", "`id` at defaults would be every robot's"),
-        ("seed = 1", 'expected one of "simulated", "utias", "folder", got nothing at world.kind'),
+        (
+            "seed = 1",
+            'expected one of "simulated", "utias", "folder", "live", got nothing at world.kind',
+        ),
         ("world = { kind = [1] }", "got [1] at world.kind"),
         ("world = 3", "expected a table, got int at world"),
         ("base = [1]\n" + SMALL, "expected a built-in scenario, got [1] at base"),
