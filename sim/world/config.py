@@ -116,10 +116,12 @@ class LiveWorld(
     newcomer: RobotConfig | None = None
 
 
-def starts_unknown(world: SimulatedWorld | UtiasWorld | FolderWorld, robot: str) -> bool:
-    """Whether the team is not told where this robot starts."""
+World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld
+
+
+def starts_unknown(world: World, robot: str) -> bool:
+    """Whether the team is not told where this robot starts; of a live one its driver says it."""
+    if isinstance(world, LiveWorld):
+        return False
     named = world.unknown_starts
     return robot in named or ("*" in named and f"!{robot}" not in named)
-
-
-World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld
