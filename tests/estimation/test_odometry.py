@@ -1,0 +1,106 @@
+"""Odometry in all its forms: parts compose to the whole, and the noise is what differences say."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from team.config import MotionModel, MotionNoise
+from team.estimation.geometry import between, compose, exponential, logarithm
+from team.estimation.models import Increment, increment_of
+from team.estimation.odometry import Interval, moved, part_of, steered
+
+SECOND = 1_000_000_000
+NOISY = MotionModel(
+    forward=MotionNoise(0.02, 0.05, 0.01),
+    turn=MotionNoise(0.01, 0.02, 0.03),
+    final_turn=MotionNoise(0.01),
+    lateral=MotionNoise(0.005, 0.02),
+    shares=(0.14, 0.15, 0.01),
+)
+CLAIM = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.004], [0.002, -0.004, 0.01]])
+
+
+def interval(increment: list[float], claim: np.ndarray | None = None) -> Interval:
+    return Interval(SECOND, SECOND, 0.0, 0.0, moved(np.array(increment), claim))
+
+
+@pytest.mark.parametrize("claim", [None, CLAIM])
+@pytest.mark.parametrize("cuts", [(0.5,), (0.1, 0.35, 0.8)])
+def test_however_an_increment_is_split_its_parts_compose_to_it(claim, cuts) -> None:
+    whole = interval([0.8, -0.3, 0.7], claim)
+    motion = MotionModel() if claim is None else NOISY
+    ends = [0, *(round(cut * SECOND) for cut in cuts), SECOND]
+    total = Increment.identity()
+    for begin, end in pairwise(ends):
+        total = total.then(whole.part(motion, end - begin, SECOND - end))
+    np.testing.assert_allclose(total.mean, [0.8, -0.3, 0.7], atol=1e-12)
+    np.testing.assert_allclose(total.covariance, np.zeros((3, 3)) if claim is None else claim,
+                               atol=1e-12)  # fmt: skip
+
+
+def test_the_densities_of_the_parts_of_an_increment_add_up_to_nearly_those_of_the_whole() -> None:
+    dense = MotionModel(forward=MotionNoise(0, 0.05), turn=MotionNoise(0, 0.02))
+    whole = interval([0.8, -0.3, 0.7])
+    one = whole.part(dense, SECOND, 0)
+    total = Increment.identity()
+    for k in range(100):
+        total = total.then(whole.part(dense, SECOND // 100, SECOND - (k + 1) * SECOND // 100))
+    np.testing.assert_allclose(np.diag(total.covariance), np.diag(one.covariance), rtol=0.2)
+
+
+@pytest.mark.parametrize("way", [1.5, -1.5])
+def test_an_increment_without_a_lateral_part_is_the_arc_of_its_speeds(way: float) -> None:
+    wheels = MotionModel("differential-drive", wheel_base=0.5, left_wheel=0.1, right_wheel=0.02)
+    for motion in (NOISY, wheels):
+        arc = increment_of(motion, 1.0, way, 0.4)
+        told = interval(arc.mean.tolist()).part(motion, SECOND, 0)
+        np.testing.assert_allclose(told.mean, arc.mean, atol=1e-12)
+        np.testing.assert_allclose(told.covariance, arc.covariance, atol=1e-12)
+
+
+def test_the_noise_of_an_increment_is_what_central_differences_of_its_arc_say() -> None:
+    motion = MotionModel(forward=MotionNoise(0.3), turn=MotionNoise(0.2), lateral=MotionNoise(0.1))
+    xi = np.array([0.8, -0.5, 0.9])
+    along = np.array([*(xi[:2] / np.hypot(*xi[:2])), 0.0])
+    end, h = exponential(xi), 1e-6
+    columns = [
+        (logarithm(between(end, exponential(xi + h * d)))
+         - logarithm(between(end, exponential(xi - h * d)))) / (2 * h)
+        for d in (along, np.array([0.0, 0.0, 1.0]))
+    ]  # fmt: skip
+    J = np.column_stack([*columns, [-along[1], along[0], 0.0]])
+    expected = J @ np.diag([0.09, 0.04, 0.01]) @ J.T
+    told = part_of(motion, moved(end, None), 1.0, 1.0, 0.0)
+    np.testing.assert_allclose(told.covariance, expected, atol=1e-9)
+
+
+def test_a_car_of_whose_left_wheel_the_speed_is_told_drives_its_circle() -> None:
+    car = MotionModel("ackermann", wheel_base=2.83, wheel_offset=0.76, steering_offset=0.02)
+    forward, yaw_rate = steered(car, 3.0, 0.18)
+    radius = 2.83 / np.tan(0.2)
+    assert forward / yaw_rate == pytest.approx(radius)
+    assert yaw_rate * (radius - 0.76) == pytest.approx(3.0), "the wheel is nearer to the centre"
+    assert np.isnan(steered(MotionModel(), 3.0, 0.18)).all()
+    assert np.isnan(steered(car, 3.0, 1.4)).all(), "the centre of the turn is under the wheel"
+
+
+def test_shares_of_the_way_are_held_for_their_time_and_then_grow_as_it_does() -> None:
+    car = MotionModel("ackermann", wheel_base=2.83, shares=(0.14, 0.15, 0.0), shares_interval_s=0.2)
+    held = increment_of(car, 0.2, 5.0, 0.0).covariance
+    np.testing.assert_allclose(np.sqrt(np.diag(held)), [0.14, 0.15, 0.0], atol=1e-12)
+    twice = increment_of(car, 0.4, 5.0, 0.0).covariance
+    np.testing.assert_allclose(twice, 2.0 * held, atol=1e-12)
+
+
+def test_what_can_not_be_configured_is_said() -> None:
+    with pytest.raises(ValueError, match="ackermann needs wheel_base"):
+        MotionModel("ackermann")
+    with pytest.raises(ValueError, match="are a car's, not of velocity"):
+        MotionModel(wheel_offset=0.5)
+
+
+def test_a_step_by_parts_ends_where_the_whole_does() -> None:
+    whole = interval([2.0, 0.5, 3.0])
+    half = whole.part(MotionModel(), SECOND // 2, SECOND // 2).mean
+    np.testing.assert_allclose(compose(half, half), [2.0, 0.5, 3.0], atol=1e-12)

@@ -1,0 +1,165 @@
+"""Measurements with noises of their own, as range and bearing and as points."""
+
+import numpy as np
+import pytest
+
+from team.config import Bounds, Sensor
+from team.estimation.hybrid_slam.landmark_kernel import condition_on_measurement, place
+from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
+from team.estimation.hybrid_slam.window import noise_of
+from team.estimation.models import landmark_jacobian, predicted
+from team.estimation.scans import (
+    POINT,
+    POLAR,
+    carried,
+    mean_claim,
+    point_scan,
+    polar_scan,
+    sensible,
+    together,
+    unclaimed,
+)
+
+POSE = np.array([0.5, -1.0, 0.7])
+MEAN, SPREAD = np.array([3.0, 2.0]), np.array([[0.3, 0.1], [0.1, 0.2]])
+CLAIM = np.array([0.05, -0.03, 0.08])
+SENSOR = (0.01, 0.0, 4e-4)
+IDS = np.array([7], np.uint32)
+
+
+def packed(P: np.ndarray) -> np.ndarray:
+    return np.array([P[0, 0], P[0, 1], P[1, 1]])
+
+
+def full(p: np.ndarray) -> np.ndarray:
+    return np.array([[p[0], p[1]], [p[1], p[2]]])
+
+
+def turn(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def updated(scan) -> tuple[np.ndarray, np.ndarray]:
+    mean, P = MEAN.copy(), packed(SPREAD)
+    z = np.array([scan.ranges[0], scan.bearings[0]])
+    condition_on_measurement(mean, P, tuple(POSE), z, SENSOR, scan.own[0])
+    return mean, P
+
+
+def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane() -> None:
+    point = np.array([[2.5, 1.5]])
+    mean, P = updated(point_scan(IDS, point, CLAIM[None]))
+    H = turn(POSE[2]).T
+    S = H @ SPREAD @ H.T + full(CLAIM)
+    K = SPREAD @ H.T @ np.linalg.inv(S)
+    expected = MEAN + K @ (point[0] - H @ (MEAN - POSE[:2]))
+    np.testing.assert_allclose(mean, expected, atol=1e-12)
+    np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
+
+
+def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does() -> None:
+    seen, R = np.array([4.0, 0.3]), np.array([[0.04, 0.006], [0.006, 0.002]])
+    mean, P = updated(polar_scan(IDS, seen[:1], seen[1:], packed(R)[None]))
+    r, b = predicted(POSE, MEAN)
+    H = landmark_jacobian(r, POSE[2] + b)
+    K = SPREAD @ H.T @ np.linalg.inv(H @ SPREAD @ H.T + R)
+    np.testing.assert_allclose(mean, MEAN + K @ (seen - [r, b]), atol=1e-12)
+    np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
+
+
+def test_a_landmark_is_placed_with_the_covariance_of_its_point() -> None:
+    scan = point_scan(IDS, np.array([[2.5, 1.5]]), CLAIM[None])
+    mean, P = np.empty(2), np.empty(3)
+    seen = np.array([scan.ranges[0], scan.bearings[0]])
+    place(mean, P, tuple(POSE), seen, SENSOR, scan.own[0])
+    R = turn(POSE[2])
+    np.testing.assert_allclose(mean, POSE[:2] + R @ [2.5, 1.5], atol=1e-12)
+    np.testing.assert_allclose(full(P), R @ full(CLAIM) @ R.T, atol=1e-12)
+
+
+def test_the_sensors_own_covariance_claimed_changes_nothing() -> None:
+    seen = np.array([4.0]), np.array([0.3])
+    claimed = polar_scan(IDS, *seen, np.array([[SENSOR[0], 0.0, SENSOR[2]]]))
+    bare = polar_scan(IDS, *seen)
+    for a, b in zip(updated(claimed), updated(bare), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_points_near_with_much_noise_place_a_landmark_without_a_bias() -> None:
+    rng = np.random.default_rng(5)
+    truth, sigma, count = np.array([0.6, 0.2]), 0.2, 4000
+    points = truth + sigma * rng.standard_normal((count, 2))
+    claims = np.tile([sigma**2, 0.0, sigma**2], (count, 1))
+    scan = point_scan(np.zeros(count, np.uint32), points, claims)
+    polar = np.column_stack((scan.ranges, scan.bearings))
+    found = {}
+    for form in (POINT, POLAR):
+        own = np.column_stack((scan.own[:, :3], np.full(count, form)))
+        means, covariances = landmarks_along_paths(
+            truth.reshape(1, 1, 2).copy(), np.array([[[1.0, 0.0, 1.0]]]), np.zeros((1, 1, 3)),
+            np.array([0, count]), np.zeros(count, np.int64), polar, own, noise_of(Sensor()),
+        )  # fmt: skip
+        error = means[0, 0] - truth
+        found[form] = error @ np.linalg.inv(full(covariances[0, 0])) @ error
+    assert found[POINT] < 13.8, "chi-square of two, 99.9 %"
+    assert found[POLAR] > 50.0, "as range and bearing they read too far: the test has power"
+
+
+@pytest.mark.parametrize("whites", [(1.0, 1.0), (0.4, 1.0), (0.5, 0.3)])
+def test_landmarks_along_paths_with_own_noises_are_least_squares(whites) -> None:
+    rng = np.random.default_rng(2)
+    path = np.column_stack((np.arange(5.0), 0.1 * np.arange(5.0), 0.2 * np.arange(5.0)))
+    truth = np.array([4.0, 6.0])
+    z = np.array([predicted(pose, truth) for pose in path])
+    A = rng.normal(size=(5, 2, 2)) * np.array([0.2, 0.03])[:, None]
+    R = A @ A.transpose(0, 2, 1) + np.diag([0.01, 4e-4])
+    z = z + 0.3 * np.array([np.linalg.cholesky(each) @ rng.normal(size=2) for each in R])
+    own = np.array([[*packed(each), POLAR] for each in R])
+    noise = noise_of(Sensor(range_white=whites[0], bearing_white=whites[1]))
+    means, covariances = landmarks_along_paths(
+        truth.reshape(1, 1, 2) + 0.02, np.array([[[1.0, 0.0, 1.0]]]), path[:, None, :],
+        np.array([0, 5]), np.arange(5), z, own, noise,
+    )  # fmt: skip
+    share = np.sqrt(np.array(whites))
+    W = np.zeros((10, 10))
+    constant = (1.0 - np.array(whites)) * np.diag(R[-1])
+    for i in range(5):
+        for j in range(5):
+            block = R[i] * np.outer(share, share) if i == j else 0.0
+            W[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = block + np.diag(constant)
+    W = np.linalg.inv(W)
+    point = truth.copy()
+    for _ in range(20):
+        h = np.array([predicted(pose, point) for pose in path])
+        H = np.vstack([
+            landmark_jacobian(r, pose[2] + b) for (r, b), pose in zip(h, path, strict=True)
+        ])  # fmt: skip
+        information = H.T @ W @ H
+        point = point + np.linalg.solve(information, H.T @ W @ (z - h).ravel())
+    np.testing.assert_allclose(means[0, 0], point, atol=2e-4)
+    np.testing.assert_allclose(full(covariances[0, 0]), np.linalg.inv(information), rtol=5e-3)
+
+
+def test_a_claim_is_carried_to_another_pose_as_the_plane_turns() -> None:
+    scan = point_scan(IDS, np.array([[2.0, 1.0]]), CLAIM[None])
+    back = np.array([0.3, -0.4, 0.5])
+    to = back[:2] + turn(back[2]) @ [2.0, 1.0]
+    direction = float(back[2] + scan.bearings[0])
+    found = carried(scan.own[0], float(scan.ranges[0]), direction, to)
+    turned = turn(back[2]) @ full(CLAIM) @ turn(back[2]).T
+    np.testing.assert_allclose(found, point_scan(IDS, to[None], packed(turned)[None]).own)
+    np.testing.assert_allclose(mean_claim([found, 3.0 * found])[0, :3], 2.0 * found[0, :3])
+
+
+def test_scans_of_which_only_some_claim_say_so_row_by_row() -> None:
+    own = together([(2, unclaimed(2)), (1, np.array([[0.1, 0.0, 0.2, POLAR]]))])
+    assert own[:, 3].tolist() == [-1.0, -1.0, POLAR]
+    assert together([(2, unclaimed(2)), (1, unclaimed(1))]).shape == (3, 0)
+
+
+def test_claims_beyond_the_bounds_are_named() -> None:
+    claims = np.array([[0.1, 0.0, 0.2], [1e-18, 0.0, 0.2], [0.1, 0.0, 1e30]])
+    ranges = np.ones(3)
+    scan = polar_scan(np.arange(3, dtype=np.uint32), ranges, np.zeros(3), claims)
+    assert sensible(scan.own, ranges, Bounds()).tolist() == [True, False, False]
