@@ -11,6 +11,8 @@ from team.config import Fraction, NonNegative, Positive, RobotConfig
 
 GarbageKind = Literal["reading", "identity", "drop"]
 Steering = Literal["together", "turn-first"]
+OdometryForm = Literal["speeds", "increments", "steering"]
+LandmarkForm = Literal["ranges", "points"]
 Point = tuple[float, float]
 
 
@@ -36,6 +38,13 @@ class SimulatedWorld(
     gives it a uniform range and bearing of what can be seen, "identity" the identity of another of
     the world's landmarks; "drop" leaves out the very measurements that the others spoil, all else
     being the same: what a run with garbage is compared with.
+    odometry: what it tells: "speeds", "increments" on SE(2) or a car's wheel speed and "steering".
+    odometry_claims: increments come with their covariance, that of the motion model's forward,
+    lateral and turn; the errors of the last two have the correlation odometry_correlation.
+    landmarks_told: as range and bearing, or as "points" in the sensor's frame. landmark_claims:
+    each comes with a covariance of its own, whose standard deviations are factors from the first to
+    the second of these of the sensor's, and with errors of that size.
+    claims_factor: what is claimed is the true covariance divided by this.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -56,8 +65,18 @@ class SimulatedWorld(
     unknown_starts: tuple[str, ...] = ()
     garbage: Fraction = 0.0
     garbage_kind: GarbageKind = "reading"
+    odometry: OdometryForm = "speeds"
+    odometry_claims: bool = False
+    odometry_correlation: Annotated[float, Meta(gt=-1.0, lt=1.0)] = 0.0
+    landmarks_told: LandmarkForm = "ranges"
+    landmark_claims: tuple[Positive, Positive] | None = None
+    claims_factor: Positive = 1.0
 
     def __post_init__(self) -> None:
+        if self.odometry_claims and self.odometry != "increments":
+            raise ValueError('odometry_claims: only odometry = "increments" has a covariance')
+        if self.garbage and (self.landmark_claims or self.landmarks_told == "points"):
+            raise ValueError("garbage is of ranges and bearings without covariances of their own")
         if self.landmarks and self.landmark_count:
             raise ValueError("landmarks and landmark_count exclude each other: leave one away")
         for i, path in enumerate(self.paths):

@@ -38,6 +38,9 @@ def told(
     of_way, of_turn, _ = _held(motion, steps, seconds)
     forward = np.hypot(deviation(motion.forward, seconds, steps), of_way)
     turn = np.hypot(deviation(motion.turn, seconds, steps), of_turn)
+    if motion.shares is not None:
+        along, _, heading = _of_the_way(motion, steps, seconds)
+        forward, turn = np.hypot(forward, along), np.hypot(turn, heading)
     way = steps[:, 0] + forward * normals[:, 0]
     turned = steps[:, 1] + turn * normals[:, 1]
     if motion.wheel_base is not None:
@@ -58,6 +61,11 @@ def slip(
     _, _, of_turn = _held(motion, steps, duration)
     turn = np.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
     left = deviation(motion.lateral, duration, steps) * normals[1]
+    if motion.shares is not None:
+        sigma = np.hypot(
+            deviation(motion.lateral, duration, steps), _of_the_way(motion, steps, duration)[1]
+        )
+        left = sigma * normals[1]
     return turn.item(), left.item()
 
 
@@ -77,6 +85,20 @@ def _held(
         motion.alpha_interval_s * np.sqrt((a * v**2 + b * w**2) * intervals)
         for a, b in zip(motion.alphas[::2], motion.alphas[1::2], strict=True)
     )
+    return first, second, third
+
+
+def _of_the_way(
+    motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
+) -> tuple[Column, Column, Column]:
+    """σ of forward, lateral and heading that are shares of the way, each held for an interval T.
+
+    A step of t has t/T such intervals: σ² = (share · way in T)² t/T.
+    """
+    assert motion.shares is not None
+    in_interval = np.abs(steps[:, 0]) / seconds * motion.shares_interval_s
+    count = np.sqrt(seconds / motion.shares_interval_s)
+    first, second, third = (share * in_interval * count for share in motion.shares)
     return first, second, third
 
 

@@ -32,13 +32,14 @@ class Drive:
 class Limits:
     """What a robot can do in one step, and when a way-point counts as reached.
 
-    turn_first: a step that turns does not drive.
+    turn_first: a step that turns does not drive. radius: a car's least; 0 turns on the spot.
     """
 
     distance: float
     turn: float
     tolerance: float
     turn_first: bool = False
+    radius: float = 0.0
 
 
 def wrapped(angle: float) -> float:
@@ -119,6 +120,9 @@ def _towards(pose: Pose, target: tuple[float, float], limits: Limits) -> Step:
     dx, dy = target[0] - pose[0], target[1] - pose[1]
     aside = wrapped(atan2(dy, dx) - pose[2])
     turn = min(max(aside, -limits.turn), limits.turn)
+    if limits.radius:
+        distance = min(limits.distance, hypot(dx, dy))
+        return distance, min(max(turn, -distance / limits.radius), distance / limits.radius)
     if limits.turn_first:
         if abs(aside) > ALIGNED_RAD:
             return 0.0, turn

@@ -12,13 +12,21 @@ from itertools import islice
 from math import atan2, hypot
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt32
 
 from sim.world.config import SimulatedWorld, starts_unknown
+from sim.world.forms import claimed, increments_told, seen_from, steering_told, with_errors
 from sim.world.odometry import slip, told
 from sim.world.outliers import spoilt
 from sim.world.paths import Drive, Limits, Pose, Step, driven, followed
-from sim.world.sensing import Visible, measurements, persistent, visible
+from sim.world.sensing import (
+    SHORTEST_MEASUREMENT_M,
+    Visible,
+    measurements,
+    on_circle,
+    persistent,
+    visible,
+)
 from sim.world.streams import (
     Detections,
     Intervals,
@@ -26,9 +34,13 @@ from sim.world.streams import (
     StartPose,
     WorldStreams,
     grouped,
+    moved,
     robot_stream,
 )
 from team.config import RobotConfig, Sensor
+
+LEAST_RADIUS = 1.5
+"""A simulated car turns on a circle of so many wheel bases."""
 
 
 def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
@@ -92,6 +104,7 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
         turn_rate * world.step_s,
         world.way_point_tolerance_m,
         world.steering == "turn-first",
+        LEAST_RADIUS * motion.wheel_base if motion.kind == "ackermann" and motion.wheel_base else 0,
     )
     normals = generator(seed, robot.id, "slip").standard_normal((world.steps, 2))
 
@@ -163,7 +176,7 @@ def _stream(
         robot=robot.id,
         start_ns=int(stamps_ns[0]),
         start=start,
-        intervals=_odometry(robot, drive, stamps_ns, seed),
+        intervals=_odometry(world, robot, drive, stamps_ns, seed),
         observations=_observations(world, robot, drive, landmarks, stamps_ns, seed),
         sightings=_sightings(world, robots, drives, index, stamps_ns[1:], seed),
         teammates=[other.id for other in robots],
@@ -174,14 +187,46 @@ def _stream(
 
 
 def _odometry(
-    robot: RobotConfig, drive: Drive, stamps_ns: Int64[np.ndarray, " K_plus_1"], seed: int
+    world: SimulatedWorld,
+    robot: RobotConfig,
+    drive: Drive,
+    stamps_ns: Int64[np.ndarray, " K_plus_1"],
+    seed: int,
 ) -> Intervals:
     count = len(drive.steps)
+    if world.odometry == "increments":
+        return _increments(world, robot, drive, stamps_ns, seed)
     normals = generator(seed, robot.id, "odometry").standard_normal((count, 2))
     of_wheels = generator(seed, robot.id, "wheels").standard_normal((count, 2))
     duration_ns = np.diff(stamps_ns)
     forward, yaw_rate = told(robot.motion, drive.steps, duration_ns * 1e-9, normals, of_wheels)
+    if world.odometry == "steering":
+        if robot.motion.kind != "ackermann":
+            raise ValueError(
+                f'world.odometry = "steering" is a car\'s: {robot.id} needs '
+                f'motion.kind = "ackermann", not "{robot.motion.kind}"'
+            )
+        forward, yaw_rate = steering_told(robot.motion, forward, yaw_rate)
+        return Intervals(stamps_ns[1:], duration_ns, forward, yaw_rate, steered=True)
     return Intervals(stamps_ns[1:], duration_ns, forward, yaw_rate)
+
+
+def _increments(
+    world: SimulatedWorld,
+    robot: RobotConfig,
+    drive: Drive,
+    stamps_ns: Int64[np.ndarray, " K_plus_1"],
+    seed: int,
+) -> Intervals:
+    normals = generator(seed, robot.id, "increments").standard_normal((len(drive.steps), 3))
+    duration_ns = np.diff(stamps_ns)
+    correlation = world.odometry_correlation if world.odometry_claims else 0.0
+    increments, covariances = increments_told(
+        robot.motion, drive.poses, drive.steps, duration_ns * 1e-9, normals, correlation
+    )
+    if not world.odometry_claims:
+        return moved(stamps_ns[1:], duration_ns, increments)
+    return moved(stamps_ns[1:], duration_ns, increments, covariances / world.claims_factor)
 
 
 def _observations(
@@ -196,9 +241,14 @@ def _observations(
     first = 0 if world.look_at_start else 1
     at_ns = stamps_ns[first:]
     seen = _visible(world, robot, drive.poses[first:], landmarks[np.newaxis])
-    ranges, bearings = _read(world, robot.sensor, seen, seed, robot.id, "observations")
     offsets = np.searchsorted(seen.steps, np.arange(len(at_ns) + 1))
     ids = (seen.points + 1).astype(np.uint32)
+    if world.landmark_claims is not None:
+        return _with_claims(world, robot, seen, (at_ns, offsets, ids), seed)
+    ranges, bearings = _read(world, robot.sensor, seen, seed, robot.id, "observations")
+    if world.landmarks_told == "points":
+        points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+        return Detections(at_ns, offsets, ids, ranges, bearings, points)
     clean = Detections(at_ns, offsets, ids, ranges, bearings)
     if not world.garbage:
         return clean
@@ -210,6 +260,40 @@ def _observations(
         robot.sensor.field_of_view,
         len(landmarks),
         generator(seed, robot.id, "garbage").random((len(ids), 3)),
+    )
+
+
+def _with_claims(
+    world: SimulatedWorld,
+    robot: RobotConfig,
+    seen: Visible,
+    messages: tuple[
+        Int64[np.ndarray, " M"], Int64[np.ndarray, " M_plus_1"], UInt32[np.ndarray, " V"]
+    ],
+    seed: int,
+) -> Detections:
+    """What is seen, each with a covariance of its own and an error of that size."""
+    assert world.landmark_claims is not None
+    points = world.landmarks_told == "points"
+    random = generator(seed, robot.id, "claims")
+    uniform, normals = (
+        random.random((len(seen.steps), 3)),
+        random.standard_normal((len(seen.steps), 2)),
+    )
+    covariances = claimed(seen, robot.sensor, world.landmark_claims, uniform, points=points)
+    told_of = covariances / world.claims_factor
+    if points:
+        ahead = np.column_stack([np.cos(seen.bearings), np.sin(seen.bearings)])
+        xy = with_errors(seen.ranges[:, np.newaxis] * ahead, covariances, normals)
+        polar = np.hypot(xy[:, 0], xy[:, 1]), np.arctan2(xy[:, 1], xy[:, 0])
+        return Detections(*messages, *polar, xy, told_of)
+    true = np.column_stack([seen.ranges, seen.bearings])
+    ranges, bearings = with_errors(true, covariances, normals).T
+    return Detections(
+        *messages,
+        np.maximum(ranges, SHORTEST_MEASUREMENT_M),
+        on_circle(bearings),
+        covariances=told_of,
     )
 
 
@@ -262,6 +346,8 @@ def _visible(
     """What the robot truly sees from these poses."""
     sensor = robot.sensor
     nearest, farthest = _limits(world, sensor)
+    if sensor.is_mounted:
+        poses = seen_from(poses, sensor.mount)
     return visible(poses, points, nearest, farthest, sensor.field_of_view)
 
 

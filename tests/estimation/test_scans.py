@@ -149,7 +149,9 @@ def test_a_claim_is_carried_to_another_pose_as_the_plane_turns() -> None:
     found = carried(scan.own[0], float(scan.ranges[0]), direction, to)
     turned = turn(back[2]) @ full(CLAIM) @ turn(back[2]).T
     np.testing.assert_allclose(found, point_scan(IDS, to[None], packed(turned)[None]).own)
-    np.testing.assert_allclose(mean_claim([found, 3.0 * found])[0, :3], 2.0 * found[0, :3])
+    np.testing.assert_allclose(
+        mean_claim([found, found * [3.0, 3.0, 3.0, 1.0]])[0, :3], 2.0 * found[0, :3]
+    )
 
 
 def test_scans_of_which_only_some_claim_say_so_row_by_row() -> None:

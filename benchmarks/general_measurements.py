@@ -1,0 +1,210 @@
+"""Are submaps consistent, whatever the form of the measurements? NEES over seeds, and mutants.
+
+    python benchmarks/general_measurements.py [--seeds 200] [--only NAME]
+
+Worlds whose robots tell odometry as increments on SE(2) with a lateral part and a correlated
+covariance, or as a car's encoders; that see landmarks as points or as range and bearing, each with
+a covariance of its own; through a sensor that is mounted away from the base. Each submap is held
+against the truth in its own frame. The mean NEES per degree of freedom must lie in the two-sided
+99.9 % interval of chi-square, and each mutant (a wrong mount, claims that are turned or lack their
+correlations, that are half or twice the truth, a lateral part left out) must lie outside of it.
+Exit status 1 where one does not.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from sim.calibration.data import interval_of, scan_of
+from sim.world.config import SimulatedWorld
+from sim.world.simulator import simulated
+from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream, WorldStreams
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.estimation.consistency import chi2_interval, nees, state_error
+from team.estimation.geometry import between, inverse, transformed
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.pipeline import HybridSlam
+
+PROBABILITY = 0.999
+WINDOW_S = 10.0
+MOTION = MotionModel(
+    forward=MotionNoise(0.02, 0.04), turn=MotionNoise(0.01, 0.02), lateral=MotionNoise(0.01, 0.03)
+)
+CAR = MotionModel(
+    "ackermann", turn=MotionNoise(0.002), lateral=MotionNoise(0.01), forward=MotionNoise(0.01),
+    wheel_base=2.83, wheel_offset=0.76, shares=(0.08, 0.06, 0.01), shares_interval_s=1.0,
+)  # fmt: skip
+MOUNT = (3.78, 0.5, -0.4)
+SENSOR = Sensor(range_sigma=0.15, bearing_sigma=0.03, max_range=25.0)
+FRONT = FrontEnd(particles=200, window_s=WINDOW_S)
+
+
+class Case(NamedTuple):
+    """A world, its robot, and what each mutant of it changes of the robot or of the streams."""
+
+    world: SimulatedWorld
+    robot: RobotConfig
+    mutants: Mapping[str, Callable[[RobotConfig, WorldStreams], tuple[RobotConfig, RobotStream]]]
+
+
+def _world(**fields: object) -> SimulatedWorld:
+    plain = SimulatedWorld(
+        steps=20, size_m=40.0, landmark_count=12, speed_m_s=1.0, turn_rate_rad_s=0.4,
+        visible_from_m=1.0, visible_to_m=18.0,
+    )  # fmt: skip
+    return msgspec.structs.replace(plain, **fields)
+
+
+def _robot(motion: MotionModel = MOTION, **sensor: object) -> RobotConfig:
+    of_robot = msgspec.structs.replace(SENSOR, **sensor)
+    return RobotConfig("r1", motion=motion, sensor=of_robot, front_end=FRONT)
+
+
+def _other_mount(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
+    x, y, heading = robot.sensor.mount
+    sensor = msgspec.structs.replace(robot.sensor, mount=(x, y + 0.4, heading + 0.05))
+    return msgspec.structs.replace(robot, sensor=sensor), world.streams[0]
+
+
+def _turned(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
+    seen = world.streams[0].landmark_detections
+    assert seen.covariances is not None
+    turned = seen.covariances[:, ::-1] * np.array([1.0, -1.0, 1.0])
+    return robot, replace(world.streams[0], landmark_detections=replace(seen, covariances=turned))
+
+
+def _uncorrelated(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
+    seen = world.streams[0].landmark_detections
+    assert seen.covariances is not None
+    blind = replace(seen, covariances=seen.covariances * np.array([1.0, 0.0, 1.0]))
+    return robot, replace(world.streams[0], landmark_detections=blind)
+
+
+def _less_lateral(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
+    told = world.streams[0].intervals
+    assert told.covariances is not None
+    less = told.covariances.copy()
+    less[:, 1, :] *= 0.1
+    less[:, :, 1] *= 0.1
+    return robot, replace(world.streams[0], intervals=replace(told, covariances=less))
+
+
+def _odometry_factor(factor: float) -> Callable[..., tuple[RobotConfig, RobotStream]]:
+    def changed(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
+        motion = msgspec.structs.replace(robot.motion, covariance_factor=factor)
+        return msgspec.structs.replace(robot, motion=motion), world.streams[0]
+
+    return changed
+
+
+def _sensor_factor(factor: float) -> Callable[..., tuple[RobotConfig, RobotStream]]:
+    def changed(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
+        sensor = msgspec.structs.replace(robot.sensor, covariance_factor=factor)
+        return msgspec.structs.replace(robot, sensor=sensor), world.streams[0]
+
+    return changed
+
+
+def _no_shares(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
+    motion = msgspec.structs.replace(robot.motion, shares=None)
+    return msgspec.structs.replace(robot, motion=motion), world.streams[0]
+
+
+CASES: Mapping[str, Case] = {
+    "increments": Case(
+        _world(odometry="increments", odometry_claims=True, odometry_correlation=0.6),
+        _robot(),
+        {"less lateral": _less_lateral, "claims halved": _odometry_factor(0.5)},
+    ),
+    "increments without covariance": Case(
+        _world(odometry="increments"),
+        _robot(),
+        {},
+    ),
+    "points": Case(
+        _world(landmarks_told="points", landmark_claims=(0.4, 3.0)),
+        _robot(),
+        {"turned by a right angle": _turned, "claims halved": _sensor_factor(0.5)},
+    ),
+    "ranges with own covariances": Case(
+        _world(landmark_claims=(0.4, 3.0)),
+        _robot(),
+        {"no correlation": _uncorrelated, "claims doubled": _sensor_factor(2.0)},
+    ),
+    "mount": Case(_world(), _robot(mount=MOUNT), {"another mount": _other_mount}),
+    "car": Case(
+        _world(odometry="steering", speed_m_s=2.0),
+        _robot(CAR, mount=MOUNT),
+        {"no shares": _no_shares, "another mount": _other_mount},
+    ),
+}  # fmt: skip
+
+
+def closed_windows(robot: RobotConfig, stream: RobotStream) -> Iterator[ClosedWindow]:
+    """The windows that the robot makes of its stream."""
+    slam = HybridSlam(robot, 1)
+    for counter in range(1, len(stream)):
+        if stream.kinds[counter] == OBSERVATIONS:
+            told = stream.observations(counter)
+            slam.observe(told.stamp_ns, scan_of(told))
+        elif stream.kinds[counter] == ODOMETRY:
+            closed = slam.drive(*interval_of(stream.odometry(counter), robot.motion))
+            if closed is not None:
+                yield closed
+
+
+def window_nees(closed: ClosedWindow, world: WorldStreams) -> tuple[float, int]:
+    """NEES of a submap against the truth in its own frame, and its degrees of freedom."""
+    stream = world.streams[0]
+    assert stream.truth is not None
+    assert stream.truth_ns is not None
+    assert world.landmarks is not None
+    start, end = (
+        stream.truth[int(np.searchsorted(stream.truth_ns, at))]
+        for at in (closed.start_ns, closed.end_ns)
+    )
+    away = inverse(start)
+    places = [transformed(away, world.landmarks[i - 1]) for i in closed.local.ids.tolist()]
+    truth = np.concatenate((between(start, end), *places))
+    return nees(state_error(closed.local.mean, truth), closed.local.covariance), len(truth)
+
+
+def mean_nees(case: Case, seeds: int, mutant: str | None = None) -> tuple[float, float, float]:
+    """The mean NEES per degree of freedom over seeds, and the interval that it should lie in."""
+    total, dof = 0.0, 0
+    for seed in range(seeds):
+        world = simulated(case.world, [case.robot], seed)
+        told = case.mutants[mutant](case.robot, world) if mutant else (case.robot, world.streams[0])
+        for closed in closed_windows(*told):
+            squared, numbers = window_nees(closed, world)
+            total, dof = total + squared, dof + numbers
+    low, high = chi2_interval(dof, PROBABILITY, 1)
+    return total / dof, low, high
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, add_help=True)
+    parser.add_argument("--seeds", type=int, default=200)
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    failed = 0
+    for name, case in CASES.items():
+        if not name.startswith(options.only):
+            continue
+        for mutant in (None, *case.mutants):
+            value, low, high = mean_nees(case, options.seeds, mutant)
+            right = (low <= value <= high) == (mutant is None)
+            failed += not right
+            what = f"{name}: {mutant}" if mutant else name
+            verdict = "" if right else "   WRONG"
+            print(f"{what:50} NEES/dof {value:8.3f}   [{low:.3f}, {high:.3f}]{verdict}", flush=True)
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

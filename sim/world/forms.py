@@ -1,0 +1,114 @@
+"""The forms in which a simulated robot's sensors tell what they measure, beside the plain ones.
+
+Odometry as motions on SE(2), with or without a covariance, or as a car's encoders; landmarks as
+points, each with a covariance of its own. The formulas are written here, not taken from the filter.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from sim.world.odometry import Column, deviation
+from sim.world.sensing import Visible
+from team.config import MotionModel, Sensor
+
+Rows = Float[np.ndarray, "K 3"]
+
+LARGEST_CORRELATION = 0.8
+"""Of what a measurement with a covariance of its own tells, at most so much to either side."""
+
+
+def seen_from(poses: Rows, mount: tuple[float, float, float]) -> Rows:
+    """Where a sensor is that is mounted there on a base at these poses."""
+    x, y, heading = mount
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return np.column_stack([
+        poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, poses[:, 2] + heading
+    ])  # fmt: skip
+
+
+def _turned(xy: Float[np.ndarray, "K 2"], angle: Column) -> Float[np.ndarray, "K 2"]:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]])
+
+
+def increments_told(
+    motion: MotionModel,
+    poses: Float[np.ndarray, "K_plus_1 3"],
+    steps: Float[np.ndarray, "K 2"],
+    seconds: Column,
+    normals: Rows,
+    correlation: float,
+) -> tuple[Rows, Float[np.ndarray, "K 3 3"]]:
+    """Each motion between two true poses with an error, and the error's covariance.
+
+    truth = told moved on by (f, l, φ) at constant twist, at the told motion's end. f, l and φ have
+    the standard deviations of the model's forward, lateral and turn; l and φ the correlation.
+    """
+    before, after = poses[:-1], poses[1:]
+    true_turn = after[:, 2] - before[:, 2]
+    there = _turned(after[:, :2] - before[:, :2], -before[:, 2])
+    kinds = (motion.forward, motion.lateral, motion.turn)
+    sigmas = np.column_stack([deviation(kind, seconds, steps) for kind in kinds])
+    shares = np.sqrt(1.0 - correlation**2)
+    ahead, left, turn = sigmas.T * normals.T
+    left = correlation * sigmas[:, 1] * normals[:, 2] + shares * left
+    half = np.sinc(0.5 * turn / np.pi)
+    moved = half[:, np.newaxis] * _turned(np.column_stack([ahead, left]), 0.5 * turn)
+    told_turn = true_turn - turn
+    told = there - _turned(moved, told_turn)
+    angle = np.mod(told_turn + np.pi, 2.0 * np.pi) - np.pi
+    C = np.zeros((len(turn), 3, 3))
+    C[:, range(3), range(3)] = sigmas**2
+    C[:, 1, 2] = C[:, 2, 1] = correlation * sigmas[:, 1] * sigmas[:, 2]
+    return np.column_stack([told, angle]), C
+
+
+def steering_told(motion: MotionModel, forward: Column, yaw_rate: Column) -> tuple[Column, Column]:
+    """What a car's encoders read at these speeds: (wheel speed [m/s], steering angle [rad]).
+
+    The base turns about a point forward/yaw_rate to its left, on the line of the rear axle.
+    """
+    assert motion.wheel_base is not None
+    moving = np.abs(forward) > 1e-9
+    curvature = np.where(moving, yaw_rate / np.where(moving, forward, 1.0), 0.0)
+    wheel = forward * (1.0 - curvature * motion.wheel_offset)
+    return wheel, np.arctan(curvature * motion.wheel_base) - motion.steering_offset
+
+
+def claimed(
+    seen: Visible,
+    sensor: Sensor,
+    sizes: tuple[float, float],
+    uniform: Float[np.ndarray, "V 3"],
+    *,
+    points: bool,
+) -> Float[np.ndarray, "V 3"]:
+    """Covariances of measurements, each of its own size and direction.
+
+    Its two standard deviations are factors between `sizes` of the sensor's: of range and bearing,
+    correlated at random; of points range_sigma along both of two axes of any direction.
+    """
+    low, high = sizes
+    first, second = (low + (high - low) * uniform[:, :2]).T
+    if points:
+        angle = np.pi * uniform[:, 2]
+        a, b = (sensor.range_sigma * first) ** 2, (sensor.range_sigma * second) ** 2
+        c, s = np.cos(angle), np.sin(angle)
+        return np.column_stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c])
+    a, b = sensor.range_sigma * first, sensor.bearing_sigma * second
+    rho = LARGEST_CORRELATION * (2.0 * uniform[:, 2] - 1.0)
+    return np.column_stack([a * a, rho * a * b, b * b])
+
+
+def with_errors(
+    true: Float[np.ndarray, "V 2"],
+    covariances: Float[np.ndarray, "V 3"],
+    normals: Float[np.ndarray, "V 2"],
+) -> Float[np.ndarray, "V 2"]:
+    """Pairs of numbers with errors of these covariances, by the rows of their Cholesky factors."""
+    xx, xy, yy = covariances.T
+    first = np.sqrt(xx)
+    across = xy / first
+    second = across * normals[:, 0] + np.sqrt(yy - across**2) * normals[:, 1]
+    found: Float[np.ndarray, "V 2"] = true + np.column_stack([first * normals[:, 0], second])
+    return found
