@@ -13,12 +13,11 @@ full solution is one of the raw set: it takes the ticks again that were condense
 """
 
 import math
-from bisect import insort
-from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from central.config import CentralConfig
+from central.members import Members
 from central.withdrawal import convicted, suspects
 from team import translate
 from team.config import UNNAMED
@@ -29,11 +28,9 @@ from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
-    Contribution,
     Fold,
     InitialPoseFactor,
     JoinSettings,
-    Sighting,
     Tick,
     compacted,
     converged,
@@ -45,11 +42,9 @@ from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyo
 from team.wire.messages import SightingFactor, Submap
 
 Stream = tuple[str, int]
-Key = tuple[int, str, int, int]
 
 GROWTH = 1.25
 """Suspects whom nothing convicted are tried again when there are so many times the submaps."""
-KEPT_DIGESTS = 4
 NEWEST = 8
 """So many checkpoints are kept of the newest ticks, and of each time as long again before."""
 
@@ -122,14 +117,10 @@ class TickFold:
         self._convicted_at = -math.inf
         self._tick_ns = round(config.tick_s * 1e9)
         self._period = max(1, math.ceil(config.broadcast_s / config.tick_s))
-        self._ticks: dict[int, dict[Key, Contribution]] = defaultdict(dict)
-        self._sightings: dict[Key, list[Sighting]] = {}
-        self._digests: dict[Key, bytes] = {}
+        self._members = Members(self._tick_ns)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self._taken: list[Checkpoint] = []
         self._agreed: tuple[Fold, Agreement] | None = None
-        self._order: list[int] = []
-        self._named: dict[tuple[bytes, ...], tuple[float, translate.Digest]] = {}
 
     def know_start(self, start: InitialPoseFactor) -> None:
         """Where a stream starts; to be told before its first submap is added."""
@@ -140,14 +131,7 @@ class TickFold:
 
         The fold goes back to before that tick if it was taken.
         """
-        contribution = translate.contribution_of(submap)
-        tick = self._tick_of(submap.stamp_ns)
-        if tick not in self._ticks:
-            insort(self._order, tick)
-        self._named = {at: each for at, each in self._named.items() if each[0] < tick}
-        self._ticks[tick][contribution.key] = contribution
-        self._sightings[contribution.key] = [translate.sighting_of(each) for each in sightings]
-        self._digests[contribution.key] = digest
+        tick = self._members.add(submap, digest, sightings)
         if submap.robot not in self._gone or tick <= self._convicted_at:
             self._roll_back(tick)
 
@@ -160,18 +144,12 @@ class TickFold:
         if robot in self._ordered:
             return
         until_ns = self._until_ns
-        touched = [tick for tick in sorted(self._ticks) if self._concerns(tick, robot)]
-        if touched:
-            self._roll_back(touched[0])
+        ticks = self._members.behind(-math.inf)
+        touched = next((tick for tick in ticks if self._members.concerns(tick, robot)), None)
+        if touched is not None:
+            self._roll_back(touched)
         self._ordered.add(robot)
         self.take_until(until_ns)
-
-    def _concerns(self, tick: int, robot: str) -> bool:
-        """Whether a tick has something by a robot or of it."""
-        return any(
-            key[1] == robot or any(each.teammate == robot for each in self._sightings[key])
-            for key in self._ticks[tick]
-        )
 
     def without(self, robots: Collection[str]) -> "TickFold":
         """Another one of the same submaps without some robots' that has taken the same ticks.
@@ -187,8 +165,7 @@ class TickFold:
     def _other(self, bounded: bool) -> "TickFold":
         """Another one of the same members that has taken nothing yet."""
         other = TickFold(self._config, bounded)
-        other._ticks, other._order, other._sightings = self._ticks, self._order, self._sightings
-        other._digests, other._starts = self._digests, self._starts
+        other._members, other._starts = self._members, self._starts
         return other
 
     def _full(self) -> "TickFold":
@@ -221,15 +198,12 @@ class TickFold:
         """
         if tick <= self._convicted_at:
             self.convicted, self._convicted_at = {}, -math.inf
-            self._taken = []
+            self._taken, self._raw_until = [], -math.inf
         if tick <= self._raw_until:
             self._raw_until = -math.inf
             self._taken = [each for each in self._taken if not each.fold.departed]
         while self._taken and self._taken[-1].tick >= tick:
             self._taken.pop()
-
-    def _tick_of(self, end_ns: int) -> int:
-        return (end_ns - 1) // self._tick_ns
 
     @property
     def fold(self) -> Fold:
@@ -289,7 +263,7 @@ class TickFold:
         robot, reason = found
         self.convicted[robot] = reason
         self._convicted_at = max(self._convicted_at, at)
-        self._taken = []
+        self._taken, self._raw_until = [], -math.inf
         return True
 
     def agreement(self, fold: Fold) -> Agreement:
@@ -336,12 +310,9 @@ class TickFold:
 
     def _open_ticks(self) -> list[int]:
         """The ticks that are not taken yet and have a submap of a robot that is not withdrawn."""
-        last, gone = self._taken[-1].tick if self._taken else -math.inf, self._gone
-        return [
-            tick
-            for tick in self._ticks_behind(last)
-            if any(key[1] not in gone for key in self._ticks[tick])
-        ]
+        last = self._taken[-1].tick if self._taken else -math.inf
+        gone = self._gone
+        return [tick for tick in self._members.behind(last) if self._members.keys(tick, gone)]
 
     def _with_tick(self, fold: Fold, tick: int) -> Fold:
         """The fold with all of a tick; members beyond the bounds are refused before the others.
@@ -352,8 +323,8 @@ class TickFold:
         if self._bounded and tick > self._raw_until:
             fold = self._condensed(fold, tick)
         gone = self._gone
-        order = sorted(key for key in self._ticks[tick] if key[1] not in gone)
-        members = [self._ticks[tick][key] for key in order]
+        order = self._members.keys(tick, gone)
+        members = [self._members.contribution(key) for key in order]
         unnamed = (each.stream for each in members if (each.local.ids >= UNNAMED).any())
         if fold.departed and (stream := next(unnamed, None)) is not None:
             raise CondensedError(stream)
@@ -363,7 +334,7 @@ class TickFold:
             if why is not None:
                 outside[each.key] = why
         sightings, starts, set_aside = [], [], []
-        for sighting in (each for key in order for each in self._sightings[key]):
+        for sighting in (each for key in order for each in self._members.sightings(key)):
             if sighting.teammate in gone:
                 continue
             why = sighting_beyond(sighting, self._config.bounds)
@@ -386,22 +357,17 @@ class TickFold:
 
     def _condensed(self, fold: Fold, tick: int) -> Fold:
         """The fold that a tick is put on; linearised again where that is due."""
-        coming = sum(key[1] not in self._gone for key in self._ticks[tick])
-        if fold.departed and is_due(fold.size, fold.size + coming):
-            keys = sorted(
+        gone = self._gone
+        if fold.departed and is_due(fold.size, fold.size + len(self._members.keys(tick, gone))):
+            keys = [
                 key
-                for at, members in self._ticks.items()
-                if at < tick
-                for key in members
-                if key[1] not in self._gone and fold.home.get(key[1:3]) == fold.main_key
-            )
-            contributions = [self._ticks[self._tick_of(key[0])][key] for key in keys]
-            sightings = [
-                each
-                for key in keys
-                for each in self._sightings[key]
-                if each.teammate not in self._gone
+                for before in self._members.behind(-math.inf, tick - 1)
+                for key in self._members.keys(before, gone)
+                if fold.home.get(key[1:3]) == fold.main_key
             ]
+            contributions = [self._members.contribution(key) for key in keys]
+            seen = (each for key in keys for each in self._members.sightings(key))
+            sightings = [each for each in seen if each.teammate not in gone]
             fold = relinearised(fold, contributions, sightings)
         return condensed(fold)
 
@@ -418,51 +384,10 @@ class TickFold:
             if (robot, incarnation) in fold.home
         ]
         gone = [f"without {robot}".encode() for robot in self.withdrawn]
-        return self._digest_of_ticks((*more, *gone, *starts), self._last_tick(fold))
-
-    def _last_tick(self, fold: Fold) -> float:
         keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
-        return max((self._tick_of(key[0]) for key in keys), default=-math.inf)
-
-    def _digest_of_ticks(self, before: tuple[bytes, ...], last: float) -> bytes:
-        """The digest of these parts and of the members up to a tick, in canonical order.
-
-        That of the ticks that have been taken is kept, by what stands before them.
-        """
+        last = max((self._members.tick_of(key[0]) for key in keys), default=-math.inf)
         closed = min(last, self._taken[-1].tick if self._taken else -math.inf)
-        until, digest = self._named.pop(before, (-math.inf, translate.Digest()))
-        if until > closed:
-            until, digest = -math.inf, translate.Digest()
-        if until == -math.inf:
-            digest.update(*before)
-        digest.update(*self._digests_between(until, closed))
-        if closed > -math.inf:
-            self._named[before] = closed, digest
-        for oldest in list(self._named)[:-KEPT_DIGESTS]:
-            del self._named[oldest]
-        whole = digest.copy()
-        whole.update(*self._digests_between(closed, last))
-        return whole.value
-
-    def _digests_between(self, after: float, last: float) -> list[bytes]:
-        """Of the members of the ticks behind `after` up to `last`."""
-        gone = self._gone
-        return [
-            self._digests[key]
-            for tick in self._ticks_behind(after)
-            if tick <= last
-            for key in sorted(self._ticks[tick])
-            if key[1] not in gone
-        ]
-
-    def _ticks_behind(self, after: float) -> list[int]:
-        """The ticks with members behind this one, ascending."""
-        behind = []
-        for tick in reversed(self._order):
-            if tick <= after:
-                break
-            behind.append(tick)
-        return behind[::-1]
+        return self._members.digest((*more, *gone, *starts), closed, last, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """The version vector: the last sequence of each stream that was taken or refused."""

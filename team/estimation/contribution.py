@@ -46,6 +46,13 @@ class Contribution:
         """P⁻¹ of the submap. Raises NotACovarianceError that names the submap."""
         return information(self.local.covariance, f"submap {self.sequence} of {named(self.stream)}")
 
+    @cached_property
+    def blocks(self) -> Float[np.ndarray, "L 3"]:
+        """Each landmark's own covariance (xx, xy, yy)."""
+        P, n = self.local.covariance, len(self.local.mean)
+        x = np.arange(n - 2 * len(self.local.ids), n, 2)
+        return np.column_stack([P[x, x], P[x, x + 1], P[x + 1, x + 1]])
+
 
 @dataclass(frozen=True, eq=False)
 class InitialPoseFactor:

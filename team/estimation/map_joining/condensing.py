@@ -46,7 +46,7 @@ BEGIN = 128
 """A fold of fewer submaps is taken in full."""
 SETTLED = 1000
 """A fold of more submaps than this is not linearised again."""
-HISTORY = 100
+HISTORY = 50
 """Of each stream the costs of so many departed submaps are kept."""
 
 

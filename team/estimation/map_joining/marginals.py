@@ -3,7 +3,7 @@
 Everything is in the frame of an island: the main one, or the one that a stream is in.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -151,8 +151,9 @@ def prior_for(
     fold: Fold, robot: str, incarnation: int, ids: Sequence[int] | None = None
 ) -> RobotPrior:
     """What a robot needs to place itself: its last end pose and the landmarks, jointly."""
-    stream = (robot, incarnation)
-    return _priors_in(fold.island(robot, incarnation), [stream], ids)[stream]
+    stream, island = (robot, incarnation), fold.island(robot, incarnation)
+    chosen = sorted(island.graph.landmarks if ids is None else ids)
+    return _priors_in(island, {stream: chosen})[stream]
 
 
 def main_priors(
@@ -170,31 +171,32 @@ def main_priors(
     island = fold.main
     ids = np.array(sorted(island.graph.landmarks) if chosen is None else chosen)
     if most is None or len(ids) <= most:
-        return _priors_in(island, streams, ids.tolist())  # the landmarks are solved for once
+        return _priors_in(island, dict.fromkeys(streams, ids.tolist()))
     places = np.array([_mean(island, node) for node in _nodes(island, ids.tolist())])
-    priors: dict[Stream, RobotPrior] = {}
+    nearest = {}
     for stream in streams:
         offsets = places - _mean(island, island.graph.streams[stream][-1])[:2]
-        nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")[:most]
-        priors |= _priors_in(island, [stream], ids[nearest].tolist())
-    return priors
+        order = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
+        nearest[stream] = sorted(ids[order[:most]].tolist())
+    return _priors_in(island, nearest)
 
 
-def _priors_in(
-    island: Island, streams: Sequence[Stream], ids: Sequence[int] | None
-) -> dict[Stream, RobotPrior]:
-    chosen = sorted(island.graph.landmarks if ids is None else ids)
-    poses = [island.graph.streams[stream][-1] for stream in streams]
+def _priors_in(island: Island, wanted: Mapping[Stream, Sequence[int]]) -> dict[Stream, RobotPrior]:
+    """A prior of each stream with some landmarks, ascending; solved for once, all together."""
+    chosen = sorted({id_ for ids in wanted.values() for id_ in ids})
+    poses = [island.graph.streams[stream][-1] for stream in wanted]
     mean, covariance = joint_marginal(island, [*poses, *_nodes(island, chosen)])
-    shared = np.arange(3 * len(poses), len(mean))
+    place = {id_: 3 * len(poses) + 2 * k for k, id_ in enumerate(chosen)}
     biases = _biases_in(island)
     priors = {}
-    for k, stream in enumerate(streams):
+    for k, (stream, ids) in enumerate(wanted.items()):
+        points = np.array([place[id_] for id_ in ids], dtype=np.int64)
+        shared = (points[:, None] + np.arange(2)).ravel()
         kept = np.concatenate([np.arange(3 * k, 3 * k + 3), shared])
         own = tuple((b.bias, b.value, b.sigma) for b in biases if b.stream == stream)
         priors[stream] = RobotPrior(
             mean[kept[:3]],
-            np.array(chosen, dtype=np.uint32),
+            np.array(ids, dtype=np.uint32),
             mean[shared].reshape(-1, 2),
             covariance[np.ix_(kept, kept)],
             Shared(island.settings.covariance_factor, own),

@@ -21,7 +21,6 @@ from team.estimation.map_joining.condensed_factor import Condensed
 from team.estimation.map_joining.inter_robot_kernel import Sightings
 from team.estimation.map_joining.joining_kernel import Factors, block_pattern
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
-from team.estimation.submap import LocalMap
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -127,7 +126,7 @@ class Graph:
                 [np.zeros(0), *(each.sensitivity.ravel() for each in self.submaps)]
             ),
             sensitivity_start=_starts([each.sensitivity.size for each in self.submaps]),
-            block=np.concatenate([np.zeros((0, 3)), *(_blocks(each.local) for each in submaps)]),
+            block=np.concatenate([np.zeros((0, 3)), *(each.blocks for each in submaps)]),
             block_start=_starts([len(each.local.ids) for each in submaps]),
             of_range=np.array(
                 [b == "range_scale" for each in self.submaps for b in each.biases], np.bool_
@@ -226,14 +225,6 @@ EMPTY_GRAPH = Graph(
     sightings=(),
     priors=(),
 )
-
-
-def _blocks(local: LocalMap) -> Float[np.ndarray, "L 3"]:
-    """Each landmark's own covariance (xx, xy, yy)."""
-    first = len(local.mean) - 2 * len(local.ids)
-    x, y = np.arange(first, len(local.mean), 2), np.arange(first + 1, len(local.mean), 2)
-    P = local.covariance
-    return np.column_stack([P[x, x], P[x, y], P[y, y]])
 
 
 def _starts(lengths: Sequence[int]) -> Indices:

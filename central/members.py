@@ -1,0 +1,109 @@
+"""The members of a fold by ticks of team time: messages as they came, made ready when asked for.
+
+A contribution (a submap as the join takes it) is several times as large as its message and can be
+made again from it; it is kept as long as some fold has it.
+"""
+
+import math
+from bisect import insort
+from collections.abc import Collection, Sequence
+from weakref import WeakValueDictionary
+
+from team import translate
+from team.estimation.contribution import Contribution
+from team.estimation.inter_robot import Sighting
+from team.wire.messages import SightingFactor, Submap
+
+Key = tuple[int, str, int, int]
+KEPT_DIGESTS = 4
+
+
+class Members:
+    """Submaps by tick, with the inter-robot measurements from them and the digests of both.
+
+    Tick b has the submaps that end in (b·tick, (b + 1)·tick].
+    """
+
+    def __init__(self, tick_ns: int) -> None:
+        self.tick_ns = tick_ns
+        self._ticks: dict[int, dict[Key, Submap]] = {}
+        self._order: list[int] = []
+        self._sightings: dict[Key, tuple[Sighting, ...]] = {}
+        self._digests: dict[Key, bytes] = {}
+        self._made: WeakValueDictionary[Key, Contribution] = WeakValueDictionary()
+        self._named: dict[tuple[bytes, ...], tuple[float, translate.Digest]] = {}
+
+    def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
+        """File a submap, with what `digest` names besides; its tick."""
+        key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
+        tick = self.tick_of(submap.stamp_ns)
+        if tick not in self._ticks:
+            self._ticks[tick] = {}
+            insort(self._order, tick)
+        self._ticks[tick][key] = submap
+        self._digests[key] = digest
+        if sightings:
+            self._sightings[key] = tuple(translate.sighting_of(each) for each in sightings)
+        self._made.pop(key, None)
+        self._named = {at: each for at, each in self._named.items() if each[0] < tick}
+        return tick
+
+    def tick_of(self, end_ns: int) -> int:
+        """The tick of a submap that ends then."""
+        return (end_ns - 1) // self.tick_ns
+
+    def behind(self, after: float, last: float = math.inf) -> list[int]:
+        """The ticks with members behind this one, up to the last, ascending."""
+        found = []
+        for tick in reversed(self._order):
+            if tick <= after:
+                break
+            if tick <= last:
+                found.append(tick)
+        return found[::-1]
+
+    def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
+        """The submaps of a tick in canonical order, less those of robots that are gone."""
+        return sorted(key for key in self._ticks[tick] if key[1] not in gone)
+
+    def contribution(self, key: Key) -> Contribution:
+        """A submap as the join takes it."""
+        found = self._made.get(key)
+        if found is None:
+            found = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
+            self._made[key] = found
+        return found
+
+    def sightings(self, key: Key) -> tuple[Sighting, ...]:
+        """The inter-robot measurements from a submap."""
+        return self._sightings.get(key, ())
+
+    def concerns(self, tick: int, robot: str) -> bool:
+        """Whether a tick has something by a robot or of it."""
+        return any(
+            key[1] == robot or any(each.teammate == robot for each in self.sightings(key))
+            for key in self._ticks[tick]
+        )
+
+    def digest(
+        self, before: tuple[bytes, ...], closed: float, last: float, gone: Collection[str]
+    ) -> bytes:
+        """The digest of these parts and of the members up to a tick, in canonical order.
+
+        That of the ticks up to `closed` is kept, by what stands before them.
+        """
+        until, digest = self._named.pop(before, (math.inf, translate.Digest()))
+        if until > closed:
+            until, digest = -math.inf, translate.Digest()
+            digest.update(*before)
+        digest.update(*self._digests_between(until, closed, gone))
+        self._named[before] = closed, digest
+        for oldest in list(self._named)[:-KEPT_DIGESTS]:
+            del self._named[oldest]
+        whole = digest.copy()
+        whole.update(*self._digests_between(closed, last, gone))
+        return whole.value
+
+    def _digests_between(self, after: float, last: float, gone: Collection[str]) -> list[bytes]:
+        ticks = self.behind(after, last)
+        return [self._digests[key] for tick in ticks for key in self.keys(tick, gone)]
