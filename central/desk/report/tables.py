@@ -143,7 +143,7 @@ PATH_HEADINGS = (
     "robot", "path\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
     "online\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
 )  # fmt: skip
-PATH_NOTE = "position RMSE of the smoothed path, then online; aligned: moved as the map is"
+PATH_NOTE = "position RMSE, smoothed and online; aligned: moved as the map is"
 
 
 def path_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple[str, ...]:
