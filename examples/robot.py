@@ -1,7 +1,8 @@
-"""A robot whose measurements stand in CSV tables: python robot.py r1 data/r1 lab ENDPOINT."""
+"""A robot from CSV tables: python robot.py r1 data/r1 lab tcp/127.0.0.1:7447 [SECONDS A STEP]."""
 
 import csv
 import sys
+import time
 from decimal import Decimal
 from itertools import groupby
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from team import Driver
 
-name, folder, team, endpoint = sys.argv[1:]
+name, folder, team, endpoint, *pause = sys.argv[1:]
 events = []
 for kind in ("observations", "odometry"):
     rows = list(csv.reader((Path(folder) / f"{kind}.csv").open()))[1:]
@@ -24,5 +25,6 @@ with Driver(name, team=team, connect=endpoint, start=start) as robot:
         if kind == "odometry":
             robot.odometry(t, *speed)  # until t, since the last call
             speed = numbers
+            time.sleep(float(pause[0]) if pause else 0.0)
         else:
             robot.observe(t, *np.reshape(numbers, (-1, 3)).T)

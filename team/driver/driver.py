@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -24,7 +24,7 @@ from team.driver import journal as j
 from team.driver import measured
 from team.driver.link import Link
 from team.driver.measured import DriverWarning, MeasurementError
-from team.driver.motion import Interval, Odometer
+from team.driver.motion import Odometer, Pose, between
 from team.driver.node import SourceNode
 from team.keys.roster import KeysError
 from team.wire import messages as m
@@ -34,8 +34,10 @@ from team.wire.codec import encoded
 
 CONNECT = "tcp/127.0.0.1:7447"
 REMIND_S = 10.0
-GAP_S = 1.0
+GAP_S = 2.0
 """Odometry without a duration covers no more than this."""
+BRIDGE_S = 5.0
+"""A gap between intervals that is no longer is bridged, by a motion of which little is known."""
 AWAY_S = 60.0
 """A difference of poses is believed over no more than this: the odometry may have begun anew."""
 AHEAD_S = 10.0
@@ -124,51 +126,117 @@ class Driver:
         t: float | Decimal,
         forward: float,
         yaw_rate: float,
-        duration: float | None = None,
+        duration: float | Decimal | None = None,
     ) -> None:
         """Mean speed [m/s] and yaw rate [rad/s] over the `duration` seconds until t.
 
         Without a duration: since the last call; the first such call says when the robot begins.
         """
-        stamp_ns = measured.stamp_of(t, "odometry")
-        length_ns = None if duration is None else measured.stamp_of(duration, "a duration")
+        stamp_ns, length_ns = _times(t, duration, "odometry")
+        v, w = measured.pair(forward, yaw_rate, f"odometry of {self.robot} at {t} s")
         with self._lock:
-            self._resume(stamp_ns)
-            end_ns = self._odometer.end_ns
-            if length_ns is None and end_ns is not None and stamp_ns - end_ns > GAP_S * 1e9:
-                self._begin_anew(end_ns, stamp_ns)
-            interval = self._odometer.speeds(stamp_ns, forward, yaw_rate, length_ns)
-            self._drive(stamp_ns, interval)
+            lasts_ns = self._until(stamp_ns, length_ns, "odometry")
+            seconds = 1e-9 * (lasts_ns or 10**9)
+            self._odometer.judge((v * seconds, 0.0, w * seconds), lasts_ns or 10**9, "odometry",
+                                 stamp_ns)  # fmt: skip
+            told = None if lasts_ns is None else m.Odometry(
+                **self._head(stamp_ns), duration_ns=lasts_ns, forward=v, yaw_rate=w
+            )  # fmt: skip
+            self._drive(stamp_ns, told, (v * seconds, 0.0, w * seconds))
 
-    def odometry_pose(self, t: float | Decimal, x: float, y: float, theta: float) -> None:
-        """The pose in the odometry's own frame at t [m, rad]; its differences count."""
-        stamp_ns = measured.stamp_of(t, "odometry_pose")
-        pose = measured.pose_of((x, y, theta), f"odometry_pose at {float(t):.3f} s")
+    def odometry_increment(
+        self,
+        t: float | Decimal,
+        increment: Sequence[float],
+        covariance: ArrayLike | None = None,
+        duration: float | Decimal | None = None,
+    ) -> None:
+        """The motion (ahead [m], left [m], turn [rad]) over the `duration` seconds until t.
+
+        In the frame of its beginning; covariance: 3 × 3, of an error in the frame of its end.
+        """
+        stamp_ns, length_ns = _times(t, duration, "odometry_increment")
+        step = measured.pose_of(increment, f"odometry_increment of {self.robot} at {t} s")
         with self._lock:
-            self._resume(stamp_ns)
-            end_ns = self._odometer.end_ns
-            if end_ns is not None and stamp_ns - end_ns > AWAY_S * 1e9:
-                self._begin_anew(end_ns, stamp_ns)
-            interval = self._odometer.posed(stamp_ns, pose)
-            if interval is None:
-                self._drive(stamp_ns, None)
+            lasts_ns = self._until(stamp_ns, length_ns, "odometry_increment")
+            told = None
+            if lasts_ns is not None:
+                self._odometer.judge(step, lasts_ns, "odometry_increment", stamp_ns)
+                told = self._increment(stamp_ns, lasts_ns, step, covariance)
+            self._drive(stamp_ns, told, step)
+
+    def odometry_pose(
+        self,
+        t: float | Decimal,
+        x: float,
+        y: float,
+        theta: float,
+        covariance: ArrayLike | None = None,
+    ) -> None:
+        """The pose in the odometry's own frame at t [m, rad]; its differences count.
+
+        covariance: 3 × 3, of the motion since the last call, in the frame of its end.
+        """
+        stamp_ns = measured.stamp_of(t, "odometry_pose")
+        pose = measured.pose_of((x, y, theta), f"odometry_pose of {self.robot} at {t} s")
+        with self._lock:
+            lasts_ns = self._until(stamp_ns, None, "odometry_pose", longest_s=AWAY_S)
+            before, told, step = self._odometer.pose, None, (0.0, 0.0, 0.0)
+            if lasts_ns is not None and before is None:  # by speeds before, or a stream anew
+                self._begin_anew(stamp_ns - lasts_ns, stamp_ns)
+            elif lasts_ns is not None and before is not None:
+                step = between(before, pose)
+                self._odometer.judge(step, lasts_ns, "odometry_pose", stamp_ns)
+                told = self._increment(stamp_ns, lasts_ns, step, covariance)
+            if not self._incarnation:
+                self._begin(stamp_ns, known=True)
             self._put(j.POSE, stamp_ns, j.pose_payload(pose))
-            if interval is not None:
-                self._drive(stamp_ns, interval)
+            self._drive(stamp_ns, told, step, pose)
 
     def observe(
-        self, t: float | Decimal, ids: ArrayLike, ranges: ArrayLike, bearings: ArrayLike
+        self,
+        t: float | Decimal,
+        ids: ArrayLike,
+        ranges: ArrayLike,
+        bearings: ArrayLike,
+        covariances: ArrayLike | None = None,
     ) -> None:
-        """Landmarks seen at t: numbers, ranges [m] and bearings [rad] from the robot's heading."""
+        """Landmarks seen at t: numbers, ranges [m] and bearings [rad] from the sensor's axis.
+
+        covariances: of each its own 2 × 2 of (range, bearing); without: the sensor's.
+        """
         stamp_ns = measured.stamp_of(t, "observe")
-        seen = measured.observations(self.robot, stamp_ns, ids, ranges, bearings)
+        seen = measured.observations(self.robot, stamp_ns, ids, (ranges, bearings), covariances)
         self._judge_ids(np.asarray(ids).reshape(-1))
         self._see(j.OBSERVATIONS, seen)
 
-    def observe_points(self, t: float | Decimal, ids: ArrayLike, xy: ArrayLike) -> None:
-        """Landmarks seen at t: numbers, and points (ahead [m], left [m]) in the robot's frame."""
-        ranges, bearings = measured.range_bearing_of(xy, f"observe_points at {float(t):.3f} s")
-        self.observe(t, ids, ranges, bearings)
+    def observe_points(
+        self,
+        t: float | Decimal,
+        ids: ArrayLike,
+        xy: ArrayLike,
+        covariances: ArrayLike | None = None,
+    ) -> None:
+        """Landmarks seen at t: numbers, and points (ahead [m], left [m]) in the sensor's frame.
+
+        covariances: of each its own 2 × 2; without: the sensor's noise of range and bearing.
+        """
+        stamp_ns = measured.stamp_of(t, "observe_points")
+        seen = measured.points(self.robot, stamp_ns, ids, xy, covariances)
+        self._judge_ids(np.asarray(ids).reshape(-1))
+        self._see(j.OBSERVATIONS, seen)
+
+    def detect(
+        self,
+        t: float | Decimal,
+        ranges: ArrayLike,
+        bearings: ArrayLike,
+        covariances: ArrayLike | None = None,
+    ) -> None:
+        """Landmarks without identities, seen at t in one scan: ranges [m] and bearings [rad]."""
+        stamp_ns = measured.stamp_of(t, "detect")
+        seen = measured.detections(self.robot, stamp_ns, (ranges, bearings), covariances)
+        self._see(j.OBSERVATIONS, seen)
 
     def sight(
         self, t: float | Decimal, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
@@ -331,27 +399,58 @@ class Driver:
         self._begin(stamp_ns, known=False)
         self._odometer = Odometer(self.robot, self._bounds)
 
-    def _drive(self, stamp_ns: int, interval: Interval | None) -> None:
-        if interval is None:
-            if not self._incarnation:
-                self._begin(stamp_ns, known=True)
-            return
-        begin_ns = interval.stamp_ns - interval.duration_ns
+    def _head(self, stamp_ns: int) -> dict[str, Any]:
+        """What every measurement has; its incarnation and number come with its place."""
+        return {"stamp_ns": stamp_ns, "robot": self.robot, "incarnation": 0, "number": 0}
+
+    def _increment(
+        self, stamp_ns: int, lasts_ns: int, step: Pose, covariance: ArrayLike | None
+    ) -> m.Increment:
+        what = f"the covariance of {self.robot} at {1e-9 * stamp_ns:.3f} s"
+        return measured.sound(
+            m.Increment(
+                **self._head(stamp_ns),
+                duration_ns=lasts_ns,
+                increment=from_floats(step),
+                covariance=measured.square(covariance, what),
+            ),
+            what,
+        )
+
+    def _until(
+        self, stamp_ns: int, length_ns: int | None, call: str, longest_s: float = GAP_S
+    ) -> int | None:
+        """How long the interval is that ends now; a stream that can not go on begins anew."""
+        self._resume(stamp_ns)
+        end_ns = self._odometer.end_ns
+        if length_ns is None and end_ns is not None and stamp_ns - end_ns > longest_s * 1e9:
+            self._begin_anew(end_ns, stamp_ns)
+        return self._odometer.until(stamp_ns, length_ns, call)
+
+    def _drive(
+        self, stamp_ns: int, told: m.AnyOdometry | None, step: Pose, pose: Pose | None = None
+    ) -> None:
+        """Put an interval of odometry into the file, and what bridges the gap before it."""
+        lasts_ns = 0 if told is None else told.duration_ns
+        begin_ns = stamp_ns - lasts_ns
+        gap_ns = self._odometer.gap_ns
         if not self._incarnation:
             self._begin(begin_ns, known=True)
-        elif self._odometer.gap_ns:
-            self._begin_anew(begin_ns - self._odometer.gap_ns, begin_ns)
-            self._odometer.end_ns = stamp_ns
-        odometry = m.Odometry(
-            stamp_ns=stamp_ns,
-            robot=self.robot,
-            incarnation=self._incarnation,
-            number=0,
-            duration_ns=interval.duration_ns,
-            forward=interval.forward,
-            yaw_rate=interval.yaw_rate,
-        )
-        self._message(j.ODOMETRY, odometry)
+        elif gap_ns > BRIDGE_S * 1e9:
+            self._begin_anew(begin_ns - gap_ns, begin_ns)
+        elif gap_ns:
+            self._warn(
+                f"gap{begin_ns}",
+                f"{self.robot}: no odometry from {1e-9 * (begin_ns - gap_ns):.3f} to "
+                f"{1e-9 * begin_ns:.3f} s: it is taken to have gone on as before, which nobody "
+                "knows; odometry should cover all of the time",
+            )
+            over, covariance = self._odometer.bridge()
+            bridged = self._increment(begin_ns, gap_ns, over, np.reshape(covariance, (3, 3)))
+            self._message(j.ODOMETRY, bridged)
+        if told is not None:
+            self._message(j.ODOMETRY, told)
+        self._odometer.taken(stamp_ns, step, lasts_ns, pose)
 
     def _see(self, kind: int, seen: m.Measurement) -> None:
         with self._lock:
@@ -386,6 +485,14 @@ class Driver:
             warnings.warn(text, DriverWarning, stacklevel=4)
 
 
+def _times(
+    t: float | Decimal, duration: float | Decimal | None, call: str
+) -> tuple[int, int | None]:
+    """The end and the length of an interval [ns]."""
+    length_ns = None if duration is None else measured.stamp_of(duration, "a duration")
+    return measured.stamp_of(t, call), length_ns
+
+
 def _start_of(
     robot: str, start: Sequence[float] | None, covariance: ArrayLike | None
 ) -> tuple[bytes, bytes]:
@@ -393,9 +500,4 @@ def _start_of(
     if start is None:
         return b"", b""
     pose = measured.pose_of(start, f"the start of {robot}")
-    if covariance is None:
-        return from_floats(pose), b""
-    matrix = np.asarray(covariance, dtype=np.float64)
-    if matrix.shape != (3, 3):
-        raise MeasurementError(f"the start of {robot}: its covariance is 3 × 3, not {matrix.shape}")
-    return from_floats(pose), from_floats(matrix.ravel())
+    return from_floats(pose), measured.square(covariance, f"the start of {robot}")

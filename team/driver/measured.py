@@ -8,7 +8,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from team.config import Bounds
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import unsound
@@ -42,19 +41,9 @@ def stamp_of(t: float | Decimal, what: str) -> int:
     return round(seconds * 1e9)
 
 
-def speeds(forward: float, yaw_rate: float, bounds: Bounds, what: str) -> tuple[float, float]:
-    """Speed and yaw rate that a robot can have."""
-    v, w = _number(forward, f"forward of {what}"), _number(yaw_rate, f"yaw_rate of {what}")
-    if abs(v) > bounds.speed_m_s:
-        raise MeasurementError(
-            f"{what}: {v:g} m/s, {bounds.speed_m_s:g} at most; speeds are in m/s (see bounds)"
-        )
-    if abs(w) > bounds.yaw_rate_rad_s:
-        raise MeasurementError(
-            f"{what}: {w:g} rad/s, {bounds.yaw_rate_rad_s:g} at most; yaw rates are in rad/s, "
-            "not in degrees (see bounds)"
-        )
-    return v, w
+def pair(forward: float, yaw_rate: float, what: str) -> tuple[float, float]:
+    """Speed [m/s] and yaw rate [rad/s]."""
+    return _number(forward, f"forward of {what}"), _number(yaw_rate, f"yaw_rate of {what}")
 
 
 def pose_of(pose: Sequence[float], what: str) -> tuple[float, float, float]:
@@ -66,24 +55,72 @@ def pose_of(pose: Sequence[float], what: str) -> tuple[float, float, float]:
 
 
 def observations(
-    robot: str, stamp_ns: int, ids: ArrayLike, ranges: ArrayLike, bearings: ArrayLike
+    robot: str,
+    stamp_ns: int,
+    ids: ArrayLike,
+    polar: tuple[ArrayLike, ArrayLike],
+    covariances: ArrayLike | None,
 ) -> m.Observations:
-    """Landmarks seen: numbers below 2³¹, ranges [m], bearings [rad], which are wrapped."""
+    """Landmarks seen: numbers below 2³¹, (ranges [m], bearings [rad]); bearings are wrapped."""
     what = f"observe at {1e-9 * stamp_ns:.3f} s"
     numbers = _numbers(ids, what)
-    far, angles = (
-        _row(ranges, "ranges", what, len(numbers)),
-        _row(bearings, "bearings", what, len(numbers)),
-    )
-    return _sound(
+    far, angles = _polar(polar, what, len(numbers))
+    return sound(
         m.Observations(
             stamp_ns=stamp_ns,
             robot=robot,
             incarnation=0,
             number=0,
             ids=from_ids(numbers),
-            ranges=from_floats(_positive(far, what)),
-            bearings=from_floats(_wrapped(angles, what)),
+            ranges=from_floats(far),
+            bearings=from_floats(angles),
+            covariances=_blocks(covariances, len(numbers), what),
+        ),
+        what,
+    )
+
+
+def points(
+    robot: str, stamp_ns: int, ids: ArrayLike, xy: ArrayLike, covariances: ArrayLike | None
+) -> m.Points:
+    """Landmarks seen: numbers below 2³¹, and points (ahead [m], left [m])."""
+    what = f"observe_points at {1e-9 * stamp_ns:.3f} s"
+    numbers = _numbers(ids, what)
+    positions = np.asarray(xy, dtype=np.float64)
+    if positions.size != 2 * len(numbers) or (len(numbers) and positions.shape[-1:] != (2,)):
+        raise MeasurementError(
+            f"{what}: xy has the shape {positions.shape}; one row (ahead [m], left [m]) for each "
+            f"of {len(numbers)} seen"
+        )
+    return sound(
+        m.Points(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=0,
+            number=0,
+            ids=from_ids(numbers),
+            positions=from_floats(positions.ravel()),
+            covariances=_blocks(covariances, len(numbers), what),
+        ),
+        what,
+    )
+
+
+def detections(
+    robot: str, stamp_ns: int, polar: tuple[ArrayLike, ArrayLike], covariances: ArrayLike | None
+) -> m.Detections:
+    """Landmarks seen without identities: (ranges [m], bearings [rad])."""
+    what = f"detect at {1e-9 * stamp_ns:.3f} s"
+    far, angles = _polar(polar, what, np.asarray(polar[0]).size)
+    return sound(
+        m.Detections(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=0,
+            number=0,
+            ranges=from_floats(far),
+            bearings=from_floats(angles),
+            covariances=_blocks(covariances, len(far), what),
         ),
         what,
     )
@@ -103,37 +140,45 @@ def sightings(
             )
     if robot in names:
         raise MeasurementError(f"{what}: {robot} can not see itself; name its teammates")
-    far, angles = (
-        _row(ranges, "ranges", what, len(names)),
-        _row(bearings, "bearings", what, len(names)),
-    )
-    return _sound(
+    far, angles = _polar((ranges, bearings), what, len(names))
+    return sound(
         m.Sightings(
             stamp_ns=stamp_ns,
             robot=robot,
             incarnation=0,
             number=0,
             teammates=names,
-            ranges=from_floats(_positive(far, what)),
-            bearings=from_floats(_wrapped(angles, what)),
+            ranges=from_floats(far),
+            bearings=from_floats(angles),
         ),
         what,
     )
 
 
-def range_bearing_of(xy: ArrayLike, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Points (ahead, left) in the robot's frame [m] as ranges and bearings."""
-    points = np.asarray(xy, dtype=np.float64)
-    if points.size == 0:
-        return np.empty(0), np.empty(0)
-    if points.ndim != 2 or points.shape[1] != 2:
+def square(covariance: ArrayLike | None, what: str) -> bytes:
+    """A 3 × 3 covariance; empty where there is none."""
+    if covariance is None:
+        return b""
+    matrix = np.asarray(covariance, dtype=np.float64)
+    if matrix.shape != (3, 3):
+        raise MeasurementError(f"{what}: a covariance is 3 × 3, not {matrix.shape}")
+    return from_floats(matrix.ravel())
+
+
+def _blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
+    """A covariance for each, packed; empty where they have none of their own."""
+    if covariances is None or not count:
+        return b""
+    blocks = np.asarray(covariances, dtype=np.float64)
+    if blocks.shape != (count, 2, 2):
         raise MeasurementError(
-            f"{what}: xy has the shape {points.shape}; one row (ahead [m], left [m]) a landmark"
+            f"{what}: covariances have the shape {blocks.shape}; {count} of 2 × 2 are needed"
         )
-    return np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
+    return from_floats(blocks[:, [0, 0, 1], [0, 1, 1]].ravel())
 
 
-def _sound(message: M, what: str) -> M:
+def sound(message: M, what: str) -> M:
+    """The message, if every receiver takes it."""
     why = unsound(message)
     if why is not None:
         raise MeasurementError(f"{what}: {why.detail}")
@@ -183,6 +228,14 @@ def _row(values: ArrayLike, name: str, what: str, count: int) -> np.ndarray:
     return row
 
 
+def _polar(
+    polar: tuple[ArrayLike, ArrayLike], what: str, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    ranges, bearings = polar
+    far = _positive(_row(ranges, "ranges", what, count), what)
+    return far, _wrapped(_row(bearings, "bearings", what, count), what)
+
+
 def _positive(ranges: np.ndarray, what: str) -> np.ndarray:
     if len(ranges) and ranges.min() < 0.0:
         raise MeasurementError(f"{what}: a range of {ranges.min():g} m; ranges are distances")
@@ -194,5 +247,12 @@ def _wrapped(angles: np.ndarray, what: str) -> np.ndarray:
         raise MeasurementError(
             f"{what}: a bearing of {angles[np.abs(angles).argmax()]:g}; bearings are in radians"
         )
-    outside = np.abs(angles) > np.pi
-    return np.where(outside, np.pi - np.mod(np.pi - angles, 2.0 * np.pi), angles)
+    return wrapped(angles)
+
+
+def wrapped(angles: np.ndarray) -> np.ndarray:
+    """The angles in (−π, π]; those that are there already keep their bits."""
+    turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    turned = np.where(turned == -np.pi, np.pi, turned)
+    inside: np.ndarray = np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)
+    return inside

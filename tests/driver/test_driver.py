@@ -58,12 +58,13 @@ def test_speeds_and_what_is_seen_become_the_messages_of_the_wire(alone):
     assert [each.number for each in (start, seen, driven)] == [0, 1, 2]
 
 
-def test_points_are_ranges_and_bearings_from_the_robot(alone):
+def test_points_carry_their_own_covariances(alone):
     robot = alone()
-    robot.observe_points(1.0, [3], [[0.0, 2.0]])
+    robot.observe_points(1.0, [3], [[0.0, 2.0]], [[[0.1, 0.02], [0.02, 0.2]]])
     _, seen = messages(robot)
-    assert floats(seen.ranges, "ranges").tolist() == [2.0]
-    assert floats(seen.bearings, "bearings") == pytest.approx([np.pi / 2])
+    assert isinstance(seen, m.Points)
+    assert floats(seen.positions, "positions").tolist() == [0.0, 2.0]
+    assert floats(seen.covariances, "covariances").tolist() == [0.1, 0.02, 0.2]
 
 
 REFUSED = [
@@ -115,7 +116,7 @@ def test_behind_a_gap_in_the_odometry_the_stream_begins_anew_at_an_unknown_pose(
     robot = alone(start=(0.0, 0.0, 0.0))
     robot.odometry(1.0, 0.0, 0.0)
     robot.odometry(1.1, 0.5, 0.0)
-    with pytest.warns(DriverWarning, match=r"no odometry from 1\.100 to 8\.900 s"):
+    with pytest.warns(DriverWarning, match=r"no odometry from 1\.100 to 8\.900 s: its stream"):
         robot.odometry(9.0, 0.5, 0.0, duration=0.1)
     robot.odometry(9.1, 0.5, 0.0)
     found = messages(robot)
@@ -125,6 +126,22 @@ def test_behind_a_gap_in_the_odometry_the_stream_begins_anew_at_an_unknown_pose(
         (2, 8_900_000_000, False),
     ]
     assert [each.incarnation for each in found] == [1, 1, 2, 2, 2]
+
+
+def test_a_short_gap_is_bridged_by_a_motion_of_which_little_is_known(alone):
+    robot = alone()
+    robot.odometry(1.0, 0.0, 0.0)
+    robot.odometry(1.1, 0.5, 0.0)
+    with pytest.warns(DriverWarning, match=r"no odometry from 1\.100 to 1\.700 s: it is taken"):
+        robot.odometry(1.8, 0.5, 0.0, duration=0.1)
+    _, first, bridge, last = messages(robot)
+    assert isinstance(bridge, m.Increment)
+    assert (bridge.stamp_ns, bridge.duration_ns) == (1_700_000_000, 600_000_000)
+    assert floats(bridge.increment, "increment").tolist() == pytest.approx([0.3, 0.0, 0.0])
+    assert floats(bridge.covariance, "covariance").reshape(3, 3).diagonal() == pytest.approx(
+        [0.36, 0.36, 0.09]
+    )
+    assert (first.incarnation, last.incarnation) == (1, 1)
 
 
 def drive(robot, ticks, *, poses=False):
@@ -145,7 +162,8 @@ def test_a_program_that_is_killed_may_hand_over_all_once_more(tmp_path, alone, p
     drive(whole, range(12), poses=poses)
     killed = alone(latency_s=0.2)
     drive(killed, range(died_at), poses=poses)
-    killed._journal.close()  # as the kernel does
+    killed._link.close()
+    killed._journal.close()  # as the kernel does: there is no last word in the file
     killed._closed = True
     again = alone(latency_s=0.2)
     drive(again, range(12), poses=poses)
@@ -170,9 +188,10 @@ def test_a_difference_of_poses_covers_the_time_in_which_a_driver_was_away(alone)
     again = alone()
     again.odometry_pose(4.2, 2.1, 0.0, 0.0)
     *_, last = messages(again)
-    assert isinstance(last, m.Odometry)
+    assert isinstance(last, m.Increment)
     assert last.duration_ns == 4_000_000_000
-    assert last.forward * 4.0 == pytest.approx(2.0, rel=0.01)
+    ahead, left, turn = floats(last.increment, "increment")
+    assert (ahead, left, turn) == pytest.approx((1.998, -0.1, -0.04), abs=2e-3)
 
 
 class Listener:
