@@ -20,6 +20,7 @@ from sim.cli.options import FAILED, WRONG_USE  # noqa: E402
 from sim.cli.recorded import app as recorded_commands  # noqa: E402
 from sim.cli.rerun import app as rerun_commands  # noqa: E402
 from sim.cli.scenarios import app as scenario_commands  # noqa: E402
+from sim.cli.status import app as status_commands  # noqa: E402
 from sim.cli.studies import add_studies  # noqa: E402
 from sim.cli.view import app as view_commands  # noqa: E402
 
@@ -33,7 +34,7 @@ app = typer.Typer(
 for _part in (
     launch_commands, scenario_commands, node_commands, key_commands, recorded_commands,
     rerun_commands, compare_commands, view_commands, calibrate_commands,
-    import_commands,
+    import_commands, status_commands,
 ):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)

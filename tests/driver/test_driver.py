@@ -1,5 +1,8 @@
 """The driver: what it refuses, what it keeps, and what the wire says of it."""
 
+import inspect
+import re
+import threading
 import warnings
 from decimal import Decimal
 from itertools import count
@@ -7,6 +10,7 @@ from itertools import count
 import numpy as np
 import pytest
 
+from sim.scenarios.scenario import load
 from team import Driver, DriverError, DriverWarning, MeasurementError
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -14,7 +18,7 @@ from team.wire.arrays import floats, ids
 from team.wire.bus import Outgoing, opened
 from team.wire.codec import decoded, encoded
 from team.wire.zenoh_bus import ZenohBus, router
-from tests.support import wait_until
+from tests.support import ROOT, wait_until
 
 
 @pytest.fixture
@@ -289,3 +293,40 @@ def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path)
 def test_a_router_that_is_not_there_are_named(tmp_path):
     with pytest.raises(DriverError, match=r"no router answers at tcp/127\.0\.0\.1:1"):
         Driver("r1", team="lab", connect="tcp/127.0.0.1:1", file=tmp_path / "a", patience_s=0.5)
+
+
+PAGE = (ROOT / "docs" / "your_robot.md").read_text()
+
+
+def test_the_pages_ten_lines_bring_a_robot_onto_its_team(tmp_path, monkeypatch):
+    (program,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    with router() as endpoint:
+        robot = Listener(endpoint)
+        text = program.replace("tcp/127.0.0.1:7447", endpoint)
+        thread = threading.Thread(target=lambda: exec(text, {}))
+        thread.start()
+
+        def done():
+            robot.look()
+            if robot.got:
+                robot.say()
+            return not thread.is_alive()
+
+        wait_until(done)
+        robot.bus.close()
+    kinds = [type(robot.got[1, n]).__name__ for n in range(len(robot.got))]
+    assert kinds == ["InitialPose", "Observations", "Odometry"]
+    assert robot.heads[-1].state == "ended"
+
+
+def test_the_pages_scenario_is_a_live_team_and_its_calls_are_the_drivers(tmp_path):
+    (scenario,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    (tmp_path / "lab.toml").write_text(scenario)
+    live = load(tmp_path / "lab.toml")
+    assert live.is_live
+    assert [robot.id for robot in live.robots] == ["r1", "r2"]
+    for call, arguments in re.findall(r"^\| `(\w+)\((.*?)\)` \|", PAGE, re.MULTILINE):
+        takes = list(inspect.signature(getattr(Driver, call)).parameters)[1:]
+        said = re.sub(r"\(ahead, left, turn\)", "increment", arguments).split(", ")
+        assert takes == [argument.partition("=")[0] for argument in said]

@@ -14,14 +14,14 @@ from central.config import BiasSigmas, CentralConfig, CommonBiasSigmas
 from sim.cli.main import app
 from sim.scenarios.scenario import Scenario, load
 from sim.scenarios.source import streams_of
-from sim.world.config import Point, SimulatedWorld, UtiasWorld
+from sim.world.config import LiveWorld, Point, SimulatedWorld, UtiasWorld
 from team.config import Bounds, FrontEnd, Lens, MotionModel, MotionNoise, RobotConfig, Sensor
 from tests.support import ROOT
 
 PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
-    Scenario, SimulatedWorld, UtiasWorld, RobotConfig, MotionModel, MotionNoise, Sensor, Lens,
-    FrontEnd, CentralConfig, BiasSigmas, CommonBiasSigmas, Bounds,
+    Scenario, SimulatedWorld, UtiasWorld, LiveWorld, RobotConfig, MotionModel, MotionNoise, Sensor,
+    Lens, FrontEnd, CentralConfig, BiasSigmas, CommonBiasSigmas, Bounds,
 )  # fmt: skip
 
 

@@ -1,0 +1,74 @@
+"""`teamslam status`: who of a running team is there."""
+
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sim.cli.options import FAILED, LOOPBACK, WRONG_USE, Connect, Keys, connected, fail
+
+app = typer.Typer()
+
+
+@app.command()
+def status(
+    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    seconds: Annotated[float, typer.Option(help="How long to look.", min=0.5)] = 3.0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write it as JSON, too.")] = None,
+) -> None:
+    """Who of a running team is there, rates, clocks, who waits for whom, and what to do."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from sim.launch.presence import Presence
+
+    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
+        fail(f"{team!r} is no team's name", WRONG_USE)
+    presence = Presence()
+    with connected(team, connect, keys, "operator") as bus:
+        presence.take(bus, seconds)
+    if not presence.members:
+        fail(f"nobody of the team {team} is at {connect}: see --team, --connect", FAILED)
+    rows = _rows(presence)
+    table = Table("node", "there", "state", "measured", "per s", "taken", "clock [s]")
+    for row in rows:
+        table.add_row(*(_cell(row[name]) for name in row if name != "warnings"))
+    console = Console()
+    console.print(table)
+    said = presence.advice()
+    for line in said:
+        console.print(f"- {line}", markup=False, highlight=False, soft_wrap=True)
+    if json_file is not None:
+        json_file.write_text(json.dumps({"nodes": rows, "advice": said}, indent=2) + "\n")
+
+
+def _rows(presence: Any) -> list[dict[str, Any]]:
+    clocks = presence.clocks()
+    rows = []
+    for node, member in sorted(presence.members.items()):
+        figures = {} if member.status is None else member.status.figures
+        rows.append(
+            {
+                "node": node,
+                "there": member.alive,
+                "state": None if member.status is None else member.status.state,
+                "measured": figures.get("measurements"),
+                "per_s": member.rate if "measurements" in figures else None,
+                "taken": figures.get("delivered"),
+                "clock_s": clocks.get(node),
+                "warnings": [] if member.status is None else list(member.status.warnings),
+            }
+        )
+    return rows
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:,.1f}".removesuffix(".0") if isinstance(value, float) else str(value)

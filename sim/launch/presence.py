@@ -1,0 +1,147 @@
+"""Who of a team is there, how far and how fast each is, by which clock, and who waits for whom."""
+
+import time
+from dataclasses import dataclass, field
+from statistics import median
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Bus, opened
+from team.wire.codec import WireError
+
+LOOK_S = 0.1
+APART_S = 1.0
+"""Clocks that are farther apart than this are named: a measurement is not so long on its way."""
+
+
+@dataclass
+class Member:
+    """One node: whether its token is there, its last status, and what it counted in which time.
+
+    clock_s: its team time less its machine's wall clock; None where it says no team time.
+    """
+
+    alive: bool = False
+    status: m.Status | None = None
+    clock_s: float | None = None
+    _first: tuple[float, float] | None = field(default=None, repr=False)
+    _last: tuple[float, float] | None = field(default=None, repr=False)
+
+    def take(self, status: m.Status, wall_ns: int) -> None:
+        """A status, and when it was said by the node's own wall clock."""
+        self.status = status
+        count = status.figures.get("measurements", status.figures.get("submaps", 0.0))
+        self._last = 1e-9 * wall_ns, count
+        self._first = self._first or self._last
+        measured = status.node.startswith("source/") and status.state == "measuring"
+        self.clock_s = 1e-9 * (status.stamp_ns - wall_ns) if measured else None
+
+    @property
+    def rate(self) -> float | None:
+        """Measurements (of the centre submaps) a second while it was looked at."""
+        if self._first is None or self._last is None or self._last[0] <= self._first[0]:
+            return None
+        return (self._last[1] - self._first[1]) / (self._last[0] - self._first[0])
+
+
+@dataclass
+class Presence:
+    """A team as it was seen for a while; members by node."""
+
+    members: dict[str, Member] = field(default_factory=dict)
+    heads: dict[str, m.StreamHead] = field(default_factory=dict)
+    is_to_end: bool = False
+    has_ended: bool = False
+
+    def _of(self, node: str) -> Member:
+        return self.members.setdefault(node, Member())
+
+    def take(self, bus: Bus, for_s: float) -> None:
+        """Look for so long."""
+        for channel in (ch.STATUS, ch.HEAD, ch.TEAM_END, ch.FINAL_MAP):
+            bus.subscribe(channel)
+        bus.watch_alive()
+        until = time.monotonic() + for_s
+        while time.monotonic() < until:
+            for sample in bus.receive(LOOK_S):
+                try:
+                    _, _, message = opened(sample)
+                except WireError:
+                    continue
+                self._hear(message, sample.wall_ns)
+
+    def _hear(self, message: m.Message, wall_ns: int) -> None:
+        match message:
+            case m.Liveliness():
+                self._of(message.node).alive = message.alive
+            case m.Status():
+                self._of(message.node).take(message, wall_ns)
+            case m.StreamHead():
+                self.heads[message.robot] = message
+            case m.TeamEnd():
+                self.is_to_end = True
+            case m.FusedMap():
+                self.has_ended = True
+            case _:
+                pass
+
+    def is_there(self, node: str) -> bool:
+        """Whether the node's token is there."""
+        return node in self.members and self.members[node].alive
+
+    @property
+    def robots(self) -> list[str]:
+        """Whoever has, or had, a process or a driver."""
+        named = (node.partition("/") for node in self.members)
+        found = {robot for kind, _, robot in named if kind in ("robot", "source")}
+        return sorted(found | self.heads.keys())
+
+    def clocks(self) -> dict[str, float]:
+        """Of each driver that measures, how far its clock is ahead of the team's middle one [s]."""
+        found = {
+            node: member.clock_s
+            for node, member in self.members.items()
+            if member.alive and member.clock_s is not None
+        }
+        middle = median(found.values()) if found else 0.0
+        return {node: clock_s - middle for node, clock_s in found.items()}
+
+    def advice(self) -> list[str]:
+        """Who waits for whom, and what to do."""
+        said = []
+        if self.has_ended:
+            said.append("the final map is out: the team has ended")
+        if not self.is_there("central"):
+            said.append("no centre: robots map on, nobody joins their maps; start teamslam central")
+        world = self.is_there("world")
+        for robot in [] if world else self.robots:
+            said += self._of_robot(robot)
+        clocks = self.clocks()
+        for node, ahead_s in sorted(clocks.items()):
+            if abs(ahead_s) > APART_S and len(clocks) > 1:
+                way = "ahead of" if ahead_s > 0 else "behind"
+                said.append(
+                    f"{node} stamps {abs(ahead_s):.1f} s {way} the others: set its machine's clock "
+                    "(NTP, PTP), or stamp with the clock that the others have"
+                )
+        for node, member in sorted(self.members.items()):
+            if member.alive and member.status is not None:
+                said += [f"{node}: {warning}" for warning in member.status.warnings]
+        return said
+
+    def _of_robot(self, robot: str) -> list[str]:
+        has_driver, head = self.is_there(ch.source_node(robot)), self.heads.get(robot)
+        ended = head is not None and head.state == "ended"
+        said = []
+        if not self.is_there(ch.robot_node(robot)):
+            said.append(
+                f"{robot} has no process: its driver keeps what it measures; start "
+                f"teamslam robot SCENARIO {robot}, or go on by teamslam end --without {robot}"
+            )
+        if not (has_driver or ended or self.has_ended):
+            kept = "" if head is None else f" after measurement {head.measurements - 1}"
+            said.append(
+                f"{robot} has no driver{kept}: start it, or end the team by teamslam end, or go on "
+                f"by teamslam end --without {robot}"
+            )
+        return said
