@@ -62,13 +62,14 @@ class RobotTables:
         self.columns["start"], self.rows["start"] = columns, [row]
 
     def write(self, folder: Path) -> None:
-        """The tables in a folder of the robot's name."""
+        """The tables in a folder of the robot's name; true landmarks beside it."""
         place = folder / self.robot
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():
             columns = self.columns[table]
+            fitted = (_fitted(row, len(columns)) for row in rows)
             write_table(
-                place / f"{table}.csv", columns, (_fitted(row, len(columns)) for row in rows)
+                (folder if table == "landmarks" else place) / f"{table}.csv", columns, fitted
             )
 
 

@@ -24,6 +24,7 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     teammates: the tags that robots carry, by the tag's number; landmarks: numbers of tags that are
     called otherwise. mount: the sensor's pose (x, y, yaw) on the base and
     optical: whether its frame is a camera's (z ahead, x right); both are of tf_static if absent.
+    types: of topics that come over a bridge which does not tell them.
     """
 
     odometry: str = ""
@@ -34,6 +35,7 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     odometry_frame: str = "odom"
     teammates: dict[str, RobotName] = {}
     landmarks: dict[str, Annotated[int, Meta(ge=0, lt=2**31)]] = {}
+    types: dict[str, str] = {}
     mount: tuple[float, float, float] | None = None
     optical: bool | None = None
 

@@ -1,0 +1,35 @@
+"""Under which Zenoh keys ROS 2 topics come: rmw_zenoh's, and zenoh-bridge-ros2dds'.
+
+rmw_zenoh   <domain>/<topic>/<pkg>::msg::dds_::<Type>_/<hash of the type>
+bridge      <topic>, and a liveliness token @/<id>/@ros2_lv/MP/<topic>/<type>/<QoS>, with § for /
+"""
+
+import re
+from collections.abc import Iterable
+
+RMW_TYPE = re.compile(r"^(\w+)::(msg)::dds_::(\w+)_$")
+BRIDGE_TOKENS = "@/*/@ros2_lv/MP/**"
+SLASH = "§"
+
+
+def expressions(topics: Iterable[str], domain: int) -> list[str]:
+    """What to subscribe to, for either way."""
+    names = [topic.strip("/") for topic in topics]
+    return [*names, *(f"{domain}/{name}/*/*" for name in names)]
+
+
+def of_rmw(key: str, domain: int) -> tuple[str, str] | None:
+    """Topic and type of a key of rmw_zenoh's; None for any other."""
+    parts = key.split("/")
+    if len(parts) < 4 or parts[0] != str(domain):
+        return None
+    match = RMW_TYPE.match(parts[-2])
+    return None if match is None else ("/" + "/".join(parts[1:-2]), "/".join(match.groups()))
+
+
+def of_token(key: str) -> tuple[str, str] | None:
+    """Topic and type that a bridge's token tells; None for any other key."""
+    parts = key.split("/")
+    if len(parts) < 6 or parts[2:4] != ["@ros2_lv", "MP"]:
+        return None
+    return "/" + parts[4].replace(SLASH, "/").strip("/"), parts[5].replace(SLASH, "/")
