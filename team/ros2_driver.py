@@ -9,8 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from decimal import Decimal
-from math import atan2, hypot
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +31,7 @@ NANO = Decimal(10) ** -9
 _LOG = logging.getLogger("teamslam")
 
 
+@runtime_checkable
 class Robot(Protocol):
     """What is needed of a driver."""
 
@@ -136,14 +136,15 @@ class Ros2Driver:
                 held = self._speeds or measured
                 self._robot.odometry(t, held.forward, held.yaw_rate)
                 self._speeds = measured
-            case Seen(names=(str(), *_)):
-                ranges = [hypot(x, y) for x, y in measured.points]
-                bearings = [atan2(y, x) for x, y in measured.points]
-                names = [str(name) for name in measured.names]
-                self._robot.sight(t, names, ranges, bearings)
             case Seen():
                 points = np.array(measured.points, dtype=np.float64).reshape(-1, 2)
-                self._robot.observe_points(t, np.array(measured.names, dtype=np.int64), points)
+                teammates = [name for name in measured.names if isinstance(name, str)]
+                if teammates:
+                    x, y = points.T
+                    self._robot.sight(t, teammates, np.hypot(x, y), np.arctan2(y, x))
+                else:
+                    ids = np.array(measured.names, dtype=np.int64)
+                    self._robot.observe_points(t, ids, points)
             case _:
                 pass
 

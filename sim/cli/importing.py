@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.options import WRONG_USE, counted, fail
+from sim.cli.options import WRONG_USE, counted, fail, parsed_start
 
 app = typer.Typer()
 
@@ -58,7 +58,7 @@ def import_(
     request = Request(
         sources=source,
         robot=robot,
-        starts=dict(map(_start, start or [])),
+        starts=dict(map(parsed_start, start or [])),
         columns=columns,
         ros2=ros2,
         truth=truth,
@@ -88,17 +88,6 @@ def imported_into(path: Path, folder: Path) -> Path:
         typer.echo(note, err=True)
     typer.echo(f"imported {path} into {folder}", err=True)
     return folder
-
-
-def _start(text: str) -> tuple[str, tuple[float, ...]]:
-    robot, colon, numbers = text.rpartition(":")
-    try:
-        pose = tuple(float(part) for part in numbers.split(","))
-    except ValueError:
-        pose = ()
-    if len(pose) not in (3, 5) or (colon and not robot):
-        fail(f"--start {text}: give x,y,theta in m and rad, as 0,0,1.57 or r1:0,0,1.57", WRONG_USE)
-    return robot, pose
 
 
 def _as_read(folder: Path) -> list[str]:

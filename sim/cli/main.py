@@ -11,6 +11,7 @@ import typer  # noqa: E402 - the threads of BLAS are set before anything imports
 
 from sim.cli.calibrate import app as calibrate_commands  # noqa: E402
 from sim.cli.compare import app as compare_commands  # noqa: E402
+from sim.cli.drivers import app as driver_commands  # noqa: E402
 from sim.cli.importing import app as import_commands  # noqa: E402
 from sim.cli.keys import app as key_commands  # noqa: E402
 from sim.cli.launch import app as launch_commands  # noqa: E402
@@ -34,7 +35,7 @@ app = typer.Typer(
 for _part in (
     launch_commands, scenario_commands, node_commands, key_commands, recorded_commands,
     rerun_commands, compare_commands, view_commands, calibrate_commands,
-    import_commands, status_commands,
+    import_commands, driver_commands, status_commands,
 ):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)

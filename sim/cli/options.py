@@ -144,6 +144,18 @@ def parsed_speed(text: str) -> float:
     return speed
 
 
+def parsed_start(text: str) -> tuple[str, tuple[float, ...]]:
+    """`[ROBOT:]x,y,theta[,sigma,sigma]`: the robot, empty if it is not named, and the numbers."""
+    robot, colon, numbers = text.rpartition(":")
+    try:
+        pose = tuple(float(part) for part in numbers.split(","))
+    except ValueError:
+        pose = ()
+    if len(pose) not in (3, 5) or (colon and not robot):
+        fail(f"--start {text}: give x,y,theta in m and rad, as 0,0,1.57 or r1:0,0,1.57", WRONG_USE)
+    return robot, pose
+
+
 def scenario_for(dataset: Path) -> str:
     """The scenario of a data set for which none was given; what it is is said."""
     from sim.scenarios.source import scenario_beside

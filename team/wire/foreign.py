@@ -10,6 +10,9 @@ import zenoh
 
 from team.wire.bus import BusError
 
+TOKENS_S = 5.0
+"""How long to wait for the tokens that are there."""
+
 
 class ForeignSample(NamedTuple):
     """One publication; of a liveliness token the payload is empty and alive says which way."""
@@ -44,10 +47,13 @@ class ForeignKeys:
         except zenoh.ZError as error:
             raise BusError(f"nobody answers at {connect} ({patience_s:g} s): {error}") from None
         self._queue: SimpleQueue[ForeignSample] = SimpleQueue()
+        for token in tokens:  # those that are there come before all samples
+            for reply in self._session.liveliness().get(token, timeout=TOKENS_S):
+                if reply.ok is not None:
+                    self._take_token(reply.ok)
+            self._session.liveliness().declare_subscriber(token, self._take_token)
         for key in keys:
             self._session.declare_subscriber(key, self._take)
-        for token in tokens:
-            self._session.liveliness().declare_subscriber(token, self._take_token, history=True)
 
     def __enter__(self) -> Self:
         return self

@@ -1,0 +1,87 @@
+"""The command `teamslam driver`: a ROS 2 robot's topics become its stream."""
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim.cli.options import FAILED, LOOPBACK, WRONG_USE, Connect, Keys, fail, over_tls, parsed_start
+
+app = typer.Typer()
+_LOG = logging.getLogger("teamslam")
+WAIT_S = 0.2
+
+
+@app.command()
+def driver(
+    robot: Annotated[str, typer.Argument(help="The robot's name, as r1.")],
+    ros2: Annotated[Path, typer.Option(help="TOML file: which topics are what.", metavar="FILE")],
+    team: Annotated[str, typer.Option(help="The team's name: its scenario's.")],
+    connect: Connect = LOOPBACK,
+    ros2_connect: Annotated[
+        str | None,
+        typer.Option(
+            help="Where ROS 2 is on Zenoh (rmw_zenoh's router, or a bridge); default: --connect.",
+            metavar="ENDPOINT",
+        ),
+    ] = None,
+    keys: Keys = None,
+    file: Annotated[
+        Path | None,
+        typer.Option(help="Where all measurements are kept; default: ROBOT.stream here."),
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(help="Where it starts (m, rad).", metavar="x,y,theta")
+    ] = None,
+    latency: Annotated[
+        float, typer.Option(help="What is seen may come so much later than odometry [s].", min=0.0)
+    ] = 0.2,
+) -> None:
+    """Drive a robot of a live team by its ROS 2 topics, with no ROS here; Ctrl-C ends its stream.
+
+    Topics come by rmw_zenoh or by zenoh-bridge-ros2dds.
+    """
+    from team.driver.driver import Driver, DriverError
+    from team.ros2.topics import TopicsError, load_topics
+    from team.ros2_driver import Ros2Driver
+    from team.shell import process
+    from team.wire.foreign import ForeignKeys
+
+    try:
+        topics = load_topics(ros2)
+    except TopicsError as error:
+        fail(str(error), WRONG_USE)
+    if robot not in topics.robots:
+        fail(f"{ros2}: no [robots.{robot}]; it has {', '.join(topics.robots)}", WRONG_USE)
+    pose = None if start is None else parsed_start(start)[1]
+    try:
+        with (
+            process(f"driver-{robot}", endless=True) as stop,
+            Driver(
+                robot,
+                team=team,
+                connect=connect if keys is None else over_tls(connect),
+                keys=keys,
+                file=file,
+                start=None if pose is None else pose[:3],
+                latency_s=latency,
+            ) as source,
+        ):
+            translated = Ros2Driver(source, topics.robots[robot], topics.domain)
+            with ForeignKeys(
+                ros2_connect or connect, translated.keys, translated.tokens
+            ) as foreign:
+                _LOG.info("listening to %s", ", ".join(translated.keys))
+                while not (stop.is_set() or source.team_has_ended):
+                    for sample in foreign.receive(WAIT_S):
+                        translated.take(sample)
+                    translated.report()
+                for sample in foreign.receive(0.0):
+                    translated.take(sample)
+            for topic, count in translated.taken.items():
+                _LOG.info("%s: %d messages", topic, count)
+            for reason, count in translated.dropped.items():
+                _LOG.warning("%s: %d", reason, count)
+    except DriverError as error:
+        fail(str(error), FAILED)

@@ -1,0 +1,191 @@
+"""A ROS 2 robot live: keys of rmw_zenoh and of a bridge, from a publisher that is not ours."""
+
+import socket
+from collections.abc import Callable
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from team.driver.measured import MeasurementError
+from team.ros2.keys import of_rmw, of_token
+from team.ros2.topics import RobotTopics, TopicsError, load_topics
+from team.ros2_driver import Ros2Driver
+from team.wire.foreign import ForeignKeys, ForeignSample
+from tests.ros2 import messages as ros
+from tests.support import wait_until
+
+S = 10**9
+
+
+def free_port() -> int:
+    """A port that is free now."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
+TOPICS = RobotTopics(
+    odometry="/r1/odom", use="twist", detections=("/r1/tags",), teammates={"5": "r2"}
+)
+
+
+class Robot:
+    """Takes what a driver would, and refuses time that goes back, as it does."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+
+    def odometry(self, t: Decimal, forward: float, yaw_rate: float) -> None:
+        if self.calls and t <= self.calls[-1][1]:
+            raise MeasurementError("time goes back")
+        self.calls.append(("odometry", t, forward, yaw_rate))
+
+    def odometry_pose(self, t: Decimal, x: float, y: float, theta: float) -> None:
+        self.calls.append(("pose", t, x, y, theta))
+
+    def observe_points(self, t: Decimal, ids: Any, xy: Any) -> None:
+        self.calls.append(("points", t, ids.tolist(), xy.tolist()))
+
+    def sight(self, t: Decimal, teammates: Any, ranges: Any, bearings: Any) -> None:
+        self.calls.append(("sight", t, list(teammates), ranges.tolist(), bearings.tolist()))
+
+
+def odometry(k: int) -> bytes:
+    return ros.cdr(ODOMETRY, ros.odometry(k * S, ros.pose(), 0.5 * k, 0.1))
+
+
+def tags(k: int) -> bytes:
+    seen = [("7", ros.pose(3.0, 4.0)), ("5", ros.pose(1.0, 0.0))]
+    return ros.cdr(TAGS, ros.detections(k * S + 1, "base_link", seen))
+
+
+def by_rmw(topic: str, kind: str) -> str:
+    package, _, name = kind.split("/")
+    return f"0/{topic.strip('/')}/{package}::msg::dds_::{name}_/{ros.STORE.hash_rihs01(kind)}"
+
+
+def by_bridge(topic: str, kind: str) -> str:
+    return topic.strip("/")
+
+
+EXPECTED = [
+    ("odometry", Decimal(1), 0.5, 0.1),
+    ("odometry", Decimal(2), 0.5, 0.1),
+    ("points", Decimal("2.000000001"), [7], [[3.0, 4.0]]),
+    ("sight", Decimal("2.000000001"), ["r2"], [1.0], [0.0]),
+    ("odometry", Decimal(3), 1.0, 0.1),
+]
+
+
+@pytest.mark.parametrize("key", [by_rmw, by_bridge])
+def test_topics_on_zenoh_become_a_driver_s_calls(key: Callable[[str, str], str]) -> None:
+    port = free_port()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    robot = Robot()
+    driver = Ros2Driver(robot, TOPICS)
+    with zenoh.open(config) as router:
+        token = "@/beef/@ros2_lv/MP/r1§tags/vision_msgs§msg§Detection3DArray/:::"
+        held = router.liveliness().declare_token(token) if key is by_bridge else None
+        with ForeignKeys(f"tcp/127.0.0.1:{port}", driver.keys, driver.tokens) as foreign:
+            odom = router.declare_publisher(key("/r1/odom", ODOMETRY))
+            tag = router.declare_publisher(key("/r1/tags", TAGS))
+            wait_until(lambda: odom.matching_status.matching and tag.matching_status.matching)
+            odom.put(odometry(1))
+            odom.put(odometry(2)[:-7])
+            odom.put(odometry(2))
+            tag.put(tags(2))
+            odom.put(odometry(1))
+            odom.put(odometry(3))
+
+            def done() -> bool:
+                for sample in foreign.receive(0.05):
+                    driver.take(sample)
+                return len(robot.calls) >= len(EXPECTED)
+
+            wait_until(done)
+        assert (held is not None) == (key is by_bridge)
+    assert robot.calls == EXPECTED
+    assert driver.taken == {"/r1/odom": 5, "/r1/tags": 1}
+    assert driver.dropped == {"/r1/odom: damaged": 1, "/r1/odom: refused": 1}
+
+
+def test_messages_before_their_type_is_told_are_kept() -> None:
+    robot = Robot()
+    driver = Ros2Driver(robot, TOPICS)
+    driver.take(ForeignSample("r1/tags", tags(1)))
+    assert robot.calls == []
+    assert "no bridge has told its type" in str(driver.dropped)
+    key = "@/beef/@ros2_lv/MP/r1§tags/vision_msgs§msg§Detection3DArray/:::"
+    driver.take(ForeignSample(key, b"", token=True))
+    assert [call[0] for call in robot.calls] == ["points", "sight"]
+
+
+def test_hostile_payloads_are_counted_and_nothing_more() -> None:
+    robot = Robot()
+    driver = Ros2Driver(robot, TOPICS)
+    random = np.random.default_rng(3)
+    sound = odometry(1)
+    for k in range(300):
+        data = bytearray(sound)
+        for at in random.integers(0, len(data), 3):
+            data[at] = int(random.integers(256))
+        cut = int(random.integers(len(data) + 1)) if k % 2 else len(data)
+        driver.take(ForeignSample(by_rmw("/r1/odom", ODOMETRY), bytes(data[:cut])))
+    driver.take(ForeignSample("0/r1/odom/what::msg::dds_::Ever_/RIHS01_0", b"1234"))
+    assert driver.taken["/r1/odom"] == 301
+    assert driver.dropped["/r1/odom: messages of type what/msg/Ever are not read"] == 1
+    refused = sum(driver.dropped.values()) - 1
+    assert 100 < refused < 300
+    assert len(robot.calls) + refused == 300
+
+
+def test_a_static_transform_says_where_the_sensor_sits() -> None:
+    robot = Robot()
+    driver = Ros2Driver(robot, RobotTopics(odometry="/odom", detections=("/tf",)))
+    turned = (0.0, 0.0, 1.0, 0.0)
+    still = ros.transforms((0, "base_link", "back", ros.vector(-0.5), turned))
+    tag = ros.transforms((S, "back", "tag36h11:7", ros.vector(2.0, 1.0), (0.0, 0.0, 0.0, 1.0)))
+    kind = "tf2_msgs/msg/TFMessage"
+    driver.take(ForeignSample(by_rmw("/tf_static", kind), ros.cdr(kind, still)))
+    driver.take(ForeignSample(by_rmw("/tf", kind), ros.cdr(kind, tag)))
+    assert [call[0] for call in robot.calls] == ["points"]
+    np.testing.assert_allclose(robot.calls[0][3], [[2.0, 1.0]], atol=1e-12)
+
+
+def test_keys_name_topic_and_type() -> None:
+    assert of_rmw(by_rmw("/r1/odom", ODOMETRY), 0) == ("/r1/odom", ODOMETRY)
+    humble = "7/odom/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported"
+    assert of_rmw(humble, 7) == ("/odom", ODOMETRY)
+    assert of_rmw(humble, 0) is None
+    assert of_rmw("r1/odom", 0) is None
+    assert of_token("@/beef/@ros2_lv/MS/odom/nav_msgs§msg§Odometry/:::") is None
+    assert of_token("@/beef/@ros2_lv/MP/r1§odom/nav_msgs§msg§Odometry/:::") == (
+        "/r1/odom",
+        ODOMETRY,
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[robots.r1", "not valid TOML"),
+        ("domain = 1", "missing required field `robots`"),
+        ("robots = {}", "no robot; give [robots.r1]"),
+        ("[robots.r1]\nodom = '/odom'", "unknown field `odom`"),
+        ("[robots.R1]\nodometry = '/odom'", "matching regex"),
+    ],
+)
+def test_a_mistake_in_a_file_of_topics_is_named(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "topics.toml").write_text(text)
+    with pytest.raises(TopicsError) as error:
+        load_topics(tmp_path / "topics.toml")
+    assert words in str(error.value)
+    assert "topics.toml" in str(error.value)
