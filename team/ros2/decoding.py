@@ -131,14 +131,14 @@ def _odometry(message: Any) -> OdometryRecord:
     pose, twist = message.pose.pose, message.twist.twist
     forward, left, yaw_rate = _finite((twist.linear.x, twist.linear.y, twist.angular.z))
     return OdometryRecord(
-        _stamp_ns(message.header),
-        message.header.frame_id,
-        message.child_frame_id,
-        _vector(pose.position),
-        _rotation(pose.orientation),
-        forward,
-        left,
-        yaw_rate,
+        stamp_ns=_stamp_ns(message.header),
+        frame=message.header.frame_id,
+        child=message.child_frame_id,
+        position=_vector(pose.position),
+        rotation=_rotation(pose.orientation),
+        forward=forward,
+        left=left,
+        yaw_rate=yaw_rate,
     )
 
 

@@ -41,7 +41,7 @@ class Robot:
         self.calls: list[tuple[Any, ...]] = []
 
     def odometry(self, t: Decimal, forward: float, yaw_rate: float) -> None:
-        if self.calls and t <= self.calls[-1][1]:
+        if any(name == "odometry" and t <= at for name, at, *_ in self.calls):
             raise MeasurementError("time goes back")
         self.calls.append(("odometry", t, forward, yaw_rate))
 
@@ -112,7 +112,8 @@ def test_topics_on_zenoh_become_a_driver_s_calls(key: Callable[[str, str], str])
 
             wait_until(done)
         assert (held is not None) == (key is by_bridge)
-    assert robot.calls == EXPECTED
+    in_time = sorted(robot.calls, key=lambda call: call[1])  # Zenoh promises no order across keys
+    assert in_time == EXPECTED
     assert driver.taken == {"/r1/odom": 5, "/r1/tags": 1}
     assert driver.dropped == {"/r1/odom: damaged": 1, "/r1/odom: refused": 1}
 
