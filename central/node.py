@@ -27,7 +27,8 @@ MOST_ROBOTS = 100
 class CentralNode:
     """One centre for the robots of a team: `begin`, then `handle`, until `finished`.
 
-    admit: a robot that nobody has named is taken into the team when it, or its driver, comes.
+    announcement: its configuration, by the digest of which its maps name it. admit: a robot that
+    nobody has named is taken into the team when it, or its driver, comes.
     """
 
     def __init__(
@@ -36,10 +37,10 @@ class CentralNode:
         self.config = config
         self._admits = admit
         self._admitted: list[str] = []
-        self._announcement = translate.configured("central", 0, 0, config)
+        self.announcement = translate.configured("central", 0, 0, config)
         self._door = Door(robots)
         self._roll = Roll.of(robots)
-        self._rule = rule_of(config, self._announcement.digest, sorted(robots))
+        self._rule = rule_of(config, self.announcement.digest, sorted(robots))
         self._broadcasts = 0
         self._newest: m.FusedMap | None = None
         self._credit: list[Outgoing] | None = None
@@ -61,7 +62,7 @@ class CentralNode:
 
     def begin(self) -> list[Outgoing]:
         """What the node says first: its configuration."""
-        return [Outgoing(ch.CENTRAL_CONFIG, "", self._announcement)]
+        return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement)]
 
     def refusal(self, message: m.Message) -> str | None:
         """Why a message can not be true of this team: its robots, counters, stamps, or its end."""
@@ -145,7 +146,7 @@ class CentralNode:
     def _conclude_anyway(self, why: str) -> list[Outgoing]:
         newest = self._newest
         if newest is None:
-            digest, now_ns = self._announcement.digest, self._roll.now_ns
+            digest, now_ns = self.announcement.digest, self._roll.now_ns
             newest = fused_message(
                 self.config, digest, NO_LANDMARKS, (), stamp_ns=now_ns, joint=False
             )

@@ -17,7 +17,9 @@ class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
 
     name: of the scenario. team: the chunk of the keys `team/<team>/…` that keeps two teams on one
     network apart. exchange: with "rendezvous" a robot sends its submaps only when it sees a
-    teammate or is seen. Fields that only a world has are ignored when one is decoded.
+    teammate or is seen. peers: every robot keeps the team's set and folds it by itself
+    (docs/without_a_centre.md). centre: whether there is a central computer; without one, robots are
+    peers. Fields that only a world has are ignored when one is decoded.
     """
 
     name: KeyChunk
@@ -28,6 +30,8 @@ class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
     estimator: Estimator = "hybrid"
     fusion: FusionRule = "join"
     exchange: Exchange = "continuous"
+    peers: bool = False
+    centre: bool = True
 
 
 def team_config(text: str) -> TeamConfig:

@@ -17,7 +17,7 @@ import msgspec
 from team.containment import Boundary
 from team.the_end import TheEnd
 from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
-from team.wire.channels import ALIVE, FAULT, STATUS, Channel
+from team.wire.channels import ALIVE, FAULT, QUERIES, STATUS, Channel
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FusedMap, Liveliness, Message, Status, tag_of
 
@@ -109,9 +109,15 @@ class Shell:
         return not (self.node.finished or self._stop.is_set())
 
     def publish(self, out: Iterable[Outgoing]) -> None:
-        """Publish what a node returned, in its order; what can not be published is a fault."""
+        """Publish what a node returned, in its order; what can not be published is a fault.
+
+        A question is asked; its replies come as other samples do.
+        """
         for outgoing in out:
             try:
+                if outgoing.channel in QUERIES:
+                    self.bus.request(*outgoing)
+                    continue
                 self._bytes += self.bus.publish(outgoing)
                 self._messages += 1
             except Exception as error:

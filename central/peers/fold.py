@@ -42,6 +42,8 @@ class PeerFold:
         self._end: m.End | None = None
         self._progress: dict[str, m.Progress] = {}
         self._alive: dict[str, bool] = {}
+        self._heads: dict[str, m.StreamHead] = {}
+        self._ordered: m.TeamEnd | None = None
         self.final: m.FusedMap | None = None
         self.finals = 0
         self._waits = when == "end"
@@ -53,9 +55,9 @@ class PeerFold:
             for alive in (True, self._alive.get(robot, False)):
                 node = ch.robot_node(robot)
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
-        if self._end is not None:
-            self._give(self._end)
-        for said in self._progress.values():
+        ends = (self._end, self._ordered)
+        known = (*self._heads.values(), *(e for e in ends if e is not None))
+        for said in (*known, *self._progress.values()):
             self._give(said)
 
     def note(self, message: m.Message) -> list[Outgoing]:
@@ -63,6 +65,10 @@ class PeerFold:
         match message:
             case m.End():
                 self._end = message
+            case m.StreamHead():
+                self._heads[message.robot] = message
+            case m.TeamEnd():
+                self._ordered = message
             case m.Progress():
                 self._progress[message.robot] = message
             case m.Liveliness():

@@ -28,14 +28,18 @@ _OF_THE_FOLD = {
     ch.TRAJECTORY: ch.TEAM_TRAJECTORY,
 }
 """What the centre would say under its own name the robot says under its own."""
-_NOT_HEARD = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
+_TALK = (*CHANNELS, ch.SET_SUMMARY, ch.CARRIED)
+"""What the set costs a radio; questions for it, too."""
+_NOT_HEARD = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TEAM_END)
 """What a robot hears from a centre and a peer from its own fold."""
 
 
 class PeerRobot:
     """One robot and its own centre: `begin`, then `handle_sample` and `tick`, until `finished`.
 
-    released: whether it need not stay for others: by the shell's word. node: the estimator's.
+    finished: whether it may leave: by its shell's word. node: the estimator's.
+    uplink, downlink: bytes of the set's talk that were said, each once, and heard.
+    world_alive: None while no world was heard of.
     """
 
     def __init__(
@@ -56,7 +60,9 @@ class PeerRobot:
         self.fold = PeerFold(central, tuple(sorted(robots)), self.peer, when)
         self._boundary = Boundary(self.name)
         self._finals = 0
-        self.released = False
+        self.finished = False
+        self.uplink = self.downlink = 0
+        self.world_alive: bool | None = None
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
@@ -67,21 +73,31 @@ class PeerRobot:
     def overhears(self) -> tuple[ch.Channel, ...]:
         """The channels to subscribe to whoever they name: members, summaries, progress."""
         own = (each for each in self.node.overhears if each is not ch.WITHDRAWAL)
-        return tuple(dict.fromkeys((*PeerNode.listens, ch.ROBOT_PROGRESS, *own)))
-
-    @property
-    def finished(self) -> bool:
-        """Whether it has its final map and nobody needs it any more."""
-        return self.final is not None and self.released
+        others = (ch.ROBOT_PROGRESS, ch.HEAD, ch.END_ORDER)
+        return tuple(dict.fromkeys((*PeerNode.listens, *others, *own)))
 
     @property
     def final(self) -> m.FusedMap | None:
         """The newest final map of its own fold."""
         return self.fold.final
 
+    @property
+    def all_concluded(self) -> bool:
+        """Whether every robot that is not given up has the final map that is here."""
+        if self.final is None:
+            return False
+        lost = {*self.final.lost, *self.final.withdrawn}
+        said = self.peer.replica.concluded
+        return all(
+            robot in lost or (robot in said and said[robot].digest == self.final.digest)
+            for robot in self.peer.replica.robots
+        )
+
     def begin(self) -> list[Outgoing]:
-        """What it says first: its configuration."""
-        return self._of_robot(self.node.begin())
+        """What it says first: its configuration, and that of its fold."""
+        announced = msgspec.structs.replace(self.fold.centre.announcement, node=self.name)
+        config = Outgoing(ch.TEAM_CONFIG, self.robot, announced)
+        return [config, *self._of_robot(self.node.begin())]
 
     def restore(self, members: Iterable[Member]) -> bool:
         """Take what an earlier life has kept, before `begin`; whether its stream goes on there."""
@@ -115,14 +131,32 @@ class PeerRobot:
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
         """Take one message from its stream, a teammate, the world or an operator."""
+        found = ch.channel_of(sample.key)
+        channel, name = (None, "") if found is None else found
+        if channel in _TALK and name not in (self.robot, self.name):
+            self.downlink += len(sample.payload)
+        heard = self._hear(message, sample)
+        return self._take(message, sample, channel, name) if heard is None else heard
+
+    def _hear(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
+        """Take what others say of themselves; None: it is something else."""
         match message:
             case m.Members():
                 self.peer.take_carried(message)
-                return self._grown() + self.peer.more_of(message.node)
+                return self._grown() + self._said(self.peer.more_of(message.node))
             case m.SetSummary():
-                return self.peer.hear(message)
+                return self._said(self.peer.hear(message))
             case m.Progress():
                 return self._of_fold(self.fold.note(message))
+            case m.StreamHead() | m.TeamEnd():
+                own = isinstance(message, m.StreamHead) and message.robot == self.robot
+                said = self._tell_robot(message, sample) if own else []
+                return said + self._of_fold(self.fold.note(message))
+            case m.Liveliness() if message.node == ch.source_node(self.robot):
+                return self._tell_robot(message, sample)
+            case m.Liveliness(node="world"):
+                self.world_alive = message.alive
+                return []
             case m.Liveliness():
                 if message.node.startswith("robot/") and message.alive:
                     self.peer.greet()
@@ -130,11 +164,15 @@ class PeerRobot:
             case m.End():
                 return self._tell_robot(message, sample) + self._of_fold(self.fold.note(message))
             case _:
-                pass
-        found = ch.channel_of(sample.key)
+                return None
+
+    def _take(
+        self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str
+    ) -> list[Outgoing]:
+        """Take a member, a measurement, or what else an estimator hears."""
         out: list[Outgoing] = []
-        if found is not None and found[0] in CHANNELS:
-            self.peer.take_sample(sample, found[0].speaker(found[1]))
+        if channel is not None and channel in CHANNELS:
+            self.peer.take_sample(sample, channel.speaker(name))
             out = self._grown()
         elif (
             isinstance(message, m.InitialPose) and message.robot == self.robot
@@ -148,10 +186,16 @@ class PeerRobot:
 
     def tick(self, now_s: float) -> list[Outgoing]:
         """What there is to say by now, by any clock that goes on."""
-        return self.peer.tick(now_s)
+        return self._said(self.peer.tick(now_s))
+
+    def _said(self, out: Sequence[Outgoing]) -> list[Outgoing]:
+        """Count what goes out of the set's talk."""
+        talk = (each.message for each in out if each.channel in _TALK or each.channel is ch.MEMBERS)
+        self.uplink += sum(len(encoded(message)) for message in talk)
+        return list(out)
 
     def _tell_robot(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        return self._of_robot(self._boundary.hand(self.node, message, sample))
+        return self._of_robot(self._said(self._boundary.hand(self.node, message, sample)))
 
     def _of_robot(self, said: Sequence[Outgoing]) -> list[Outgoing]:
         """What the estimator says goes out; what of it is for fusion goes into the set, too."""
@@ -173,6 +217,9 @@ class PeerRobot:
             channel = _OF_THE_FOLD.get(each.channel)
             if each.channel is ch.FAULT:
                 out.append(each)
+            elif each.channel is ch.TEAM_END:
+                sample = Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, -1)
+                out += self._tell_robot(each.message, sample)
             elif channel is None or each.name not in ("", self.robot):
                 continue
             else:
@@ -190,7 +237,10 @@ class PeerRobot:
 
     def answer(self, request: bytes) -> list[bytes]:
         """The answer to a peer's `MembersRequest`."""
-        return self.peer.answer(request)
+        answer = self.peer.answer(request)
+        self.uplink += sum(len(batch) for batch in answer)
+        self.downlink += len(request)
+        return answer
 
     def status(self) -> m.Status:
         """The estimator's status with how much of the set is here, and what the fold finds."""
@@ -199,6 +249,10 @@ class PeerRobot:
         figures = dict(own.figures)
         figures["set_submaps"] = float(replica.submaps)
         figures["set_refused"] = float(self.peer.refused)
+        figures["set_uplink_bytes"] = float(self.uplink)
+        figures["set_downlink_bytes"] = float(self.downlink)
+        agreeing = self.peer.agrees
+        figures["set_agrees"] = float(sum(agreeing.values()))
         for robot in replica.robots:
             have = replica.have(robot)
             figures[f"set_submaps.{robot}"] = float(have.submaps)

@@ -20,6 +20,7 @@ from sim.cli.options import (
     EstimatorOption,
     FusionOption,
     Keys,
+    Peers,
     Robots,
     Seed,
     SpeedText,
@@ -85,6 +86,10 @@ def launch(
             min=10.0,
         ),
     ] = None,
+    peers: Peers = False,
+    without_centre: Annotated[
+        bool, typer.Option("--without-centre", help="No central computer: robots are peers.")
+    ] = False,
     view: Annotated[
         bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
     ] = False,
@@ -111,6 +116,8 @@ def launch(
         estimator=estimator,
         fusion=fusion,
         dataset=dataset,
+        peers=peers,
+        centre=not without_centre,
     )
     resolved, missing = with_present_robots(resolved)
     _check_world(resolved)

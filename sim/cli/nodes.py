@@ -5,7 +5,7 @@ import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,7 @@ from sim.cli.options import (
     EstimatorOption,
     FusionOption,
     Keys,
+    Peers,
     Robots,
     ScenarioArgument,
     Seed,
@@ -36,6 +37,13 @@ from team.wire.arrays import ids
 
 NAME = "[a-z][a-z0-9_]{0,31}"
 """A robot's name."""
+if TYPE_CHECKING:
+    import threading
+
+    from central.peers.main import PeerShell
+    from team.config import RobotConfig
+    from team.wire.bus import Bus
+
 _LOG = logging.getLogger("teamslam")
 
 app = typer.Typer()
@@ -126,10 +134,22 @@ def robot(
         Path | None,
         typer.Option(help="Its own log: what it sends and receives; `teamslam log merge` joins."),
     ] = None,
+    peers: Peers = False,
+    kept: Annotated[
+        Path | None,
+        typer.Option(
+            "--set", help="With --peers: the file that keeps the team's set.", metavar="FILE"
+        ),
+    ] = None,
+    fold: Annotated[
+        str,
+        typer.Option(help="With --peers: fold the set always, or at the end only.", metavar="WHEN"),
+    ] = "always",
 ) -> None:
     """A robot: runs its estimator on its sensor stream and publishes submaps, maps and poses.
 
-    Started again after a crash it resumes after its last submap.
+    Started again after a crash it resumes after its last submap. With --peers it keeps the whole
+    team's submaps and is its own centre.
     """
     from contextlib import nullcontext
 
@@ -138,7 +158,12 @@ def robot(
     from team.shell import process
 
     resolved = with_options(
-        scenario_of(scenario), robots=robots, seed=seed, estimator=estimator, fusion=fusion
+        scenario_of(scenario),
+        robots=robots,
+        seed=seed,
+        estimator=estimator,
+        fusion=fusion,
+        peers=peers,
     )
     config = resolved.config_of(name)
     if config is None:
@@ -153,7 +178,38 @@ def robot(
     ):
         bus.tap = tap
         _connected(resolved, connect)
-        RobotShell(bus, config, stop, exchange=resolved.exchange).run()
+        if resolved.peers:
+            _peer_shell(bus, resolved, config, stop, kept, fold).run()
+        else:
+            RobotShell(bus, config, stop, exchange=resolved.exchange).run()
+
+
+def _peer_shell(
+    bus: "Bus",
+    scenario: Scenario,
+    config: "RobotConfig",
+    stop: "threading.Event",
+    kept: Path | None,
+    fold: str,
+) -> "PeerShell":
+    from central.peers.main import PeerShell
+    from team.peers.store import StoreError
+
+    if fold not in ("always", "end"):
+        fail(f"--fold is always or end, not {fold!r}", WRONG_USE)
+    try:
+        return PeerShell(
+            bus,
+            config,
+            stop,
+            central=scenario.central,
+            robots=[each.id for each in scenario.robots],
+            store=kept,
+            exchange=scenario.exchange,
+            when="end" if fold == "end" else "always",
+        )
+    except StoreError as error:
+        fail(str(error), WRONG_USE)
 
 
 @app.command()
@@ -223,7 +279,8 @@ def record(
             check_continues(output, resolved.team, metadata)
     except LogError as error:
         fail(str(error), WRONG_USE)
-    expected = ["central", *(robot_node(r.id) for r in resolved.robots)]
+    expected = [robot_node(r.id) for r in resolved.robots]
+    expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
     told = [translate.configured("world", 0, 0, resolved)] if resolved.is_live else []
     with (
@@ -260,13 +317,13 @@ def record(
 def _lost_in(parts: Sequence[Path]) -> tuple[str, ...]:
     """The robots that the final map in a log lacks, if there is one."""
     from team.recording.reader import LogError, open_log
-    from team.wire.channels import FINAL_MAP
+    from team.wire.channels import FINAL_MAP, TEAM_FINAL
     from team.wire.codec import WireError, decoded
     from team.wire.messages import FusedMap
 
     for part in parts:
         try:
-            for sample in open_log(part).samples([FINAL_MAP]):
+            for sample in open_log(part).samples([FINAL_MAP, TEAM_FINAL]):
                 return decoded(sample.payload, FusedMap).lost
         except (LogError, WireError, OSError) as error:
             _LOG.debug("%s", error)

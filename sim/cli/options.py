@@ -53,6 +53,9 @@ Seed = Annotated[
     int | None, typer.Option(help="Seed of the world and of every estimator.", min=0, metavar="N")
 ]
 Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 100.", metavar="N")]
+Peers = Annotated[
+    bool, typer.Option("--peers", help="Each robot keeps the team's set and folds it by itself.")
+]
 EstimatorOption = Annotated[str | None, typer.Option(help=_either(Estimator), metavar="NAME")]
 FusionOption = Annotated[str | None, typer.Option(help=_either(FusionRule), metavar="RULE")]
 Dataset = Annotated[

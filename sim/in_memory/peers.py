@@ -219,11 +219,11 @@ class PeerTeam:
 
 def peer_world(scenario: Scenario, streams: WorldStreams) -> WorldNode:
     """The world of a team without a centre."""
-    expected = expected_nodes([each.id for each in scenario.robots], recorder=False)
+    names = [each.id for each in scenario.robots]
     announced = translate.configured("world", 0, 0, scenario)
     return WorldNode(
         streams,
-        expected - {"central"},
+        expected_nodes(names, recorder=False, centre=False),
         announced,
         tells_map=tells_map(scenario, streams),
         batch_s=ROUND_S,

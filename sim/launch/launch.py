@@ -71,6 +71,10 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
             bus.subscribe(ch.FUSED_MAP)
             bus.subscribe(ch.FINAL_MAP)
             bus.subscribe(ch.FAULT)
+            if plan.scenario.peers:
+                watch.peers = frozenset(each.id for each in plan.scenario.robots)
+                for channel in (ch.CONCLUDED, ch.TEAM_MAP, ch.TEAM_FINAL):
+                    bus.subscribe(channel)
             for channel in watch.errors.listens:
                 bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):
@@ -144,13 +148,20 @@ def _endpoint(service: Supervised) -> str:
     raise LaunchError(f"the router did not come up within {ROUTER_PATIENCE_S:g} s")
 
 
+def _kept(plan: Plan, robot: str) -> list[str]:
+    return ["--set", str(plan.folder / f"{robot}.set")] if plan.scenario.peers else []
+
+
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
     common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
-    robots = [(f"robot-{r.id}", ["robot", *common, r.id]) for r in plan.scenario.robots]
+    robots = [
+        (f"robot-{r.id}", ["robot", *common, r.id, *_kept(plan, r.id)])
+        for r in plan.scenario.robots
+    ]
     return [
         ("recorder", ["record", *common, "--output", str(plan.log)]),
-        ("central", ["central", *common]),
+        *([("central", ["central", *common])] if plan.scenario.centre else []),
         *robots,
         *([("viewer", ["viewer", *common])] if plan.views else []),
         *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),

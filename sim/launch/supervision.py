@@ -50,7 +50,7 @@ def supervise(
         except BusError as error:
             watch.failures.append(str(error))
             return
-        is_final = watch.fused is not None and watch.fused.final
+        is_final = watch.is_over
         memory.look(services, is_final=is_final)
         for service in services:
             _look_after(service, bus, watch, is_final=is_final)

@@ -4,9 +4,10 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from central.desk.voices import Voices
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, opened
+from team.wire.bus import Bus, Sample, opened
 from team.wire.codec import WireError
 from team.wire.newer import is_newer_map
 
@@ -32,7 +33,8 @@ class Watch:
     robots: how many there are to be. drivers: of a live team, whose drivers are waited for. errors:
     against the truth, where there is one. place: by what other commands reach the team. notes: what
     became of processes, in words. restarts: how often each was started again. given_up: those that
-    were. heard: when each node's last status came.
+    were. heard: when each node's last status came. peers: the robots that are to have a
+    final map of their own; concluded: whose is there, concluded_s: since when.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -47,6 +49,10 @@ class Watch:
     given_up: list[str] = field(default_factory=list)
     heard: dict[str, float] = field(default_factory=dict)
     drivers: tuple[str, ...] | None = None
+    peers: frozenset[str] = frozenset()
+    concluded: dict[str, m.Concluded] = field(default_factory=dict)
+    concluded_s: dict[str, float] = field(default_factory=dict)
+    _voices: Voices = field(default_factory=Voices)
 
     @property
     def world(self) -> m.Status | None:
@@ -70,23 +76,41 @@ class Watch:
             warnings=waiting,
         )
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the final map is there: the centre's, and every peer's of whom one is awaited."""
+        if self.fused is None or not self.fused.final:
+            return False
+        lost = {*self.fused.lost, *(name.removeprefix("robot-") for name in self.given_up)}
+        return self.concluded.keys() >= self.peers - lost
+
     def take(self, bus: Bus) -> None:
         """Take what has come since."""
         for sample in bus.receive(TURN_S):
-            found = ch.channel_of(sample.key)
-            if found is None or not self.errors.wants(*found, sample):
-                continue
-            try:
-                channel, _, message = opened(sample)
-            except WireError:
-                continue
-            if isinstance(message, m.Status):
-                self.statuses[message.node] = message
-                self.heard[message.node] = time.monotonic()
-            elif isinstance(message, m.FusedMap):
-                self.fused = message if is_newer_map(message, self.fused) else self.fused
-            elif isinstance(message, m.Fault):
-                self._take_fault(message)
+            self._take(sample)
+            said = self._voices.of(sample) if self.peers else None
+            if said is not None:
+                self._take(said)
+
+    def _take(self, sample: Sample) -> None:
+        found = ch.channel_of(sample.key)
+        if found is None or not self.errors.wants(*found, sample):
+            return
+        try:
+            channel, _, message = opened(sample)
+        except WireError:
+            return
+        if isinstance(message, m.Status):
+            self.statuses[message.node] = message
+            self.heard[message.node] = time.monotonic()
+        elif isinstance(message, m.FusedMap) and channel in (ch.FUSED_MAP, ch.FINAL_MAP):
+            self.fused = message if is_newer_map(message, self.fused) else self.fused
+        elif isinstance(message, m.Fault):
+            self._take_fault(message)
+        elif isinstance(message, m.Concluded):
+            self.concluded[message.robot] = message
+            self.concluded_s.setdefault(message.robot, time.monotonic() - self.began)
+        if channel not in (ch.TEAM_MAP, ch.TEAM_FINAL):
             self.errors.take(channel, message)
 
     def _take_fault(self, fault: m.Fault) -> None:

@@ -35,12 +35,13 @@ def run_world(
     configured = translate.configured("world", 0, 0, scenario)
     node = WorldNode(
         streams,
-        expected_nodes(robots, recorder=recorder),
+        expected_nodes(robots, recorder=recorder, centre=scenario.centre),
         configured,
         speed,
         cache,
         Configurations(expected_configurations(scenario)),
         tells_map(scenario, streams),
+        peers=frozenset(robots if scenario.peers else ()),
     )
     shell = Shell(bus, node, "world", stop)
     for channel in (*node.listens, *node.announcements):
@@ -72,4 +73,5 @@ def expected_configurations(scenario: Scenario) -> dict[str, m.Configuration]:
     """What the centre and the robots of a scenario announce, by node."""
     nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
     robots = {node: translate.configured(node, 0, 0, robot) for node, robot in nodes.items()}
-    return {"central": translate.configured("central", 0, 0, scenario.central)} | robots
+    central = translate.configured("central", 0, 0, scenario.central)
+    return ({"central": central} if scenario.centre else {}) | robots

@@ -173,7 +173,8 @@ class WorldNode:
     incarnation instead: a start at an unknown pose, and measurements that count from there.
     configurations: what the others are to announce; the world does not begin while anyone has
     announced something else. tells_map: the robots are told the landmarks, since they only localise
-    themselves. batch_s: team time between two looks at what has come in, at the most.
+    themselves. batch_s: team time between two looks at what has come in, at the most. peers:
+    robots whose own final maps the world waits for, too, until they are all of one set.
     """
 
     streams: WorldStreams
@@ -184,6 +185,7 @@ class WorldNode:
     configurations: Configurations = field(default_factory=lambda: Configurations({}))
     tells_map: bool = False
     batch_s: float = float("inf")
+    peers: frozenset[str] = frozenset()
     ended: bool = field(default=False, init=False)
     finished: bool = field(default=False, init=False)
     final: m.FusedMap | None = field(default=None, init=False)
@@ -194,6 +196,8 @@ class WorldNode:
         robots, indices = self.streams.order()
         self._order = deque(zip(robots.tolist(), indices.tolist(), strict=True))
         self._alive: set[str] = set()
+        self._concluded: dict[str, m.Concluded] = {}
+        self.centre = "central" in self.expected or not self.peers
         self._recorded: dict[tuple[str, int], int] = {}
         self._recorder = False
         self._unrecorded = 0
@@ -213,6 +217,7 @@ class WorldNode:
         ch.ROBOT_PROGRESS,
         ch.RECORDER_PROGRESS,
         ch.FINAL_MAP,
+        ch.CONCLUDED,
         ch.GIVEN_UP,
     )
     announcements: ClassVar[tuple[ch.Channel, ...]] = (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
@@ -279,12 +284,25 @@ class WorldNode:
             case m.Configuration():
                 self.configurations.take(message)
             case m.FusedMap() if message.final:
-                self.finished, self.final = True, message
+                self.final = message
+                self._finish()
+            case m.Concluded():
+                self._concluded[message.robot] = message
+                self._finish()
             case m.GivenUp():
                 self.expected -= {message.node}
+                self.peers -= {ch.robot_of(message.node) or ""}
+                self._finish()
             case _:
                 pass
         return []
+
+    def _finish(self) -> None:
+        """The centre, if there is to be one, and every peer have their final maps."""
+        said = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
+        agreed = len(said) == len(self.peers) and len({each.digest for each in said}) <= 1
+        central = self.final is not None or (bool(said) and not self.centre)
+        self.finished = self.finished or (agreed and central)
 
     def _note_consumed(self, progress: m.Progress) -> None:
         """What robots say before this world has begun is of an earlier life of it."""
@@ -502,7 +520,7 @@ class WorldNode:
         )
 
 
-def expected_nodes(robots: Sequence[str], *, recorder: bool) -> frozenset[str]:
+def expected_nodes(robots: Sequence[str], *, recorder: bool, centre: bool = True) -> frozenset[str]:
     """Who must be alive before the world begins."""
-    nodes = {ch.robot_node(robot) for robot in robots} | {"central"}
+    nodes = {ch.robot_node(robot) for robot in robots} | ({"central"} if centre else set())
     return frozenset(nodes | {"recorder"} if recorder else nodes)

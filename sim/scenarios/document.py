@@ -1,7 +1,7 @@
 """A user's TOML document → the plain fields of a resolved scenario.
 
 base = "thesis"            # optional: a built-in scenario that this file changes
-name, team, seed, estimator, fusion, exchange
+name, team, seed, estimator, fusion, exchange, peers, centre
 [world]      kind = "simulated" | "utias" | "folder", then the fields of sim.world.config
 [defaults]   fields of every robot (team.config.RobotConfig)
 [[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS

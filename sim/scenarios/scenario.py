@@ -88,15 +88,20 @@ def with_options(
     estimator: str | None = None,
     fusion: str | None = None,
     dataset: str | Path | None = None,
+    peers: bool = False,
+    centre: bool = True,
 ) -> Scenario:
     """The scenario with what a command line changes; None leaves it as it is.
 
-    robots: the first so many; further ones repeat the scenario's robots in turn, with new ids.
+    peers, centre: that there are peers, or no centre. robots: the first so many; further ones
+    repeat the scenario's robots in turn, with new ids.
     Raises ScenarioError.
     """
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
     fields |= {key: value for key, value in changes.items() if value is not None}
+    fields["peers"] = fields["peers"] or peers
+    fields["centre"] = fields["centre"] and centre
     if dataset is not None:
         fields["world"] = _world_of(scenario, str(dataset))
     world = fields["world"]
@@ -217,6 +222,13 @@ def _filled(scenario: Scenario) -> Scenario:
             f"the rule {scenario.fusion} can not serve a live team, whose robots come and go: "
             'world.kind = "live" needs a rule on submaps, as "join"'
         )
+    peers = scenario.peers or not scenario.centre
+    if peers and (scenario.fusion != "join" or scenario.exchange == "rendezvous"):
+        raise ScenarioError(
+            f"the rule {scenario.fusion} with exchange {scenario.exchange} needs a centre and no "
+            'peers: peers fold a set of submaps (fusion = "join", exchange = "continuous"), and '
+            "who meets whom is the radio's"
+        )
     _check_team([robot.id for robot in scenario.robots], scenario.world)
     robots = tuple(
         msgspec.structs.replace(
@@ -225,7 +237,7 @@ def _filled(scenario: Scenario) -> Scenario:
         for robot in scenario.robots
     )
     central = msgspec.structs.replace(scenario.central, fusion=scenario.fusion)
-    return msgspec.structs.replace(scenario, robots=robots, central=central)
+    return msgspec.structs.replace(scenario, robots=robots, central=central, peers=peers)
 
 
 def _check_way_points(robots: int, world: SimulatedWorld) -> None:

@@ -42,8 +42,8 @@ class PeerNode:
     """One node's copy of the set, and its talk with others about it.
 
     proof: checks members that come over third nodes; None: there are no keys, and everyone is
-    believed. carried: by the node over which it came. refused: members that were not kept, in
-    words the newest.
+    believed. unsaved: what was news since somebody has last cleared it. carried: by the node
+    over which it came. refused: how many members were not kept; last_refused: why.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
@@ -68,6 +68,7 @@ class PeerNode:
         self.refused = 0
         self.last_refused = ""
         self.stamp_ns = 0
+        self.unsaved: list[Member] = []
 
     # Members.
 
@@ -83,6 +84,7 @@ class PeerNode:
         if outcome == "known":
             return False
         over.members += 1
+        self.unsaved.append(member)
         self.stamp_ns = max(self.stamp_ns, member.message.stamp_ns)
         if not isinstance(member.message, m.InitialPose | m.Submap | m.SightingFactor):
             self._news.append(member.message)

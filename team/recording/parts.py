@@ -15,7 +15,7 @@ from team.recording.inventory import Inventory
 from team.recording.reader import Log, LogError, open_log
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.repair import salvaged
-from team.wire.channels import FINAL_MAP
+from team.wire.channels import FINAL_MAP, TEAM_FINAL
 
 LONGEST_AWAY_S = 3600.0
 """A recorder is not started again later than this; the log is of another run then."""
@@ -57,7 +57,7 @@ def check_continues(path: Path, team: str, metadata: Mapping[str, str]) -> None:
             raise LogError(part, "exists, and is no log of ours", remedy)
         if (log.team, log.metadata.get("scenario")) != (team, metadata.get("scenario")):
             raise LogError(part, "exists, of another team or scenario", remedy)
-        if log.complete and any(True for _ in log.samples([FINAL_MAP])):
+        if log.complete and any(True for _ in log.samples([FINAL_MAP, TEAM_FINAL])):
             raise LogError(part, "exists, with the final map of its run", remedy)
 
 

@@ -16,6 +16,7 @@ from team.wire.bus import Bus, Outgoing, Sample
 from team.wire.channels import (
     ALIVE,
     CHANNELS,
+    CONCLUDED,
     FINAL_MAP,
     MEASUREMENTS,
     RECORDER_PROGRESS,
@@ -219,7 +220,7 @@ class RecordLoop:
         if channel is ALIVE:
             return self._noted_alive(sample, name)
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
-        self._final = self._final or channel is FINAL_MAP
+        self._final = self._final or channel in (FINAL_MAP, CONCLUDED)
         return sample
 
     def _noted_alive(self, sample: Sample, node: str) -> Sample:

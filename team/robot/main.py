@@ -51,21 +51,31 @@ class RobotShell:
         """Until the final map."""
         name = self.node.robot
         self._be_the_only_one()
-        for channel in self.node.listens:
-            self._bus.subscribe(channel, name)
-        for channel in self.node.overhears:
-            self._bus.subscribe(channel)
-        self._bus.watch_alive("central")
-        self._bus.watch_alive(RECORDER)
+        self._subscribe()
         self._shell.answer(ch.SENT, name, lambda request: self.node.answer_submaps(request))
         self._shell.look_for_the_end()
         if not self.node.finished and self._resume():
             self._catch_up()
         self._look_for_driver()
-        self._shell.run(self._mend)
+        self._shell.run(self._duty)
         _LOG.info("%d submaps from %d measurements", self.node.submaps, self.node.next_measurement)
         self._await_recorder()
-        self._shell.end(self.node.final)
+        self._shell.end(self._final)
+
+    def _subscribe(self) -> None:
+        for channel in self.node.listens:
+            self._bus.subscribe(channel, self.node.robot)
+        for channel in self.node.overhears:
+            self._bus.subscribe(channel)
+        self._bus.watch_alive("central")
+        self._bus.watch_alive(RECORDER)
+
+    @property
+    def _final(self) -> m.FusedMap | None:
+        return self.node.final
+
+    def _duty(self) -> None:
+        self._mend()
 
     def _look_for_driver(self) -> None:
         """Whether the robot's driver is there is known before anything else is heard."""

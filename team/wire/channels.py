@@ -190,6 +190,8 @@ FINAL_KEPT = Channel(name="final_kept", template="router/final", message=m.Final
 ORDERS_KEPT = Channel(name="orders_kept", template="router/orders", message=m.OrdersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                       meaning="a query; the replies are the orders `given_up` that hold, when who gave them has left, too")  # fmt: skip
 
+TEAM_CONFIG = Channel(name="team_config", template="robot/{robot}/team/config", message=m.Configuration, rate="once", delivery="latest", recorded=True,
+                      recomputable=False, meaning="the configuration of the peer's own fold: a centre's")  # fmt: skip
 TEAM_MAP = Channel(name="team_map", template="robot/{robot}/team/map", message=m.FusedMap, rate="one per broadcast", delivery="latest", recorded=True,
                    recomputable=True, meaning="the team's map by the peer's own fold")  # fmt: skip
 TEAM_PRIOR = Channel(name="team_prior", template="robot/{robot}/team/prior", message=m.Prior, rate="one per broadcast", delivery="latest", recorded=True,

@@ -24,6 +24,7 @@ from central.desk.evaluation.errors import (
     rigid_alignment,
 )
 from central.desk.evaluation.log import Collected, Traffic, collected
+from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
 from central.team_config import TeamConfig, team_config
 from team import translate
@@ -126,6 +127,7 @@ class Evaluation:
     faults: int = 0
     scale_by_robot: Mapping[str, float] = field(default_factory=dict)
     arbitrary_frame: bool = False
+    peers: Mapping[str, PeerResult] = field(default_factory=dict)
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
@@ -164,6 +166,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         faults=len(faults),
         scale_by_robot=_by_robot(log, "covariance_scale."),
         arbitrary_frame=_is_arbitrary(log),
+        peers=peer_results(log),
     )
 
 
@@ -238,6 +241,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "joined": [] if fused is None else list(fused.joined),
         "withdrawn": [] if fused is None else list(fused.withdrawn),
         "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},
+        "peers": {name: peer_json(peer) for name, peer in evaluation.peers.items()},
         "channels": {
             key: {"messages": traffic.messages, "bytes": traffic.bytes}
             for key, traffic in evaluation.channels.items()

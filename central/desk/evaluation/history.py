@@ -16,6 +16,7 @@ from jaxtyping import Float, Int64
 from central.desk.evaluation.events import MOST, Event, EventTeller
 from central.desk.evaluation.log import head_of
 from central.desk.evaluation.running import TrueLandmarks
+from central.desk.voices import Voices
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -174,6 +175,10 @@ class _Gathering:
         self.traffic[sample.key].take(sample.stamp_ns, float(len(sample.payload)))
         if channel in ch.SENSORS:
             self._take_measurement(sample)
+        self.hear(sample, channel)
+
+    def hear(self, sample: Sample, channel: ch.Channel | None) -> None:
+        """What is said in a message, whatever it takes to carry it."""
         if channel not in _LOOKED_AT:
             return
         try:
@@ -234,12 +239,17 @@ class _Gathering:
 def history(samples: Iterable[Sample]) -> History:
     """The history of one run, from its log's samples in the order of the log."""
     found = _Gathering()
+    voices = Voices()
     rows: dict[str, ch.Channel | None] = {}
     for sample in samples:
         if sample.key not in rows:
             known = ch.channel_of(sample.key)
             rows[sample.key] = None if known is None else known[0]
         found.take(sample, rows[sample.key])
+        said = voices.of(sample)
+        if said is not None:
+            as_centre = ch.channel_of(said.key)
+            found.hear(said, None if as_centre is None else as_centre[0])
     stamps = [column.stamps for column in found.traffic.values()]
     span = found.span
     if span == _NO_SPAN:

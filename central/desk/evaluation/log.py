@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from central.desk.voices import Voices
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -18,7 +19,7 @@ from team.wire.codec import WireError
 
 _SENSORS = frozenset(channel.name for channel in ch.SENSORS)
 _NEWEST = (
-    ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END, ch.STATUS, ch.OWN_MAP,
+    ch.CONCLUDED, ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END, ch.STATUS, ch.OWN_MAP,
 )  # fmt: skip
 _LATEST = frozenset(channel.name for channel in _NEWEST)
 _KEPT = frozenset(
@@ -80,7 +81,8 @@ class Measurements:
 class Collected:
     """What a log holds, by channel and robot; `kept` still as payloads, decoded when asked for.
 
-    unsound: samples that are no sound message of their channel; they count as traffic only.
+    first_ns: the wall clock of the first sample that has one. unsound: samples
+    that are no sound message of their channel; they count as traffic only.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
@@ -88,6 +90,7 @@ class Collected:
     latest: dict[str, Sample] = field(default_factory=dict)
     kept: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
     unsound: int = 0
+    first_ns: int | None = None
 
     @property
     def robots(self) -> list[str]:
@@ -130,6 +133,8 @@ class Collected:
 
     def take(self, sample: Sample, channel: str, robot: str) -> None:
         """Count one sample and keep of it what its channel (by name) asks for."""
+        if self.first_ns is None and sample.wall_ns:
+            self.first_ns = sample.wall_ns
         traffic = self.traffic[sample.key]
         traffic.messages += 1
         traffic.bytes += len(sample.payload)
@@ -137,7 +142,17 @@ class Collected:
             self.kept[sample.key].append(sample)
         if channel in _SENSORS:
             self._count(sample, robot, odometry=channel == ch.ODOMETRY.name)
-        elif channel in _LATEST:
+        else:
+            self._keep(sample, channel)
+
+    def keep(self, sample: Sample) -> None:
+        """Keep what somebody said for the centre; the traffic is his."""
+        found = channel_of(sample.key)
+        if found is not None:
+            self._keep(sample, found[0].name)
+
+    def _keep(self, sample: Sample, channel: str) -> None:
+        if channel in _LATEST:
             self.latest[sample.key] = sample
         elif channel in _KEPT:
             self.kept[sample.key].append(sample)
@@ -156,10 +171,14 @@ class Collected:
 def collected(samples: Iterable[Sample]) -> Collected:
     """What the samples of a log hold."""
     found = Collected()
+    voices = Voices()
     channels: dict[str, tuple[str, str]] = {}
     for sample in samples:
         if sample.key not in channels:
             known = channel_of(sample.key)
             channels[sample.key] = ("", "") if known is None else (known[0].name, known[1])
         found.take(sample, *channels[sample.key])
+        said = voices.of(sample)
+        if said is not None:
+            found.keep(said)
     return found

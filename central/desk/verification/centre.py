@@ -4,7 +4,7 @@ The rule is the centre's own, and so is its function of the inputs (`central.rul
 knew beyond them when it spoke (`unnamed`) is taken from the recorded map.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import msgspec
 
@@ -13,28 +13,61 @@ from central.rule import FusionRule, Inputs, Tail, rule_of
 from team.pairs import CONSUMES, Channel
 from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.bus import Outgoing
 
 
 def retold_centre(log: Recorded) -> dict[Identity, m.Message]:
     """What the inputs that the recorded maps name give, under the names of these inputs."""
     finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
     maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
+    found: dict[Identity, m.Message] = {}
+    for out in _retold(log, maps, finals):
+        found.setdefault(identity(out.key, out.message), out.message)
+    return found
+
+
+_OF_A_PEER = {
+    ch.FUSED_MAP.name: ch.TEAM_MAP,
+    ch.PRIOR.name: ch.TEAM_PRIOR,
+    ch.FINAL_MAP.name: ch.TEAM_FINAL,
+    ch.TRAJECTORY.name: ch.TEAM_TRAJECTORY,
+}
+
+
+def retold_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
+    """As `retold_centre`, of a peer's own fold: by the same rule from the same submaps."""
+
+    def said(channel: ch.Channel) -> list[m.FusedMap]:
+        key = channel.key(robot)
+        own = (each.message for each in log.said if each.sample.key == key)
+        return [each for each in own if isinstance(each, m.FusedMap)]
+
+    found: dict[Identity, m.Message] = {}
+    for out in _retold(log, said(ch.TEAM_MAP), said(ch.TEAM_FINAL)):
+        if out.channel.name in _OF_A_PEER and out.name in ("", robot):
+            key = _OF_A_PEER[out.channel.name].key(robot)
+            found.setdefault(identity(key, out.message), out.message)
+    return found
+
+
+def _retold(
+    log: Recorded, maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """What the inputs that maps name give, in the order of the inputs."""
     if not maps and not finals:
-        return {}
+        return
     config, digest = log.central_config()
     announced = {n.removeprefix("robot/") for n in log.configured if n.startswith("robot/")}
     rule = rule_of(config, digest, sorted(announced.union(log.robots)))
     inputs = _LogInputs(log, CONSUMES[config.fusion])
     lost = finals[-1].lost if finals else ()
-    found: dict[Identity, m.Message] = {}
     for fused in (*sorted(maps, key=lambda f: f.exchange), *finals):
         named = inputs.of(fused)
         for out in [] if named is None else rule.fuse(named, _tail(fused)):
             message = _as_known(out.message, fused, rule)
             if lost and isinstance(message, m.FusedMap) and message.final:  # no input says it
                 message = msgspec.structs.replace(message, provisional=True, lost=lost)
-            found.setdefault(identity(out.key, message), message)
-    return found
+            yield Outgoing(out.channel, out.name, message)
 
 
 def _tail(fused: m.FusedMap) -> Tail:
@@ -47,6 +80,11 @@ def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule) -> m.Mess
         fields = set(rule.unnamed) & set(message.__struct_fields__)
         return msgspec.structs.replace(message, **{name: getattr(fused, name) for name in fields})
     return message
+
+
+def _order(robot: str) -> m.Withdrawal:
+    """What a peer's fold has found by itself, and says nowhere but in its maps."""
+    return m.Withdrawal(stamp_ns=0, robot=robot, by="central", reason="")
 
 
 class _LogInputs:
@@ -80,7 +118,7 @@ class _LogInputs:
             starts=self._starts,
             submaps=chains,
             sightings=self._sightings,
-            withdrawals={r: orders[r] for r in fused.withdrawn if r in orders},
+            withdrawals={r: orders.get(r) or _order(r) for r in fused.withdrawn},
             stamp_ns=fused.stamp_ns,
         )
 

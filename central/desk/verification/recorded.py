@@ -71,7 +71,8 @@ class Recorded:
                 if stream.setdefault(message.number, message) != message:
                     self.contradicted.append(message)
             case m.Configuration():
-                self.configured[message.node] = message
+                of_a_fold = channel is ch.TEAM_CONFIG
+                self.configured["central" if of_a_fold else message.node] = message
             case m.Progress():
                 consumed = self.reported.get((message.robot, message.incarnation), 0)
                 self.reported[message.robot, message.incarnation] = max(
@@ -155,8 +156,8 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
         raise RerunError(f"{what} is not one of this version: {error}") from None
 
 
-_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.ROBOT_PROGRESS, ch.END, ch.HEAD,
-         ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
+_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,
+         ch.END, ch.HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_TOLD))
 """The channels whose samples are filed."""
 

@@ -76,7 +76,8 @@ def retold_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
 
 def _poses_said(log: Recorded, robot: str) -> PosesSaid:
-    priors = {p.digest: p for p in log.of(ch.PRIOR) if isinstance(p, m.Prior) and p.robot == robot}
+    heard = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
+    priors = {p.digest: p for p in heard if isinstance(p, m.Prior) and p.robot == robot}
     said: dict[tuple[int, int], list[m.Prior | None]] = {}
     for channel in (ch.TEAM_POSE, ch.OWN_POSE):
         for pose in log.of(channel):

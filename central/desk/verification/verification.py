@@ -11,7 +11,7 @@ itself, and what followed from it is right again.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from central.desk.verification.centre import retold_centre
+from central.desk.verification.centre import retold_centre, retold_peer
 from central.desk.verification.differences import first_difference
 from central.desk.verification.recorded import Identity, Recorded, Said, identity, recorded
 from central.desk.verification.robot import retold_robot
@@ -26,10 +26,11 @@ PLATFORM = (
     "version.numpy", "version.scipy", "version.numba", "version.llvmlite",
 )  # fmt: skip
 """The metadata that have to be equal for equal bits."""
+MAPS = (ch.FUSED_MAP, ch.FINAL_MAP, ch.TEAM_MAP, ch.TEAM_FINAL)
 CHECKED = (
     ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE, ch.ROBOT_DONE,
     ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
-    ch.CENTRAL_POSE,
+    ch.CENTRAL_POSE, ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_FINAL,
 )  # fmt: skip
 """Causes before what follows from them."""
 
@@ -113,6 +114,8 @@ def verify(log: Log) -> Verification:
     for robot in found.robots:
         retold |= retold_robot(found, robot)
     retold |= retold_centre(found)
+    for robot in found.robots:
+        retold |= retold_peer(found, robot)
     results = []
     for channel in CHECKED:
         said = [each for each in found.said if each.channel is channel]
@@ -193,13 +196,14 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
     """The input that is not in the log, in words; None where nothing that a message names lacks."""
     match message:
         case m.PoseEstimate() if any(message.map_digest):
-            own = (p for p in log.of(ch.PRIOR) if isinstance(p, m.Prior))
+            heard = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
+            own = (p for p in heard if isinstance(p, m.Prior))
             priors = {p.digest for p in own if p.robot == message.robot}
             digest = message.map_digest
             lost = None if digest in priors else f"no prior {digest.hex()} in the log"
             return lost or _gap(log, message)
         case m.Prior() | m.Trajectory():
-            maps = (*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP))
+            maps = [each for channel in MAPS for each in log.of(channel)]
             digests = {each.digest for each in maps if isinstance(each, m.FusedMap)}
             digest = message.digest
             return None if digest in digests else f"no map {digest.hex()} in the log"

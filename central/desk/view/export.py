@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from central.desk.view.node import ViewerNode
+from central.desk.voices import Voices, with_voices
 from team.recording.reader import Log
 from team.recording.recorder import Recorder
 from team.wire import channels as ch
@@ -45,11 +46,12 @@ class Viewing:
 
 def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
     """The samples, and behind each the views that it brings; earlier views are left out."""
-    viewing = Viewing()
+    viewing, voices = Viewing(), Voices()
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
             yield sample
-            yield from viewing.take(sample, heard(sample))
+            for said in with_voices(voices, [sample]):
+                yield from viewing.take(said, heard(said))
 
 
 def export_views(log: Log, out: Path) -> int:

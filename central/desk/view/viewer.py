@@ -5,6 +5,7 @@ import time
 from dataclasses import replace
 
 from central.desk.view.export import Viewing, heard
+from central.desk.voices import LISTENS, Voices, with_voices
 from team.containment import Boundary
 from team.shell import STATUS_S, WAIT_S, judge
 from team.the_end import TheEnd
@@ -21,7 +22,8 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     Raises FaultyRunError, at its end, where the map lacks a robot or something could not be drawn.
     """
     viewing = Viewing()
-    for channel in viewing.node.listens:
+    voices = Voices()
+    for channel in (*viewing.node.listens, *LISTENS):
         bus.subscribe(channel)
     bus.watch_alive()
     bus.declare_alive(NODE)
@@ -38,7 +40,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
                 stamp_ns=0, node=NODE, state="viewing", figures={"messages": float(published)}
             )
             bus.publish(Outgoing(ch.STATUS, NODE, status))
-        for sample in (*bus.receive(WAIT_S), *end.missed()):
+        for sample in with_voices(voices, (*bus.receive(WAIT_S), *end.missed())):
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
             try:

@@ -1,0 +1,77 @@
+"""What a log says of peers: each one's final map, when it was there, and what the set has cost."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from central.desk.evaluation.log import Collected
+from team.wire import channels as ch
+from team.wire import messages as m
+
+_OF, _OVER, _OVER_BYTES = "set_submaps.", "set_over.", "set_over_bytes."
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerResult:
+    """One peer's end, by its own word.
+
+    complete_at_s: wall time from the log's beginning to its final map. uplink, downlink: bytes of
+    the set's talk that it said, each once, and heard. have: submaps of each robot. over: members
+    that were news, by the node over which they came. agrees: other peers whose last summary was of
+    the same set.
+    """
+
+    final_map_sha256: str | None
+    submaps: int
+    complete_at_s: float | None
+    uplink: int | None
+    downlink: int | None
+    agrees: int
+    have: Mapping[str, int] = field(default_factory=dict)
+    over: Mapping[str, int] = field(default_factory=dict)
+
+
+def peer_results(log: Collected) -> dict[str, PeerResult]:
+    """Of every robot that says anything of a set."""
+    found = {}
+    for robot in log.robots:
+        status = log.sound(log.latest.get(ch.STATUS.key(ch.robot_node(robot))))
+        figures = status.figures if isinstance(status, m.Status) else {}
+        if "set_submaps" not in figures:
+            continue
+        sample = log.latest.get(ch.CONCLUDED.key(robot))
+        said = log.sound(sample)
+        concluded = said if isinstance(said, m.Concluded) else None
+        at_ns = 0 if sample is None else sample.wall_ns - (log.first_ns or sample.wall_ns)
+        found[robot] = PeerResult(
+            final_map_sha256=None if concluded is None else concluded.sha256.hex(),
+            submaps=int(figures["set_submaps"]) if concluded is None else concluded.submaps,
+            complete_at_s=None if concluded is None else at_ns * 1e-9,
+            uplink=int(figures.get("set_uplink_bytes", 0.0)),
+            downlink=int(figures.get("set_downlink_bytes", 0.0)),
+            agrees=int(figures.get("set_agrees", 0.0)),
+            have=_named(figures, _OF),
+            over=_named(figures, _OVER),
+        )
+    return found
+
+
+def _named(figures: Mapping[str, float], prefix: str) -> dict[str, int]:
+    return {
+        name.removeprefix(prefix): int(value)
+        for name, value in figures.items()
+        if name.startswith(prefix)
+    }
+
+
+def peer_json(peer: PeerResult) -> dict[str, object]:
+    """The figures under the names that machines read."""
+    return {
+        "final_map_sha256": peer.final_map_sha256,
+        "submaps": peer.submaps,
+        "complete_at_s": peer.complete_at_s,
+        "uplink_bytes": peer.uplink,
+        "downlink_bytes": peer.downlink,
+        "agrees_with": peer.agrees,
+        "have": dict(peer.have),
+        "over": dict(peer.over),
+    }

@@ -1,0 +1,91 @@
+"""A team without a centre as its desk looks at it: what peers say of the team's map, as a centre's.
+
+The running maps are those of one peer, the first that speaks; the final one is anybody's, since
+they are the same; a prior and a smoothed path are their own robot's. While a centre speaks for
+itself nobody speaks in its place.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import msgspec
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import WireError, decoded, encoded
+
+_CENTRE = frozenset({ch.FUSED_MAP.key(), ch.FINAL_MAP.key()})
+_AS = {
+    ch.TEAM_CONFIG.name: ch.CENTRAL_CONFIG,
+    ch.TEAM_MAP.name: ch.FUSED_MAP,
+    ch.TEAM_FINAL.name: ch.FINAL_MAP,
+    ch.TEAM_PRIOR.name: ch.PRIOR,
+    ch.TEAM_TRAJECTORY.name: ch.TRAJECTORY,
+}
+LISTENS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY)
+"""The channels that are heard so."""
+_FOLD = "fold."
+
+
+class Voices:
+    """Gives samples a centre's key, one after the other."""
+
+    def __init__(self) -> None:
+        self._centre = False
+        self._voice: str | None = None
+
+    def of(self, sample: Sample) -> Sample | None:
+        """The sample as a centre would have said it; None: nothing of the kind."""
+        if sample.key in _CENTRE:
+            self._centre = True
+        found = ch.channel_of(sample.key)
+        if self._centre or found is None:
+            return None
+        channel, name = found
+        if channel is ch.STATUS:
+            return self._status(sample, name)
+        as_channel = _AS.get(channel.name)
+        if as_channel is None:
+            return None
+        if channel is ch.TEAM_MAP or channel is ch.TEAM_CONFIG:
+            self._voice = name if self._voice is None else self._voice
+            if name != self._voice:
+                return None
+        renamed = replace(sample, key=as_channel.key(name))
+        return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
+
+    def _spoken(self, sample: Sample) -> Sample | None:
+        try:
+            message = decoded(sample.payload, m.Configuration)
+        except WireError:
+            return None
+        said = msgspec.structs.replace(message, node="central")
+        return replace(sample, payload=encoded(said))
+
+    def _status(self, sample: Sample, node: str) -> Sample | None:
+        """What the voice says of its fold, as a centre's status."""
+        if self._voice is None or node != ch.robot_node(self._voice):
+            return None
+        try:
+            status = decoded(sample.payload, m.Status)
+        except WireError:
+            return None
+        figures = {
+            name.removeprefix(_FOLD): value
+            for name, value in status.figures.items()
+            if name.startswith(_FOLD)
+        }
+        own = m.Status(
+            stamp_ns=status.stamp_ns, node="central", state=status.state, figures=figures
+        )
+        return replace(sample, key=ch.STATUS.key("central"), payload=encoded(own))
+
+
+def with_voices(voices: Voices, samples: Iterable[Sample]) -> Iterator[Sample]:
+    """The samples, and behind each what it says in a centre's place."""
+    for sample in samples:
+        yield sample
+        said = voices.of(sample)
+        if said is not None:
+            yield said

@@ -1,0 +1,82 @@
+"""A peer's set on disk: an append-only file, from which a robot that was started again goes on.
+
+After eight bytes that say what it is come records: length and CRC-32 of the body, four bytes each,
+little-endian; the body is a MessagePack array [key, payload, signature]. A record that a death tore
+is cut off when the file is opened again: its member comes from others, or is computed once more. A
+record is in the hands of the operating system when `append` returns: a process that is killed
+loses nothing, a computer without power the last seconds.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import msgpack
+
+from team.peers.members import LARGEST_MEMBER, Member, member_of
+
+MAGIC = b"tmsset1\n"
+_HEAD = struct.Struct("<II")
+_LARGEST = LARGEST_MEMBER + 2**16
+
+
+class StoreError(RuntimeError):
+    """The file can not be used; the text says why and what to do."""
+
+
+def record_of(member: Member) -> bytes:
+    """A member as the file has it."""
+    body: bytes = msgpack.packb([member.key, member.payload, member.signature], use_bin_type=True)
+    return _HEAD.pack(len(body), zlib.crc32(body)) + body
+
+
+def records_in(content: bytes) -> Iterator[tuple[int, Member]]:
+    """The whole members of a file, each with where its record ends; stops at what is torn."""
+    at = len(MAGIC)
+    while at + _HEAD.size <= len(content):
+        length, crc = _HEAD.unpack_from(content, at)
+        body = content[at + _HEAD.size : at + _HEAD.size + length]
+        if length > _LARGEST or len(body) < length or zlib.crc32(body) != crc:
+            return
+        at += _HEAD.size + length
+        try:
+            key, payload, signature = msgpack.unpackb(body)
+            yield at, member_of(key, payload, signature)
+        except (ValueError, TypeError, msgpack.UnpackException):
+            return
+
+
+class Store:
+    """The file of one peer; `kept` is what was there when it was opened. Raises StoreError."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            content = path.read_bytes() if path.exists() else b""
+            if content and content[: len(MAGIC)] != MAGIC[: len(content)]:
+                raise StoreError(f"{path} is no set of a peer: give --set another file")
+            found = list(records_in(content))
+            self.kept = [member for _, member in found]
+            whole = found[-1][0] if found else len(MAGIC)
+            self._file = path.open("r+b" if content else "w+b", buffering=0)
+            if len(content) < len(MAGIC):
+                self._file.write(MAGIC)
+            self.torn = max(len(content) - whole, 0)
+            self._file.truncate(whole)
+            self._file.seek(whole)
+        except OSError as error:
+            raise StoreError(f"{path} can not be written: {error}") from error
+
+    def append(self, members: Iterable[Member]) -> None:
+        """Keep members; raises StoreError."""
+        records = b"".join(record_of(member) for member in members)
+        if records:
+            try:
+                self._file.write(records)
+            except OSError as error:
+                raise StoreError(f"{self.path} can not be written: {error}") from error
+
+    def close(self) -> None:
+        """Nothing more is kept."""
+        self._file.close()
