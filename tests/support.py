@@ -162,6 +162,7 @@ def peers_examples(digest: bytes) -> Iterator[m.Message]:
         payloads=(b"bytes",),
         signatures=(b"",),
     )
+    yield m.RadioPlan(stamp_ns=0, robots=("alpha", "bravo"), ends_ns=(9, 8), pairs=b"\x80\x00")
     yield m.Concluded(
         stamp_ns=9, robot="alpha", serial=1, digest=digest, sha256=4 * digest, submaps=7
     )

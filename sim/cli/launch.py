@@ -90,6 +90,15 @@ def launch(
     without_centre: Annotated[
         bool, typer.Option("--without-centre", help="No central computer: robots are peers.")
     ] = False,
+    comm_range: Annotated[
+        float | None,
+        typer.Option(
+            "--comm-range",
+            help="Peers reach each other within so many metres of true distance.",
+            metavar="M",
+            min=0.001,
+        ),
+    ] = None,
     view: Annotated[
         bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
     ] = False,
@@ -118,6 +127,7 @@ def launch(
         dataset=dataset,
         peers=peers,
         centre=not without_centre,
+        comm_range_m=comm_range,
     )
     resolved, missing = with_present_robots(resolved)
     _check_world(resolved)

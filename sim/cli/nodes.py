@@ -193,13 +193,15 @@ def _peer_shell(
     fold: str,
 ) -> "PeerShell":
     from central.peers.main import PeerShell
+    from sim.radio.bus import behind_radio
     from team.peers.store import StoreError
 
     if fold not in ("always", "end"):
         fail(f"--fold is always or end, not {fold!r}", WRONG_USE)
     try:
+        door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
         return PeerShell(
-            bus,
+            door,
             config,
             stop,
             central=scenario.central,

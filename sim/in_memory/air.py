@@ -5,6 +5,10 @@ loss, duplicates, and how many bytes a link carries.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from sim.scenarios.scenario import Scenario
+from sim.world.radio import Reach as WorldReach
+from sim.world.radio import reach_of
+from sim.world.streams import WorldStreams
 from team.estimation.randomness import generator
 
 EVERYONE = "*"
@@ -24,6 +28,28 @@ class Meeting:
     nodes: frozenset[str]
     begin_ns: int
     end_ns: int
+
+
+def reach_in(reach: WorldReach) -> Reach:
+    """As the world of a scenario has it."""
+
+    def between(one: str, other: str, now_ns: int) -> bool:
+        return reach.between(one, other, now_ns)
+
+    return between
+
+
+def air_of(scenario: Scenario, streams: WorldStreams, seed: int = 0) -> "Air":
+    """The radio of a scenario, in memory."""
+    radio = scenario.radio
+    delay_ns = round(radio.delay_s * 1e9)
+    return Air(
+        reach=reach_in(reach_of(radio, streams.streams)),
+        loss=radio.loss,
+        delay_ns=(delay_ns, delay_ns),
+        bytes_per_s=radio.bytes_per_s,
+        seed=seed,
+    )
 
 
 def meetings(windows: Sequence[Meeting]) -> Reach:

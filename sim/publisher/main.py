@@ -6,14 +6,16 @@ import time
 
 from sim.publisher.configurations import Configurations
 from sim.publisher.node import WorldNode, expected_nodes
+from sim.radio.bus import plan_of
 from sim.scenarios.scenario import Scenario
 from sim.scenarios.source import tells_map
+from sim.world.radio import reach_of
 from sim.world.streams import WorldStreams
 from team import translate
 from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus
+from team.wire.bus import Bus, Outgoing
 
 PACE_S = 0.002
 """Wait when there is nothing to publish: the clock or the credit must move first."""
@@ -52,6 +54,9 @@ def run_world(
     shell.look_for_the_end()
     if shell.going:
         shell.begin()
+    if scenario.peers and not scenario.radio.is_perfect:
+        reach = reach_of(scenario.radio, streams.streams)
+        shell.publish([Outgoing(ch.RADIO, "", plan_of(reach))])
     said: set[str] = set()
     while shell.going:
         out = node.publish(time.monotonic())

@@ -26,6 +26,7 @@ from sim.scenarios.document import (
     resolved,
 )
 from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UtiasWorld, World
+from sim.world.radio import Radio
 from team.config import Estimator, Exchange, FusionRule, RobotConfig
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from team.registry import absence
@@ -42,9 +43,10 @@ WORLDS: dict[str, type[World]] = {
 
 
 class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A resolved scenario: what the team is told, and its world."""
+    """A resolved scenario: what the team is told, its world, and what peers reach each other by."""
 
     world: World
+    radio: Radio = Radio()
 
     def config_of(self, robot: str) -> RobotConfig | None:
         """The configuration of a robot; of one that is not named that of newcomers, if any."""
@@ -90,6 +92,7 @@ def with_options(
     dataset: str | Path | None = None,
     peers: bool = False,
     centre: bool = True,
+    comm_range_m: float | None = None,
 ) -> Scenario:
     """The scenario with what a command line changes; None leaves it as it is.
 
@@ -100,6 +103,8 @@ def with_options(
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
     fields |= {key: value for key, value in changes.items() if value is not None}
+    if comm_range_m is not None:
+        fields["radio"]["comm_range_m"] = comm_range_m
     fields["peers"] = fields["peers"] or peers
     fields["centre"] = fields["centre"] and centre
     if dataset is not None:
@@ -223,6 +228,10 @@ def _filled(scenario: Scenario) -> Scenario:
             'world.kind = "live" needs a rule on submaps, as "join"'
         )
     peers = scenario.peers or not scenario.centre
+    if not (peers or scenario.radio.is_perfect):
+        raise ScenarioError(
+            "a radio is between peers: give `centre = false` (--without-centre), or `peers = true`"
+        )
     if peers and (scenario.fusion != "join" or scenario.exchange == "rendezvous"):
         raise ScenarioError(
             f"the rule {scenario.fusion} with exchange {scenario.exchange} needs a centre and no "

@@ -164,6 +164,8 @@ KNOWN_MAP = Channel(name="known_map", template="world/known_map", message=m.Know
                     meaning="prior map for localisation-only robots")  # fmt: skip
 END = Channel(name="end", template="world/end", message=m.End, rate="once", delivery="latest", recorded=True, recomputable=False,
               meaning="everything is published; the last counters")  # fmt: skip
+RADIO = Channel(name="radio", template="world/radio", message=m.RadioPlan, rate="once", delivery="latest", recorded=True, recomputable=False,
+                meaning="of a simulated radio: who reaches whom")  # fmt: skip
 RECORDER_PROGRESS = Channel(name="recorder_progress", template="recorder/progress/{robot}", message=m.Progress,
                             rate="every 256 measurements, every submap", delivery="latest", recorded=False, recomputable=False,
                             meaning="credit for the world, and that a robot may leave")  # fmt: skip

@@ -962,6 +962,24 @@ class Members(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag
             raise ValueError("wrong length: keys, payloads and signatures")
 
 
+class RadioPlan(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="radio/1"):
+    """Of a simulated radio: who reaches whom, by seconds of team time from stamp_ns on.
+
+    pairs: a row of bits for each second, of the robots two by two in their order, padded to bytes.
+    ends_ns: when each robot's stream ends.
+    """
+
+    robots: tuple[Name, ...]
+    ends_ns: tuple[StampNs, ...]
+    pairs: bytes
+
+    def check(self) -> None:  # noqa: D102
+        n = len(self.robots)
+        width = max((n * (n - 1) // 2 + 7) // 8, 1)
+        if len(self.ends_ns) != n or not self.pairs or len(self.pairs) % width:
+            raise ValueError("wrong length: ends_ns or pairs")
+
+
 class Concluded(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="concluded/1"):
     """A peer has the final map of its own fold. digest: its set's. sha256: of the map's payload.
 

@@ -1,0 +1,178 @@
+"""A robot's bus as its radio would be: over a router, what is out of reach is dropped at the door.
+
+The world, which alone knows where everyone is, says beforehand who reaches whom (`world/radio`).
+A message counts as sent at its stamp: so a run does not depend on how fast the team is driven. What
+is lost is decided by the bytes of the message and its receiver. Only what robots and their drivers
+say is carried by radio; the world, the recorder and the operator are the test bench's.
+"""
+
+import heapq
+import time
+from collections.abc import Iterable
+from hashlib import blake2b
+from typing import cast
+
+from sim.world.radio import Radio, Reach
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Answer, Bus, Outgoing, Sample
+from team.wire.codec import WireError, decoded, encoded
+
+_RADIO = {
+    channel.name
+    for channel in ch.CHANNELS
+    if channel.template.startswith(("robot/{robot}", "source/{robot}", "{node}"))
+}
+
+
+class RadioBus:
+    """A bus of one robot behind a radio; everything else is its bus's own."""
+
+    def __init__(self, bus: Bus, robot: str, radio: Radio, reach: Reach | None = None) -> None:
+        self._bus = bus
+        self._robot = robot
+        self._radio = radio
+        self._reach = reach
+        self._done = False
+        self._held: list[tuple[float, int, Sample]] = []
+        self._count = 0
+        self._busy: dict[str, float] = {}
+        self._tokens: dict[str, bool] = {}
+        self._near: dict[str, bool] = {}
+        self._now_ns = -(2**62)
+        bus.subscribe(ch.RADIO)
+        self.tap = None
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._bus, name)
+
+    def publish(self, out: Outgoing) -> int:
+        """Publish; a robot's last word says that its stream has ended."""
+        self._now_ns = max(self._now_ns, out.message.stamp_ns)
+        self._done = self._done or out.channel is ch.ROBOT_DONE
+        return self._bus.publish(out)
+
+    def request(self, channel: ch.Channel, name: str, request: m.Message) -> None:
+        """Ask; nobody hears a question that is out of reach."""
+        robot = ch.robot_of(name)
+        if channel is not ch.MEMBERS or robot is None or self._reaches(robot, self._now_ns):
+            self._bus.request(channel, name, request)
+
+    def answer(self, channel: ch.Channel, name: str, answer: Answer) -> None:
+        """Answer; a question from out of reach has not been heard."""
+
+        def heard(request: bytes) -> Iterable[bytes]:
+            if channel is ch.MEMBERS:
+                asker = ch.robot_of(decoded(request, m.MembersRequest).node)
+                if asker is not None and not self._reaches(asker, self._now_ns):
+                    return []
+            return answer(request)
+
+        self._bus.answer(channel, name, heard)
+
+    def receive(self, timeout_s: float) -> list[Sample]:
+        """What the radio lets through, and who has come into reach or left it."""
+        through: list[Sample] = []
+        for sample in self._bus.receive(timeout_s):
+            found = ch.channel_of(sample.key)
+            if found is not None and found[0] is ch.RADIO:
+                self._reach = reach_in(sample.payload) or self._reach
+            elif found is None or (by := self._said_by(*found)) is None:
+                through.append(sample)
+            elif found[0] is ch.ALIVE:
+                self._note(by, sample)
+            else:
+                self._carry(by, sample, through)
+        now_s = time.monotonic()
+        while self._held and self._held[0][0] <= now_s:
+            through.append(heapq.heappop(self._held)[-1])
+        return [*self._changes(), *through]
+
+    def _said_by(self, channel: ch.Channel, name: str) -> str | None:
+        """The other robot that says something by radio; None: it is not by radio, or our own."""
+        if channel.name not in _RADIO:
+            return None
+        robot = ch.robot_of(name) if channel.template.startswith("{node}") else name
+        return None if robot in (None, self._robot) else robot
+
+    def _carry(self, by: str, sample: Sample, through: list[Sample]) -> None:
+        sent_ns = max(sample.stamp_ns, -(2**62))
+        if not self._reaches(by, sent_ns) or self._is_lost(sample):
+            return
+        wait_s = self._radio.delay_s
+        if self._radio.bytes_per_s is not None:
+            now_s = time.monotonic()
+            begin_s = max(now_s, self._busy.get(by, 0.0))
+            self._busy[by] = begin_s + len(sample.payload) / self._radio.bytes_per_s
+            wait_s += self._busy[by] - now_s
+        if wait_s <= 0.0:
+            through.append(sample)
+            return
+        self._count += 1
+        heapq.heappush(self._held, (time.monotonic() + wait_s, self._count, sample))
+
+    def _reaches(self, other: str, at_ns: int) -> bool:
+        reach = self._reach
+        if reach is None or other not in reach.ends_ns:
+            return reach is None
+        ended = at_ns >= reach.ends_ns[other]
+        if ended:  # its stream is over: it waits until this robot's is, too
+            return self._done
+        return reach.between(self._robot, other, at_ns)
+
+    def _is_lost(self, sample: Sample) -> bool:
+        if not self._radio.loss:
+            return False
+        named = f"{self._robot} {sample.key} {sample.counter} {sample.wall_ns}".encode()
+        drawn = int.from_bytes(blake2b(named, digest_size=8).digest(), "little") / 2.0**64
+        return drawn < self._radio.loss
+
+    def _note(self, robot: str, sample: Sample) -> None:
+        self._tokens[robot] = decoded(sample.payload, m.Liveliness).alive
+
+    def _changes(self) -> list[Sample]:
+        """A robot is there for another one while it lives and is in reach."""
+        changed = []
+        for robot, alive in self._tokens.items():
+            there = alive and self._reaches(robot, self._now_ns)
+            if there != self._near.get(robot):
+                self._near[robot] = there
+                node = ch.robot_node(robot)
+                token = m.Liveliness(stamp_ns=0, node=node, alive=there)
+                changed.append(Sample(ch.ALIVE.key(node), encoded(token), 0, time.time_ns(), 0))
+        return changed
+
+
+def behind_radio(bus: Bus, robot: str, radio: Radio) -> Bus:
+    """A robot's bus behind its radio."""
+    return cast(Bus, RadioBus(bus, robot, radio))
+
+
+def plan_of(reach: Reach) -> m.RadioPlan:
+    """What the world says of who reaches whom."""
+    import numpy as np
+
+    return m.RadioPlan(
+        stamp_ns=reach.first_ns,
+        robots=reach.robots,
+        ends_ns=tuple(reach.ends_ns[robot] for robot in reach.robots),
+        pairs=np.packbits(reach.pairs, axis=1).tobytes(),
+    )
+
+
+def reach_in(payload: bytes) -> Reach | None:
+    """Who reaches whom, as the world has said it."""
+    import numpy as np
+
+    try:
+        plan = decoded(payload, m.RadioPlan)
+    except WireError:
+        return None
+    n = len(plan.robots)
+    couples = n * (n - 1) // 2
+    width = (couples + 7) // 8
+    rows = np.frombuffer(plan.pairs, np.uint8).reshape(-1, max(width, 1))
+    pairs = np.unpackbits(rows, axis=1)[:, :couples].astype(np.bool_)
+    return Reach(
+        plan.robots, plan.stamp_ns, pairs, dict(zip(plan.robots, plan.ends_ns, strict=True))
+    )

@@ -1,0 +1,102 @@
+"""Who reaches whom by radio: by true distance, or in given windows of time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from msgspec import Meta
+
+from sim.world.streams import RobotStream
+from team.config import NonNegative, Positive
+
+PERIOD_NS = 1_000_000_000
+"""Who is in reach is looked at so often [ns of team time]."""
+
+
+class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """These robots reach each other from from_s until to_s of team time since the beginning."""
+
+    robots: tuple[str, ...]
+    from_s: NonNegative
+    to_s: Positive
+
+
+class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What robots without a centre reach each other by; the default is everyone, at once.
+
+    comm_range_m: by true distance; absent: any. windows: if there are any, only then, and within
+    the range. loss: the share of messages that never arrive. delay_s: until one does. bytes_per_s:
+    what each link carries; absent: anything. Once a robot's stream has ended it reaches everyone
+    whose stream has ended, too: robots are collected, and what is not known yet spreads.
+    """
+
+    comm_range_m: Positive | None = None
+    windows: tuple[RadioWindow, ...] = ()
+    loss: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
+    delay_s: NonNegative = 0.0
+    bytes_per_s: Positive | None = None
+
+    @property
+    def is_perfect(self) -> bool:
+        """Whether everyone reaches everyone at once."""
+        return self == Radio()
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Who reaches whom: row t is for first_ns + t · PERIOD_NS and the period behind it.
+
+    pairs: T × P, of the robots two by two in their order. ends_ns: when each robot's stream ends.
+    """
+
+    robots: tuple[str, ...]
+    first_ns: int
+    pairs: Bool[np.ndarray, "T P"]
+    ends_ns: dict[str, int]
+
+    def between(self, one: str, other: str, now_ns: int) -> bool:
+        """Whether two robots reach each other at a time; behind the last row as in it."""
+        if one == other or one not in self.ends_ns or other not in self.ends_ns:
+            return True
+        if now_ns >= max(self.ends_ns[one], self.ends_ns[other]):
+            return True
+        row = min(max((now_ns - self.first_ns) // PERIOD_NS, 0), len(self.pairs) - 1)
+        i, j = sorted((self.robots.index(one), self.robots.index(other)))
+        n = len(self.robots)
+        return bool(self.pairs[row, i * n - i * (i + 1) // 2 + j - i - 1])
+
+
+def reach_of(radio: Radio, streams: Sequence[RobotStream]) -> Reach:
+    """Who reaches whom in a world; raises ValueError where a range needs a truth that is none."""
+    robots = tuple(stream.robot for stream in streams)
+    first_ns = min((int(s.stamps_ns[0]) for s in streams if len(s)), default=0)
+    ends_ns = {s.robot: int(s.stamps_ns[-1]) if len(s) else first_ns for s in streams}
+    rows = (max(ends_ns.values(), default=first_ns) - first_ns) // PERIOD_NS + 1
+    times = first_ns + PERIOD_NS * np.arange(rows, dtype=np.int64)
+    couples = list(combinations(range(len(streams)), 2))
+    pairs = np.ones((rows, len(couples)), dtype=np.bool_)
+    if radio.comm_range_m is not None:
+        at = [_positions(stream, times) for stream in streams]
+        for k, (i, j) in enumerate(couples):
+            pairs[:, k] = np.hypot(*(at[i] - at[j]).T) <= radio.comm_range_m
+    if radio.windows:
+        seconds = (times - first_ns) * 1e-9
+        opened = np.zeros_like(pairs)
+        for window in radio.windows:
+            then = (window.from_s <= seconds) & (seconds < window.to_s)
+            for k, (i, j) in enumerate(couples):
+                opened[:, k] |= then & ({robots[i], robots[j]} <= set(window.robots))
+        pairs &= opened
+    return Reach(robots, first_ns, pairs, ends_ns)
+
+
+def _positions(stream: RobotStream, times: Int64[np.ndarray, " T"]) -> Float[np.ndarray, "T 2"]:
+    """True positions at some times, by linear interpolation."""
+    if stream.truth is None or stream.truth_ns is None or not len(stream.truth):
+        raise ValueError(f"radio.comm_range_m needs the truth of {stream.robot}: there is none")
+    x, y = (np.interp(times, stream.truth_ns, stream.truth[:, axis]) for axis in (0, 1))
+    return np.column_stack([x, y])
