@@ -2,6 +2,8 @@
 
 import os
 import sys
+from collections.abc import Callable
+from functools import cache
 
 # Before NumPy: one BLAS thread per process, for the same bits everywhere and no fight for cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -51,10 +53,16 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
         raise typer.Exit
 
 
+@cache
+def command() -> Callable[[], None]:
+    """All commands, built from their functions; a launch's template does it once for all."""
+    return typer.main.get_command(app)
+
+
 def main() -> None:
     """Run a command; what a user did wrong ends with 2, what failed with 1, without a traceback."""
     try:
-        app()
+        command()()
     except Exception as error:
         told = _told(error)
         if told is None:

@@ -9,13 +9,16 @@ started by its command line: docs/decisions/0076-warm-template.md.
 import gc
 import importlib
 import json
+import logging
 import os
 import select
 import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NoReturn
 
 from sim.launch.linux import end_with_parent, threads, write_command_line
 from sim.launch.processes import TEMPLATE
@@ -44,15 +47,17 @@ class _Request:
     output: int
 
 
-def become_a_process() -> None:
+def become_a_process(prepare: Callable[[], object]) -> None:
     """Be the template that sys.argv speaks of; return in each forked process, with its sys.argv.
 
-    The template itself never returns: it ends when its launch does.
+    The template itself never returns: it ends when its launch does. prepare: what else every
+    process would do first.
     """
     end_with_parent(signal.SIGKILL)
     launch, estimator, rule = os.getppid(), sys.argv[3], sys.argv[4]
     write_command_line(sys.orig_argv[: sys.orig_argv.index(TEMPLATE) + 1])
     asked = socket.socket(fileno=int(sys.argv[2]))
+    prepare()
     for module in LIGHT:
         importlib.import_module(module)
     while _is_asked(asked, 0.0):  # the router does not wait for the others' imports
@@ -71,6 +76,25 @@ def become_a_process() -> None:
     while True:
         if _serve(asked, launch):
             return
+
+
+def end_by(run: Callable[[], None]) -> NoReturn:
+    """Run, and end this forked process as Python would, but for taking all modules apart.
+
+    That would copy every page that it shares with the others: 0.2 s and 100 MB each.
+    """
+    status: object = None
+    try:
+        run()
+    except SystemExit as ended:
+        status = ended.code
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        status = 1
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status if isinstance(status, int) else int(status is not None))
 
 
 def _is_asked(asked: socket.socket, patience_s: float) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 import numba
+import numpy as np
 from llvmlite import binding  # type: ignore[import-untyped] # no stubs
 
 import central
@@ -14,7 +15,7 @@ import team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld
-from team.estimation.geometry import wrapped
+from team.estimation.geometry import inverse, logarithm, wrapped
 
 _VERSIONS = (sys.version, numba.__version__, binding.get_host_cpu_name())
 _STEPS = 48
@@ -68,3 +69,4 @@ def run_small_team(estimator: str, fusion: str) -> None:
     )
     for _ in run_team(small, streams_of(small)):
         pass
+    logarithm(inverse(np.zeros(3)))  # the centre asks this of robots without an initial pose

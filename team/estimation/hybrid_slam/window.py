@@ -205,10 +205,11 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
     slots = np.searchsorted(ids, window.ids)
     by_slot = np.argsort(slots, kind="stable")
     bounds = np.searchsorted(slots[by_slot], np.arange(len(ids) + 1))
+    # One layout, whatever the indexing left: each would be a form of the kernel of its own.
     means, covariances = landmarks_along_paths(
-        means,
-        covariances,
-        window.paths,
+        np.ascontiguousarray(means),
+        np.ascontiguousarray(covariances),
+        np.ascontiguousarray(window.paths),
         bounds,
         window.keyframes[by_slot],
         window.measurements[by_slot],
@@ -237,7 +238,13 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
         of_nodes = base_poses(of_nodes, mount)
     poses = np.concatenate((particles.poses, *of_nodes), axis=1)
     weights = np.exp(particles.log_weights)
-    mean, covariance = moments(poses, weights, means, covariances, sample_factor(weights))
+    mean, covariance = moments(
+        poses,
+        weights,
+        np.ascontiguousarray(means),
+        np.ascontiguousarray(covariances),
+        sample_factor(weights),
+    )
     numbers = np.arange(poses.shape[1])
     covariance[numbers, numbers] += np.tile(POSE_JITTER, len(numbers) // 3)
     cholesky_factor(covariance, "the submap of a window")

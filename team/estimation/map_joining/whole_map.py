@@ -91,8 +91,8 @@ def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> tuple[
         whole.mean[place],
         whole.covariance[place[:, None], place],
         local.end_pose,
-        local.covariance[:3, :3],
-        local.covariance[:3, sights],
+        np.ascontiguousarray(local.covariance[:3, :3]),
+        np.ascontiguousarray(local.covariance[:3, sights]),
     )
     return PoseGaussian(pose, covariance), seen - len(local.ids)
 
