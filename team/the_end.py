@@ -17,18 +17,16 @@ SINCE = "TEAMSLAM_SINCE"
 _LOG = logging.getLogger("teamslam")
 
 
-class _Life:
-    """When this process began; for one that was forked: the fork."""
-
-    def __init__(self) -> None:
-        self.begin()
-
-    def begin(self) -> None:
-        self.began = time.monotonic()
+_STARTED = time.monotonic()
 
 
-_LIFE = _Life()
-os.register_at_fork(after_in_child=_LIFE.begin)
+def _forked() -> None:
+    """The life of a process that was forked begins with the fork."""
+    global _STARTED
+    _STARTED = time.monotonic()
+
+
+os.register_at_fork(after_in_child=_forked)
 
 
 class TheEnd:
@@ -46,7 +44,7 @@ class TheEnd:
         self._due = 0.0
         began = os.environ.get(SINCE)
         self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
-        self._began = _LIFE.began
+        self._began = _STARTED
 
     def missed(self) -> list[Sample]:
         """The final map, if the router has it; it is asked at most every FINAL_S."""

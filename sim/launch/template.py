@@ -31,6 +31,7 @@ HEAVY = (
     "central.main",
     "sim.in_memory.team",
     "sim.publisher.main",
+    "team.keys.credentials",
     "team.recording.own_log",
     "team.recording.provenance",
     "team.recording.shell",

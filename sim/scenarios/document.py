@@ -20,7 +20,6 @@ from typing import Any
 import msgspec
 
 from central.config import CentralConfig
-from sim.datasets.folder import robots_of
 from sim.scenarios.checks import ScenarioError, check_fields, check_known, plain
 from team.config import RobotConfig
 
@@ -102,6 +101,8 @@ def _unnamed(world: Fields, count: object) -> list[Fields]:
     if count is not None:
         return [{}] * checked_count(count)
     if world.get("kind") == "folder":
+        from sim.datasets.folder import robots_of
+
         path = world.get("path")
         named = robots_of(path) if isinstance(path, str) and path else (ANY_ROBOT,)
         return [{"id": name} for name in named]

@@ -12,9 +12,6 @@ from typing import Any
 import msgspec
 
 from central.team_config import TeamConfig
-from sim.datasets.folder import robots_of
-from sim.datasets.kinds import kind_of
-from sim.datasets.tables import DatasetError
 from sim.scenarios.checks import ScenarioError, check_fields, plain
 from sim.scenarios.document import (
     MAX_ROBOTS,
@@ -111,6 +108,8 @@ def with_options(
         fields["world"] = _world_of(scenario, str(dataset))
     world = fields["world"]
     if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
+        from sim.datasets.folder import robots_of
+
         fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
     if robots is not None:
         fields["robots"] = _counted(fields["robots"], robots)
@@ -135,6 +134,9 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
 
 def _kind_of(path: str, otherwise: str) -> str:
     """The kind of a data set; what can not be told is found wrong when it is read."""
+    from sim.datasets.kinds import kind_of
+    from sim.datasets.tables import DatasetError
+
     try:
         return kind_of(path)
     except DatasetError:

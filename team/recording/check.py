@@ -9,7 +9,7 @@ from team.recording.counters import Counters, TallyCount
 from team.recording.cut import CUT
 from team.recording.declared import declared, misdeclared
 from team.recording.inventory import Inventory
-from team.recording.last_words import LastWords
+from team.recording.last_words import MISSING, LastWords
 from team.recording.reader import Log, LogError
 from team.recording.records import index_damage
 from team.recording.repair import salvaged
@@ -142,8 +142,6 @@ _OF_AN_END = (ch.ROBOT_DONE, ch.FINAL_MAP)
 """Who says this has heard of the end of the streams."""
 NO_END = "missing: how many measurements there were is not known"
 DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
-MISSING = "missing: "
-"""How the recorder's last word on what it lacks begins."""
 
 
 def _of_file(log: Log) -> list[Finding]:

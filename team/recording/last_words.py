@@ -14,6 +14,9 @@ from team.wire import channels as ch
 from team.wire.bus import NO_COUNTER, Sample
 from team.wire.messages import Tally
 
+MISSING = "missing: "
+"""How the recorder's last word on what it lacks begins."""
+
 
 class _Spoke(NamedTuple):
     """A status: the publisher's wall clock [ns], its counter, the team time [ns]."""

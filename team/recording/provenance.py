@@ -2,45 +2,45 @@
 
 import hashlib
 import subprocess
+import sys
 from importlib import metadata
 from pathlib import Path
 from platform import platform, python_version
 
 import numpy as np
-from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
 
-import team.estimation
-
+ESTIMATION = Path(__file__).parents[1] / "estimation"
 _PACKAGES = ("teamslam", "numpy", "scipy", "numba", "llvmlite", "eclipse-zenoh", "msgpack", "mcap")
 
 
 def provenance() -> dict[str, str]:
     """Versions, BLAS, CPU and kernels of this process, as a log's metadata carries them."""
-    cpu_features = binding.get_host_cpu_features()
+    cpu_name, cpu_features = _cpu()
     versions = {f"version.{package}": _version(package) for package in _PACKAGES}
     return {
         **versions,
         "version.python": python_version(),
         "platform": platform(),
         "blas": _blas(),
-        "cpu.name": binding.get_host_cpu_name(),
-        "cpu.features": " ".join(sorted(n for n, has in cpu_features.items() if has)),
+        "cpu.name": cpu_name,
+        "cpu.features": cpu_features,
         "kernels": kernel_fingerprint(),
         "git.commit": git_commit(),
     }
 
 
 def kernel_fingerprint() -> str:
-    """SHA-256 of the sources of `team.estimation`, in the order of their names; 16 hex digits."""
+    """SHA-256 of all sources of `team.estimation`, in the order of their paths; 16 hex digits."""
     digest = hashlib.sha256()
-    for source in sorted(Path(team.estimation.__path__[0]).glob("*.py")):
-        digest.update(f"{source.name}\n".encode() + source.read_bytes())
+    for source in sorted(ESTIMATION.rglob("*.py")):
+        digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())
+        digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def git_commit() -> str:
     """The commit of the checkout that this program runs from, "+" when changed; else "unknown"."""
-    root = Path(team.estimation.__path__[0]).parents[1]
+    root = ESTIMATION.parents[1]
     if not (root / ".git").exists():
         return "unknown"
     git = ["git", "-C", str(root)]
@@ -52,6 +52,25 @@ def git_commit() -> str:
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return commit + ("+" if changes else "")
+
+
+def cpu() -> tuple[str, str]:
+    """The processor and its features, as the kernels' compiler sees them."""
+    from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
+
+    features = binding.get_host_cpu_features()
+    return binding.get_host_cpu_name(), " ".join(sorted(n for n, has in features.items() if has))
+
+
+def _cpu() -> tuple[str, str]:
+    """Asked of a process of its own, unless this one has the compiler: it takes 110 MB."""
+    if "llvmlite.binding" in sys.modules:
+        return cpu()
+    code = f"from {__name__} import cpu; print(*cpu(), sep='\\n')"
+    asked = [sys.executable, "-P", "-c", code]
+    told = subprocess.run(asked, capture_output=True, check=True, text=True).stdout  # noqa: S603 - our own program
+    name, features = told.splitlines()
+    return name, features
 
 
 def _version(package: str) -> str:

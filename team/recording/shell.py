@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 
-from team.recording.check import MISSING
 from team.recording.inventory import Inventory, Stream, intervals
+from team.recording.last_words import MISSING
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.replayer import schedule
 from team.the_end import TheEnd

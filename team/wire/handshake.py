@@ -7,8 +7,10 @@ router refuses our certificate, or we its; one side speaks TLS and the other doe
 import re
 import socket
 import ssl
+from typing import TYPE_CHECKING
 
-from team.keys.credentials import Credentials
+if TYPE_CHECKING:
+    from team.keys.credentials import Credentials
 
 TIMEOUT_S = 1.0
 """For each step; a router on a busy machine that takes longer is asked again."""
@@ -24,7 +26,7 @@ _ALERTS = {
 }
 
 
-def why_refused(connect: str, keys: Credentials | None) -> str | None:
+def why_refused(connect: str, keys: "Credentials | None") -> str | None:
     """In words, with the remedy; None: nobody listens there, or TLS is not what stands between."""
     at = _ENDPOINT.match(connect)
     if at is None:
@@ -38,7 +40,7 @@ def why_refused(connect: str, keys: Credentials | None) -> str | None:
         return _without_keys(link, connect) if keys is None else _with(link, host, connect, keys)
 
 
-def router_ends(connect: str, keys: Credentials) -> float | None:
+def router_ends(connect: str, keys: "Credentials") -> float | None:
     """When the router's certificate ends [s since 1970]; None: it can not be learnt now."""
     at = _ENDPOINT.match(connect)
     if at is None:
@@ -56,7 +58,7 @@ def router_ends(connect: str, keys: Credentials) -> float | None:
     return ssl.cert_time_to_seconds(ends) if isinstance(ends, str) else None
 
 
-def _with(link: socket.socket, host: str, connect: str, keys: Credentials) -> str | None:
+def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> str | None:
     try:
         context = keys.context()
     except OSError as error:
@@ -83,7 +85,7 @@ def _with(link: socket.socket, host: str, connect: str, keys: Credentials) -> st
     return None
 
 
-def _alerted(error: ssl.SSLError, connect: str, keys: Credentials) -> str:
+def _alerted(error: ssl.SSLError, connect: str, keys: "Credentials") -> str:
     reason = error.reason or str(error)
     for alert, meaning in _ALERTS.items():
         if alert in reason:

@@ -31,13 +31,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
-from team.keys.credentials import Credentials
 from team.keys.roster import Roster
 from team.wire.access import access_control
 from team.wire.arrivals import Arrivals
@@ -56,6 +55,9 @@ from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded
 from team.wire.handshake import router_ends, why_refused
 from team.wire.kept import Kept
 from team.wire.messages import FinalMapRequest, Liveliness, Message, Tally
+
+if TYPE_CHECKING:  # a node without keys needs none of it
+    from team.keys.credentials import Credentials
 
 _ATTACHMENT = struct.Struct("<qqq")
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
@@ -142,7 +144,7 @@ class ZenohBus:
         team: str,
         connect: str,
         patience_s: float = 10.0,
-        keys: Credentials | None = None,
+        keys: "Credentials | None" = None,
     ) -> None:
         self._prefix = f"team/{team}/"
         self._queue: SimpleQueue[_Item] = SimpleQueue()
@@ -548,7 +550,7 @@ class _Door:
     without our certificate: there is nothing else on the key that it holds a token on.
     """
 
-    def __init__(self, session: zenoh.Session, connect: str, keys: Credentials) -> None:
+    def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials") -> None:
         self._session = session
         self._connect = connect
         self._keys = keys
@@ -633,7 +635,7 @@ def _session(settings: dict[str, object]) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def _client(connect: str, patience_s: float, keys: Credentials | None) -> zenoh.Session:
+def _client(connect: str, patience_s: float, keys: "Credentials | None") -> zenoh.Session:
     settings: dict[str, object] = {
         "mode": "client",
         "connect/endpoints": [connect],
@@ -665,7 +667,7 @@ def _client(connect: str, patience_s: float, keys: Credentials | None) -> zenoh.
                 ) from error
 
 
-def _client_tls(keys: Credentials) -> dict[str, object]:
+def _client_tls(keys: "Credentials") -> dict[str, object]:
     return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
@@ -679,7 +681,7 @@ def _client_tls(keys: Credentials) -> dict[str, object]:
     }
 
 
-def _router_tls(keys: Credentials, roster: Roster) -> dict[str, object]:
+def _router_tls(keys: "Credentials", roster: Roster) -> dict[str, object]:
     return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
@@ -695,7 +697,7 @@ def _router_tls(keys: Credentials, roster: Roster) -> dict[str, object]:
 
 @contextmanager
 def router(
-    listen: str = "tcp/127.0.0.1:0", keys: tuple[Credentials, Roster] | None = None
+    listen: str = "tcp/127.0.0.1:0", keys: "tuple[Credentials, Roster] | None" = None
 ) -> Iterator[str]:
     """A router in this process; yields the endpoint that it is bound to.
 

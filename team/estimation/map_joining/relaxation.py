@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from team.estimation.map_joining.submap_graph import Graph
 
@@ -64,6 +62,9 @@ def _least_squares(
     rows: Sequence[_Rows], numbers: Values, free: Bool[np.ndarray, " _"]
 ) -> Values | None:
     """The free numbers that solve the rows best, given the others."""
+    from scipy.sparse import csc_array  # slow to import, and no robot uses it
+    from scipy.sparse.linalg import splu
+
     weighted = [each.weights[:, None] * each.coefficients for each in rows]
     counts = np.repeat([each.numbers.shape[1] for each in rows], [len(r.right) for r in rows])
     line = np.repeat(np.arange(len(counts)), counts)
