@@ -5,8 +5,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from team.association import AssociationProfile
 from team.config import Bounds, FusionRule, NonNegative, Positive
-from team.estimation.map_joining.association.profile import AssociationProfile
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

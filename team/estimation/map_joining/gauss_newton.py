@@ -19,12 +19,12 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.association import DEFAULT_PROFILE, AssociationProfile
 from team.config import Bias
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
-from team.estimation.map_joining.association.profile import DEFAULT_PROFILE, AssociationProfile
 from team.estimation.map_joining.submap_graph import Graph
 from team.estimation.sparse_cholesky import sparse
 

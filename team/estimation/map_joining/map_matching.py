@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from team.association import AssociationProfile
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.geometry import compose, inverse
 from team.estimation.map_joining.associating import View, applied, associated, union
@@ -37,7 +38,6 @@ from team.estimation.map_joining.association.landmarks import (
     between,
     united,
 )
-from team.estimation.map_joining.association.profile import AssociationProfile
 from team.estimation.map_joining.association.voting import Points
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, is_solvable, settled
 from team.estimation.map_joining.joining import Fold, merged_islands

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team.association import AssociationProfile
 from team.estimation.map_joining.association.growing import Grown, Indices, Joint, Pair, grow
-from team.estimation.map_joining.association.profile import AssociationProfile
 from team.estimation.map_joining.association.voting import Points, Vote, moved, voted
 
 BEND = 8.0

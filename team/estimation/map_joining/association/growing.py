@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.estimation.map_joining.association.profile import AssociationProfile
+from team.association import AssociationProfile
 
 Indices = Int64[np.ndarray, " _"]
 PREGATE = 4.0

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from team.association import AssociationProfile
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.association.landmarks import Landmarks, Member, Verdict
-from team.estimation.map_joining.association.profile import AssociationProfile
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
+from team.association import AssociationProfile
 from team.estimation.map_joining.association.growing import (
     Joint,
     conditioned,
     grow,
     likelihoods,
 )
-from team.estimation.map_joining.association.profile import AssociationProfile
 
 PROFILE = AssociationProfile(slack=0.0)
 
