@@ -44,7 +44,11 @@ class Observer:
 
 
 async def endpoint_of(folder: Path) -> str:
-    """Where the router of the launch listens whose run's folder this is."""
+    """Where the router of the launch listens whose run's folder this is, once all are started.
+
+    The router comes first; where kernels have to be compiled, the others a minute later.
+    """
+    await until((folder / "world.log").exists, "the world is started", 600.0)
     said = folder / "router.log"
     spoken = re.compile(r"^listening at (\S+)$", re.MULTILINE)
     await until(lambda: said.exists() and spoken.search(said.read_text()), "the router listens")
