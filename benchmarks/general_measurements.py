@@ -31,7 +31,7 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 
 PROBABILITY = 0.999
-WINDOW_S = 10.0
+WINDOW_S = 8.0
 MOTION = MotionModel(
     forward=MotionNoise(0.02, 0.04), turn=MotionNoise(0.01, 0.02), lateral=MotionNoise(0.01, 0.03)
 )
@@ -40,8 +40,8 @@ CAR = MotionModel(
     wheel_base=2.83, wheel_offset=0.76, shares=(0.08, 0.06, 0.01), shares_interval_s=1.0,
 )  # fmt: skip
 MOUNT = (3.78, 0.5, -0.4)
-SENSOR = Sensor(range_sigma=0.15, bearing_sigma=0.03, max_range=25.0)
-FRONT = FrontEnd(particles=200, window_s=WINDOW_S)
+SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02, max_range=25.0)
+FRONT = FrontEnd(particles=400, window_s=WINDOW_S)
 
 
 class Case(NamedTuple):
@@ -54,8 +54,8 @@ class Case(NamedTuple):
 
 def _world(**fields: object) -> SimulatedWorld:
     plain = SimulatedWorld(
-        steps=20, size_m=40.0, landmark_count=12, speed_m_s=1.0, turn_rate_rad_s=0.4,
-        visible_from_m=1.0, visible_to_m=18.0,
+        steps=16, size_m=30.0, landmark_count=12, speed_m_s=1.0, turn_rate_rad_s=0.4,
+        visible_from_m=1.0, visible_to_m=12.0,
     )  # fmt: skip
     return msgspec.structs.replace(plain, **fields)
 
@@ -116,6 +116,7 @@ def _no_shares(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, Ro
 
 
 CASES: Mapping[str, Case] = {
+    "speeds": Case(_world(), _robot(), {}),
     "increments": Case(
         _world(odometry="increments", odometry_claims=True, odometry_correlation=0.6),
         _robot(),

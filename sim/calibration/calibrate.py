@@ -22,6 +22,7 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
+from sim.calibration import claims
 from sim.calibration import motion as motion
 from sim.calibration import sensor as sensor
 from sim.calibration.consistency import covariance_factor, normal_scale
@@ -86,7 +87,8 @@ def _by_truth(
     for label, world in worlds:
         paths = true_paths(world.streams)
         turning = _turning_first(world, scenario)
-        data += references(world, paths, _positions(world), TRUTH_GAP_NS, label, turning)
+        given = world, paths, _positions(world), TRUTH_GAP_NS, label, turning
+        data += references(*given, scenario.robots[0])
         notes += _left_out(label, world, paths, "no ground truth")
     for note in notes:
         progress(note)
@@ -98,6 +100,10 @@ def _by_truth(
         return sensor.fit_sensor(part, depth=depth)
 
     of_sensor = jackknifed(fit, data, sensor.UNITS)
+    of_sensor += jackknifed(
+        lambda part: claims.landmark_factor(part, scenario.robots[0].sensor), data, claims.UNITS
+    )
+    placed = claims.mount_note(data, scenario.robots[0].sensor)
     own = own_constants(data, depth=depth)
     learnt = with_figures(scenario, of_motion, of_sensor, own.robots)
     folds = []
@@ -106,7 +112,7 @@ def _by_truth(
         team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
         folds.append(team.fold)
     of_central = _central_figures(folds, learnt, own.strays, progress)
-    said = (*notes, *_alarms(of_motion, scenario), *_other_model(data, depth))
+    said = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
     return Calibration(of_motion, of_sensor, True, said, of_central, own.robots)
 
 
@@ -137,7 +143,8 @@ def _by_the_map(
             mistrusting = _mistrusting(learnt)
             team = joined_team(world, mistrusting, lambda robot: progress(f"  {robot} is done"))
             turning = _turning_first(world, scenario)
-            data += references(world, team.paths, team.landmarks, JOINED_GAP_NS, label, turning)
+            given = world, team.paths, team.landmarks, JOINED_GAP_NS, label, turning
+            data += references(*given, scenario.robots[0])
             notes += _left_out(label, world, team.paths, "not in the team's joined map")
         found = (f for f in _motion_figures(data, learnt) if f.name in SCALES)
         figures = tuple(_with_systematic(f) for f in found)
@@ -148,6 +155,8 @@ def _by_the_map(
         folds.append(joined_team(world, learnt).fold)
     of_central = _central_figures(folds, scenario, (), progress)
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
+    if any(each.seen.covariances is not None for each in data):
+        note += "; so do the factors of covariances that come with measurements, and the mount"
     said = (note, *notes, *_alarms(figures, scenario))
     return Calibration(figures, (), False, said, of_central)
 
@@ -197,6 +206,8 @@ def _motion_figures(data: Sequence[Reference], scenario: Scenario) -> tuple[Figu
     given = scenario.robots[0].motion
     if not data:
         raise CalibrationError("no robot has both odometry and a known path")
+    if all(each.intervals.covariances is not None for each in data):
+        return jackknifed(claims.odometry_factor, data, claims.UNITS)
 
     slow_below = given.slow_below if motion.creep(data, given.slow_below) else 0.0
 

@@ -17,7 +17,7 @@ from sim.world.streams import (
     RobotStream,
     WorldStreams,
 )
-from team.config import MotionModel
+from team.config import MotionModel, RobotConfig
 from team.estimation.odometry import Interval, moved, steered
 from team.estimation.scans import Scan, point_scan, polar_scan
 
@@ -33,6 +33,7 @@ class Reference:
     name: the world's label, then the robot's id.
     gap_ns: between poses of `path` that are at most this far apart it is interpolated.
     landmarks: position of each id in the path's frame; `teammates`: the paths of the others.
+    mount: the sensor's pose on the robot's base.
     turns_first: between two poses the robot turns, then drives straight on (else: an arc).
     """
 
@@ -46,6 +47,7 @@ class Reference:
     names: tuple[str, ...]
     teammates: Mapping[str, Path]
     turns_first: bool = False
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def robot(self) -> str:
@@ -62,6 +64,32 @@ class Reference:
 def _between(seen: Detections, begin_ns: int, end_ns: int) -> Detections:
     first, last = (int(at) for at in np.searchsorted(seen.stamps_ns, [begin_ns, end_ns]))
     return seen.only(first, last)
+
+
+def sensor_poses(
+    data: Reference, stamps_ns: Int64[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Where the sensor was at these times, and which of them are known."""
+    poses, known = poses_at(data.path, stamps_ns, data.gap_ns, turns_first=data.turns_first)
+    if not any(data.mount):
+        return poses, known
+    x, y, heading = data.mount
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    moved_on = np.column_stack([c * x - s * y, s * x + c * y, np.full(len(poses), heading)])
+    return poses + moved_on, known
+
+
+def as_speeds(told: Intervals, motion: MotionModel) -> Intervals:
+    """Odometry of any form with the mean speeds that it means; those of a motion are its arc's."""
+    if told.increments is not None:
+        twists = np.array([moved(each, None).twist for each in told.increments]).reshape(-1, 3)
+        rates = twists / (told.duration_ns * 1e-9)[:, np.newaxis]
+        return replace(told, forward=rates[:, 0], yaw_rate=rates[:, 2])
+    if not told.steered:
+        return told
+    pairs = zip(told.forward.tolist(), told.yaw_rate.tolist(), strict=True)
+    speeds = np.array([steered(motion, *pair) for pair in pairs]).reshape(-1, 2)
+    return replace(told, forward=speeds[:, 0], yaw_rate=speeds[:, 1], steered=False)
 
 
 def scan_of(seen: ObservationMeasurement) -> Scan:
@@ -128,12 +156,14 @@ def references(
     gap_ns: int,
     label: str,
     turning_first: frozenset[str] = frozenset(),
+    models: RobotConfig | None = None,
 ) -> list[Reference]:
-    """The references of the robots that have a path and odometry."""
+    """The references of the robots that have a path and odometry; models: what reads the latter."""
+    robot = models or RobotConfig("any")
     return [
         Reference(
             name=f"{label} {stream.robot}",
-            intervals=stream.intervals,
+            intervals=as_speeds(stream.intervals, robot.motion),
             seen=stream.landmark_detections,
             path=paths[stream.robot],
             gap_ns=gap_ns,
@@ -142,6 +172,7 @@ def references(
             names=stream.teammates,
             teammates=paths,
             turns_first=stream.robot in turning_first,
+            mount=robot.sensor.mount,
         )
         for stream in world.streams
         if stream.robot in paths and len(stream.intervals.end_ns)

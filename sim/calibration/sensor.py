@@ -14,7 +14,7 @@ from jaxtyping import Float, Int64
 from scipy.optimize import least_squares, minimize
 
 from central.desk.evaluation.errors import on_circle
-from sim.calibration.data import Reference, poses_at
+from sim.calibration.data import Reference, poses_at, sensor_poses
 from sim.calibration.figures import CalibrationError, huber
 from team.config import Sensor
 from team.estimation.models import corrected
@@ -70,7 +70,7 @@ def _rows(data: Sequence[Reference]) -> _Rows:
         seen = each.seen
         ids = np.array(sorted(each.landmarks), dtype=np.int64)
         stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
-        poses, known = poses_at(each.path, stamps, each.gap_ns, turns_first=each.turns_first)
+        poses, known = sensor_poses(each, stamps)
         known &= np.isin(seen.ids, ids)
         if not known.any():
             continue
@@ -289,7 +289,7 @@ def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[st
         if own is None:
             continue
         stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
-        here, known = poses_at(each.path, stamps, each.gap_ns, turns_first=each.turns_first)
+        here, known = sensor_poses(each, stamps)
         measured = own.distances(seen.ranges, seen.bearings)
         for index, name in enumerate(each.names):
             if name in each.teammates:

@@ -1,0 +1,149 @@
+"""What measurements claim of themselves, and where a sensor is mounted, held against the truth.
+
+Covariances that come with odometry or with landmarks are right up to a factor: the median of the
+squared errors in their metric, over the median of chi-square. Errors of odometry are taken over
+spans, since those of a moment are the reference's own. A mount's heading is what a bearing reads
+too much, so it can not be told from `bearing_offset`; its place can, unless landmarks are seen in
+one direction only.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sim.calibration.data import Reference, poses_at, sensor_poses
+from sim.calibration.figures import huber
+from team.config import Sensor
+from team.estimation.consistency import chi2_quantile
+from team.estimation.geometry import between, logarithm
+from team.estimation.models import Increment, corrected
+
+SPAN_NS = 10_000_000_000
+LEAST = 30
+"""Spans or measurements from which a factor is learnt."""
+CERTAIN_M = 0.02
+"""A mount that is not known as well as this [m], at three standard deviations, is not told."""
+DISTANT = 3.0
+"""Standard deviations from which a mount is not the scenario's."""
+
+UNITS = {"covariance_factor": ""}
+
+
+def odometry_factor(data: Sequence[Reference]) -> Mapping[str, float]:
+    """`motion.covariance_factor` of increments that come with covariances; nothing of too few."""
+    squared = [value for each in data for value in _spans(each)]
+    return _factor(np.array(squared), 3)
+
+
+def _spans(data: Reference) -> list[float]:
+    told = data.intervals
+    if told.increments is None or told.covariances is None or not len(told.end_ns):
+        return []
+    edges = np.append(told.end_ns[0] - told.duration_ns[0], told.end_ns)
+    poses, known = poses_at(data.path, edges, data.gap_ns)
+    found, start, sum_ = [], 0, Increment.identity()
+    for k in range(len(told.end_ns)):
+        sum_ = sum_.then(Increment(told.increments[k], told.covariances[k]))
+        if edges[k + 1] - edges[start] < SPAN_NS:
+            continue
+        if known[start] and known[k + 1]:
+            error = logarithm(between(sum_.mean, between(poses[start], poses[k + 1])))
+            found.append(float(error @ np.linalg.solve(sum_.covariance, error)))
+        start, sum_ = k + 1, Increment.identity()
+    return found
+
+
+def landmark_factor(data: Sequence[Reference], sensor: Sensor) -> Mapping[str, float]:
+    """`sensor.covariance_factor` of landmarks that come with covariances; nothing of too few."""
+    parts = [np.empty(0)]
+    for each in data:
+        claims = each.seen.covariances
+        if claims is None:
+            continue
+        rows = _rows(each, sensor)
+        if each.seen.points is None:
+            error = np.column_stack([rows.ranges - rows.true_ranges, rows.of_bearings])
+        else:
+            error = rows.points - rows.true_points
+        full = claims[rows.taken][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        parts.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(full), error))
+    return _factor(np.concatenate(parts), 2)
+
+
+def _factor(squared: Float[np.ndarray, " n"], dof: int) -> Mapping[str, float]:
+    if len(squared) < LEAST:
+        return {}
+    return {"covariance_factor": float(np.median(squared)) / float(chi2_quantile(0.5, dof))}
+
+
+class _Rows(NamedTuple):
+    """Landmarks that are known, as they were seen and as they were, relative to the sensor."""
+
+    taken: np.ndarray
+    ranges: Float[np.ndarray, " n"]
+    points: Float[np.ndarray, "n 2"]
+    true_ranges: Float[np.ndarray, " n"]
+    true_points: Float[np.ndarray, "n 2"]
+    of_bearings: Float[np.ndarray, " n"]
+
+
+def _rows(data: Reference, sensor: Sensor) -> _Rows:
+    seen = data.seen
+    stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
+    poses, known = sensor_poses(data, stamps)
+    taken = known & np.isin(seen.ids, np.array(sorted(data.landmarks), dtype=np.int64))
+    places = np.array([data.landmarks[i] for i in seen.ids[taken].tolist()]).reshape(-1, 2)
+    ranges, bearings = corrected(sensor, seen.ranges[taken], seen.bearings[taken])
+    c, s = np.cos(poses[taken, 2]), np.sin(poses[taken, 2])
+    dx, dy = (places - poses[taken, :2]).T
+    true = np.column_stack([c * dx + s * dy, c * dy - s * dx])
+    points = ranges[:, np.newaxis] * np.column_stack([np.cos(bearings), np.sin(bearings)])
+    off = bearings - np.arctan2(true[:, 1], true[:, 0])
+    off = np.arctan2(np.sin(off), np.cos(off))
+    return _Rows(taken, ranges, points, np.hypot(true[:, 0], true[:, 1]), true, off)
+
+
+def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
+    """What the truth says of the sensor's place on the base, where it is not the scenario's."""
+    rows = [_rows(each, sensor) for each in data]
+    points = np.concatenate([np.empty((0, 2)), *(each.points for each in rows)])
+    true = np.concatenate([np.empty((0, 2)), *(each.true_points for each in rows)])
+    if len(points) < LEAST:
+        return ()
+    # The true points relative to the assumed mount are those seen, moved by the mount's error.
+    ranges = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-3)
+    rays = points / ranges[:, np.newaxis]
+    sigma = np.hypot(sensor.range_sigma, sensor.bearing_sigma * ranges)
+
+    def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        c, s = np.cos(p[2]), np.sin(p[2])
+        stretched = points + p[3] * rays
+        x = c * stretched[:, 0] - s * stretched[:, 1] + p[0] - true[:, 0]
+        y = s * stretched[:, 0] + c * stretched[:, 1] + p[1] - true[:, 1]
+        return np.concatenate([x, y])
+
+    both = np.concatenate([sigma, sigma])
+    found = huber(residual, both, np.zeros(4))
+    J = np.column_stack([
+        (residual(found + h) - residual(found - h)) / 2e-6 / both for h in 1e-6 * np.eye(4)
+    ])  # fmt: skip
+    spread = float(np.median(np.abs(residual(found) / both))) * 1.4826
+    P = np.linalg.pinv(J.T @ J) * spread**2
+    sigmas = np.sqrt(np.diag(P))[:2]
+    if 3.0 * float(sigmas.max()) > CERTAIN_M:
+        return (
+            f"mount: the sensor's place on the base is not learnt (± {sigmas.max():.3f} m): in so "
+            "narrow a view it is not told from range_offset and bearing_offset",
+        )
+    if np.all(np.abs(found[:2]) <= DISTANT * sigmas):
+        return ()
+    x, y, heading = sensor.mount
+    c, s = np.cos(heading), np.sin(heading)
+    at = x + c * found[0] - s * found[1], y + s * found[0] + c * found[1]
+    return (
+        f"mount: the sensor is at ({at[0]:.3f}, {at[1]:.3f}) m on the base, ± {sigmas[0]:.3f} and "
+        f"{sigmas[1]:.3f} m, not at ({x:g}, {y:g}): set sensor.mount = [{at[0]:.3f}, {at[1]:.3f}, "
+        f"{heading:g}] and calibrate again. Its heading is not told from bearing_offset",
+    )
