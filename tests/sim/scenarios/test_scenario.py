@@ -182,7 +182,8 @@ UTIAS = 'world = { kind = "utias" }\n'
         (SMALL + "[defaults.sensor]\nrange_sigma = nan", "expected a finite number, got nan at d"),
         (
             SMALL + "[defaults.motion]\nkind = 'velo'",
-            'expected one of "turn-then-drive", "velocity", "differential-drive", "ackermann", got ',
+            'expected one of "turn-then-drive", "velocity", "differential-drive", "ackermann", '
+            "got ",
         ),
         (SMALL + "[central]\ntick_s = -1", "expected float > 0.0 at central.tick_s"),
         (SMALL + "[central", "not valid TOML: "),
