@@ -13,6 +13,7 @@ from central.submap_rule import SubmapRule
 from central.tick_fold import TickFold
 from team import translate
 from team.estimation.map_joining import marginals
+from team.estimation.map_joining.association.landmarks import Decision
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.refusal import refusals
 from team.wire import channels as ch
@@ -49,11 +50,18 @@ class JoinRule(SubmapRule):
         Who was withdrawn is an input: nobody is judged again by a part of the set.
         """
         shrunk = any(len(inputs.submaps.get(s, ())) < n for s, n in self._entered.items())
-        if shrunk or not self._orders <= inputs.withdrawals.keys():
+        verdicts = {translate.verdict_of(each) for each in inputs.verdicts}
+        if (
+            shrunk
+            or not self._orders <= inputs.withdrawals.keys()
+            or not self._ticks.verdicts <= verdicts
+        ):
             self._begin()
         self._ticks.convicts = False
         for order in inputs.withdrawals.values():
             self.take_withdrawal(order)
+        for verdict in sorted(verdicts):
+            self._ticks.judge(verdict)
         for stream, submaps in sorted(inputs.submaps.items()):
             if stream in inputs.starts:
                 self.take_start(inputs.starts[stream])
@@ -74,6 +82,9 @@ class JoinRule(SubmapRule):
     def _enters(self, submap: m.Submap, sightings: Sequence[m.SightingFactor]) -> None:
         named = translate.digest_of(encoded(submap), *(encoded(each) for each in sightings))
         self._ticks.add(submap, named, sightings)
+
+    def _judges(self, verdict: m.Verdict) -> None:
+        self._ticks.judge(translate.verdict_of(verdict.judgement))
 
     def _goes(self, robot: str) -> None:
         self._ticks.withdraw(robot)
@@ -116,8 +127,8 @@ class JoinRule(SubmapRule):
 
     @property
     def _heard(self) -> int:
-        """Submaps that are in the fold's reach, and robots that were withdrawn by an order."""
-        return sum(self._entered.values()) + len(self._orders)
+        """Submaps in the fold's reach, robots that were withdrawn by an order, and verdicts."""
+        return sum(self._entered.values()) + len(self._orders) + len(self._ticks.verdicts)
 
     def _lacks(self, members: Mapping[Stream, int], watermark_ns: float) -> bool:
         """Whether the watermark has passed a submap that is in reach and not among these."""
@@ -226,6 +237,7 @@ class JoinRule(SubmapRule):
             *(fold.reasons[k] for k in sorted(fold.reasons)),
             *_worded(refusals(fold)),
             *fold.warnings,
+            *_worded([_awaited(each) for each in _waiting(fold)]),
             *self._unconfirmed(fold, shown),
             *miscalibrations(biases),
         )
@@ -262,6 +274,9 @@ class JoinRule(SubmapRule):
             withdrawn=self._ticks.withdrawn,
             covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
             heard=self._heard,
+            memberships=translate.memberships_of(fold.landmarks),
+            decisions=translate.decisions_of(fold.landmarks),
+            verdicts=tuple(translate.judgement_of(v) for v in fold.landmarks.verdicts),
         )
 
     def _shown(self, fold: Fold) -> list[int]:
@@ -320,6 +335,16 @@ class JoinRule(SubmapRule):
             )
             paths.append(((robot, incarnation), with_start))
         return paths
+
+
+def _waiting(fold: Fold) -> list[Decision]:
+    """Merges of robots by their maps that wait, by whom they are about."""
+    waits = fold.landmarks.waits
+    return [waits[of] for of in sorted(waits) if of[1] in fold.islands and of[0] != of[1]]
+
+
+def _awaited(decision: Decision) -> str:
+    return f"{decision.about} not joined by their maps: {decision.why}"
 
 
 def _worded(words: Sequence[str]) -> tuple[str, ...]:

@@ -30,8 +30,9 @@ class Inputs:
 
     starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
     by (robot, incarnation, sequence) of their submap. maps: the robots' own. withdrawals: whom the
-    team goes on without, by robot. heard: raw measurements, the robots' models and the end of the
-    streams, for rules that take these. exchange: the round, of rules in lockstep.
+    team goes on without, by robot. verdicts: an operator's on unnamed landmarks. heard: raw
+    measurements, the robots' models and the end of the streams, for rules that take these.
+    exchange: the round, of rules in lockstep.
     """
 
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
@@ -41,6 +42,7 @@ class Inputs:
     )
     maps: Sequence[m.MapEstimate] = ()
     withdrawals: Mapping[str, m.Withdrawal] = field(default_factory=dict)
+    verdicts: Sequence[m.Judgement] = ()
     heard: Sequence[m.Message] = ()
     exchange: int = 0
     stamp_ns: int = 0

@@ -15,7 +15,7 @@ from team.wire.bus import Outgoing
 class SubmapRule(FusionRule):
     """A set of submaps; every submap is acknowledged when nobody need send it any more."""
 
-    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.ORDER, ch.WITHDRAWALS_HEARD)
+    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.ORDER, ch.WITHDRAWALS_HEARD, ch.VERDICT)
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
         super().__init__(config, digest, robots)
@@ -45,6 +45,9 @@ class SubmapRule(FusionRule):
     def _goes(self, robot: str) -> None:
         """The team goes on without a robot."""
 
+    def _judges(self, verdict: m.Verdict) -> None:
+        """An operator says that two unnamed landmarks are one, or two."""
+
     # What comes.
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
@@ -60,6 +63,8 @@ class SubmapRule(FusionRule):
                 return _credit(message, count, now_ns) if count > before else []
             case m.Withdrawal():
                 return self._follow(message)
+            case m.Verdict():
+                self._judges(message)
             case m.WithdrawalHeard():
                 order = self._hearsay.take(message)
                 return [] if order is None else self._follow(order)

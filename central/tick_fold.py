@@ -24,6 +24,7 @@ from team.config import UNNAMED
 from team.estimation.contribution import named
 from team.estimation.hybrid_slam.sensitivity import BIASES
 from team.estimation.map_joining import marginals
+from team.estimation.map_joining.association.landmarks import Verdict
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.joining import (
@@ -104,6 +105,7 @@ class TickFold:
     convicted: whom the fold found to be wrong, with the reason in words; nobody, unless `convicts`.
     bounded: what is old is condensed, but for the ticks up to `_raw_until`, behind which an island
     whose frame had to turn was found to be condensed.
+    verdicts: an operator's on unnamed landmarks.
     """
 
     def __init__(self, config: CentralConfig, bounded: bool = True) -> None:
@@ -119,6 +121,8 @@ class TickFold:
         self._period = max(1, math.ceil(config.broadcast_s / config.tick_s))
         self._members = Members(self._tick_ns)
         self._starts: dict[Stream, InitialPoseFactor] = {}
+        self.verdicts: set[Verdict] = set()
+        self._tick_with: dict[tuple[str, int, int], int] = {}
         self._taken: list[Checkpoint] = []
         self._agreed: tuple[Fold, Agreement] | None = None
 
@@ -132,8 +136,29 @@ class TickFold:
         The fold goes back to before that tick if it was taken.
         """
         tick = self._members.add(submap, digest, sightings)
+        self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
         if submap.robot not in self._gone or tick <= self._convicted_at:
             self._roll_back(tick)
+
+    def judge(self, verdict: Verdict) -> None:
+        """What an operator says of two unnamed landmarks, in whichever submaps, here or to come.
+
+        The fold goes back to before the tick that has both.
+        """
+        if verdict in self.verdicts:
+            return
+        until_ns = self._until_ns
+        self.verdicts.add(verdict)
+        tick = self._tick_judging(verdict)
+        if tick is not None:
+            self._roll_back(tick)
+            self.take_until(until_ns)
+
+    def _tick_judging(self, verdict: Verdict) -> int | None:
+        """The first tick with both landmarks' submaps behind it or in it; None: one is not here."""
+        ticks = [self._tick_with.get(each[:3]) for each in verdict[:2]]
+        known = [tick for tick in ticks if tick is not None]
+        return max(known) if len(known) == len(ticks) else None
 
     def withdraw(self, robot: str) -> None:
         """Leave out a robot's submaps, and the sightings by it or of it, now and in future.
@@ -166,6 +191,7 @@ class TickFold:
         """Another one of the same members that has taken nothing yet."""
         other = TickFold(self._config, bounded)
         other._members, other._starts = self._members, self._starts
+        other.verdicts, other._tick_with = self.verdicts, self._tick_with
         return other
 
     def _full(self) -> "TickFold":
@@ -352,7 +378,12 @@ class TickFold:
             else:
                 of = named(start.stream)
                 set_aside.append(f"the initial pose of {of} refused, taken as unknown: {why}")
-        news = Tick(members, sightings, starts, outside, tuple(set_aside))
+        verdicts = sorted(
+            v
+            for v in self.verdicts
+            if self._tick_judging(v) == tick and not {v.first.robot, v.second.robot} & gone
+        )
+        news = Tick(members, sightings, starts, outside, tuple(set_aside), tuple(verdicts))
         return taken(fold, news, self.settings)
 
     def _condensed(self, fold: Fold, tick: int) -> Fold:
@@ -384,10 +415,11 @@ class TickFold:
             if (robot, incarnation) in fold.home
         ]
         gone = [f"without {robot}".encode() for robot in self.withdrawn]
+        said = sorted(f"{v.first} {v.second} {v.same}".encode() for v in fold.landmarks.verdicts)
         keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
         last = max((self._members.tick_of(key[0]) for key in keys), default=-math.inf)
         closed = min(last, self._taken[-1].tick if self._taken else -math.inf)
-        return self._members.digest((*more, *gone, *starts), closed, last, self._gone)
+        return self._members.digest((*more, *gone, *starts, *said), closed, last, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """The version vector: the last sequence of each stream that was taken or refused."""

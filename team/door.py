@@ -82,6 +82,8 @@ def _robots(message: m.Message) -> Iterator[str]:
             yield from (message.robot, message.withdrawn)
         case m.Withdrawal():
             yield message.robot
+        case m.Verdict():
+            yield from (message.judgement.first.robot, message.judgement.second.robot)
         case _ if isinstance(message, OF_ROBOTS):
             yield message.robot
 

@@ -312,6 +312,17 @@ def examples() -> Iterator[m.Message]:
         measurements=(12, 14),
     )
     yield m.Withdrawal(stamp_ns=9_000, robot="alpha", by="operator", reason="its wheel is flat")
+    yield m.Verdict(
+        stamp_ns=0,
+        robot="alpha",
+        judgement=m.Judgement(
+            first=m.LocalLandmark(robot="alpha", incarnation=1, sequence=3, local=5),
+            second=m.LocalLandmark(robot="beta", incarnation=1, sequence=8, local=0),
+            same=True,
+        ),
+        by="operator",
+        reason="the same tree",
+    )
     yield m.WithdrawalHeard(
         stamp_ns=9_000, robot="alpha", withdrawn="bravo", by="operator", reason="its wheel is flat"
     )
@@ -369,6 +380,38 @@ def examples() -> Iterator[m.Message]:
         covariance_scale=1.25,
         lost=(),
         heard=9,
+        memberships=(
+            m.Membership(
+                robot="alpha",
+                incarnation=1,
+                sequences=from_ids(np.array([0, 1], np.uint32)),
+                locals=from_ids(np.array([4, 2], np.uint32)),
+                identities=from_ids(np.array([2**31 + 7, 2**31 + 7], np.uint32)),
+                steps=bytes([0, 1]),
+                figures=from_floats(np.array([0.0, 0.0, 0.0, 5.5, -2.0, 0.25])),
+            ),
+        ),
+        decisions=(
+            m.AssociationDecision(
+                stamp_ns=8_000,
+                kind="merge",
+                about="alpha (incarnation 1) and bravo (incarnation 0)",
+                pairs=12,
+                llr=40.5,
+                rival_pairs=5,
+                rival_llr=6.0,
+                share=0.75,
+                sd=20.0,
+                why="",
+            ),
+        ),
+        verdicts=(
+            m.Judgement(
+                first=m.LocalLandmark(robot="alpha", incarnation=1, sequence=0, local=4),
+                second=m.LocalLandmark(robot="alpha", incarnation=1, sequence=1, local=2),
+                same=True,
+            ),
+        ),
     )
     yield m.Prior(
         stamp_ns=9_000,

@@ -364,6 +364,48 @@ def withdraw(
 
 
 @app.command()
+def verdict(
+    word: Annotated[str, typer.Argument(help="same: they are one landmark; different: two.")],
+    first: Annotated[str, typer.Argument(help="robot/incarnation/submap/landmark, as r1/1/12/7.")],
+    second: Annotated[str, typer.Argument(help="The other one, likewise.")],
+    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    reason: Annotated[str, typer.Option(help="Why, for the log.")] = "seen by an operator",
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for a map that rests on it.", min=0.0)
+    ] = 60.0,
+) -> None:
+    """Tell a running team that two landmarks without names are one, or that they are two.
+
+    The page names them where one clicks on a landmark. The verdict is recorded and stays.
+    """
+    from sim.launch.verdict import judge, local_landmark
+    from sim.launch.withdraw import WithdrawError
+    from team.wire.messages import Judgement
+
+    if word not in ("same", "different"):
+        fail(f"{word!r} is no verdict: same or different", WRONG_USE)
+    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
+        fail(f"{team!r} is no team's name", WRONG_USE)
+    try:
+        one, two = local_landmark(first), local_landmark(second)
+    except ValueError as error:
+        fail(str(error), WRONG_USE)
+    if one == two:
+        fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
+    with connected(team, connect, keys, "operator") as bus:
+        try:
+            fused = judge(
+                bus, Judgement(first=one, second=two, same=word == "same"), reason, patience
+            )
+        except WithdrawError as error:
+            fail(str(error), FAILED)
+    landmarks = len(ids(fused.ids, "ids"))
+    typer.echo(f"{first} and {second} are {word}; the map of {landmarks} landmarks rests on it")
+
+
+@app.command()
 def end(
     team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
     without: Annotated[

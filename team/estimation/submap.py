@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from team.config import Bias
+from team.config import UNNAMED, Bias
 
 NO_NODES = np.empty(0, np.int64)
 NO_COLUMNS = np.empty((0, 0))
@@ -68,6 +68,22 @@ class LocalMap:
     def motion(self) -> "LocalMap":
         """The marginal over the end pose alone."""
         return LocalMap(self.ids[:0], self.mean[:3], self.covariance[:3, :3])
+
+    @property
+    def with_names(self) -> "LocalMap":
+        """The marginal without the landmarks that have no name; itself where all have one."""
+        if not len(self.ids) or self.ids[-1] < UNNAMED:
+            return self
+        kept = int(np.searchsorted(self.ids, UNNAMED))
+        n = len(self.mean) - 2 * (len(self.ids) - kept)
+        return LocalMap(
+            self.ids[:kept],
+            self.mean[:n],
+            self.covariance[:n, :n],
+            self.node_stamps,
+            self.biases,
+            self.sensitivity[:, :n] if self.biases else NO_COLUMNS,
+        )
 
     @property
     def without_biases(self) -> "LocalMap":

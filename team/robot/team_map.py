@@ -35,7 +35,8 @@ class TeamMap:
     def pose(self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None) -> Posed:
         """The robot's pose in the team's frame; `window`: the one in progress, if it has begun."""
         given = self.given(prior, submaps)
-        posed = pose_now(given.whole, None if window is None else self._shared.taken(window))
+        open_window = None if window is None else self._shared.taken(window.with_names)
+        posed = pose_now(given.whole, open_window)
         self.known = posed.known + sum(given.known[-1:])
         self.refused = posed.refused + sum(given.refused[-1:])
         self.doubt = self._doubt(given)
@@ -57,12 +58,16 @@ class TeamMap:
     def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
         """The prior times those of the incarnation's submaps that are not in it.
 
+        Their landmarks without names are known to themselves alone before the team's fold has taken
+        them (the prior's own are not compared with them), so they say nothing here.
         The prior may have more of them than a robot that has come back. That a prior and submaps
         have no solution is found once, not at every keyframe, and raised again.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             told = translate.prior_of(prior)
-            pending = [told.shared.taken(each) for each in submaps[max(0, prior.sequence + 1) :]]
+            pending = [
+                told.shared.taken(each.with_names) for each in submaps[max(0, prior.sequence + 1) :]
+            ]
             self._prior, self._shared, self._submaps = prior, told.shared, len(submaps)
             try:
                 self._followed = followed(told.whole, pending)

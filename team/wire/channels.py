@@ -138,6 +138,8 @@ PRIOR = Channel(name="prior", template="central/prior/{robot}", message=m.Prior,
                 recomputable=True, meaning="the joint marginal that a robot needs")  # fmt: skip
 ORDER = Channel(name="order", template="operator/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
                 meaning="an operator's order: the team goes on without the robot")  # fmt: skip
+VERDICT = Channel(name="verdict", template="operator/verdict/{robot}", message=m.Verdict, rate="once per verdict", delivery="all", recorded=True,
+                  recomputable=False, meaning="an operator says that two unnamed landmarks are one, or two")  # fmt: skip
 WITHDRAWAL = Channel(name="withdrawal", template="central/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
                      meaning="the team goes on without the robot; every order that the centre follows")  # fmt: skip
 WITHDRAWALS_HEARD = Channel(name="withdrawals_heard", template="robot/{robot}/withdrawals", message=m.WithdrawalHeard,

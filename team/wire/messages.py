@@ -458,6 +458,42 @@ class WithdrawalHeard(
     reason: Text
 
 
+class LocalLandmark(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """An unnamed landmark of submap (robot, incarnation, sequence): its number is 2³¹ + `local`."""
+
+    robot: Name
+    incarnation: Count
+    sequence: Count
+    local: Annotated[int, Meta(ge=0, lt=2**31)]
+
+
+class Judgement(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """That two local landmarks are one landmark, or are two."""
+
+    first: LocalLandmark
+    second: LocalLandmark
+    same: bool
+
+
+class Verdict(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="verdict/1"):
+    """An operator says of two local landmarks that they are one, or two. A member of the set like a
+    submap; of a pair of which both were said they are two.
+
+    robot: that of the first landmark. by: who says so. reason: in words.
+    """
+
+    robot: Name
+    judgement: Judgement
+    by: Text
+    reason: Text
+
+    def check(self) -> None:  # noqa: D102
+        if self.judgement.first == self.judgement.second:
+            raise ValueError("out of bounds: a verdict on one landmark and itself")
+        if self.robot != self.judgement.first.robot:
+            raise ValueError("out of bounds: a verdict in the name of another robot")
+
+
 class GivenUp(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="given_up/1"):
     """Nobody waits for a node any more: what has come of a robot is in the map, what has not is
     missing, and the final map names it as lost.
@@ -563,6 +599,46 @@ class BiasEstimate(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     sigma: Real
 
 
+class Membership(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """Of which landmark of the map each unnamed landmark of (robot, incarnation) is: M of them.
+
+    sequences, locals: of the submap, and its number less 2³¹; identities: as in the map. steps: M
+    bytes, why it went into another set than its own: 0 it has not, 1 track, 2 near, 3 sweep, 4
+    closure, 5 merge of robots, 6 verdict. figures: M × 3 floats: the log-likelihood ratio of one
+    landmark against two, that of the best rival, the standard deviation of the difference [m].
+    """
+
+    robot: Name
+    incarnation: Count
+    sequences: Ids
+    locals: Ids
+    identities: Ids
+    steps: bytes
+    figures: Floats
+
+
+class AssociationDecision(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """A closure or a merge of robots: accepted, undone, or waiting, with its figures.
+
+    kind: "closure", "merge", "undone" or "waits"; stamp_ns: the end of the last submap that it
+    rests on. about: between whom. pairs, llr: landmarks that are one, and the sum of their
+    log-likelihood ratios; rival_pairs, rival_llr: of the best other alignment. share: of the
+    landmarks there, of the side that has fewer. sd: the largest standard deviation of a pair [m].
+    why: the test that failed.
+    """
+
+    stamp_ns: StampNs
+    kind: Text
+    about: Text
+    pairs: Count
+    llr: Real
+    rival_pairs: Count
+    rival_llr: Real
+    share: Real
+    sd: Real
+    why: Text
+
+
 class FusedMap(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="fused_map/1"):
     """The team's map: landmark means and covariances, its set and its frame.
 
@@ -579,6 +655,9 @@ class FusedMap(Message, frozen=True, kw_only=True, array_like=True, gc=False, ta
     are not wholly in it, since nobody waited for them any more, ascending; such a map is
     provisional. heard: how many submaps and orders to withdraw a robot the centre had, in the map
     or not: of two maps that with more is the newer one, and of equals that with more members.
+    memberships: by robot and incarnation, where landmarks have no names: a landmark with members of
+    one submap is tentative. decisions: the newest closures and merges of robots, then what waits.
+    verdicts: an operator's that the map rests on.
     """
 
     rule: Text
@@ -602,8 +681,18 @@ class FusedMap(Message, frozen=True, kw_only=True, array_like=True, gc=False, ta
     covariance_scale: Annotated[float, Meta(ge=0.0, le=1e300)] = 0.0
     lost: tuple[Name, ...] = ()
     heard: Count = 0
+    memberships: tuple[Membership, ...] = ()
+    decisions: tuple[AssociationDecision, ...] = ()
+    verdicts: tuple[Judgement, ...] = ()
 
     def check(self) -> None:  # noqa: D102
+        for each in self.memberships:
+            n = len(ids(each.identities, "identities"))
+            if not len(ids(each.sequences, "sequences")) == len(ids(each.locals, "locals")) == n:
+                raise ValueError("wrong length: a membership's numbers")
+            if len(each.steps) != n:
+                raise ValueError(f"wrong length: {len(each.steps)} steps of {n} members")
+            check_finite(each.figures, "figures", 3 * n)
         for name, robots in (("withdrawn", self.withdrawn), ("lost", self.lost)):
             if any(a >= b for a, b in pairwise(robots)):
                 raise ValueError(f"not ascending: {name}")

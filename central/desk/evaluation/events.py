@@ -8,7 +8,17 @@ from team.wire import messages as m
 from team.wire.channels import robot_node
 
 Kind = Literal[
-    "joined", "restarted", "lost", "left", "map", "withdrawn", "refused", "warning", "done"
+    "joined",
+    "restarted",
+    "lost",
+    "left",
+    "map",
+    "closure",
+    "undone",
+    "withdrawn",
+    "refused",
+    "warning",
+    "done",
 ]
 MOST = 2000
 """Events of a run that are kept; a node that warns anew every second says no more by then."""
@@ -49,6 +59,7 @@ class EventTeller:
     _members: set[str] = field(default_factory=set)
     _withdrawn: set[str] = field(default_factory=set)
     _reasons: dict[str, str] = field(default_factory=dict)
+    _decided: set[tuple[int, str, str]] = field(default_factory=set)
     _warned: set[tuple[str, str]] = field(default_factory=set)
     _refused: int = 0
     _ended: bool = False
@@ -127,6 +138,7 @@ class EventTeller:
             for robot in sorted((self._members & {*fused.withdrawn}) - self._withdrawn)
         ]
         self._members = members
+        events += self._decisions(fused, now_ns)
         reasons = {without_decimals(reason): reason for reason in fused.reasons}
         events += [
             Event(now_ns, "warning", "central", reasons[shape])
@@ -141,6 +153,18 @@ class EventTeller:
             count = len(fused.ids) // 4
             events.append(Event(now_ns, "done", "central", f"final map of {count} landmarks"))
             self._done |= set(self._alive)
+        return events
+
+    def _decisions(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
+        """Closures and merges by maps that are accepted or undone, once each; not what waits."""
+        events = []
+        for each in fused.decisions:
+            name = (each.stamp_ns, each.kind, each.about)
+            if each.kind == "waits" or name in self._decided:
+                continue
+            self._decided.add(name)
+            kind: Kind = "undone" if each.kind == "undone" else "closure"
+            events.append(Event(now_ns, kind, "central", decision_words(each)))
         return events
 
     def _status(self, status: m.Status, now_ns: int) -> list[Event]:
@@ -159,6 +183,20 @@ class EventTeller:
             kind: Kind = "refused" if "refused" in warning else "warning"
             events.append(Event(now_ns, kind, status.node, f"{status.node}: {warning}"))
         return events
+
+
+def decision_words(decision: m.AssociationDecision) -> str:
+    """A closure or a merge with its figures, and why it was undone."""
+    figures = (
+        f"{decision.pairs} landmarks, log-likelihood ratio {decision.llr:.0f} against "
+        f"{decision.rival_llr:.0f}, share {decision.share:.2f}"
+    )
+    if decision.kind == "undone":
+        return f"a closure of {decision.about} is undone: {decision.why} ({figures})"
+    if decision.kind == "waits":
+        return f"{decision.about} wait: {decision.why} ({figures})"
+    what = "merged by their maps" if decision.kind == "merge" else "closed a loop"
+    return f"{decision.about} {what}: {figures}"
 
 
 def without_decimals(text: str) -> str:

@@ -119,6 +119,7 @@ class _LogInputs:
             submaps=chains,
             sightings=self._sightings,
             withdrawals={r: orders.get(r) or _order(r) for r in fused.withdrawn},
+            verdicts=fused.verdicts,
             stamp_ns=fused.stamp_ns,
         )
 

@@ -196,6 +196,7 @@ def identity(key: str, message: m.Message) -> Identity:
                 message.provisional,
                 message.members,
                 message.withdrawn,
+                message.verdicts,
             )
         case _:
             names = (message.stamp_ns,)

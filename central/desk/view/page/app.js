@@ -289,7 +289,7 @@ function drawTicks() {
   canvas.width = canvas.clientWidth * ratio;
   canvas.height = canvas.clientHeight * ratio;
   const g = canvas.getContext('2d'), half = 8 * ratio;
-  const marks = { lost: 'bad', refused: 'bad', withdrawn: 'bad', warning: 'warn', map: 'good', joined: 'good', restarted: 'warn' };
+  const marks = { lost: 'bad', refused: 'bad', withdrawn: 'bad', warning: 'warn', map: 'good', joined: 'good', closure: 'good', undone: 'warn', restarted: 'warn' };
   for (const event of store.events) {
     if (!marks[event.e]) continue;
     g.fillStyle = colour(marks[event.e]);

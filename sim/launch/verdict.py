@@ -1,0 +1,58 @@
+"""An operator's verdict on two unnamed landmarks of a running team: one landmark, or two."""
+
+import re
+import time
+
+from sim.launch.withdraw import LOOK_S, WithdrawError
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Bus, Outgoing, opened
+
+CENTRE_S = 10.0
+"""A living centre is heard of within this time."""
+_NAME = re.compile(r"([a-z][a-z0-9_]{0,31})/(\d+)/(\d+)/(\d+)")
+
+
+def local_landmark(text: str) -> m.LocalLandmark:
+    """`r1/1/12/7`: robot, incarnation, sequence of the submap, local landmark; ValueError."""
+    found = _NAME.fullmatch(text)
+    if found is None:
+        raise ValueError(f"{text!r} is no local landmark: robot/incarnation/submap/landmark")
+    robot, *numbers = found.groups()
+    incarnation, sequence, local = (int(each) for each in numbers)
+    return m.LocalLandmark(robot=robot, incarnation=incarnation, sequence=sequence, local=local)
+
+
+def judge(bus: Bus, judgement: m.Judgement, reason: str, patience_s: float) -> m.FusedMap:
+    """Say the verdict and wait for the first map that rests on it.
+
+    Raises WithdrawError where there is no centre, or no such map within the time.
+    """
+    for channel in (ch.FUSED_MAP, ch.FINAL_MAP):
+        bus.subscribe(channel)
+    bus.watch_alive()
+    until = time.monotonic() + CENTRE_S
+    while not bus.is_alive("central"):
+        if time.monotonic() > until:
+            raise WithdrawError(
+                "no centre answers; is the team running there? see --team, --connect"
+            )
+        bus.receive(LOOK_S)
+    robot = judgement.first.robot
+    verdict = m.Verdict(stamp_ns=0, robot=robot, judgement=judgement, by="operator", reason=reason)
+    bus.publish(Outgoing(ch.VERDICT, robot, verdict))
+    wanted = {judgement.first, judgement.second}
+    until = time.monotonic() + patience_s
+    while time.monotonic() < until:
+        for sample in bus.receive(LOOK_S):
+            _, _, message = opened(sample)
+            if not isinstance(message, m.FusedMap):
+                continue
+            if any(
+                {each.first, each.second} == wanted and each.same == judgement.same
+                for each in message.verdicts
+            ):
+                return message
+            if message.final:
+                raise WithdrawError("the final map was out before the verdict; run the log again")
+    raise WithdrawError(f"no map that rests on it within {patience_s:g} s; the verdict stands")
