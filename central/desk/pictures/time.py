@@ -44,7 +44,8 @@ LOGARITHMIC_FROM = 12.0
 SHOWN_KEYS = 8
 EVENT_STYLES = {
     "joined": ("o", GREEN), "lost": ("X", RED), "restarted": ("^", ORANGE), "left": ("<", GREY),
-    "map": ("D", BLUE), "closure": ("d", BLUE), "undone": ("d", RED), "withdrawn": ("P", PURPLE), "refused": ("*", RED),
+    "map": ("D", BLUE), "closure": ("d", BLUE), "undone": ("d", RED), "withdrawn": ("P", PURPLE),
+    "refused": ("*", RED),
     "warning": ("v", VERMILION), "done": ("s", GREY),
 }  # fmt: skip
 
