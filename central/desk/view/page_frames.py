@@ -21,6 +21,7 @@ from central.desk.drawing import ROBOT_COLOURS
 from central.desk.evaluation.events import EventTeller
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from central.desk.view.drawn import landmarks_of
+from central.desk.view.landmark_sets import sets_of
 from central.desk.view.node import FORGET_NS
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -196,6 +197,11 @@ class PageFrames:
         self._map_ns = message.stamp_ns
         landmarks = landmarks_of(message)
         fit = self._truth.fit(message)
+        sets = sets_of(message)
+        unnamed: dict[str, object] = {}
+        if sets:
+            told = [sets.get(int(id_), (0, [])) for id_ in landmarks.ids]
+            unnamed = {"n": [count for count, _ in told], "why": [words for _, words in told]}
         self._say(
             "map",
             t=self._t(message.stamp_ns),
@@ -205,6 +211,7 @@ class PageFrames:
             final=message.final,
             rmse=None if fit is None else _short(fit.rmse_m),
             nees=None if fit is None else _short(fit.nees_per_dof),
+            **unnamed,
         )
 
     def _take_status(self, message: m.Status) -> None:

@@ -61,6 +61,17 @@ function choose(name) {
   lookedAt = 0;
 }
 
+map.onPick = (x, y) => {
+  const shown = store.mapAt(state.time);
+  const i = map.landmarkAt(shown, x, y);
+  $('why').hidden = i < 0;
+  if (i < 0) return;
+  const lines = shown.why && shown.why[i].length
+    ? [`landmark ${shown.ids[i]}, ${shown.n[i] === 1 ? 'tentative: one submap has it' : `confirmed by ${shown.n[i]} submaps`}`, ...shown.why[i]]
+    : [`landmark ${shown.ids[i]}, known by its name`];
+  $('why').textContent = lines.join('\n');
+};
+
 for (const [name, text] of LAYERS) {
   const button = document.createElement('button');
   button.textContent = text;

@@ -119,6 +119,9 @@ export class MapView {
     for (const end of ['pointerup', 'pointercancel']) {
       canvas.addEventListener(end, (event) => { fingers.delete(event.pointerId); distance = 0; });
     }
+    canvas.addEventListener('click', (event) => {
+      if (this.onPick) this.onPick(event.offsetX * this.ratio, event.offsetY * this.ratio);
+    });
     canvas.addEventListener('dblclick', () => { this.follow = null; this.fit(); });
   }
 
@@ -239,8 +242,11 @@ export class MapView {
         g.beginPath();
         g.ellipse(x, y, Math.max(major * k, 2 * r), Math.max(minor * k, 2 * r), -turn, 0, 2 * Math.PI);
         if (!this.fast) { g.globalAlpha = 0.16; g.fill(); }
-        g.globalAlpha = 0.85; g.stroke();
+        const tentative = map.n && map.n[i] === 1;  // one submap alone has it
+        g.setLineDash(tentative ? [3 * r, 3 * r] : []);
+        g.globalAlpha = tentative ? 0.5 : 0.85; g.stroke();
       }
+      g.setLineDash([]);
       g.globalAlpha = 1;
     }
     g.fillStyle = this.colours.landmark;
@@ -256,6 +262,17 @@ export class MapView {
       g.fillStyle = this.colours.soft;
       for (const [x, y, i] of seen) g.fillText(map.ids[i], x + 6 * r, y - 5 * r);
     }
+  }
+
+  // The landmark of a map that is drawn within 12 pixels of a place on the screen; -1: there is none.
+  landmarkAt(map, x, y) {
+    let best = -1, least = 12 * this.ratio;
+    for (let i = 0; map && i < map.ids.length; i++) {
+      const [u, v] = this.screen(map.xy[2 * i], map.xy[2 * i + 1]);
+      const away = Math.hypot(u - x, v - y);
+      if (away < least) { best = i; least = away; }
+    }
+    return best;
   }
 
   paintPaths(time, view) {

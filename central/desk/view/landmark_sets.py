@@ -1,0 +1,38 @@
+"""Why an unnamed landmark of a map is one: its members, and the step by which each came to it."""
+
+from team.translate import STEPS
+from team.wire import messages as m
+from team.wire.arrays import floats, ids
+
+MOST = 12
+"""So many members of a landmark are told; a landmark may have hundreds."""
+
+
+def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
+    """Of each landmark that has unnamed members: its number of submaps, and its members in words.
+
+    `r1/1/12/7` is robot, incarnation, submap, local landmark: what `teamslam verdict` takes.
+    """
+    found: dict[int, tuple[set[tuple[str, int, int]], list[str]]] = {}
+    for table in fused.memberships:
+        columns = zip(
+            ids(table.sequences, "sequences").tolist(),
+            ids(table.locals, "locals").tolist(),
+            ids(table.identities, "identities").tolist(),
+            table.steps,
+            floats(table.figures, "figures").reshape(-1, 3).tolist(),
+            strict=True,
+        )
+        for sequence, local, identity, step, (llr, rival, sd) in columns:
+            submaps, words = found.setdefault(identity, (set(), []))
+            submaps.add((table.robot, table.incarnation, sequence))
+            name = f"{table.robot}/{table.incarnation}/{sequence}/{local}"
+            if not 0 < step < len(STEPS):
+                words.append(name)
+                continue
+            against = f", its best rival {rival:.1f}" if rival > -1e299 else ", no rival"
+            words.append(
+                f"{name}: {STEPS[step]}, log-likelihood ratio {min(llr, 1e6):.1f}{against}, "
+                f"sd {sd:.2f} m"
+            )
+    return {number: (len(submaps), words[:MOST]) for number, (submaps, words) in found.items()}

@@ -1,0 +1,128 @@
+"""Law 2 where landmarks have no names: the map is a function of the set of submaps and verdicts."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from central.config import CentralConfig
+from central.join_rule import JoinRule
+from central.rule import Inputs
+from team import translate
+from team.estimation.map_joining.association.profile import AssociationProfile
+from team.wire import messages as m
+from team.wire.codec import encoded
+from tests.estimation.map_joining.association.unnamed_worlds import circle, drive
+
+CONFIG = CentralConfig(association=AssociationProfile(recent=4), withdraw_above=None)
+RING = 20.0
+
+
+def _team() -> dict[str, list[m.Submap]]:
+    """Two robots with unknown initial poses on one ring, the second behind the first."""
+    rng = np.random.default_rng(8)
+    angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 80))
+    r = rng.uniform(16.0, 24.0, 80)
+    world = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+    found = {}
+    for robot, phase in (("r1", 0.0), ("r2", 2.0)):
+        submaps, _ = drive(robot, circle((0.0, 0.0), RING, 8, 0.45, phase), world, rng)
+        found[robot] = [
+            translate.submap_message(
+                robot,
+                1,
+                each.sequence,
+                (10 * each.sequence + 1, 10 * each.sequence + 10),
+                (each.end_ns - 10**10, each.end_ns),
+                bytes(8),
+                each.local,
+            )
+            for each in submaps
+        ]
+    return found
+
+
+TEAM = _team()
+
+
+def _rule() -> JoinRule:
+    rule = JoinRule(CONFIG, bytes(8), ("r1", "r2"))
+    for robot in TEAM:
+        start = m.InitialPose(
+            stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
+        )
+        rule.take_start(start)
+    return rule
+
+
+def _verdict(same: bool = False) -> m.Verdict:
+    first = m.LocalLandmark(robot="r1", incarnation=1, sequence=3, local=0)
+    second = m.LocalLandmark(robot="r1", incarnation=1, sequence=4, local=0)
+    return m.Verdict(
+        stamp_ns=0,
+        robot="r1",
+        judgement=m.Judgement(first=first, second=second, same=same),
+        by="operator",
+        reason="",
+    )
+
+
+def _final(rule: JoinRule) -> m.FusedMap:
+    final = rule.conclude(10**12)[-1].message
+    assert isinstance(final, m.FusedMap)
+    return final
+
+
+@pytest.fixture(scope="module")
+def final() -> m.FusedMap:
+    rule = _rule()
+    for robot in TEAM:
+        for submap in TEAM[robot]:
+            rule.take(submap, 0)
+    return _final(rule)
+
+
+def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(
+    final: m.FusedMap,
+) -> None:
+    rule = _rule()
+    for k in range(8):
+        rule.take(TEAM["r2"][k], 0)
+        if k % 3 == 2:
+            rule.broadcasts(TEAM["r2"][k].stamp_ns, TEAM["r2"][k].stamp_ns)
+    for submap in reversed(TEAM["r1"]):
+        rule.take(submap, 0)
+    assert encoded(_final(rule)) == encoded(final)
+    assert final.memberships
+    assert [each.kind for each in final.decisions if each.kind == "merge"] == ["merge"]
+
+
+def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map() -> None:
+    maps = []
+    for order in permutations(("r1", "r2", "verdict")):
+        rule = _rule()
+        for what in order[:3]:
+            for message in [_verdict()] if what == "verdict" else TEAM[what]:
+                rule.take(message, 0)
+        if order[0] == "r1":
+            maps.append(_final(rule))
+    assert len({encoded(each) for each in maps}) == 1
+    assert maps[0].verdicts == (_verdict().judgement,)
+
+
+def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedMap) -> None:
+    rule = _rule()
+    starts = {
+        (robot, 1): m.InitialPose(
+            stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
+        )
+        for robot in TEAM
+    }
+    submaps = {(robot, 1): TEAM[robot] for robot in TEAM}
+    told = Inputs(starts=starts, submaps=submaps, verdicts=(_verdict().judgement,))
+    with_verdict = rule.fuse(told, "final")[-1].message
+    without = rule.fuse(Inputs(starts=starts, submaps=submaps), "final")[-1].message
+    assert isinstance(with_verdict, m.FusedMap)
+    assert isinstance(without, m.FusedMap)
+    assert with_verdict.digest != without.digest
+    assert without.means == final.means
