@@ -258,6 +258,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     teammate_speed: NonNegative = 0.2
     garbage: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     biases: tuple[Bias, ...] = ()
+    association: Association = Association()
 
     def __post_init__(self) -> None:
         if tuple(sorted(set(self.biases))) != self.biases:

@@ -22,6 +22,8 @@ class Rejection(StrEnum):
     ITSELF = "a robot does not see itself"
     NO_LANDMARKS = "this estimator uses no landmarks"
     NO_ASSOCIATION = "this estimator takes no landmarks without identities"
+    UNCONFIRMED = "no detection of it is seen often enough"
+    CLUTTER = "clutter alone"
     NO_TEAMMATES = "sightings are not used by this estimator"
     NO_NODES = "sightings need pose nodes, and front_end.node_s is 0"
     NO_NODE = "no pose node near it"

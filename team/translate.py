@@ -2,20 +2,20 @@
 
 import hashlib
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import RobotConfig
+from team.config import UNNAMED, RobotConfig
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.map_joining.association.landmarks import Landmarks, Member, Verdict
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
 from team.estimation.map_joining.joining import Contribution, InitialPoseFactor, Sighting
 from team.estimation.odometry import Interval, moved, steered
 from team.estimation.scans import Scan, point_scan, polar_scan
-from team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
+from team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, octets, stamps
 from team.wire.codec import unsound
@@ -90,9 +90,16 @@ def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
     )
 
 
-def scan_of(message: m.AnyScan) -> Scan:
-    """Landmarks seen, in the machine's byte order; points become range and bearing."""
-    seen = ids(message.ids, "ids").astype(np.uint32)
+def scan_of(message: m.AnyScan | m.Detections) -> Scan:
+    """Landmarks seen, in the machine's byte order; points become range and bearing.
+
+    Detections without identities have the numbers 2³¹ + their place in the message, until their
+    window knows better.
+    """
+    if isinstance(message, m.Detections):
+        seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
+    else:
+        seen = ids(message.ids, "ids").astype(np.uint32)
     own = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
     claimed = own if message.covariances else None
     if isinstance(message, m.Points):
@@ -101,25 +108,6 @@ def scan_of(message: m.AnyScan) -> Scan:
     ranges = floats(message.ranges, "ranges").astype(np.float64)
     return polar_scan(
         seen, ranges, floats(message.bearings, "bearings").astype(np.float64), claimed
-    )
-
-
-class Detected(NamedTuple):
-    """One scan of landmarks without identities; the last two are empty where there are none."""
-
-    ranges: Float[np.ndarray, " n"]
-    bearings: Float[np.ndarray, " n"]
-    covariances: Float[np.ndarray, "_ 3"]
-    signatures: Float[np.ndarray, " _"]
-
-
-def detected_of(message: m.Detections) -> Detected:
-    """A scan of detections in the machine's byte order."""
-    return Detected(
-        floats(message.ranges, "ranges").astype(np.float64),
-        floats(message.bearings, "bearings").astype(np.float64),
-        floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3),
-        floats(message.signatures, "signatures").astype(np.float64),
     )
 
 
@@ -220,6 +208,23 @@ def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
         return NO_COLUMNS
     rows = floats(message.sensitivity, "sensitivity").astype(np.float64)
     return rows.reshape(len(message.biases), -1)
+
+
+def association_message(
+    robot: str, incarnation: int, sequence: int, stamp_ns: int, became: Became
+) -> m.Association:
+    """What became of the detections of a submap's window."""
+    landmarks = np.where(became.clutter, m.CLUTTER, m.UNCONFIRMED)
+    return m.Association(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        sequence=sequence,
+        stamps=from_stamps(became.stamps),
+        counts=from_ids(became.counts),
+        rows=from_ids(became.rows),
+        landmarks=from_ids(np.where(became.landmarks >= UNNAMED, became.landmarks, landmarks)),
+    )
 
 
 def sighting_message(

@@ -74,6 +74,17 @@ class _Source:
         if kind == s.OBSERVATIONS:
             z = self.stream.observations(index)
             covariances = b"" if z.covariances is None else from_floats(z.covariances)
+            if z.hidden:
+                return m.Detections(
+                    stamp_ns=stamp_ns,
+                    robot=robot,
+                    incarnation=incarnation,
+                    number=measurement,
+                    ranges=from_floats(z.ranges),
+                    bearings=from_floats(z.bearings),
+                    covariances=covariances,
+                    signatures=b"" if z.signatures is None else from_floats(z.signatures),
+                )
             if z.points is not None:
                 return m.Points(
                     stamp_ns=stamp_ns,
@@ -153,6 +164,30 @@ def _odometry(
         forward=told.forward,
         yaw_rate=told.yaw_rate,
     )
+
+
+def _for_the_evaluator(stream: RobotStream) -> list[Outgoing]:
+    """The true identities of what is told without, and where another sensor says the robot was."""
+    out, seen, first_ns = [], stream.landmark_detections, int(stream.stamps_ns[0])
+    if seen.hidden is not None and seen.hidden.any():
+        rows = np.repeat(seen.hidden, np.diff(seen.offsets))
+        labels = m.TruthLabels(
+            stamp_ns=first_ns,
+            robot=stream.robot,
+            stamps=from_stamps(seen.stamps_ns[seen.hidden]),
+            counts=from_ids(np.diff(seen.offsets)[seen.hidden]),
+            labels=from_ids(seen.ids[rows]),
+        )
+        out.append(Outgoing(ch.TRUTH_LABELS, stream.robot, labels))
+    if stream.positions is not None and stream.positions_ns is not None:
+        positions = m.TruthPositions(
+            stamp_ns=first_ns,
+            robot=stream.robot,
+            stamps=from_stamps(stream.positions_ns),
+            positions=from_floats(stream.positions),
+        )
+        out.append(Outgoing(ch.TRUTH_POSITIONS, stream.robot, positions))
+    return out
 
 
 _CHANNEL_OF_KIND = {
@@ -245,6 +280,8 @@ class WorldNode:
             if self.tells_map:
                 told = m.KnownMap(stamp_ns=self._first_ns, ids=truth.ids, positions=truth.positions)
                 out.append(Outgoing(ch.KNOWN_MAP, "", told))
+        for stream in self.streams.streams:
+            out += _for_the_evaluator(stream)
         return out
 
     def refusal(self, message: m.Message) -> str | None:

@@ -90,6 +90,7 @@ def with_options(
     peers: bool = False,
     centre: bool = True,
     comm_range_m: float | None = None,
+    identities: str | None = None,
 ) -> Scenario:
     """The scenario with what a command line changes; None leaves it as it is.
 
@@ -107,6 +108,8 @@ def with_options(
     if dataset is not None:
         fields["world"] = _world_of(scenario, str(dataset))
     world = fields["world"]
+    if identities is not None:
+        world["identities"] = identities
     if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
         from sim.datasets.folder import robots_of
 

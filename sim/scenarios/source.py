@@ -1,6 +1,7 @@
 """The streams of a scenario's world, whichever kind it is."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -13,6 +14,7 @@ from sim.datasets.utias_log import present_robots
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario
 from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld
+from sim.world.identities import Hiding, with_hidden_identities
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
 from team.pairs import NEEDS_MAP
@@ -20,6 +22,19 @@ from team.pairs import NEEDS_MAP
 
 def streams_of(scenario: Scenario) -> WorldStreams:
     """Simulate the world or read its data set; raises DatasetError."""
+    streams = _with_identities(scenario)
+    world = scenario.world
+    if isinstance(world, SimulatedWorld):
+        hiding = Hiding(world.tagged, world.missed, world.clutter, world.visible_to_m)
+        if world.identities == "hidden" or world.missed:
+            hiding = hiding if world.identities == "hidden" else replace(hiding, tagged=1.0)
+            return with_hidden_identities(streams, hiding, noise_seed(scenario))
+        return streams
+    hidden = world.identities == "hidden"
+    return with_hidden_identities(streams, Hiding(), scenario.seed) if hidden else streams
+
+
+def _with_identities(scenario: Scenario) -> WorldStreams:
     if isinstance(scenario.world, SimulatedWorld):
         return simulated(scenario.world, scenario.robots, noise_seed(scenario))
     if isinstance(scenario.world, FolderWorld):

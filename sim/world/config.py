@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from team.config import Fraction, NonNegative, Positive, RobotConfig
 
+Identities = Literal["known", "hidden"]
 GarbageKind = Literal["reading", "identity", "drop"]
 Steering = Literal["together", "turn-first"]
 OdometryForm = Literal["speeds", "increments", "steering"]
@@ -45,6 +46,9 @@ class SimulatedWorld(
     each comes with a covariance of its own, whose standard deviations are factors from the first to
     the second of these of the sensor's, and with errors of that size.
     claims_factor: what is claimed is the true covariance divided by this.
+    identities: "hidden" tells detections without them, but of the share `tagged` of landmarks.
+    missed: the probability of a measurement of a landmark to be left out. clutter: with hidden
+    identities, the share of detections that are of nothing at all.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -71,6 +75,10 @@ class SimulatedWorld(
     landmarks_told: LandmarkForm = "ranges"
     landmark_claims: tuple[Positive, Positive] | None = None
     claims_factor: Positive = 1.0
+    identities: Identities = "known"
+    tagged: Fraction = 0.0
+    missed: Fraction = 0.0
+    clutter: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
 
     def __post_init__(self) -> None:
         if self.odometry_claims and self.odometry != "increments":
@@ -102,6 +110,7 @@ class UtiasWorld(
     unknown_starts: tuple[str, ...] = ()
     duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     errata: bool = True
+    identities: Identities = "known"
 
     def __post_init__(self) -> None:
         if (self.start_sigma_m == 0.0) != (self.start_sigma_rad == 0.0):
@@ -120,6 +129,7 @@ class FolderWorld(
     path: str = ""
     unknown_starts: tuple[str, ...] = ()
     duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
+    identities: Identities = "known"
 
 
 class LiveWorld(

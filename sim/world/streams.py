@@ -17,6 +17,8 @@ START = 0
 OBSERVATIONS = 1
 SIGHTINGS = 2
 ODOMETRY = 3
+NO_LABEL = 2**32 - 1
+"""The identity of a detection that is clutter, or of which nobody knows the landmark."""
 
 KIND_NAMES = ("start pose", "observations", "sightings", "odometry")
 
@@ -66,7 +68,9 @@ class Detections:
 
     ids are landmark identities, or indices into a tuple of teammates. points: what the sensor tells
     are these (x, y) in its frame [m], and ranges and bearings are theirs. covariances: what it
-    claims of each, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points.
+    claims of each, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points. hidden: messages
+    that are told without identities (None: none); their ids are for scoring, NO_LABEL of clutter.
+    signatures: a number of each that looks alike for the same landmark, of hidden ones only.
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -76,6 +80,8 @@ class Detections:
     bearings: Float[np.ndarray, " R"]
     points: Float[np.ndarray, "R 2"] | None = None
     covariances: Float[np.ndarray, "R 3"] | None = None
+    hidden: Bool[np.ndarray, " M"] | None = None
+    signatures: Float[np.ndarray, " R"] | None = None
 
     def rows(self, message: int) -> slice:
         """The rows of one message."""
@@ -92,6 +98,8 @@ class Detections:
             self.bearings[rows],
             None if self.points is None else self.points[rows],
             None if self.covariances is None else self.covariances[rows],
+            None if self.hidden is None else self.hidden[first:last],
+            None if self.signatures is None else self.signatures[rows],
         )
 
 
@@ -110,7 +118,7 @@ class OdometryMeasurement(NamedTuple):
 class ObservationMeasurement(NamedTuple):
     """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty.
 
-    points, covariances: as in `Detections`.
+    points, covariances, signatures: as in `Detections`. hidden: it is told without the ids.
     """
 
     stamp_ns: int
@@ -119,6 +127,8 @@ class ObservationMeasurement(NamedTuple):
     bearings: Float[np.ndarray, " R"]
     points: Float[np.ndarray, "R 2"] | None = None
     covariances: Float[np.ndarray, "R 3"] | None = None
+    hidden: bool = False
+    signatures: Float[np.ndarray, " R"] | None = None
 
 
 class SightingMeasurement(NamedTuple):
@@ -138,7 +148,8 @@ class RobotStream:
     start: None when the start pose is not known. rows: the measurement's row in the arrays of its
     kind. truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was repaired or can
     not be given, in a user's words. clock_offset_ns: all stamps here are team time, and the
-    odometry's own clock, whose stamps go out, reads so much less.
+    odometry's own clock, whose stamps go out, reads so much less. positions: where another sensor,
+    as a GPS, says that it was at positions_ns, in a frame of its own.
     """
 
     robot: str
@@ -154,6 +165,8 @@ class RobotStream:
     truth: Float[np.ndarray, "T 3"] | None = None
     notes: tuple[str, ...] = ()
     clock_offset_ns: int = 0
+    positions_ns: Int64[np.ndarray, " G"] | None = None
+    positions: Float[np.ndarray, "G 2"] | None = None
 
     def __len__(self) -> int:
         """The number of measurements, the start pose included."""
@@ -176,7 +189,8 @@ class RobotStream:
     def observations(self, counter: int) -> ObservationMeasurement:
         """The landmarks seen, of the message with this measurement counter."""
         seen = self.landmark_detections
-        at = seen.rows(self._row(counter, OBSERVATIONS))
+        row = self._row(counter, OBSERVATIONS)
+        at = seen.rows(row)
         return ObservationMeasurement(
             int(self.stamps_ns[counter]),
             seen.ids[at],
@@ -184,6 +198,8 @@ class RobotStream:
             seen.bearings[at],
             None if seen.points is None else seen.points[at],
             None if seen.covariances is None else seen.covariances[at],
+            seen.hidden is not None and bool(seen.hidden[row]),
+            None if seen.signatures is None else seen.signatures[at],
         )
 
     def sightings(self, counter: int) -> SightingMeasurement:
@@ -243,6 +259,8 @@ def robot_stream(
     truth: Float[np.ndarray, "T 3"] | None = None,
     notes: Sequence[str] = (),
     clock_offset_ns: int = 0,
+    positions_ns: Int64[np.ndarray, " G"] | None = None,
+    positions: Float[np.ndarray, "G 2"] | None = None,
 ) -> RobotStream:
     """Number the measurements of one robot by (stamp, kind), the start pose first.
 
@@ -274,6 +292,8 @@ def robot_stream(
         truth=truth,
         notes=tuple(notes),
         clock_offset_ns=clock_offset_ns,
+        positions_ns=positions_ns,
+        positions=positions,
     )
 
 

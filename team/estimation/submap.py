@@ -1,6 +1,7 @@
 """What a robot sends: one Gaussian over poses and landmarks in the submap's own frame."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
@@ -21,6 +22,28 @@ class Unnamed:
 
     counts: UInt32[np.ndarray, " U"]
     seen: Bool[np.ndarray, "U keyframes"]
+
+
+class Slipped(NamedTuple):
+    """Up to the keyframe at stamp_ns the odometry missed about this (forward, left, turn)."""
+
+    stamp_ns: int
+    by: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class Became:
+    """What became of a window's detections without identities.
+
+    stamps: of M scans [ns]; counts: the detections of each; by detection: rows, its place in its
+    scan's message; landmarks, its number in the submap, 0 of what is in none; clutter: it is none.
+    """
+
+    stamps: Int64[np.ndarray, " M"]
+    counts: Int64[np.ndarray, " M"]
+    rows: Int64[np.ndarray, " n"]
+    landmarks: Int64[np.ndarray, " n"]
+    clutter: Bool[np.ndarray, " n"]
 
 
 NONE_UNNAMED = Unnamed(np.empty(0, np.uint32), np.empty((0, 0), np.bool_))
@@ -63,6 +86,22 @@ class LocalMap:
     def nodes(self) -> Float[np.ndarray, "K 3"]:
         """start_from_node of each pose node."""
         return self.mean[3 : 3 + 3 * len(self.node_stamps)].reshape(-1, 3)
+
+    @property
+    def named(self) -> "LocalMap":
+        """The marginal without the landmarks that have no name: what another window can know."""
+        kept = int(np.searchsorted(self.ids, UNNAMED))
+        if kept == len(self.ids):
+            return self
+        size = len(self.mean) - 2 * (len(self.ids) - kept)
+        return replace(
+            self,
+            ids=self.ids[:kept],
+            mean=self.mean[:size],
+            covariance=self.covariance[:size, :size],
+            sensitivity=self.sensitivity[:, :size] if self.biases else NO_COLUMNS,
+            unnamed=NONE_UNNAMED,
+        )
 
     @property
     def motion(self) -> "LocalMap":

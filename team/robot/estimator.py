@@ -138,6 +138,13 @@ class MakesSubmaps(Protocol):
 
 
 @runtime_checkable
+class Associates(Protocol):
+    """An estimator that takes scans of landmarks without identities: numbers from 2³¹ on."""
+
+    associates: bool
+
+
+@runtime_checkable
 class AbsorbsMaps(Protocol):
     """An estimator that takes the team's map back in (rules with feedback)."""
 

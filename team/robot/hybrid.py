@@ -1,7 +1,9 @@
 """Hybrid-SLAM as a robot runs it: the front end's submaps, and the own whole map made of them.
 
 The own map is what the robot knows by itself: its submaps joined one by one (Brooks & Bailey's back
-end). No submap depends on it.
+end). No submap depends on it. Landmarks without names are in none of it: which of them are one over
+several submaps the centre finds out, so meanwhile the pose follows odometry and landmarks with
+names.
 """
 
 import numpy as np
@@ -35,6 +37,7 @@ class HybridEstimator:
 
     used = "in a submap"
     joint = True
+    associates = True
 
     def __init__(
         self,
@@ -64,7 +67,7 @@ class HybridEstimator:
 
     def resume(self, closed: ClosedWindow) -> None:
         """Go on behind a submap of an earlier life: the next window begins where it ended."""
-        self.whole, self._open = self._joined(closed.local), None
+        self.whole, self._open = self._joined(closed.local.named), None
         self._slam.resume(closed)
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
@@ -104,7 +107,7 @@ class HybridEstimator:
         """The pose and the map are new with a submap."""
         begun_at = self.whole.mean[:3]
         cloud = None if closed.window is None else thinned(closed.window.particles, begun_at)
-        self.whole = self._joined(closed.local)
+        self.whole = self._joined(closed.local.named)
         return Estimates(closed=closed, pose_ns=closed.end_ns, map_ns=closed.end_ns, cloud=cloud)
 
     def open_window(self) -> LocalMap | None:

@@ -21,7 +21,7 @@ from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond, start_beyond
 from team.estimation.scans import sensible
-from team.estimation.submap import LocalMap
+from team.estimation.submap import LocalMap, Slipped
 from team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
 from team.rejection import UNMEASURED, Rejection
 from team.robot.estimator import (
@@ -29,6 +29,7 @@ from team.robot.estimator import (
     NOTHING_KNOWN,
     NOTHING_NEW,
     AbsorbsMaps,
+    Associates,
     Estimates,
     InitialPose,
     KnownMap,
@@ -213,7 +214,7 @@ class RobotNode:
         self._begin_incarnation(start)
         for submap in submaps:
             local = translate.local_map_of(submap)
-            self._locals.append(local)
+            self._locals.append(local.named)
             closed = ClosedWindow(
                 sequence=submap.sequence,
                 first_measurement=submap.first_measurement,
@@ -392,7 +393,7 @@ class RobotNode:
             match measurement:
                 case m.Odometry() | m.Increment() | m.Steering():
                     self._go(measurement)
-                case m.Observations() | m.Points():
+                case m.Observations() | m.Points() | m.Detections():
                     self._look(measurement)
                 case m.Sightings():
                     self._see(measurement)
@@ -454,11 +455,8 @@ class RobotNode:
                 self._ledger["start pose"] += 1
             case m.Odometry() | m.Increment() | m.Steering():
                 out += self._drive(measurement)
-            case m.Observations() | m.Points():
+            case m.Observations() | m.Points() | m.Detections():
                 self._observe(measurement)
-            case m.Detections():
-                self._goes_in(measurement)
-                self._ledger[Rejection.NO_ASSOCIATION.disposition] += 1
             case m.Sightings():
                 out += self._sight(measurement)
         if self._taking is not None:
@@ -530,7 +528,7 @@ class RobotNode:
             self.warnings.append(f"{np.count_nonzero(~inside)} known landmarks beyond the bounds")
         return KnownMap(known.ids[inside], known.landmarks[inside])
 
-    def _observe(self, measurement: m.AnyScan) -> None:
+    def _observe(self, measurement: m.AnyScan | m.Detections) -> None:
         self._goes_in(measurement)
         reason = self._look(measurement)
         self._ledger[self._estimator.used if reason is None else reason.disposition] += 1
@@ -554,7 +552,9 @@ class RobotNode:
 
     # A measurement within the bounds goes to the estimator; of one beyond them the reason is said.
 
-    def _look(self, measurement: m.AnyScan) -> Rejection | None:
+    def _look(self, measurement: m.AnyScan | m.Detections) -> Rejection | None:
+        if isinstance(measurement, m.Detections) and not self._associates:
+            return Rejection.NO_ASSOCIATION
         scan = translate.scan_of(measurement)
         near = self._judge.near(scan.ranges) & sensible(scan.own, scan.ranges, self.config.bounds)
         reason = self._judge.time(measurement.stamp_ns)
@@ -588,6 +588,11 @@ class RobotNode:
         if self._unused not in UNMEASURED:
             return NOTHING_NEW
         return self._estimator.drive(*motion, measured=self._unused is None)
+
+    @property
+    def _associates(self) -> bool:
+        """Whether detections without identities are of use: only `join` knows what to do then."""
+        return isinstance(self._estimator, Associates) and self.config.fusion == "join"
 
     # What goes out.
 
@@ -625,7 +630,15 @@ class RobotNode:
         if closed.late:
             self._ledger[self._estimator.used] -= closed.late
             self._ledger[Rejection.LATE.disposition] += closed.late
-        self._locals.append(closed.local)
+        for count, reason in (
+            (closed.unconfirmed, Rejection.UNCONFIRMED),
+            (closed.clutter, Rejection.CLUTTER),
+        ):
+            if count:
+                self._ledger[self._estimator.used] -= count
+                self._ledger[reason.disposition] += count
+        self.warnings += [_slipped(slip) for slip in closed.slips]
+        self._locals.append(closed.local.named)
         self._judge = StreamJudge(self.config.bounds, closed.end_ns)
         if closed.unsolved:
             self._ledger[self._estimator.used] -= closed.unsolved
@@ -645,6 +658,7 @@ class RobotNode:
         self._sent.note(released)
         self._pending += released
         out = [self._speaker.innovation(closed.end_ns, closed.sequence, closed.innovation)]
+        out += self._speaker.association(closed)
         self._gated += closed.gated
         out += self._poses(closed.end_ns)
         out += self._mapped(closed.end_ns)
@@ -900,3 +914,9 @@ def _end_at(head: m.StreamHead) -> m.End:
         robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
     )
     return m.End(stamp_ns=head.stamp_ns, streams=(last,))
+def _slipped(slip: Slipped) -> str:
+    """A slip of the odometry in words."""
+    metres, turn = float(np.hypot(*slip.by[:2])), float(np.degrees(slip.by[2]))
+    return (
+        f"the odometry slipped by {metres:.2f} m, {turn:.0f}° before {slip.stamp_ns * 1e-9:.2f} s"
+    )

@@ -42,6 +42,15 @@ class Speaker:
         )
         return Outgoing(ch.SUBMAP, self.robot, message)
 
+    def association(self, closed: ClosedWindow) -> list[Outgoing]:
+        """What became of the window's detections without identities, if it had any."""
+        if closed.became is None:
+            return []
+        message = translate.association_message(
+            self.robot, self.incarnation, closed.sequence, closed.end_ns, closed.became
+        )
+        return [Outgoing(ch.ASSOCIATION, self.robot, message)]
+
     def sighting(self, closed: ClosedWindow, each: NodeSighting) -> Outgoing:
         """A teammate seen from a pose node of the window."""
         sighting = Sighting(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
 from team.estimation.hybrid_slam.window import Window
-from team.estimation.submap import LocalMap
+from team.estimation.submap import Became, LocalMap, Slipped
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,6 +16,9 @@ class ClosedWindow:
     the window had no solution. innovation: of the window's measurements that were predicted.
     gated: measurements that no others of the window confirmed, and that are not in the submap.
     late: scans of the interval that are stamped behind the window's end; they are rejected.
+    unconfirmed, clutter: scans without identities of which no detection is in the submap. became:
+    what became of each detection; None where there was none. slips: motions that the odometry
+    missed.
     unsolved: scans that led to no Gaussian, of which only the odometry's motion is in the submap.
     """
 
@@ -32,3 +35,7 @@ class ClosedWindow:
     gated: int = 0
     late: int = 0
     unsolved: int = 0
+    unconfirmed: int = 0
+    clutter: int = 0
+    became: Became | None = None
+    slips: tuple[Slipped, ...] = ()

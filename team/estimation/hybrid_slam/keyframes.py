@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from team.config import MotionModel, Sensor
+from team.config import UNNAMED, MotionModel, Sensor
 from team.estimation import geometry
 from team.estimation.geometry import adjoint, inverse
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
@@ -74,7 +74,7 @@ class Segmenter:
     With keyframe_s = 0 every observation message is a keyframe. Otherwise the scans within
     keyframe_s are reduced to one range and bearing per landmark (the median, each scan first moved
     by the odometry to the end of the interval that closes the keyframe). With a grid each of its
-    times is a keyframe without measurements.
+    times is a keyframe without measurements. A scan without identities is one of its own, too.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class Segmenter:
             scan = self._waiting.pop(0)
             keyframes += self._nodes(scan.stamp_ns - 1, over)
             at_ns = self._go_to(scan.stamp_ns, over)
-            if self._keyframe_ns:
+            if self._keyframe_ns and not (scan.ids >= UNNAMED).any():
                 self._keyframe.append(replace(scan, stamp_ns=at_ns, pose=self._scan_motion))
             else:
                 seen = scan.ids, scan.ranges, scan.bearings

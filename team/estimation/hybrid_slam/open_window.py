@@ -13,6 +13,7 @@ from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
+from team.estimation.hybrid_slam.unnamed import Settled, settled, split
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.models import Increment
 from team.estimation.mount import of_base
@@ -34,6 +35,9 @@ class OpenWindow:
         self._solvable = True
         self.motion = Increment.identity()
         self.last_keyframe_ns: int | None = None
+        self._named: list[Keyframe] = []
+        self._unnamed: list[Keyframe] = []
+        self.settled = Settled(())
         self._begin()
 
     def _begin(self) -> None:
@@ -45,7 +49,7 @@ class OpenWindow:
     @property
     def gated(self) -> int:
         """Measurements that no others of the window confirmed."""
-        return self._gate.gated
+        return self._gate.gated + self.settled.gated
 
     def advance(self, keyframe: Keyframe) -> None:
         """Particles move and weigh, once more: those measurements count that others agree with."""
@@ -54,8 +58,10 @@ class OpenWindow:
         self._try(lambda: self._admit(keyframe))
 
     def confirm(self) -> None:
-        """Where there may be outliers, the window once more with what all of it confirms."""
-        if self._gate.judges:
+        """Where there may be outliers, or there are detections without identities, the window once
+        more with what all of it confirms.
+        """
+        if self._gate.judges or any(len(each.ids) for each in self._unnamed):
             self._try(self._settle)
 
     def move(self, rest: Increment, forward: np.ndarray) -> None:
@@ -87,7 +93,10 @@ class OpenWindow:
 
     def _admit(self, keyframe: Keyframe) -> None:
         most = self._config.bounds.submap_landmarks
-        bounded = nearest_landmarks(keyframe, self.particles.particles.ids, most)
+        named, unnamed = split(keyframe)
+        bounded = nearest_landmarks(named, self.particles.particles.ids, most)
+        self._named.append(bounded)
+        self._unnamed.append(unnamed)
         self._take(self._gate.admitted(bounded))
 
     def _take(self, keyframe: Keyframe) -> None:
@@ -106,8 +115,19 @@ class OpenWindow:
             self.particles = windows.marked(self.particles, keyframe.stamp_ns)
 
     def _settle(self) -> None:
+        named = list(self._gate.settled()) if self._gate.judges else self._named
+        if any(len(each.ids) for each in self._unnamed):
+            config = self._config
+            self.settled = settled(
+                named,
+                self._unnamed,
+                config.front_end.association,
+                config.sensor,
+                config.bounds.submap_landmarks,
+            )
+            named = list(self.settled.keyframes)
         self._begin()
-        for keyframe in self._gate.settled():
+        for keyframe in named:
             self._take(keyframe)
 
     def _go(self, rest: Increment, forward: np.ndarray) -> None:

@@ -136,9 +136,14 @@ class HybridSlam:
             unsolved=0 if is_sensible else scans - late,
         )
         if submap is not None and is_sensible:
+            found = self._open.settled
             closed = replace(
                 closed,
-                local=submap,
+                local=replace(submap, unnamed=found.unnamed),
+                unconfirmed=found.unconfirmed,
+                clutter=found.clutter,
+                became=found.became,
+                slips=found.slips,
                 sightings=() if self._grid is None else self._grid.sightings(),
                 window=windows.of_base(self.window),
                 keyframes_ns=self._open.keyframes_ns,

@@ -1,0 +1,154 @@
+"""Worlds whose landmarks have no names: identities hidden, detections missed, clutter among them.
+
+The stream keeps the true identities, for whoever scores; what is published is told without them.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64, UInt32
+
+from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams, robot_stream
+
+
+@dataclass(frozen=True)
+class Hiding:
+    """How identities are hidden.
+
+    tagged: the share of landmarks that keep theirs. missed: the probability of a detection to be
+    left out. clutter: the share of all detections that are of nothing; they lie anywhere in the
+    disc of detections, which reaches out to reach_m or else to the farthest of the robot's.
+    """
+
+    tagged: float = 0.0
+    missed: float = 0.0
+    clutter: float = 0.0
+    reach_m: float | None = None
+
+
+def with_hidden_identities(streams: WorldStreams, hiding: Hiding, seed: int) -> WorldStreams:
+    """The streams with detections in the place of observations; random numbers are keyed by seed,
+    robot and purpose.
+    """
+    rng = np.random.default_rng([seed, 0x7A65])
+    ids = np.unique(np.concatenate([s.landmark_detections.ids for s in streams.streams]))
+    ids = ids[ids != NO_LABEL]
+    tagged = ids[rng.random(len(ids)) < hiding.tagged]
+    hidden = tuple(
+        _hidden(stream, hiding, tagged, np.random.default_rng([seed, 0x7A66, index]))
+        for index, stream in enumerate(streams.streams)
+    )
+    return replace(streams, streams=hidden)
+
+
+def _hidden(
+    stream: RobotStream, hiding: Hiding, tagged: UInt32[np.ndarray, " T"], rng: np.random.Generator
+) -> RobotStream:
+    seen = stream.landmark_detections
+    message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
+    kept = rng.random(len(seen.ids)) >= hiding.missed
+    named = np.isin(seen.ids, tagged)
+    parts = [_rows(seen, message, kept & named, hidden=False)] if len(tagged) else []
+    untagged = _rows(seen, message, kept & ~named, hidden=True)
+    if hiding.clutter:
+        untagged = _with_clutter(untagged, hiding, rng)
+    both = _in_order([*parts, untagged])
+    # A scan that saw nothing stays a measurement, whichever kind it is.
+    return robot_stream(
+        robot=stream.robot,
+        start_ns=int(stream.stamps_ns[0]),
+        start=stream.start,
+        intervals=stream.intervals,
+        observations=both,
+        sightings=stream.teammate_detections,
+        teammates=stream.teammates,
+        truth_ns=stream.truth_ns,
+        truth=stream.truth,
+        notes=stream.notes,
+        clock_offset_ns=stream.clock_offset_ns,
+        positions_ns=stream.positions_ns,
+        positions=stream.positions,
+    )
+
+
+def _rows(
+    seen: Detections,
+    message: Int64[np.ndarray, " R"],
+    chosen: Bool[np.ndarray, " R"],
+    *,
+    hidden: bool,
+) -> Detections:
+    """Every message with the chosen of its rows."""
+    count = len(seen.stamps_ns)
+    offsets = np.concatenate(([0], np.cumsum(np.bincount(message[chosen], minlength=count))))
+    was = seen.hidden
+    return Detections(
+        seen.stamps_ns,
+        offsets.astype(np.int64),
+        seen.ids[chosen],
+        seen.ranges[chosen],
+        seen.bearings[chosen],
+        None if seen.points is None or hidden else seen.points[chosen],
+        None if seen.covariances is None else seen.covariances[chosen],
+        np.full(count, hidden) if was is None else was | hidden,
+        None if seen.signatures is None else seen.signatures[chosen],
+    )
+
+
+def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> Detections:
+    counts = np.diff(seen.offsets)
+    ratio = hiding.clutter / (1.0 - hiding.clutter)
+    false = rng.poisson(ratio * counts)
+    farthest = float(seen.ranges.max(initial=1.0))
+    total = int(false.sum())
+    reach = hiding.reach_m or farthest
+    ranges = reach * np.sqrt(rng.uniform(0.01, 1.0, total))
+    bearings = rng.uniform(-np.pi, np.pi, total)
+    message = np.concatenate(
+        (np.repeat(np.arange(len(counts)), counts), np.repeat(np.arange(len(counts)), false))
+    )
+    shuffle = rng.random(len(message))
+    order = np.lexsort((shuffle, message))
+    covariances = seen.covariances
+    if covariances is not None and len(covariances):
+        drawn = covariances[rng.integers(0, len(covariances), total)]
+        covariances = np.concatenate((covariances, drawn))[order]
+    return replace(
+        seen,
+        offsets=np.concatenate(([0], np.cumsum(counts + false))).astype(np.int64),
+        ids=np.concatenate((seen.ids, np.full(total, NO_LABEL, np.uint32)))[order],
+        ranges=np.concatenate((seen.ranges, ranges))[order],
+        bearings=np.concatenate((seen.bearings, bearings))[order],
+        covariances=covariances,
+        signatures=None,
+    )
+
+
+def _in_order(parts: list[Detections]) -> Detections:
+    """The messages of all by time; at one time those with names first."""
+    if len(parts) == 1:
+        return parts[0]
+    stamps = np.concatenate([part.stamps_ns for part in parts])
+    order = np.argsort(stamps, kind="stable")
+    pieces = [part.only(i, i + 1) for part in parts for i in range(len(part.stamps_ns))]
+    chosen = [pieces[i] for i in order if len(pieces[i].ids)]
+    counts = [len(piece.ids) for piece in chosen]
+
+    def joined(values: list[Float[np.ndarray, "..."]]) -> Float[np.ndarray, "..."]:
+        return np.concatenate(values)
+
+    def optional(name: str) -> Float[np.ndarray, "..."] | None:
+        values = [getattr(piece, name) for piece in chosen]
+        return None if any(value is None for value in values) else joined(values)
+
+    return Detections(
+        np.concatenate([piece.stamps_ns for piece in chosen]),
+        np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        np.concatenate([piece.ids for piece in chosen]),
+        joined([piece.ranges for piece in chosen]),
+        joined([piece.bearings for piece in chosen]),
+        None,
+        optional("covariances"),
+        np.concatenate([piece.hidden for piece in chosen if piece.hidden is not None]),
+        None,
+    )
