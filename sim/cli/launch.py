@@ -19,11 +19,14 @@ from sim.cli.options import (
     Dataset,
     EstimatorOption,
     FusionOption,
+    IdentitiesOption,
     Keys,
     Peers,
+    Pieces,
     Robots,
     Seed,
     SpeedText,
+    check_pieces,
     fail,
     over_tls,
     parsed_speed,
@@ -53,6 +56,8 @@ def launch(
     ] = None,
     dataset: Dataset = None,
     robots: Robots = None,
+    pieces: Pieces = None,
+    identities: IdentitiesOption = None,
     estimator: EstimatorOption = None,
     fusion: FusionOption = None,
     seed: Seed = None,
@@ -120,7 +125,7 @@ def launch(
     name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
     resolved = with_options(
         scenario_of(name),
-        robots=robots,
+        robots=robots if pieces is None else pieces,
         seed=seed,
         estimator=estimator,
         fusion=fusion,
@@ -128,7 +133,10 @@ def launch(
         peers=peers,
         centre=not without_centre,
         comm_range_m=comm_range,
+        identities=identities,
     )
+    if pieces is not None:
+        check_pieces(resolved)
     resolved, missing = with_present_robots(resolved)
     _check_world(resolved)
     if resolved.is_live and listen == ANY_PORT:

@@ -11,6 +11,7 @@ import typer
 
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario, load, loads
+from sim.world.config import UnlabelledWorld
 from team.config import Estimator, FusionRule
 
 if TYPE_CHECKING:
@@ -56,6 +57,23 @@ Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 100.", m
 Peers = Annotated[
     bool, typer.Option("--peers", help="Each robot keeps the team's set and folds it by itself.")
 ]
+Pieces = Annotated[
+    int | None,
+    typer.Option(
+        help="Cut the log of a data set of one robot into so many robots, which do not know where "
+        "they begin.",
+        min=1,
+        max=100,
+        metavar="N",
+    ),
+]
+IdentitiesOption = Annotated[
+    str | None,
+    typer.Option(
+        help="hidden: landmarks have no names, of any world or data set; or known.",
+        metavar="WHICH",
+    ),
+]
 EstimatorOption = Annotated[str | None, typer.Option(help=_either(Estimator), metavar="NAME")]
 FusionOption = Annotated[str | None, typer.Option(help=_either(FusionRule), metavar="RULE")]
 Dataset = Annotated[
@@ -68,6 +86,16 @@ SpeedText = Annotated[
     str,
     typer.Option(help="Multiple of real time, or max: as fast as everyone keeps up.", metavar="X"),
 ]
+
+
+def check_pieces(scenario: Scenario) -> None:
+    """Only the log of a data set of one robot can be cut into several."""
+    if not isinstance(scenario.world, UnlabelledWorld):
+        fail(
+            "--pieces cuts the log of a data set of one robot with detections.csv: give it with "
+            "--dataset, or --robots for other worlds",
+            WRONG_USE,
+        )
 
 
 def connected(team: str, connect: str, keys: Path | None, node: str) -> "ZenohBus":

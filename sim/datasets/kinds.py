@@ -3,15 +3,17 @@
 from pathlib import Path
 from typing import Literal
 
-from sim.datasets import folder, tables
+from sim.datasets import folder, tables, unlabelled
 from sim.datasets.tables import DatasetError
 
-Kind = Literal["utias", "folder"]
+Kind = Literal["utias", "folder", "unlabelled"]
 UTIAS_MARKER = "Barcodes.dat"
 
 
 def kind_of(path: str | Path) -> Kind:
-    """UTIAS files, or CSV tables by robot; raises DatasetError for what is neither."""
+    """UTIAS files, CSV tables by robot or of detections; raises DatasetError for what is none."""
+    if unlabelled.is_unlabelled(path):
+        return "unlabelled"
     if folder.is_folder(path):
         return "folder"
     try:

@@ -22,7 +22,14 @@ from sim.scenarios.document import (
     named_document,
     resolved,
 )
-from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UtiasWorld, World
+from sim.world.config import (
+    FolderWorld,
+    LiveWorld,
+    SimulatedWorld,
+    UnlabelledWorld,
+    UtiasWorld,
+    World,
+)
 from sim.world.radio import Radio
 from team.config import Estimator, Exchange, FusionRule, RobotConfig
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
@@ -36,6 +43,7 @@ WORLDS: dict[str, type[World]] = {
     "utias": UtiasWorld,
     "folder": FolderWorld,
     "live": LiveWorld,
+    "unlabelled": UnlabelledWorld,
 }
 
 

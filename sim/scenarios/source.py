@@ -9,11 +9,12 @@ import msgspec
 from sim.datasets.folder import SCENARIO, folder, robots_of
 from sim.datasets.kinds import UTIAS_MARKER, kind_of
 from sim.datasets.tables import opened
+from sim.datasets.unlabelled import is_car, unlabelled
 from sim.datasets.utias import utias
 from sim.datasets.utias_log import present_robots
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario
-from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld
+from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UnlabelledWorld
 from sim.world.identities import Hiding, with_hidden_identities
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
@@ -30,6 +31,8 @@ def streams_of(scenario: Scenario) -> WorldStreams:
             hiding = hiding if world.identities == "hidden" else replace(hiding, tagged=1.0)
             return with_hidden_identities(streams, hiding, noise_seed(scenario))
         return streams
+    if isinstance(world, UnlabelledWorld | LiveWorld):
+        return streams
     hidden = world.identities == "hidden"
     return with_hidden_identities(streams, Hiding(), scenario.seed) if hidden else streams
 
@@ -37,6 +40,8 @@ def streams_of(scenario: Scenario) -> WorldStreams:
 def _with_identities(scenario: Scenario) -> WorldStreams:
     if isinstance(scenario.world, SimulatedWorld):
         return simulated(scenario.world, scenario.robots, noise_seed(scenario))
+    if isinstance(scenario.world, UnlabelledWorld):
+        return unlabelled(scenario.world, len(scenario.robots))
     if isinstance(scenario.world, FolderWorld):
         return folder(scenario.world, scenario.robots)
     if isinstance(scenario.world, LiveWorld):
@@ -49,8 +54,11 @@ def _with_identities(scenario: Scenario) -> WorldStreams:
 
 def scenario_beside(path: str | Path) -> str:
     """The scenario that a data set brings with it, or the built-in one for its kind."""
-    if kind_of(path) == "utias":
+    kind = kind_of(path)
+    if kind == "utias":
         return "utias"
+    if kind == "unlabelled" and not (Path(path) / SCENARIO).is_file():
+        return "victoria" if is_car(path) else "dlr"
     own = Path(path) / SCENARIO
     return str(own) if own.is_file() else "recorded"
 
@@ -62,7 +70,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     Raises DatasetError.
     """
     world = scenario.world
-    if isinstance(world, SimulatedWorld | LiveWorld) or not world.path:
+    if isinstance(world, SimulatedWorld | LiveWorld | UnlabelledWorld) or not world.path:
         return scenario, None
     if isinstance(world, FolderWorld):
         present = set(robots_of(world.path))

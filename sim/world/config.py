@@ -145,7 +145,23 @@ class LiveWorld(
     newcomer: RobotConfig | None = None
 
 
-World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld
+class UnlabelledWorld(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="unlabelled"
+):
+    """A data set of one robot whose landmarks have no names: odometry.csv and detections.csv.
+
+    path: the folder. With several robots, each drives a piece of the log from an unknown initial
+    pose. duration_s: only this much from the first measurement. identities: "known" takes its
+    labels for identities, for a run to compare with.
+    """
+
+    path: str = ""
+    unknown_starts: tuple[str, ...] = ()
+    duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
+    identities: Identities = "hidden"
+
+
+World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld | UnlabelledWorld
 
 
 def starts_unknown(world: World, robot: str) -> bool:

@@ -914,6 +914,8 @@ def _end_at(head: m.StreamHead) -> m.End:
         robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
     )
     return m.End(stamp_ns=head.stamp_ns, streams=(last,))
+
+
 def _slipped(slip: Slipped) -> str:
     """A slip of the odometry in words."""
     metres, turn = float(np.hypot(*slip.by[:2])), float(np.degrees(slip.by[2]))

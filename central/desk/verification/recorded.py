@@ -180,6 +180,8 @@ def identity(key: str, message: m.Message) -> Identity:
                 message.first_measurement,
                 message.last_measurement,
             )
+        case m.Association():
+            names = (message.incarnation, message.sequence, message.stamps)
         case m.SightingFactor():
             names = (message.incarnation, message.sequence, message.stamp_ns, message.teammate)
         case m.MapEstimate():

@@ -1,13 +1,14 @@
 """One robot's messages again: its node over its recorded measurements."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import takewhile
 
 import msgspec
+import numpy as np
 
 from central.desk.verification.recorded import Identity, Recorded, identity
-from team.config import RobotConfig
+from team.config import UNNAMED, RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
 from team.rejection import Rejection
@@ -15,6 +16,7 @@ from team.robot.hybrid import HybridEstimator
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.arrays import ids, stamps
 from team.wire.bus import Outgoing
 
 PosesSaid = Mapping[tuple[int, int], Sequence[m.Prior | None]]
@@ -33,6 +35,7 @@ class RetoldRobot(RobotNode):
         self._boundary = Boundary(ch.robot_node(config.id))
         self._announcement = msgspec.structs.replace(self._announcement, digest=digest)
         self._said = said
+        self._associated: m.Association | None = None
 
     def _poses(self, stamp_ns: int | None) -> list[Outgoing]:
         if stamp_ns is None:
@@ -45,7 +48,26 @@ class RetoldRobot(RobotNode):
 
     def given(self, message: m.Message) -> list[Outgoing]:
         """Handle a message as the shell did: one that raises is set aside."""
-        return self._boundary.give(self, message)
+        out = self._boundary.give(self, message)
+        for each in out:
+            if isinstance(each.message, m.Association):
+                self._associated = each.message
+        return out
+
+    def silent(self) -> dict[int, str]:
+        """By stamp, the scans of the last window none of whose detections is in its submap."""
+        said: dict[int, str] = {}
+        if self._associated is None:
+            return said
+        landmarks = ids(self._associated.landmarks, "landmarks")
+        bounds = np.cumsum([0, *ids(self._associated.counts, "counts").tolist()])
+        for k, stamp in enumerate(stamps(self._associated.stamps, "stamps").tolist()):
+            of_scan = landmarks[bounds[k] : bounds[k + 1]]
+            if (of_scan < UNNAMED).all():
+                clutter = (of_scan == m.CLUTTER).all()
+                reason = Rejection.CLUTTER if clutter else Rejection.UNCONFIRMED
+                said[stamp] = reason.disposition
+        return said
 
     def took(self, message: m.Message) -> Counter[str]:
         """Take a measurement or the end; the dispositions that it gave, how many of each."""
@@ -198,6 +220,19 @@ def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
                 inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
 
 
+SILENT = {Rejection.UNCONFIRMED.disposition, Rejection.CLUTTER.disposition}
+"""What becomes of scans without identities of which nothing is in the submap."""
+
+
+def _silent(
+    node: RetoldRobot, scans: Iterable[int], measurements: Mapping[int, m.Measurement]
+) -> dict[int, str]:
+    """What the last window has found out about these scans."""
+    said = node.silent()
+    detected = [n for n in scans if isinstance(measurements[n], m.Detections)]
+    return {n: said[measurements[n].stamp_ns] for n in detected if measurements[n].stamp_ns in said}
+
+
 def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     """What the robot's node does with each measurement of an incarnation that it consumed, in its
     own words.
@@ -217,18 +252,26 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
         measurements.__contains__, range(len(measurements) if done is None else done)
     ):
         took, late = node.took(measurements[counter]), Rejection.LATE.disposition
+        scans = [n for n in said if isinstance(measurements[n], m.AnyScan | m.Detections)]
+        scans = [n for n in scans if not said[n].startswith("rejected")]
+        silent = SILENT & set(took)
         if late in took:  # an odometry interval that ends a window, and scans that it leaves behind
-            scans = [n for n in said if isinstance(measurements[n], m.AnyScan)]
-            scans = [n for n in scans if not said[n].startswith("rejected")]
             said |= dict.fromkeys(scans[-took.pop(late) :], late)
             said[counter] = HybridEstimator.used
-        else:
-            said[counter] = next(iter(took), "lost")
+        if silent:  # … and scans that it has found nothing in
+            said |= _silent(node, scans, measurements)
+            said[counter] = HybridEstimator.used
+        said.setdefault(counter, next(iter(took), "lost"))
     if said and done is not None:
         end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(said))
-        for reason, count in node.took(m.End(stamp_ns=0, streams=(end,))).items():
+        took = node.took(m.End(stamp_ns=0, streams=(end,)))
+        if SILENT & set(took):
+            said |= _silent(node, list(said), measurements)
+        for reason, count in took.items():
+            if reason in SILENT:
+                continue
             sighted = reason == Rejection.NO_NODE.disposition
-            kinds = (m.Sightings,) if sighted else (m.Observations, m.Points)
+            kinds = (m.Sightings,) if sighted else (m.Observations, m.Points, m.Detections)
             taken = [n for n in said if isinstance(measurements[n], kinds)]
             taken = [n for n in taken if not said[n].startswith("rejected")]
             said |= dict.fromkeys(taken[-count:], reason)

@@ -28,8 +28,8 @@ PLATFORM = (
 """The metadata that have to be equal for equal bits."""
 MAPS = (ch.FUSED_MAP, ch.FINAL_MAP, ch.TEAM_MAP, ch.TEAM_FINAL)
 CHECKED = (
-    ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE, ch.ROBOT_DONE,
-    ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
+    ch.SUBMAP, ch.ASSOCIATION, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE,
+    ch.ROBOT_DONE, ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
     ch.CENTRAL_POSE, ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_FINAL,
 )  # fmt: skip
 """Causes before what follows from them."""

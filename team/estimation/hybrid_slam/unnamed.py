@@ -77,7 +77,11 @@ def settled(
         clutter=clutter,
         gated=int(np.count_nonzero(~kept)),
         slips=tuple(Slipped(both[slip.keyframe].stamp_ns, slip.by) for slip in found.slips),
-        became=_became(unnamed, np.where(kept, ids, 0)[is_detection], found.clutter[is_detection]),
+        became=_became(
+            unnamed,
+            np.where(kept, ids, 0)[is_detection].astype(np.int64),
+            found.clutter[is_detection],
+        ),
     )
 
 
@@ -90,7 +94,7 @@ def _became(
         stamps=np.array([each.stamp_ns for each in seen], np.int64),
         counts=np.array([len(each.ids) for each in seen], np.int64),
         rows=np.concatenate([each.ids for each in seen]).astype(np.int64) - UNNAMED,
-        landmarks=landmarks.astype(np.int64),
+        landmarks=landmarks,
         clutter=clutter,
     )
 

@@ -27,6 +27,7 @@ def written(folder: Path, text: str) -> Path:
 
 def test_the_built_in_scenarios_are_the_documented_ones() -> None:
     assert builtin_names() == (
+        "dlr",
         "downs-10",
         "downs-100",
         "large",
@@ -207,7 +208,7 @@ UTIAS = 'world = { kind = "utias" }\n'
         (SMALL + "[defaults]\nid = 'a'", "`id` at defaults would be every robot's"),
         (
             "seed = 1",
-            'expected one of "simulated", "utias", "folder", "live", got nothing at world.kind',
+            'expected one of "simulated", "utias", "folder", "live", "unlabelled", got nothing at world.kind',
         ),
         ("world = { kind = [1] }", "got [1] at world.kind"),
         ("world = 3", "expected a table, got int at world"),
@@ -241,7 +242,7 @@ UTIAS = 'world = { kind = "utias" }\n'
         ("world = { kind = 'utias', start_sigma_m = 1 }", "are both 0 or both above 0"),
         (
             "base = 'thesys'",
-            "expected a built-in scenario, got 'thesys' at base; known: downs-10, ",
+            "expected a built-in scenario, got 'thesys' at base; known: dlr, downs-10, ",
         ),
         ("estimator = 'hybrid-thesis'\n" + SMALL, "valid: hybrid + join, hybrid + kalman, "),
     ],

@@ -14,14 +14,23 @@ from central.config import BiasSigmas, CentralConfig, CommonBiasSigmas
 from sim.cli.main import app
 from sim.scenarios.scenario import Scenario, load
 from sim.scenarios.source import streams_of
-from sim.world.config import LiveWorld, Point, SimulatedWorld, UtiasWorld
-from team.config import Bounds, FrontEnd, Lens, MotionModel, MotionNoise, RobotConfig, Sensor
+from sim.world.config import LiveWorld, Point, SimulatedWorld, UnlabelledWorld, UtiasWorld
+from team.config import (
+    Association,
+    Bounds,
+    FrontEnd,
+    Lens,
+    MotionModel,
+    MotionNoise,
+    RobotConfig,
+    Sensor,
+)
 from tests.support import ROOT
 
 PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
     Scenario, SimulatedWorld, UtiasWorld, LiveWorld, RobotConfig, MotionModel, MotionNoise, Sensor,
-    Lens, FrontEnd, CentralConfig, BiasSigmas, CommonBiasSigmas, Bounds,
+    Lens, FrontEnd, Association, UnlabelledWorld, CentralConfig, BiasSigmas, CommonBiasSigmas, Bounds,
 )  # fmt: skip
 
 

@@ -1,0 +1,303 @@
+"""A data set of one robot whose landmarks have no names, in a folder of CSV tables.
+
+odometry.csv      t_s,rear_wheel_speed_m_s,steering_rad, or step,dx_m,dy_m,dtheta_rad with the upper
+                  triangle of the covariance c_xx,c_xy,c_yy,c_xt,c_yt,c_tt; a step is taken as 1 s
+detections.csv    t_s,range_m,bearing_rad[,diameter_m], or step,x_m,y_m,c_xx,c_xy,c_yy
+labels.csv        landmark: row by row of detections.csv, -1 for clutter       (optional)
+reference_landmarks.csv, gps.csv                                               (optional)
+
+Labels, reference and GPS are for scoring: no estimator sees them.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.tables import DatasetError
+from sim.world.config import UnlabelledWorld
+from sim.world.streams import (
+    NO_LABEL,
+    Detections,
+    Intervals,
+    RobotStream,
+    StartPose,
+    WorldStreams,
+    robot_stream,
+)
+
+FILES = ("odometry.csv", "detections.csv")
+COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
+CAR = ("t_s", "rear_wheel_speed_m_s", "steering_rad")
+STEPS = ("step", "dx_m", "dy_m", "dtheta_rad")
+STEP_NS = 1_000_000_000
+EXPECTED = "expected a folder with odometry.csv and detections.csv"
+
+
+def is_unlabelled(path: str | Path) -> bool:
+    """Whether a folder has the tables of such a set."""
+    return all((Path(path) / name).is_file() for name in FILES)
+
+
+def is_car(path: str | Path) -> bool:
+    """Whether its odometry is that of a car; raises DatasetError."""
+    return _table(Path(path), "odometry.csv").has(*CAR)
+
+
+def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
+    """The streams of a data set, cut into as many pieces as there are robots.
+
+    The pieces follow each other in the log, and begin at one time here. Raises DatasetError.
+    """
+    if not world.path or not is_unlabelled(world.path):
+        raise DatasetError(f"{world.path or 'no data set'}: {EXPECTED}")
+    root = Path(world.path)
+    whole = _stream(root, world)
+    ids, positions = _reference(root)
+    return WorldStreams(
+        streams=pieces(whole, robots) if robots > 1 else (whole,),
+        landmark_ids=ids,
+        landmarks=positions if len(ids) else None,
+        source=f"data set {root.resolve().name}",
+    )
+
+
+def _table(root: Path, name: str) -> CsvTable:
+    return read_table(root / name, name)
+
+
+def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
+    odometry, detections = _table(root, "odometry.csv"), _table(root, "detections.csv")
+    labels = _labels(root, len(detections))
+    if odometry.has(*CAR) and detections.has("t_s", "range_m", "bearing_rad"):
+        intervals, seen = _of_car(odometry, detections, labels)
+    elif odometry.has(*STEPS, *COVARIANCE) and detections.has("step", "x_m", "y_m"):
+        intervals, seen = _of_steps(odometry, detections, labels)
+    else:
+        raise DatasetError(
+            f"{root}: columns of neither kind; odometry.csv has {','.join(CAR)} or "
+            f"{','.join(STEPS + COVARIANCE)}, detections.csv the same time column"
+        )
+    start_ns = int(intervals.end_ns[0] - intervals.duration_ns[0])
+    end_ns = int(intervals.end_ns[-1])
+    outside = int(np.sum((seen.stamps_ns < start_ns) | (seen.stamps_ns > end_ns)))
+    if world.duration_s is not None:
+        end_ns = min(end_ns, start_ns + round(world.duration_s * 1e9))
+        intervals = intervals.where(intervals.end_ns <= end_ns)
+        end_ns = int(intervals.end_ns[-1])
+    first, last = np.searchsorted(seen.stamps_ns, [start_ns, end_ns + 1])
+    seen = seen.only(int(first), int(last))
+    if world.identities == "known":
+        seen = _named(seen)
+    gps_ns, gps = _positions(root)
+    return robot_stream(
+        robot="r1",
+        start_ns=start_ns,
+        start=StartPose(np.zeros(3), None),
+        intervals=intervals,
+        observations=seen,
+        sightings=_nothing(),
+        teammates=("r1",),
+        notes=(f"{outside} scans are outside the time of the odometry",) if outside else (),
+        positions_ns=gps_ns,
+        positions=gps,
+    )
+
+
+def _of_car(
+    odometry: CsvTable, detections: CsvTable, labels: UInt32[np.ndarray, " R"]
+) -> tuple[Intervals, Detections]:
+    """A row of odometry holds until the next one; before the first, its own."""
+    stamps, seen_ns = odometry.stamps("t_s"), detections.stamps("t_s")
+    first = min(int(seen_ns.min(initial=stamps[0])), int(stamps[0]))
+    values = odometry.numbers(*CAR[1:])
+    if first < stamps[0]:
+        stamps = np.concatenate(([first], stamps))
+        values = np.concatenate((values[:1], values))
+    duration = np.diff(stamps)
+    if (duration <= 0).any():
+        raise odometry.fault("t_s does not ascend")
+    intervals = Intervals(
+        stamps[1:], duration, values[:-1, 0].copy(), values[:-1, 1].copy(), steered=True
+    )
+    polar = detections.numbers("range_m", "bearing_rad")
+    diameters = detections.numbers("diameter_m")[:, 0] if detections.has("diameter_m") else None
+    return intervals, _scans(detections, seen_ns, polar, labels, None, diameters)
+
+
+def _of_steps(
+    odometry: CsvTable, detections: CsvTable, labels: UInt32[np.ndarray, " R"]
+) -> tuple[Intervals, Detections]:
+    steps = _steps(odometry)
+    if not np.array_equal(steps, np.arange(len(steps))):
+        raise odometry.fault("step does not count from 0 by ones")
+    ends = (steps + 1) * STEP_NS
+    xx, xy, yy, xt, yt, tt = odometry.numbers(*COVARIANCE).T
+    covariances = np.stack((xx, xy, xt, xy, yy, yt, xt, yt, tt), axis=1).reshape(-1, 3, 3)
+    untold = np.zeros(len(ends))
+    increments = odometry.numbers(*STEPS[1:])
+    covariances = _in_the_end(increments, covariances)
+    intervals = Intervals(
+        ends, np.full(len(ends), STEP_NS), untold, untold, False, increments, covariances
+    )
+    points = detections.numbers("x_m", "y_m")
+    own = detections.numbers("c_xx", "c_xy", "c_yy")
+    polar, claimed = _polar(points, own)
+    stamps = (_steps(detections) + 1) * STEP_NS
+    return intervals, _scans(detections, stamps, polar, labels, claimed, None)
+
+
+def _in_the_end(
+    increments: Float[np.ndarray, "I 3"], covariances: Float[np.ndarray, "I 3 3"]
+) -> Float[np.ndarray, "I 3 3"]:
+    """Of (x, y, theta) in the frame of the pose before, as of (forward, left, turn) of the end."""
+    c, s = np.cos(increments[:, 2]), np.sin(increments[:, 2])
+    turned = np.zeros((len(increments), 3, 3))
+    turned[:, 0, 0], turned[:, 0, 1], turned[:, 1, 0], turned[:, 1, 1] = c, s, -s, c
+    turned[:, 2, 2] = 1.0
+    return np.asarray(turned @ covariances @ turned.transpose(0, 2, 1))
+
+
+def _steps(table: CsvTable) -> Int64[np.ndarray, " rows"]:
+    return table.numbers("step")[:, 0].astype(np.int64)
+
+
+def _polar(
+    points: Float[np.ndarray, "R 2"], covariances: Float[np.ndarray, "R 3"]
+) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "R 3"]]:
+    """(r, b) of points and J S Jᵀ, J = ∂(r, b)/∂(x, y), as (rr, rb, bb)."""
+    x, y = points.T
+    ranges = np.maximum(np.hypot(x, y), 1e-3)
+    c, s = x / ranges, y / ranges
+    xx, xy, yy = covariances.T
+    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
+    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / ranges
+    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (ranges * ranges)
+    return np.column_stack((ranges, np.arctan2(y, x))), np.column_stack((rr, rb, bb))
+
+
+def _scans(
+    table: CsvTable,
+    stamps: Int64[np.ndarray, " R"],
+    polar: Float[np.ndarray, "R 2"],
+    labels: UInt32[np.ndarray, " R"],
+    covariances: Float[np.ndarray, "R 3"] | None,
+    signatures: Float[np.ndarray, " R"] | None,
+) -> Detections:
+    """One message for each stamp; its rows in the order of the table."""
+    if (np.diff(stamps) < 0).any():
+        raise table.fault("its rows are not in order of time")
+    if (polar[:, 0] < 0.0).any():
+        raise table.fault("a range is negative")
+    first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
+    return Detections(
+        stamps[first],
+        np.append(first, len(stamps)).astype(np.int64),
+        labels,
+        polar[:, 0].copy(),
+        np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi),
+        None,
+        covariances,
+        np.ones(len(first), np.bool_),
+        signatures,
+    )
+
+
+def _labels(root: Path, rows: int) -> UInt32[np.ndarray, " R"]:
+    if not (root / "labels.csv").is_file():
+        return np.full(rows, NO_LABEL, np.uint32)
+    table = _table(root, "labels.csv")
+    labels = table.numbers("landmark")[:, 0].astype(np.int64)
+    if len(labels) != rows:
+        raise table.fault(f"{len(labels)} rows, {rows} in detections.csv: row by row, one for each")
+    return np.where(labels < 0, NO_LABEL, labels).astype(np.uint32)
+
+
+def _named(seen: Detections) -> Detections:
+    """The labels as identities, for a run to compare with; what has none is left out."""
+    message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
+    kept = seen.ids != NO_LABEL
+    _, first = np.unique(np.column_stack((message, seen.ids)), axis=0, return_index=True)
+    once = np.zeros(len(kept), np.bool_)
+    once[first] = True
+    kept &= once
+    counts = np.bincount(message[kept], minlength=len(seen.stamps_ns))
+    return replace(
+        seen,
+        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        ids=seen.ids[kept],
+        ranges=seen.ranges[kept],
+        bearings=seen.bearings[kept],
+        covariances=None if seen.covariances is None else seen.covariances[kept],
+        hidden=None,
+        signatures=None,
+    )
+
+
+def _nothing() -> Detections:
+    none = np.empty(0)
+    return Detections(
+        none.astype(np.int64), np.zeros(1, np.int64), none.astype(np.uint32), none, none
+    )
+
+
+def _reference(root: Path) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    if not (root / "reference_landmarks.csv").is_file():
+        return np.empty(0, np.uint32), np.empty((0, 2))
+    table = _table(root, "reference_landmarks.csv")
+    ids = table.names("landmark")
+    order = np.argsort(ids)
+    return ids[order], table.numbers("x_m", "y_m")[order]
+
+
+def _positions(
+    root: Path,
+) -> tuple[Int64[np.ndarray, " G"] | None, Float[np.ndarray, "G 2"] | None]:
+    if not (root / "gps.csv").is_file():
+        return None, None
+    table = _table(root, "gps.csv")
+    return table.stamps("t_s"), table.numbers("x_m", "y_m")
+
+
+def pieces(whole: RobotStream, count: int) -> tuple[RobotStream, ...]:
+    """One log as several robots r1, r2, … with unknown initial poses, of as many intervals each."""
+    intervals = whole.intervals
+    bounds = np.linspace(0, len(intervals.end_ns), count + 1).astype(np.int64)
+    names = tuple(f"r{i + 1}" for i in range(count))
+    zero_ns = int(whole.stamps_ns[0])
+    return tuple(
+        _piece(whole, names, i, (int(bounds[i]), int(bounds[i + 1])), zero_ns) for i in range(count)
+    )
+
+
+def _piece(
+    whole: RobotStream, names: tuple[str, ...], index: int, part: tuple[int, int], zero_ns: int
+) -> RobotStream:
+    intervals = whole.intervals
+    chosen = np.zeros(len(intervals.end_ns), np.bool_)
+    chosen[part[0] : part[1]] = True
+    own = intervals.where(chosen)
+    begin_ns, end_ns = int(own.end_ns[0] - own.duration_ns[0]), int(own.end_ns[-1])
+    back = begin_ns - zero_ns
+    seen = whole.landmark_detections
+    # What is seen at the end of an interval is that interval's, and at the first start its own.
+    first, last = np.searchsorted(seen.stamps_ns, [begin_ns + (index > 0), end_ns + 1])
+    mine = seen.only(int(first), int(last))
+    gps_ns, gps = whole.positions_ns, whole.positions
+    if gps_ns is not None and gps is not None:
+        inside = (gps_ns >= begin_ns) & (gps_ns <= end_ns)
+        gps_ns, gps = gps_ns[inside] - back, gps[inside]
+    return robot_stream(
+        robot=names[index],
+        start_ns=zero_ns,
+        start=None,
+        intervals=replace(own, end_ns=own.end_ns - back),
+        observations=replace(mine, stamps_ns=mine.stamps_ns - back),
+        sightings=_nothing(),
+        teammates=names,
+        notes=(*whole.notes, f"it begins {back * 1e-9:.2f} s into the log"),
+        positions_ns=gps_ns,
+        positions=gps,
+    )

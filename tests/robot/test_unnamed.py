@@ -1,0 +1,122 @@
+"""A robot whose landmarks have no names: what it sends, and that each measurement is used once."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.desk.evaluation.evaluation import evaluate
+from central.desk.verification.verification import verify
+from sim.in_memory.team import run_team
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from team.config import UNNAMED
+from team.rejection import Rejection
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import ids, octets, stamps
+from team.wire.bus import opened
+from tests.sim.reruns import written
+
+STEPS = 50
+
+
+def hidden(**world):
+    scenario = with_options(load("thesis-b"), seed=3, robots=1, identities="hidden")
+    changed = msgspec.structs.replace(scenario.world, steps=STEPS, **world)
+    return msgspec.structs.replace(scenario, world=changed)
+
+
+@pytest.fixture(scope="module")
+def run():
+    scenario = hidden(clutter=0.2, missed=0.1, tagged=0.4)
+    streams = streams_of(scenario)
+    return streams, list(run_team(scenario, streams))
+
+
+def of(samples, channel):
+    return [message for c, _, message in map(opened, samples) if c is channel]
+
+
+def test_detections_are_told_without_identities_and_the_labels_only_to_the_evaluator(run):
+    _streams, samples = run
+    seen = of(samples, ch.OBSERVATIONS)
+    detections = [x for x in seen if isinstance(x, m.Detections)]
+    named = [x for x in seen if isinstance(x, m.Observations)]
+    assert detections
+    assert named
+    (labels,) = of(samples, ch.TRUTH_LABELS)
+    assert stamps(labels.stamps, "stamps").tolist() == [x.stamp_ns for x in detections]
+    counts = [len(x.ranges) // 8 for x in detections]
+    assert ids(labels.counts, "counts").tolist() == counts
+    told = set(ids(labels.labels, "labels").tolist())
+    assert m.NO_LABEL in told
+    assert not told & set(np.concatenate([ids(x.ids, "ids") for x in named]).tolist())
+
+
+def test_each_measurement_is_used_once_and_what_nobody_confirms_is_named(run):
+    _, samples = run
+    used = evaluate(samples).robots["r1"].consumption
+    assert used.each_once
+    reasons = {Rejection.UNCONFIRMED.disposition, Rejection.CLUTTER.disposition}
+    assert sum(used.ledger.values()) == used.published
+    assert set(used.ledger) <= reasons | {"in a submap", "start pose"}
+
+
+def test_a_submap_says_of_its_unnamed_landmarks_what_the_detections_say(run):
+    _, samples = run
+    became = {x.sequence: x for x in of(samples, ch.ASSOCIATION)}
+    submaps = of(samples, ch.SUBMAP)
+    assert len(submaps) == len(became) > 3
+    for submap in submaps:
+        numbers = ids(submap.ids, "ids")
+        unnamed = numbers[numbers >= UNNAMED]
+        landmarks = ids(became[submap.sequence].landmarks, "landmarks")
+        taken, counts = np.unique(landmarks[landmarks >= UNNAMED], return_counts=True)
+        assert (taken == unnamed).all()
+        assert (counts == ids(submap.counts, "counts")).all()
+        rows = octets(submap.seen, "seen").reshape(len(unnamed), -1)
+        seen = np.unpackbits(rows, axis=1, count=submap.keyframes, bitorder="little")
+        assert (seen.sum(axis=1) == counts).all()
+        assert submap.gated == (landmarks < UNNAMED).sum()
+
+
+def test_inside_windows_nearly_every_pair_is_right(run):
+    _, samples = run
+    (labels,) = of(samples, ch.TRUTH_LABELS)
+    bounds = np.cumsum([0, *ids(labels.counts, "counts")])
+    label_of = {
+        (stamp, row): label
+        for k, stamp in enumerate(stamps(labels.stamps, "stamps").tolist())
+        for row, label in enumerate(ids(labels.labels, "labels")[bounds[k] : bounds[k + 1]])
+    }
+    wrong = used = 0
+    for each in of(samples, ch.ASSOCIATION):
+        scans = np.repeat(stamps(each.stamps, "stamps"), ids(each.counts, "counts"))
+        rows = zip(scans.tolist(), ids(each.rows, "rows").tolist(), strict=True)
+        own = np.array([label_of[place] for place in rows])
+        landmarks = ids(each.landmarks, "landmarks")
+        for landmark in np.unique(landmarks[landmarks >= UNNAMED]):
+            members = own[landmarks == landmark]
+            _, counts = np.unique(members, return_counts=True)
+            used, wrong = used + len(members), wrong + len(members) - counts.max()
+    assert used > 40
+    assert wrong <= 0.02 * used
+
+
+def test_a_log_with_hidden_identities_is_computed_again_to_the_same_bytes(run, tmp_path):
+    _, samples = run
+    result = verify(written(tmp_path / "log.mcap", samples))
+    assert result.first is None
+    checked = {each.channel: each for each in result.channels}
+    assert checked["association"].equal == checked["association"].messages > 3
+
+
+def test_the_same_world_with_known_identities_has_the_same_measurements():
+    without = streams_of(hidden()).streams[0].landmark_detections
+    scenario = hidden()
+    known = msgspec.structs.replace(scenario.world, identities="known")
+    named = streams_of(msgspec.structs.replace(scenario, world=known)).streams[0]
+    assert without.hidden is not None
+    assert without.hidden.all()
+    for name in ("stamps_ns", "ids", "ranges", "bearings"):
+        assert np.array_equal(getattr(without, name), getattr(named.landmark_detections, name))

@@ -1,0 +1,126 @@
+"""Data sets without landmark identities: both kinds, their pieces, and what is wrong with them."""
+
+import numpy as np
+import pytest
+
+from sim.datasets.kinds import kind_of
+from sim.datasets.tables import DatasetError
+from sim.datasets.unlabelled import unlabelled
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import scenario_beside, streams_of
+from sim.world.config import UnlabelledWorld
+from sim.world.streams import NO_LABEL, OBSERVATIONS, ODOMETRY
+
+
+def write(folder, **tables):
+    folder.mkdir(exist_ok=True)
+    for name, (header, rows) in tables.items():
+        lines = [header, *(",".join(map(str, row)) for row in rows)]
+        (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.fixture
+def steps(tmp_path):
+    odometry = [(i, 0.5, 0.0, 0.1, 1e-4, 0.0, 2e-4, 0.0, 0.0, 3e-4) for i in range(12)]
+    seen = [(i, 2.0, 0.5 * j, 0.01, 0.001, 0.02) for i in range(12) for j in range(2)]
+    labels = [(3 if j else -1,) for _ in range(12) for j in range(2)]
+    return write(
+        tmp_path / "steps",
+        odometry=("step,dx_m,dy_m,dtheta_rad,c_xx,c_xy,c_yy,c_xt,c_yt,c_tt", odometry),
+        detections=("step,x_m,y_m,c_xx,c_xy,c_yy", seen),
+        labels=("landmark", labels),
+        reference_landmarks=("landmark,x_m,y_m", [(3, 2.5, 0.5)]),
+    )
+
+
+@pytest.fixture
+def car(tmp_path):
+    odometry = [(f"{0.1 * i:.3f}", 1.0, 0.1) for i in range(1, 41)]
+    seen = [(f"{0.05 + 0.5 * i:.3f}", 10.0 + i, 1.5, 0.3) for i in range(7)]
+    return write(
+        tmp_path / "car",
+        odometry=("t_s,rear_wheel_speed_m_s,steering_rad", odometry),
+        detections=("t_s,range_m,bearing_rad,diameter_m", seen),
+        gps=("t_s,x_m,y_m", [(0.2, 1.0, 2.0), (3.0, 4.0, 5.0)]),
+    )
+
+
+def streams(folder, robots=1, **fields):
+    return unlabelled(UnlabelledWorld(path=str(folder), **fields), robots)
+
+
+def test_a_set_in_steps_keeps_every_number(steps):
+    (stream,) = streams(steps).streams
+    assert kind_of(steps) == "unlabelled"
+    assert scenario_beside(steps) == "dlr"
+    odometry = stream.odometry(int(np.flatnonzero(stream.kinds == ODOMETRY)[3]))
+    assert odometry.increment.tolist() == [0.5, 0.0, 0.1]
+    c, s = np.cos(0.1), np.sin(0.1)
+    turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    assert np.allclose(odometry.covariance, turned @ np.diag([1e-4, 2e-4, 3e-4]) @ turned.T)
+    scan = stream.observations(int(np.flatnonzero(stream.kinds == OBSERVATIONS)[5]))
+    assert scan.hidden
+    assert scan.ids.tolist() == [NO_LABEL, 3]
+    assert np.allclose(scan.ranges * np.cos(scan.bearings), 2.0)
+    assert np.allclose(scan.ranges * np.sin(scan.bearings), [0.0, 0.5])
+    assert np.allclose(scan.covariances[0], [0.01, 0.001 / 2.0, 0.02 / 4.0])
+
+
+def test_a_car_keeps_its_steering_and_gps_and_what_nobody_has_labelled(car):
+    found = streams(car)
+    (stream,) = found.streams
+    assert scenario_beside(car) == "victoria"
+    assert found.landmarks is None
+    first = stream.odometry(int(np.flatnonzero(stream.kinds == ODOMETRY)[0]))
+    assert first.steered
+    assert (first.forward, first.yaw_rate, first.duration_ns) == (1.0, 0.1, 50_000_000)
+    assert set(stream.landmark_detections.ids.tolist()) == {NO_LABEL}
+    assert stream.landmark_detections.signatures.tolist() == [0.3] * 7
+    assert stream.positions.tolist() == [[1.0, 2.0], [4.0, 5.0]]
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_pieces_have_each_measurement_once_begin_together_and_know_no_initial_pose(
+    steps, car, count
+):
+    for folder in (steps, car):
+        (whole,) = streams(folder).streams
+        parts = streams(folder, count).streams
+        assert [part.robot for part in parts] == [f"r{i + 1}" for i in range(count)]
+        assert all(part.start is None for part in parts)
+        assert len({int(part.stamps_ns[0]) for part in parts}) == 1
+        for kind in (ODOMETRY, OBSERVATIONS):
+            lengths = [int((part.kinds == kind).sum()) for part in parts]
+            assert sum(lengths) == (whole.kinds == kind).sum()
+        together = [part.landmark_detections.ranges for part in parts]
+        assert np.array_equal(np.concatenate(together), whole.landmark_detections.ranges)
+
+
+def test_labels_are_identities_where_they_are_asked_for(steps):
+    (stream,) = streams(steps, identities="known").streams
+    assert stream.landmark_detections.hidden is None
+    assert stream.landmark_detections.ids.tolist() == [3] * 12
+
+
+def test_the_command_lines_options_make_the_pieces(steps):
+    scenario = with_options(load("dlr"), dataset=steps, robots=3, identities="known")
+    found = streams_of(scenario)
+    assert len(found.streams) == 3
+    assert found.streams[2].landmark_detections.hidden is None
+
+
+@pytest.mark.parametrize(
+    ("table", "text", "why"),
+    [
+        ("labels", "landmark\n1\n", "1 rows, 24 in detections.csv"),
+        ("odometry", "step,dx_m,dy_m\n0,1,0\n", "columns of neither kind"),
+        ("detections", "step,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,0,1\n0,1,1,1,0,1\n", "order of time"),
+    ],
+)
+def test_what_is_wrong_with_a_table_is_named(steps, table, text, why):
+    (steps / f"{table}.csv").write_text(text)
+    if table == "detections":
+        (steps / "labels.csv").unlink()
+    with pytest.raises(DatasetError, match=why):
+        streams(steps)
