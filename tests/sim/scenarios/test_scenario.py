@@ -208,7 +208,7 @@ UTIAS = 'world = { kind = "utias" }\n'
         (SMALL + "[defaults]\nid = 'a'", "`id` at defaults would be every robot's"),
         (
             "seed = 1",
-            'expected one of "simulated", "utias", "folder", "live", "unlabelled", got nothing at world.kind',
+            'expected one of "simulated", "utias", "folder", "live", "unlabelled"',
         ),
         ("world = { kind = [1] }", "got [1] at world.kind"),
         ("world = 3", "expected a table, got int at world"),

@@ -30,7 +30,8 @@ from tests.support import ROOT
 PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
     Scenario, SimulatedWorld, UtiasWorld, LiveWorld, RobotConfig, MotionModel, MotionNoise, Sensor,
-    Lens, FrontEnd, Association, UnlabelledWorld, CentralConfig, BiasSigmas, CommonBiasSigmas, Bounds,
+    Lens, FrontEnd, Association, UnlabelledWorld, CentralConfig, BiasSigmas, CommonBiasSigmas,
+    Bounds,
 )  # fmt: skip
 
 
