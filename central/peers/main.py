@@ -10,19 +10,25 @@ from central.config import CentralConfig
 from central.peers.fold import FoldWhen
 from central.peers.robot import PeerRobot
 from team.config import Exchange, RobotConfig
+from team.peers.members import Member
 from team.peers.node import Proof
 from team.peers.store import Store, StoreError
 from team.robot.main import SECOND_PATIENCE_S, RobotShell
 from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus
+from team.wire.bus import NO_COUNTER, Bus, Sample
 
 LINGER_S = 5.0
 """A robot that knows that all others have concluded stays so long, so that they know of it, too."""
 WORLD_GONE_S = 1.0
 """The world leaves when everyone has concluded; one that died is there again sooner."""
 _LOG = logging.getLogger("teamslam")
+
+
+def _as_heard(member: Member) -> Sample:
+    stamp_ns = member.message.stamp_ns
+    return Sample(member.key, member.payload, stamp_ns, time.time_ns(), NO_COUNTER)
 
 
 class PeerShell(RobotShell):
@@ -94,8 +100,18 @@ class PeerShell(RobotShell):
         self._mend()
         now = time.monotonic()
         self._shell.publish(self._peer.tick(now))
+        self._log_carried()
         self._save()
         self._peer.finished = self._may_leave(now)
+
+    def _log_carried(self) -> None:
+        """What others have brought stands in the robot's own log as who first said it had said it:
+        so the log proves the robot's maps, and logs of a team can be merged.
+        """
+        members, self._peer.carried = self._peer.carried, []
+        tap = getattr(self._bus, "tap", None)
+        if tap is not None and members:
+            tap([_as_heard(member) for member in members])
 
     def _save(self) -> None:
         members, self._peer.peer.unsaved = self._peer.peer.unsaved, []

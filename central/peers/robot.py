@@ -38,6 +38,7 @@ class PeerRobot:
     """One robot and its own centre: `begin`, then `handle_sample` and `tick`, until `finished`.
 
     finished: whether it may leave: by its shell's word. node: the estimator's.
+    carried: members that others have brought, since somebody has last cleared it.
     uplink, downlink: bytes of the set's talk that were said, each once, and heard.
     world_alive: None while no world was heard of.
     """
@@ -62,6 +63,7 @@ class PeerRobot:
         self._finals = 0
         self.finished = False
         self.uplink = self.downlink = 0
+        self.carried: list[Member] = []
         self.world_alive: bool | None = None
 
     @property
@@ -142,7 +144,7 @@ class PeerRobot:
         """Take what others say of themselves; None: it is something else."""
         match message:
             case m.Members():
-                self.peer.take_carried(message)
+                self.carried += self.peer.take_carried(message)
                 return self._grown() + self._said(self.peer.more_of(message.node))
             case m.SetSummary():
                 return self._said(self.peer.hear(message))

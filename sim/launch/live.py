@@ -173,6 +173,8 @@ _COLUMNS = (
     ("messages_per_s", "\nmsg/s", "{:,.0f}"),
     ("bytes_per_s", "\nB/s", "{:,.0f}"),
 )
+_PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
+_NEWEST = "set_newest_s."
 _SHOWN_AT_MOST = 12
 """Robots with a row of their own: a table that is higher than the terminal would be cut."""
 
@@ -185,6 +187,9 @@ def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
     headings = [heading for _, heading, _ in _COLUMNS] + ["NEES\n/dof", "in\n95 %"] * judged
     for heading in headings:
         table.add_column(Text(heading), justify="right", no_wrap=True)
+    peers = any("set_submaps" in status.figures for status in statuses.values())
+    for heading in _PEER_HEADINGS if peers else ():
+        table.add_column(Text(heading), justify="right", no_wrap=True)
     table.add_column(Text("\nstate"), no_wrap=True)
     for node, status in list(statuses.items())[:_SHOWN_AT_MOST]:
         robot = node.removeprefix("robot/")
@@ -195,10 +200,28 @@ def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
         if judged:
             tally = errors.of(robot)
             cells += [_number(tally.mean, ".2f"), _number(tally.coverage, ".0%")]
+        cells += _peer_cells(robot, statuses) if peers else []
         table.add_row(robot, *cells, status.state)
     if len(statuses) > _SHOWN_AT_MOST:
         table.add_row(f"… {len(statuses) - _SHOWN_AT_MOST} more")
     return table
+
+
+def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
+    """How much of the set a robot has, the age of the newest that it has of the others, and how
+    many of these have the same set.
+    """
+    figures = statuses[f"robot/{robot}"].figures
+    sets = [status.figures.get("set_submaps", 0.0) for status in statuses.values()]
+    newest = {
+        name.removeprefix(_NEWEST): at for name, at in figures.items() if name.startswith(_NEWEST)
+    }
+    ages = [newest[robot] - at for name, at in newest.items() if name != robot and robot in newest]
+    return [
+        f"{figures.get('set_submaps', 0.0):.0f}/{max(sets):.0f}",
+        f"{max(0.0, *ages):.0f}" if ages else "–",
+        f"{figures.get('set_agrees', 0.0):.0f}",
+    ]
 
 
 def _map_lines(watch: Watch) -> list[str]:

@@ -8,7 +8,7 @@ say is carried by radio; the world, the recorder and the operator are the test b
 
 import heapq
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from hashlib import blake2b
 from typing import cast
 
@@ -41,7 +41,9 @@ class RadioBus:
         self._near: dict[str, bool] = {}
         self._now_ns = -(2**62)
         bus.subscribe(ch.RADIO)
-        self.tap = None
+        tap = getattr(bus, "tap", None)
+        self.tap: Callable[[list[Sample]], None] | None = tap
+        self._tap(None)
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._bus, name)
@@ -50,7 +52,16 @@ class RadioBus:
         """Publish; a robot's last word says that its stream has ended."""
         self._now_ns = max(self._now_ns, out.message.stamp_ns)
         self._done = self._done or out.channel is ch.ROBOT_DONE
-        return self._bus.publish(out)
+        self._tap(self.tap)
+        try:
+            return self._bus.publish(out)
+        finally:
+            self._tap(None)
+
+    def _tap(self, tap: Callable[[list[Sample]], None] | None) -> None:
+        """A robot's own log has what the radio let through, not what came to its door."""
+        if hasattr(self._bus, "tap"):
+            self._bus.tap = tap
 
     def request(self, channel: ch.Channel, name: str, request: m.Message) -> None:
         """Ask; nobody hears a question that is out of reach."""
@@ -86,7 +97,10 @@ class RadioBus:
         now_s = time.monotonic()
         while self._held and self._held[0][0] <= now_s:
             through.append(heapq.heappop(self._held)[-1])
-        return [*self._changes(), *through]
+        heard = [*self._changes(), *through]
+        if self.tap is not None and heard:
+            self.tap(heard)
+        return heard
 
     def _said_by(self, channel: ch.Channel, name: str) -> str | None:
         """The other robot that says something by radio; None: it is not by radio, or our own."""

@@ -27,9 +27,12 @@ from central.desk.report.tables import (
     OWN_NOTE,
     PATH_HEADINGS,
     PATH_NOTE,
+    PEER_HEADINGS,
+    PEER_NOTE,
     ROBOT_HEADINGS,
     own_rows,
     path_row,
+    peer_rows,
     robot_note,
     robot_row,
     shown,
@@ -139,6 +142,7 @@ def _page(
     sections = [
         ("Map", [_image(pictures, "map", wide=False), *_own_maps(run)]),
         ("Robots", _robots(run, pictures)),
+        ("Peers", _peers(run)),
         ("Consistency", _consistency(run, pictures)),
         ("Paths", _paths(run)),
         ("Measurements", _measurements(run)),
@@ -158,6 +162,13 @@ def _page(
         f"<style>{_STYLE}</style>\n<h1>{title}</h1>\n<nav>{links}</nav>\n"
         f"{_table((), team_rows(run.evaluation), words=True)}\n{_notes(run)}\n{body}\n</html>\n"
     )
+
+
+def _peers(run: Run) -> list[str]:
+    """Each robot's copy of the team's set, where there are peers."""
+    if not run.evaluation.peers:
+        return []
+    return [_table(PEER_HEADINGS, peer_rows(run.evaluation)), _note(PEER_NOTE)]
 
 
 def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]:

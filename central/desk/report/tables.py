@@ -26,6 +26,8 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     for name, robot in evaluation.robots.items():
         cells = robot_row(name, robot, arbitrary=evaluation.arbitrary_frame)
         robots.add_row(*(Text(cell) for cell in cells))
+    if evaluation.peers:
+        return [team, robots, *_paths(evaluation), _peers(evaluation)]
     if unfused(evaluation):
         own = Table(caption=OWN_NOTE)
         for heading in OWN_HEADINGS:
@@ -33,15 +35,65 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
         for row in own_rows(evaluation):
             own.add_row(*(Text(cell) for cell in row))
         return [team, robots, own]
+    return [team, robots, *_paths(evaluation)]
+
+
+def _paths(evaluation: Evaluation) -> list[Table]:
+    """A row for the path of each robot; nothing where no path was smoothed."""
     if all(robot.smoothed is None for robot in evaluation.robots.values()):
-        return [team, robots]
+        return []
     paths = Table(caption=PATH_NOTE)
     for heading in PATH_HEADINGS:
         paths.add_column(Text(heading), justify="left" if heading == "robot" else "right")
     for name, robot in evaluation.robots.items():
         cells = path_row(name, robot, arbitrary=evaluation.arbitrary_frame)
         paths.add_row(*(Text(cell) for cell in cells))
-    return [team, robots, paths]
+    return [paths]
+
+
+def _peers(evaluation: Evaluation) -> Table:
+    """A row for each robot's copy of the set."""
+    table = Table(caption=PEER_NOTE)
+    for heading in PEER_HEADINGS:
+        table.add_column(Text(heading), justify="left" if heading == "robot" else "right")
+    for row in peer_rows(evaluation):
+        table.add_row(*(Text(cell) for cell in row))
+    return table
+
+
+PEER_HEADINGS = ("robot", "final map", "set", "at [s]", "said [B]", "heard [B]", "star", "over")
+PEER_NOTE = (
+    "set: submaps of all robots; at: wall time of the final map; said, heard: bytes of the set's "
+    "talk; star: those of its own submaps, as a centre would get them; over: members that came by "
+    "each teammate, its own and those that it carried"
+)
+
+
+def peer_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """Of each robot its final map's SHA-256, how much of the set it has, and what that took."""
+    rows: list[tuple[str, ...]] = []
+    for name, peer in evaluation.peers.items():
+        robot = evaluation.robots.get(name)
+        star = None if robot is None else robot.uplink_bytes
+        over = (
+            f"{node.removeprefix('robot/')} {members}"
+            for node, members in peer.over.items()
+            if node.startswith("robot/") and node != f"robot/{name}"
+        )
+        sha256 = peer.final_map_sha256
+        rows.append(
+            (
+                name,
+                "none" if sha256 is None else sha256[:12],
+                f"{peer.submaps}",
+                shown(peer.complete_at_s, ".1f", ""),
+                shown(peer.uplink, ",.0f", ""),
+                shown(peer.downlink, ",.0f", ""),
+                shown(star, ",.0f", ""),
+                ", ".join(over),
+            )
+        )
+    return rows
 
 
 def title_of(evaluation: Evaluation) -> str:

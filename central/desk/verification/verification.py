@@ -15,6 +15,7 @@ from central.desk.verification.centre import retold_centre, retold_peer
 from central.desk.verification.differences import first_difference
 from central.desk.verification.recorded import Identity, Recorded, Said, identity, recorded
 from central.desk.verification.robot import retold_robot
+from team.recording.own_log import OWN
 from team.recording.provenance import provenance
 from team.recording.reader import Log
 from team.wire import channels as ch
@@ -111,19 +112,31 @@ def verify(log: Log) -> Verification:
     other = tuple(name for name in PLATFORM if log.metadata.get(name) != here[name])
     found = recorded(log)
     retold: dict[Identity, m.Message] = {}
+    others = _others(log, found)
     for robot in found.robots:
-        retold |= retold_robot(found, robot)
+        if robot not in others:
+            retold |= retold_robot(found, robot)
     retold |= retold_centre(found)
     for robot in found.robots:
-        retold |= retold_peer(found, robot)
+        if robot not in others:
+            retold |= retold_peer(found, robot)
     results = []
     for channel in CHECKED:
-        said = [each for each in found.said if each.channel is channel]
+        heard = (each for each in found.said if each.channel is channel)
+        said = [each for each in heard if getattr(each.message, "robot", "") not in others]
         if said:
             results.append(_compared(channel.name, said, retold, found, exact=not other))
     stamps = [r.stamp_ns for stream in found.measurements.values() for r in stream.values()]
     span_s = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
     return Verification(tuple(results), other, len(stamps), span_s, found.unsound)
+
+
+def _others(log: Log, found: Recorded) -> frozenset[str]:
+    """In a robot's own log, the teammates: what they have said is an input and proves nothing."""
+    if OWN not in log.metadata:
+        return frozenset()
+    there = frozenset(r for r in found.robots if ch.robot_node(r) in found.configured)
+    return frozenset(found.robots) - there if there else frozenset()
 
 
 def _compared(
