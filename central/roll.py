@@ -134,11 +134,10 @@ class Roll:
         streams = []
         for name, robot in self.robots.items():
             last = robot.stream_end
-            if last is None and self.ordered and robot.done is not None:
+            done = robot.done
+            if last is None and self.ordered and done and done.incarnation >= robot.began:
                 last = m.StreamEnd(
-                    robot=name,
-                    incarnation=robot.done.incarnation,
-                    measurements=robot.done.measurements,
+                    robot=name, incarnation=done.incarnation, measurements=done.measurements
                 )
             if last is not None:
                 streams.append(last)

@@ -1,0 +1,169 @@
+"""A live team at the centre and at a robot: drivers end their streams, an operator ends the team."""
+
+import pytest
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from tests.teams import config, driven, of, published, stream
+
+STREAMS = {name: stream(name, 9, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
+
+
+def head(robot, count, state="ended", incarnation=1):
+    return m.StreamHead(
+        stamp_ns=0, robot=robot, incarnation=incarnation, measurements=count, state=state
+    )
+
+
+def begun(robot, incarnation=1):
+    return m.InitialPose(
+        stamp_ns=0, robot=robot, incarnation=incarnation, number=0, pose=b"", covariance=b""
+    )
+
+
+ORDER = m.TeamEnd(stamp_ns=0, by="operator", reason="it rains")
+
+
+class Live:
+    """A centre, and what robots and drivers have said to it."""
+
+    def __init__(self, *robots, admit=False):
+        self.centre = CentralNode(CentralConfig(), robots, admit=admit)
+        self.said = self.centre.begin()
+
+    def tell(self, *messages):
+        for message in messages:
+            if self.centre.refusal(message) is None:
+                self.said += self.centre.handle(message, 0)
+        return self
+
+    def robot(self, name, *, state="ended"):
+        """A robot that has consumed all of its stream."""
+        measured = published(STREAMS[name])
+        self.tell(m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True))
+        node = RobotNode(config(name))
+        out = driven(node, measured, end=False)
+        out += node.handle(head(name, len(measured)), 0)
+        self.tell(measured[0], head(name, len(measured), state), *(o.message for o in out))
+        return self
+
+    @property
+    def final(self):
+        return self.centre.final
+
+
+def test_the_team_has_ended_when_every_driver_has():
+    team = Live("r1", "r2").robot("r1")
+    assert team.final is None
+    assert team.centre.awaited == ["r2"]
+    team.robot("r2")
+    assert (team.final.final, team.final.provisional, team.final.lost) == (True, False, ())
+
+
+def test_a_driver_that_comes_back_is_waited_for_again():
+    team = Live("r1", "r2").robot("r1").tell(begun("r1", 2)).robot("r2")
+    assert team.final is None
+    team.tell(head("r1", 1, "left", 2), ORDER)
+    assert team.final is None  # its process has not said that it is done with that
+
+
+def test_an_operator_ends_a_team_some_of_which_never_came():
+    team = Live("r1", "r2", "r3").robot("r1").tell(ORDER)
+    assert [o.channel for o in team.said if isinstance(o.message, m.TeamEnd)] == [ch.TEAM_END]
+    assert team.final.lost == ()
+    assert not team.final.provisional
+
+
+@pytest.mark.parametrize(("state", "lost"), [("left", ()), ("open", ("r1",))])
+def test_whose_driver_was_away_at_the_end_is_lost_unless_it_had_said_its_last_counter(state, lost):
+    team = Live("r1").robot("r1", state=state)
+    assert team.final is None
+    team.tell(ORDER)
+    assert team.final.lost == lost
+    assert team.final.provisional == bool(lost)
+
+
+def test_a_robot_that_nobody_has_named_is_admitted_only_where_the_scenario_says_so():
+    closed = Live("r1").robot("r1")
+    assert closed.final is not None
+    refused = CentralNode(CentralConfig(), ["r1"])
+    assert "not in this team" in refused.refusal(begun("r2"))
+    team = Live("r1", admit=True).tell(begun("r2")).robot("r1")
+    assert team.final is None
+    assert team.centre.status().warnings == ("admitted, though not in the scenario: r2",)
+    team.robot("r2")
+    assert {member.robot for member in team.final.members} == {"r1", "r2"}
+
+
+def test_the_map_of_a_live_team_is_that_of_the_same_streams_of_a_world():
+    live = Live("r1", "r2").robot("r1").robot("r2")
+    world = Live("r1", "r2")
+    counts = []
+    for name, each in STREAMS.items():
+        measured = published(each)
+        counts.append(m.StreamEnd(robot=name, incarnation=1, measurements=len(measured)))
+        said = driven(RobotNode(config(name)), measured)
+        world.tell(measured[0], *(o.message for o in said))
+    world.tell(m.End(stamp_ns=0, streams=tuple(counts)))
+    assert world.final.digest == live.final.digest
+    assert world.final.means == live.final.means
+
+
+def test_nothing_waits_for_a_robot_whose_driver_has_not_come_or_is_away():
+    team = Live("r1", "r2", "r3").robot("r1", state="open")
+    roll = team.centre._roll
+    dealt, count = team.centre._rule.dealt, team.centre._rule.count
+    assert roll.watermark_ns(dealt, count) == roll.robots["r1"].progress.stamp_ns
+    team.tell(m.Liveliness(stamp_ns=0, node="source/r1", alive=False))
+    assert roll.watermark_ns(dealt, count) == float("inf")
+
+
+def robot_with(count):
+    node = RobotNode(config("r1"))
+    measured = published(STREAMS["r1"])
+    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=True), 0)
+    for each in measured[:count]:
+        node.handle(each, 0)
+    return node, measured
+
+
+def test_a_robot_asks_for_what_its_driver_has_numbered_and_it_has_not():
+    node, measured = robot_with(5)
+    assert node.wanted() is None
+    node.handle(head("r1", 12, "open"), 0)
+    assert (node.wanted().first, node.wanted().last) == (5, 11)
+    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False), 0)
+    assert node.wanted() is None
+    assert "its driver is away after measurement 4" in node.status().warnings[0]
+    assert len(measured) > 12
+
+
+def test_a_robot_that_is_told_to_end_waits_for_its_driver_and_ends_without_one():
+    node, measured = robot_with(5)
+    assert of(node.handle(ORDER, 0), ch.ROBOT_DONE) == []
+    (done,) = of(
+        node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False), 0), ch.ROBOT_DONE
+    )
+    assert done.measurements == 5
+    node, measured = robot_with(len(STREAMS["r1"]))
+    node.handle(ORDER, 0)
+    (done,) = of(node.handle(head("r1", len(measured)), 0), ch.ROBOT_DONE)
+    assert done.measurements == len(measured)
+
+
+def test_a_robot_goes_on_with_a_driver_that_had_ended_and_comes_back():
+    node, measured = robot_with(len(STREAMS["r1"]))
+    (first,) = of(node.handle(head("r1", len(measured)), 0), ch.ROBOT_DONE)
+    out = node.handle(begun("r1", 2), 0) + node.handle(head("r1", 1, incarnation=2), 0)
+    dones = of(out, ch.ROBOT_DONE)
+    assert [done.incarnation for done in dones] == [2, 1]
+    assert dones[1].submaps == first.submaps
+
+
+def test_an_end_before_what_was_consumed_and_a_head_of_another_are_refused():
+    node, _ = robot_with(9)
+    assert "has consumed 9" in node.refusal(head("r1", 3))
+    assert node.refusal(head("r2", 30)) == "how far r2 is"
