@@ -51,7 +51,8 @@ class CentralNode:
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
         """The channels to subscribe to."""
-        own = (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.GIVEN_UP, ch.HEAD, ch.END_ORDER)
+        own = (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.GIVEN_UP, ch.HEAD, ch.ROBOT_HEAD,
+               ch.END_ORDER)  # fmt: skip
         others = (ch.ROBOT_CONFIG,) if self._admits else ()
         return tuple(dict.fromkeys((*self._rule.listens, *own, *others)))
 

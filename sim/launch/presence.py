@@ -8,6 +8,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, opened
 from team.wire.codec import WireError
+from team.wire.newer import later_head
 
 LOOK_S = 0.1
 APART_S = 1.0
@@ -58,7 +59,7 @@ class Presence:
 
     def take(self, bus: Bus, for_s: float) -> None:
         """Look for so long."""
-        for channel in (ch.STATUS, ch.HEAD, ch.TEAM_END, ch.FINAL_MAP):
+        for channel in (ch.STATUS, ch.HEAD, ch.ROBOT_HEAD, ch.TEAM_END, ch.FINAL_MAP):
             bus.subscribe(channel)
         bus.watch_alive()
         until = time.monotonic() + for_s
@@ -77,7 +78,8 @@ class Presence:
             case m.Status():
                 self._of(message.node).take(message, wall_ns)
             case m.StreamHead():
-                self.heads[message.robot] = message
+                held = self.heads.get(message.robot)
+                self.heads[message.robot] = later_head(message, held)
             case m.TeamEnd():
                 self.is_to_end = True
             case m.FusedMap():

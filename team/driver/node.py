@@ -25,6 +25,8 @@ class SourceNode:
 
     An incarnation begins on the wire when the robot has had all of the one before: it would drop
     the rest of that. delivered, recorded: how far the robot and a recorder are by their own word.
+    done: incarnation, measurements and submaps of the robot's last word; joined: incarnation and
+    submaps that the centre has dealt with.
     """
 
     journal: Journal
@@ -32,6 +34,8 @@ class SourceNode:
     told_to_end: bool = field(default=False, init=False)
     delivered: Stream = field(default=(0, 0), init=False)
     recorded: Stream = field(default=(0, 0), init=False)
+    done: tuple[int, int, int] = field(default=(0, 0, 0), init=False)
+    joined: Stream = field(default=(0, 0), init=False)
     pose: m.PoseEstimate | None = field(default=None, init=False)
     warnings: list[str] = field(default_factory=list, init=False)
 
@@ -47,6 +51,8 @@ class SourceNode:
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
+        ch.ROBOT_DONE,
+        ch.CENTRAL_PROGRESS,
         ch.RECORDER_PROGRESS,
         ch.TEAM_POSE,
         ch.TEAM_END,
@@ -125,6 +131,12 @@ class SourceNode:
         match message:
             case m.Progress() if message.robot != self._robot:
                 pass
+            case m.Progress() if message.node == "central":
+                self.joined = max(self.joined, (message.incarnation, message.submaps))
+            case m.Done() if message.robot == self._robot:
+                self.done = max(
+                    self.done, (message.incarnation, message.measurements, message.submaps)
+                )
             case m.Progress() if message.node == "recorder":
                 self.recorded = max(self.recorded, (message.incarnation, message.measurements))
             case m.Progress():
@@ -168,9 +180,13 @@ class SourceNode:
 
     @property
     def is_delivered(self) -> bool:
-        """The robot has all that there is, and so has a recorder that is there."""
+        """The robot is done with all that there is, the centre with all of its submaps, and a
+        recorder that is there has it: whoever dies now needs nothing of this driver any more.
+        """
         newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
-        return self.delivered >= newest and not self.recorder_lacks
+        incarnation, measurements, submaps = self.done
+        is_joined = self.joined >= (incarnation, submaps) or not submaps
+        return (incarnation, measurements) >= newest and is_joined and not self.recorder_lacks
 
     @property
     def recorder_lacks(self) -> bool:

@@ -96,7 +96,7 @@ class _Evidence:
         self.counters[sample.key].take(sample)
         self.inventory.take(sample)
         row = ch.channel_of(sample.key)
-        if row is not None and row[0] in (ch.END, ch.HEAD, *_OF_AN_END):
+        if row is not None and row[0] in (ch.END, ch.HEAD, ch.ROBOT_HEAD, *_OF_AN_END):
             self.heard.add(row[0])
         if row is None or row[0] not in (ch.TALLY, ch.STATUS):
             return
@@ -130,7 +130,7 @@ class _Evidence:
         if not self.part:
             for key, line in (*self.inventory.findings(), *self.last_words.findings()):
                 yield Finding(key, line)
-            if self.heard and not self.heard & {ch.END, ch.HEAD}:
+            if self.heard and not self.heard & {ch.END, ch.HEAD, ch.ROBOT_HEAD}:
                 yield Finding(ch.END.key(), NO_END)
         for said in self.last_word:
             if said.startswith(MISSING):

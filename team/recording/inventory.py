@@ -119,7 +119,7 @@ class Inventory:
                 return True
             kind: Kind = "submaps" if channel is ch.SUBMAP else "measurements"
             return self._of(kind, robot, named[0]).take(named[1], sample.payload)
-        if channel in (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.HEAD):
+        if channel in (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.HEAD, ch.ROBOT_HEAD):
             self._hear(sample)
         return True
 

@@ -841,6 +841,8 @@ class RobotNode:
             self._take_end(_end_at(head))
         elif self._end is not None and head.incarnation > self._end.incarnation:
             self._end = None
+        if head.state != "open":
+            self._pending.append(Outgoing(ch.ROBOT_HEAD, self.robot, head))
         if self._consumed:
             self._pending.append(self._progress())
 

@@ -127,6 +127,8 @@ INNOVATION = Channel(name="innovation", template="robot/{robot}/innovation", mes
                      recorded=True, recomputable=True, meaning="how well a window's measurements were predicted (NIS)")  # fmt: skip
 ROBOT_PROGRESS = Channel(name="robot_progress", template="robot/{robot}/progress", message=m.Progress, rate="every 64 measurements",
                          delivery="latest", recorded=True, recomputable=False, meaning="credit for the world")  # fmt: skip
+ROBOT_HEAD = Channel(name="robot_head", template="robot/{robot}/head", message=m.StreamHead, rate="when its driver leaves or ends", delivery="latest",
+                     recorded=True, recomputable=False, meaning="its driver's last word, for a centre that is started again when the driver has gone")  # fmt: skip
 ROBOT_DONE = Channel(name="robot_done", template="robot/{robot}/done", message=m.Done, rate="once per incarnation", delivery="latest", recorded=True,
                      recomputable=True, meaning="all measurements consumed, last submap sent")  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""A live team at the centre and at a robot: drivers end their streams, an operator ends the team."""
+"""A live team at centre and robot: drivers end their streams, an operator ends the team."""
 
 import pytest
 
@@ -46,7 +46,8 @@ class Live:
         self.tell(m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True))
         node = RobotNode(config(name))
         out = driven(node, measured, end=False)
-        out += node.handle(head(name, len(measured)), 0)
+        out += node.handle(head(name, len(measured), state), 0)
+        out += [] if state == "ended" else node.handle(ORDER, 0)
         self.tell(measured[0], head(name, len(measured), state), *(o.message for o in out))
         return self
 
@@ -150,8 +151,10 @@ def test_a_robot_that_is_told_to_end_waits_for_its_driver_and_ends_without_one()
     assert done.measurements == 5
     node, measured = robot_with(len(STREAMS["r1"]))
     node.handle(ORDER, 0)
-    (done,) = of(node.handle(head("r1", len(measured)), 0), ch.ROBOT_DONE)
+    out = node.handle(head("r1", len(measured)), 0)
+    (done,) = of(out, ch.ROBOT_DONE)
     assert done.measurements == len(measured)
+    assert of(out, ch.ROBOT_HEAD) == [head("r1", len(measured))]  # when its driver has gone
 
 
 def test_a_robot_goes_on_with_a_driver_that_had_ended_and_comes_back():

@@ -235,6 +235,17 @@ class Listener:
             stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=whole, submaps=0
         )
         self.bus.publish(Outgoing(ch.ROBOT_PROGRESS, "r1", progress))
+        done = m.Done(
+            stamp_ns=0,
+            robot="r1",
+            incarnation=1,
+            measurements=whole,
+            steps=0,
+            submaps=0,
+            ledger=(),
+        )
+        if self.heads and self.heads[-1].state == "ended":
+            self.bus.publish(Outgoing(ch.ROBOT_DONE, "r1", done))
 
 
 def test_a_robot_gets_all_from_a_driver_that_was_killed_and_the_driver_waits_for_that(tmp_path):

@@ -157,7 +157,7 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
 
 
 _TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,
-         ch.END, ch.HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
+         ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_TOLD))
 """The channels whose samples are filed."""
 
