@@ -41,8 +41,10 @@ class Robot(Protocol):
     def odometry_pose(self, t: Decimal, x: float, y: float, theta: float) -> None:
         """The pose in the odometry's frame."""
 
-    def observe_points(self, t: Decimal, ids: ArrayLike, xy: ArrayLike) -> None:
-        """Landmarks."""
+    def observe_points(
+        self, t: Decimal, ids: ArrayLike, xy: ArrayLike, covariances: ArrayLike | None
+    ) -> None:
+        """Landmarks; covariances: of each its own 2 × 2."""
 
     def sight(
         self, t: Decimal, teammates: Sequence[str], ranges: ArrayLike, bearings: ArrayLike
@@ -144,7 +146,8 @@ class Ros2Driver:
                     self._robot.sight(t, teammates, np.hypot(x, y), np.arctan2(y, x))
                 else:
                     ids = np.array(measured.names, dtype=np.int64)
-                    self._robot.observe_points(t, ids, points)
+                    blocks = [[[xx, xy], [xy, yy]] for xx, xy, yy in measured.covariances]
+                    self._robot.observe_points(t, ids, points, blocks or None)
             case _:
                 pass
 

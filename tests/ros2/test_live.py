@@ -48,7 +48,8 @@ class Robot:
     def odometry_pose(self, t: Decimal, x: float, y: float, theta: float) -> None:
         self.calls.append(("pose", t, x, y, theta))
 
-    def observe_points(self, t: Decimal, ids: Any, xy: Any) -> None:
+    def observe_points(self, t: Decimal, ids: Any, xy: Any, covariances: Any) -> None:
+        assert covariances is None
         self.calls.append(("points", t, ids.tolist(), xy.tolist()))
 
     def sight(self, t: Decimal, teammates: Any, ranges: Any, bearings: Any) -> None:

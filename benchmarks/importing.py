@@ -1,0 +1,117 @@
+"""ROS 2 bags: how fast they are imported beside the library's plain reading; damage is survived.
+
+    python benchmarks/importing.py [--messages 40000] [--damaged 1000000] [--json FILE]
+
+A bag of odometry and detections is written as .mcap and .db3, read plainly (every message
+deserialised by rosbags), and imported to a folder. Then so many damaged payloads are decoded: each
+is refused or is a sound message after all, and none raises anything else. The figures are held
+against benchmarks/importing.json; exit status 1 if something was raised or a figure is worse.
+"""
+
+import argparse
+import json
+import random
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from rosbags.highlevel import AnyReader
+
+from sim.importing.bag import imported_bag
+from team.ros2.decoding import READERS, DamagedError, decode
+from team.ros2.definitions import types
+from tests.ros2 import messages as ros
+from tests.ros2.test_decoding import SAMPLES
+
+BASELINE = Path(__file__).with_suffix(".json")
+ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
+PERIOD_NS = 10_000_000
+ODOMETRY_PER_SCAN = 9
+
+
+def drive(count: int) -> list[ros.Message]:
+    """Nine poses and a scan of four tags, again and again."""
+    found: list[ros.Message] = []
+    for k in range(count):
+        at = (k + 1) * PERIOD_NS
+        if k % (ODOMETRY_PER_SCAN + 1) == ODOMETRY_PER_SCAN:
+            seen = [(str(i), ros.pose(1.0 + i, 0.1 * i)) for i in range(4)]
+            found.append((at, "/tags", TAGS, ros.detections(at, "base_link", seen)))
+        else:
+            found.append((at, "/odom", ODOMETRY, ros.odometry(at, ros.pose(0.01 * k), 1.0)))
+    return found
+
+
+def plain_s(bag: Path) -> float:
+    """Seconds of reading and deserialising everything."""
+    began = time.perf_counter()
+    with AnyReader([bag], default_typestore=types()) as reader:
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+    return time.perf_counter() - began
+
+
+def imported_s(bag: Path, folder: Path) -> float:
+    began = time.perf_counter()
+    for robot in imported_bag(bag, None, None).robots:
+        robot.write(folder)
+    return time.perf_counter() - began
+
+
+def damaged(count: int) -> tuple[int, int, float]:
+    """How many were refused, how many raised something else, and the seconds that it took."""
+    chance = random.Random(0)
+    sound = [(kind, ros.cdr(kind, SAMPLES[kind])) for kind in READERS]
+    refused = wrong = 0
+    began = time.perf_counter()
+    for k in range(count):
+        kind, data = sound[k % len(sound)]
+        spoilt = bytearray(data)
+        for _ in range(chance.randint(1, 4)):
+            spoilt[chance.randrange(len(spoilt))] = chance.randrange(256)
+        if chance.random() < 0.5:
+            spoilt = spoilt[: chance.randrange(len(spoilt))]
+        try:
+            decode(kind, bytes(spoilt))
+        except DamagedError:
+            refused += 1
+        except Exception as error:
+            wrong += 1
+            print(f"{kind}: {type(error).__name__}: {error}: {bytes(spoilt).hex()}")
+    return refused, wrong, time.perf_counter() - began
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--messages", type=int, default=40_000)
+    parser.add_argument("--damaged", type=int, default=1_000_000)
+    parser.add_argument("--json", type=Path)
+    asked = parser.parse_args()
+    figures: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as place:
+        messages = drive(asked.messages)
+        for name in ("mcap", "db3"):
+            bag = ros.write_bag(Path(place) / name, messages, db3=name == "db3")
+            plain = min(plain_s(bag) for _ in range(2))
+            took = min(imported_s(bag, Path(place) / f"{name}-{k}") for k in range(2))
+            figures[f"{name}_plain_per_s"] = round(len(messages) / plain)
+            figures[f"{name}_imported_per_s"] = round(len(messages) / took)
+            figures[f"{name}_times_plain"] = round(took / plain, 2)
+    refused, wrong, seconds = damaged(asked.damaged)
+    figures |= {"damaged": asked.damaged, "refused": refused, "raised": wrong}
+    figures["damaged_per_s"] = round(asked.damaged / seconds)
+    print(json.dumps(figures, indent=1))
+    if asked.json:
+        asked.json.write_text(json.dumps(figures, indent=1) + "\n")
+    worse = wrong > 0
+    for name, told in json.loads(BASELINE.read_text())["figures"].items():
+        worst = told["value"] * (1.0 + told["tolerance"])
+        if figures[name] > worst:
+            print(f"{name}: {figures[name]}, was {told['value']}, at most {worst:.2f}")
+            worse = True
+    return int(worse)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

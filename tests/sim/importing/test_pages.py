@@ -1,0 +1,86 @@
+"""The examples of docs/your_data.md and docs/your_ros2_robot.md do what the pages say."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from sim.cli.main import app
+from sim.importing.columns import load_map
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import scenario_beside, streams_of
+from team.ros2.topics import load_topics
+
+ROOT = Path(__file__).parents[3]
+
+
+def blocks(page: str, language: str) -> list[str]:
+    text = (ROOT / "docs" / page).read_text("utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def made(command: str, folder: Path) -> None:
+    """Run `python examples/… NAME` of a page."""
+    python, program, name = command.split()
+    assert python == "python"
+    subprocess.run([sys.executable, ROOT / program, name], cwd=folder, check=True)
+
+
+def test_the_data_set_of_the_page_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    first, second = blocks("your_data.md", "sh")[0].splitlines()
+    made(first, tmp_path)
+    assert second == "teamslam launch --dataset my_set"
+    scenario = with_options(load(scenario_beside("my_set")), dataset="my_set")
+    world = streams_of(scenario)
+    assert [stream.robot for stream in world.streams] == ["anna", "bert"]
+    assert all(len(stream.landmark_detections.ids) == 600 for stream in world.streams)
+    assert world.landmarks is not None
+
+
+def test_the_scenario_and_the_map_of_the_page_are_sound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    columns, own = blocks("your_data.md", "toml")
+    (tmp_path / "columns.toml").write_text(columns)
+    assert set(load_map(tmp_path / "columns.toml")) == {"odometry", "observations"}
+    made("python examples/own_data.py my_set", tmp_path)
+    (tmp_path / "my_set" / "scenario.toml").write_text(own)
+    scenario = load(scenario_beside("my_set"))
+    assert [robot.id for robot in scenario.robots] == ["anna", "bert"]
+    assert scenario.robots[0].sensor.bearing_sigma == 0.02
+
+
+def test_the_bag_of_the_page_is_listed_and_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "your_ros2_robot.md").read_text("utf-8")
+    command = re.search(r"`(python examples/\S+ my_bag)`", page)
+    assert command is not None
+    made(command[1], tmp_path)
+    listed = CliRunner().invoke(app, ["import", "my_bag"])
+    assert listed.exit_code == 2
+    proposal = listed.output.partition("with this:\n\n")[2].partition("\nand type")[0]
+    (tmp_path / "topics.toml").write_text(proposal)
+    typed = "import my_bag -o my_set --ros2 topics.toml"
+    assert f"teamslam {typed}" in page
+    assert "teamslam import my_bag -o FOLDER --ros2 topics.toml" in listed.output
+    done = CliRunner().invoke(app, typed.split())
+    assert done.exit_code == 0, done.output
+    scenario = load(scenario_beside("my_set"))
+    assert scenario.robots[0].sensor.mount == pytest.approx((0.2, 0.0, 0.0), abs=1e-12)
+    (stream,) = streams_of(scenario).streams
+    assert set(stream.landmark_detections.ids.tolist()) == {7, 12, 13}
+    assert stream.landmark_detections.points is not None
+    assert stream.landmark_detections.points[0] == pytest.approx([1.8, 1.0])
+
+
+def test_the_topics_of_the_page_are_sound(tmp_path: Path) -> None:
+    (tmp_path / "topics.toml").write_text(blocks("your_ros2_robot.md", "toml")[0])
+    topics = load_topics(tmp_path / "topics.toml")
+    assert topics.robots["r1"].teammates == {"5": "r2"}
