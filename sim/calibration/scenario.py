@@ -8,13 +8,14 @@ from central.config import CentralConfig
 from sim.calibration.calibrate import Calibration, nested
 from sim.calibration.figures import Figure
 from sim.scenarios.scenario import Scenario, builtin_names
-from sim.world.config import FolderWorld
+from sim.world.config import FolderWorld, LiveWorld
 from team.config import MotionModel, Sensor
 
 
 def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
     """A document with `base`: the scenario's name if it is built in, else that of its data set."""
-    otherwise = "recorded" if isinstance(scenario.world, FolderWorld) else "utias"
+    world = scenario.world
+    otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
     base = scenario.name if scenario.name in builtin_names() else otherwise
     how = "ground truth" if calibration.by_truth else "the team's own joined map"
     lines = [
@@ -23,6 +24,9 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
         *(f"# {note}" for note in calibration.notes),
         f'base = "{base}"',
     ]
+    if isinstance(world, LiveWorld):
+        lines += [f'name = "{scenario.name}"', f'team = "{scenario.team}"']
+        lines += ["", "[world]", 'kind = "live"', *(["admit = true"] if world.admit else [])]
     parts = (
         ("defaults.motion", calibration.motion, MotionModel),
         ("defaults.sensor", calibration.sensor, Sensor),
@@ -33,7 +37,7 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
             lines += ["", f"[{name}]", *_table(figures, declared)]
     differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
     told_apart = calibration.robots or (calibration.by_truth and differ)
-    for robot in scenario.robots if told_apart else ():
+    for robot in scenario.robots if told_apart or isinstance(world, LiveWorld) else ():
         fields = nested({}, calibration.robots.get(robot.id, ()), Sensor)
         own = [f"sensor = {_inline(fields)}"] if fields else []
         lines += ["", "[[robots]]", f'id = "{robot.id}"', *own]

@@ -29,10 +29,12 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
         scenario = _with_its_robots(path)
         return streams_of(scenario), scenario
     messages = [opened(sample)[2] for sample in _samples(path)]
-    configured = [each for each in messages if isinstance(each, m.Configuration)]
-    if not configured:
+    told = [each.configuration for each in messages if isinstance(each, m.Configuration)]
+    by_recorder = open_log(path).metadata.get("scenario")  # of a team without a world
+    told = told or ([] if by_recorder is None else [by_recorder])
+    if not told:
         raise ScenarioError(f"{path}: the log does not say the world's scenario")
-    scenario = loads(configured[-1].configuration)
+    scenario = loads(told[-1])
     clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
     return recorded_streams(messages, path.name, clocks), scenario
 

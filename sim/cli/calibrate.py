@@ -40,13 +40,16 @@ def calibrate(
     from sim.calibration.figures import CalibrationError
     from sim.calibration.scenario import scenario_toml
     from sim.calibration.source import measurements_of
-    from sim.cli.options import scenario_of
+    from sim.cli.options import scenario_of, warn_of_holes
+    from team.recording.reader import open_log
 
     if output is not None and output.suffix != ".toml":
         fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)
     read = []
     for path in source:
         typer.echo(f"reading {path}", err=True)
+        if path.suffix == ".mcap":
+            warn_of_holes(open_log(path))
         read.append((path.name, *measurements_of(path)))
     start = read[0][2] if scenario is None else scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.options import FAILED, WRONG_USE, LogArgument, counted, fail, refuse_existing
+from sim.cli.options import (
+    FAILED,
+    WRONG_USE,
+    LogArgument,
+    counted,
+    fail,
+    refuse_existing,
+    warn_of_holes,
+)
 from sim.cli.recorded import repair
 
 if TYPE_CHECKING:
@@ -172,6 +180,7 @@ def export(
     chosen = _channels(channels)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         fail(f"{output} is there and not an empty folder: give a new one", WRONG_USE)
+    warn_of_holes(opened)
     if form in (Format.UTIAS, Format.TUM):
         if channels is not None:
             fail(f"--channels is for tables: {form} is of all that the format has", WRONG_USE)

@@ -16,8 +16,11 @@ from team.config import Estimator, FusionRule
 
 if TYPE_CHECKING:
     from team.keys.credentials import Credentials
+    from team.recording.reader import Log
     from team.wire.zenoh_bus import ZenohBus
 
+MOST_HOLES = 5
+"""Findings of what a log lacks that a command names; `teamslam log check` names all."""
 WRONG_USE = 2
 FAILED = 1
 
@@ -155,6 +158,18 @@ def refuse_existing(path: Path) -> None:
     """End with an error where there is something already."""
     if path.exists():
         fail(f"{path} exists: choose another name or remove it", WRONG_USE)
+
+
+def warn_of_holes(log: "Log") -> None:
+    """Say what a log lacks, on stderr: whatever is made of it lacks that, too."""
+    from team.recording.check import holes
+
+    found = holes(log)
+    for finding in found[:MOST_HOLES]:
+        typer.echo(f"warning: {log.path} is not whole, {finding}", err=True)
+    if len(found) > MOST_HOLES:
+        more = counted(len(found) - MOST_HOLES, "more finding")
+        typer.echo(f"warning: {more}: `teamslam log check {log.path}` names all", err=True)
 
 
 def counted(count: int, what: str) -> str:

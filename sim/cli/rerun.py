@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.options import FAILED, WRONG_USE, EstimatorOption, FusionOption, LogArgument, fail
+from sim.cli.options import (
+    FAILED,
+    WRONG_USE,
+    EstimatorOption,
+    FusionOption,
+    LogArgument,
+    fail,
+    warn_of_holes,
+)
 from sim.recorded.changes import Changes
 
 if TYPE_CHECKING:
@@ -164,8 +172,11 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from central.desk.verification.recorded import RerunError
     from sim.recorded.changed_run import changed_run
     from sim.recorded.data_set import log_or_run
+    from team.recording.reader import Log
 
     log = log_or_run(path)
+    if isinstance(log, Log):
+        warn_of_holes(log)
     recorded = evaluate(log.samples())
     try:
         changed = evaluate(changed_run(log, changes))
@@ -204,6 +215,7 @@ def _verify(path: Path, json_file: Path | None) -> None:
     from team.recording.reader import open_log
 
     log = open_log(path)
+    warn_of_holes(log)
     began = time.monotonic()
     try:
         result = verify(log)
@@ -272,6 +284,7 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
 
     try:
         opened = open_log(log)
+        warn_of_holes(opened)
         found = ledger(recorded(opened))
     except RerunError as error:
         fail(f"{log}: {error}", FAILED)

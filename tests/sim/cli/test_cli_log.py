@@ -194,3 +194,25 @@ def test_the_program_itself_ends_with_2_and_one_line(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f"error: {tmp_path / 'hello.mcap'}: not an MCAP file; give a log")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("verify-ledger",),
+        ("rerun", "--verify"),
+        ("calibrate",),
+        ("log", "export", "--output", "tables"),
+        ("report", "--output", "report"),
+    ],
+)
+def test_a_log_with_a_hole_says_so_in_every_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Recorder(tmp_path / "hole.mcap", "small", {"seed": "1"}) as recorder:
+        lost = [s for s in published() if s.key == "source/r2/odometry"][5:8]
+        recorder.write([sample for sample in published() if sample not in lost])
+    result = CliRunner().invoke(app, [*words, "hole.mcap"])
+    said = " ".join((result.stdout + result.stderr).split())
+    assert "not whole, source/r2: 3 measurements of incarnation 1 missing" in said
