@@ -15,7 +15,7 @@ def calibrate(
     source: Annotated[
         list[Path],
         typer.Argument(
-            help="UTIAS data sets (folder or zip) or logs (.mcap), learnt from together."
+            help="Data sets (folders, UTIAS zips) or logs (.mcap), learnt from together."
         ),
     ],
     output: Annotated[

@@ -1,6 +1,7 @@
 """The command `teamslam driver`: a ROS 2 robot's topics become its stream."""
 
 import logging
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -43,11 +44,15 @@ def driver(
     Topics come by rmw_zenoh or by zenoh-bridge-ros2dds.
     """
     from team.driver.driver import Driver, DriverError
+    from team.driver.measured import DriverWarning
     from team.ros2.topics import TopicsError, load_topics
     from team.ros2_driver import Ros2Driver
     from team.shell import process
     from team.wire.foreign import ForeignKeys
 
+    logging.captureWarnings(True)
+    # A detector names its tags in any order, and the measurements stay with their names.
+    warnings.filterwarnings("ignore", message=".*ids are not ascending", category=DriverWarning)
     try:
         topics = load_topics(ros2)
     except TopicsError as error:

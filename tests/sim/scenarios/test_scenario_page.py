@@ -14,7 +14,14 @@ from central.config import BiasSigmas, CentralConfig, CommonBiasSigmas
 from sim.cli.main import app
 from sim.scenarios.scenario import Scenario, load
 from sim.scenarios.source import streams_of
-from sim.world.config import LiveWorld, Point, SimulatedWorld, UnlabelledWorld, UtiasWorld
+from sim.world.config import (
+    FolderWorld,
+    LiveWorld,
+    Point,
+    SimulatedWorld,
+    UnlabelledWorld,
+    UtiasWorld,
+)
 from team.config import (
     Association,
     Bounds,
@@ -29,7 +36,9 @@ from tests.support import ROOT
 
 PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
-    Scenario, SimulatedWorld, UtiasWorld, LiveWorld, RobotConfig, MotionModel, MotionNoise, Sensor,
+    Scenario, SimulatedWorld, UtiasWorld, FolderWorld, LiveWorld, RobotConfig, MotionModel,
+    MotionNoise,
+    Sensor,
     Lens, FrontEnd, Association, UnlabelledWorld, CentralConfig, BiasSigmas, CommonBiasSigmas,
     Bounds,
 )  # fmt: skip
