@@ -19,6 +19,7 @@ class Rejection(StrEnum):
     TIME = "a time beyond the bounds"
     RANGE = "a range beyond the bounds"
     SENSOR_LIMITS = "outside the sensor's limits"
+    CLAIMS = "this estimator takes no covariances of measurements"
     ITSELF = "a robot does not see itself"
     NO_LANDMARKS = "this estimator uses no landmarks"
     NO_ASSOCIATION = "this estimator takes no landmarks without identities"

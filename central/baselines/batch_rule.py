@@ -14,9 +14,10 @@ from team.config import RobotConfig
 from team.estimation.baselines import batch
 from team.estimation.baselines.batch import Batch
 from team.estimation.baselines.robot_step import RobotStep
-from team.estimation.gaussian import Matrix
-from team.estimation.geometry import Pose
+from team.estimation.gaussian import Matrix, PoseGaussian
+from team.estimation.geometry import Pose, inverse
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.mount import moved_by
 from team.estimation.sparse_cholesky import sparse
 from team.wire import channels as ch
 from team.wire.bus import Outgoing
@@ -127,6 +128,15 @@ class BatchRule(MeasurementRule):
             if not stamps:
                 continue
             incarnation = self._members[robot].incarnation
+            sensor = self._robots[robot].sensor
+            if sensor.is_mounted:
+                away = inverse(np.array(sensor.mount))
+                moved = [
+                    moved_by(PoseGaussian(*each), away)
+                    for each in zip(poses, covariances, strict=True)
+                ]
+                poses = np.array([each.mean for each in moved])
+                covariances = np.array([each.covariance for each in moved])
             message = translate.trajectory_message(
                 stamps[-1], robot, incarnation, self._digest, stamps, poses[1:], covariances[1:]
             )

@@ -16,7 +16,8 @@ from team import translate
 from team.config import RobotConfig
 from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.geometry import Pose
+from team.estimation.geometry import Pose, inverse
+from team.estimation.mount import moved_by
 from team.estimation.plausible import start_beyond
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -146,11 +147,22 @@ class MeasurementRule(FusionRule):
         }
         self._start(
             {
-                name: (np.zeros(3) if pose is None else pose, covariance)
+                name: self._sensors_start(name, np.zeros(3) if pose is None else pose, covariance)
                 for name, (pose, covariance) in known.items()
             }
         )
         return True
+
+    def _sensors_start(
+        self, robot: str, pose: Pose, covariance: Matrix | None
+    ) -> tuple[Pose, Matrix | None]:
+        """Where the robot's sensor begins: keyframes are of it."""
+        sensor = self._robots[robot].sensor
+        if not sensor.is_mounted:
+            return pose, covariance
+        uncertain = np.zeros((3, 3)) if covariance is None else covariance
+        start = moved_by(PoseGaussian(pose, uncertain), np.array(sensor.mount))
+        return start.mean, None if covariance is None else start.covariance
 
     def _is_placed(self, start: m.InitialPose) -> bool:
         """Whether the initial pose is known, and within the bounds."""
@@ -168,6 +180,7 @@ class MeasurementRule(FusionRule):
                 each.keyframe.ids,
                 each.keyframe.ranges,
                 each.keyframe.bearings,
+                each.keyframe.own,
             )
             for each in step
         ]
@@ -187,6 +200,9 @@ class MeasurementRule(FusionRule):
     def _pose(self, each: RobotKeyframe, pose: PoseGaussian) -> Outgoing:
         """The pose at the end of a keyframe."""
         self._pose_ns[each.robot] = each.stamp_ns
+        sensor = self._robots[each.robot].sensor
+        if sensor.is_mounted:
+            pose = moved_by(pose, inverse(np.array(sensor.mount)))
         incarnation = self._members[each.robot].incarnation
         message = translate.pose_message(
             each.stamp_ns, each.robot, incarnation, each.number, translate.NO_MAP, *pose

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from team.config import Sensor
 from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import information
-from team.estimation.geometry import inverse, transformed, wrapped
+from team.estimation.geometry import Pose, inverse, transformed, wrapped
 from team.estimation.models import NEAREST_M, Increment, noise
 
 
@@ -73,6 +73,12 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
     turn = _turn(bearing)
     spread = np.diag([range_variance + own, bearing_variance * distance**2 + own])
     return Carried(distance * turn[:, 0], turn @ spread @ turn.T)
+
+
+def of_base(seen: Carried, mount: Pose) -> Carried:
+    """A point that the sensor sees, in the frame of the base on which it is mounted."""
+    turn = _turn(float(mount[2]))
+    return Carried(transformed(mount, seen.point), turn @ seen.covariance @ turn.T)
 
 
 def carried_back(seen: Carried, node_from_here: Increment) -> Carried:

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from team.estimation.gaussian import PoseGaussian
 from team.estimation.geometry import Pose, adjoint, compose, inverse
 from team.estimation.models import Increment
 
@@ -27,6 +28,14 @@ def of_sensor(step: Increment, mount: Pose) -> Increment:
 def of_base(step: Increment, mount: Pose) -> Increment:
     """The base's motion as the sensor moves: `of_sensor` the other way round."""
     return of_sensor(step, inverse(mount))
+
+
+def moved_by(pose: PoseGaussian, step: Pose) -> PoseGaussian:
+    """The pose ∘ step of a pose in (x, y, θ), and its covariance."""
+    end = compose(pose.mean, step)
+    dx, dy = end[:2] - pose.mean[:2]
+    F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    return PoseGaussian(end, F @ pose.covariance @ F.T)
 
 
 def base_poses(poses: Float[np.ndarray, "*n 3"], mount: Pose) -> Float[np.ndarray, "*n 3"]:

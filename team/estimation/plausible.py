@@ -61,8 +61,9 @@ def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None
 
 
 def is_motion_spread(covariance: Matrix, bounds: Bounds) -> bool:
-    """Whether a motion on SE(2) is claimed to be as uncertain as the bounds allow."""
-    return _spread(covariance, np.array([False, False, True]), bounds) is None
+    """Whether a motion on SE(2) is claimed to be no more uncertain than the bounds allow."""
+    most = np.array([bounds.sigma_m[1], bounds.sigma_m[1], bounds.sigma_rad[1]])
+    return bool((np.sqrt(np.diag(covariance)) <= most).all())
 
 
 def are_landmarks(covariance: Matrix) -> bool:

@@ -91,6 +91,13 @@ def together(parts: list[tuple[int, Own]]) -> Own:
     )
 
 
+def of_each(parts: list[tuple[int, Own]]) -> Float[np.ndarray, "_ 4"]:
+    """The rows of several scans by count and rows; what claims nothing says so."""
+    found = together(parts)
+    sensors = np.array([0.0, 0.0, 0.0, SENSOR])
+    return found if found.shape[1] else np.tile(sensors, (len(found), 1))
+
+
 def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[np.ndarray, " n"]:
     """Which measurements claim standard deviations within the bounds, if they claim any."""
     if not own.size:

@@ -94,6 +94,24 @@ def check_covariance(data: Floats, n: int, what: str) -> None:
     _check_positive(scaled, what)
 
 
+def check_semidefinite(data: Floats, n: int, what: str) -> None:
+    """Raise ValueError unless n × n floats are symmetric and positive semi-definite, of any rank.
+
+    A variance of zero is a number that its source takes as exact; its row is then zero.
+    """
+    check_finite(data, what, n * n)
+    matrix = floats(data, what).reshape(n, n)
+    variances = np.diag(matrix)
+    if not (variances >= 0.0).all() or matrix[variances == 0.0].any():
+        raise ValueError(f"not positive definite: {what}")
+    sigmas = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    scaled = np.clip(matrix / sigmas / sigmas[:, None], -2.0, 2.0)
+    if np.abs(scaled - scaled.T).max(initial=0.0) > 1e-9:
+        raise ValueError(f"not symmetric: {what}")
+    if np.linalg.eigvalsh(scaled).min(initial=0.0) < -1e-9:
+        raise ValueError(f"not positive definite: {what}")
+
+
 def check_packed_covariance(data: Floats, n: int, what: str) -> None:
     """Raise ValueError unless the packed upper triangle is of a positive definite n × n matrix."""
     if n > LARGEST_JOINT:

@@ -28,6 +28,7 @@ from team.wire.arrays import (
     check_covariance,
     check_finite,
     check_packed_covariance,
+    check_semidefinite,
     floats,
     ids,
     stamps,
@@ -95,7 +96,7 @@ class Increment(
 
     increment: 3 floats (forward [m], left [m], turn [rad]), the pose of its end in the frame of its
     start. covariance: 3 × 3 floats, row by row, of an error in the frame of its end (pose ∘
-    Exp(error)); empty where the source claims none.
+    Exp(error)), of any rank; empty where the source claims none.
     """
 
     duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
@@ -107,7 +108,7 @@ class Increment(
         if not abs(float(floats(self.increment, "increment")[2])) <= np.pi:
             raise ValueError("out of bounds: increment turns outside (−π, π]")
         if self.covariance:
-            check_covariance(self.covariance, 3, "covariance")
+            check_semidefinite(self.covariance, 3, "covariance")
 
 
 class Steering(Measurement, frozen=True, kw_only=True, array_like=True, gc=False, tag="steering/1"):

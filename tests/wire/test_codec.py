@@ -74,7 +74,10 @@ def test_observations_from_before_their_covariances_have_the_sensors() -> None:
     [
         ("increment/1", -2, from_floats([1.0, 0.0, 3.2]), "out of bounds"),
         ("increment/1", -2, from_floats([1.0, 0.0]), "wrong length"),
-        ("increment/1", -1, from_floats(np.zeros(9)), "not positive definite"),
+        ("increment/1", -1, from_floats(np.diag([1.0, -1.0, 1.0])), "not positive definite"),
+        ("increment/1", -1, from_floats([1, 2, 0, 2, 1, 0, 0, 0, 1]), "not positive definite"),
+        ("increment/1", -1, from_floats([0, 1, 0, 1, 1, 0, 0, 0, 1]), "not positive definite"),
+        ("increment/1", -1, from_floats([1, 0, 0, 0.5, 1, 0, 0, 0, 1]), "not symmetric"),
         ("steering/1", -1, 1.6, "out of bounds"),
         ("points/1", -2, from_floats([1.0, 0.0]), "wrong length"),
         ("points/1", -1, from_floats([1.0, 2.0, 1.0] * 2), "not positive definite"),
@@ -88,6 +91,13 @@ def test_a_general_measurement_that_can_not_be_is_refused(
     fields = fields_of(EXAMPLES[tag])
     fields[field] = value
     assert reason_of(msgpack.packb(fields)) == why
+
+
+@pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.diag([0.1, 0.0, 0.2]), np.ones((3, 3))])
+def test_a_motion_may_be_exact_in_some_direction(matrix: np.ndarray) -> None:
+    fields = fields_of(EXAMPLES["increment/1"])
+    fields[-1] = from_floats(matrix)
+    assert decoded(msgpack.packb(fields), m.Increment).covariance == from_floats(matrix)
 
 
 def test_a_submap_from_before_the_pose_nodes_has_none() -> None:

@@ -23,6 +23,7 @@ from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian, information
 from team.estimation.geometry import Pose, compose, tangent
 from team.estimation.models import located, variances
+from team.estimation.scans import of_each
 from team.estimation.sparse_cholesky import sparse
 
 FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
@@ -269,9 +270,8 @@ def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
         np.array(seen, np.int64),
         np.concatenate([np.empty(0), *(turn.ranges for turn in turns)]),
         np.concatenate([np.empty(0), *(turn.bearings for turn in turns)]),
-        np.repeat(
-            np.array([variances(turn.sensor) for turn in turns]).reshape(-1, 3), counts, axis=0
-        ),
+        _variances(turns, counts),
+        of_each([(count, turn.own) for count, turn in zip(counts, turns, strict=True)]),
     )
     return replace(
         batch,
@@ -293,6 +293,15 @@ def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
         ids=np.array(list(place), np.uint32),
         age=np.concatenate([batch.age, np.zeros(len(seen), np.int64)]),
     )
+
+
+def _variances(turns: Sequence[RobotStep], counts: Sequence[int]) -> Float[np.ndarray, "n 3"]:
+    """Of each measurement; ones of those that claim their own, whose residuals are whitened."""
+    found = np.array([variances(turn.sensor) for turn in turns]).reshape(-1, 3)
+    found = np.repeat(found, counts, axis=0)
+    claims = np.repeat([turn.own.shape[1] > 0 for turn in turns], counts)
+    found[claims] = 1.0, 0.0, 1.0
+    return found
 
 
 def solved(batch: Batch, iterations: int, least_decrement: float) -> Batch:

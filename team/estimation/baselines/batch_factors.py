@@ -11,6 +11,7 @@ Log and Jr⁻¹ are those of SE(2): Solà et al., A micro Lie theory, eq. 158 an
 row is what `geometry` and `models` say of one, and every sum runs in the order of the factors.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -28,6 +29,7 @@ from team.estimation.geometry import (
     logarithm,
     wrapped,
 )
+from team.estimation.hybrid_slam.landmark_kernel import innovation_of
 from team.estimation.map_joining.joining_kernel import block_pattern
 from team.estimation.models import landmark_jacobian, pose_jacobian, predicted
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
@@ -64,7 +66,8 @@ class Measurements(NamedTuple):
     """Landmarks seen from poses, and the sensor's variances of each measurement.
 
     landmark: its place among the landmarks. variances: (σ_range² [m²], σ_range_per_m²,
-    σ_bearing² [rad²]), as `models.variances`.
+    σ_bearing² [rad²]), as `models.variances`. own: the noises that they claim themselves
+    (`team.estimation.scans`); the residuals of these are whitened by it, and their variances 1.
     """
 
     pose: Indices
@@ -72,6 +75,7 @@ class Measurements(NamedTuple):
     ranges: Values
     bearings: Values
     variances: Float[np.ndarray, "n 3"]
+    own: Float[np.ndarray, "_ 4"] = np.empty((0, 4))
 
 
 class Linear(NamedTuple):
@@ -175,7 +179,42 @@ def motion_residuals(motions: Motions, poses: Poses) -> Linear:
 def measurement_residuals(measurements: Measurements, poses: Poses, landmarks: Points) -> Linear:
     """R of (range, bearing), ∂r/∂ξ of the pose and ∂r/∂ of the landmark, as in `models`."""
     z = np.column_stack([measurements.ranges, measurements.bearings])
-    return Linear(*_linearised(poses[measurements.pose], landmarks[measurements.landmark], z))
+    found = _linearised(poses[measurements.pose], landmarks[measurements.landmark], z)
+    if measurements.own.size:
+        _whiten(*found, z, measurements.own)
+    return Linear(*found)
+
+
+@compiled
+def _whiten(
+    residual: Float[np.ndarray, "n 2"],
+    of_pose: Float[np.ndarray, "n 2 3"],
+    of_landmark: Float[np.ndarray, "n 2 2"],
+    z: Float[np.ndarray, "n 2"],
+    own: Float[np.ndarray, "n 4"],
+) -> None:
+    """Rows times L⁻¹, R = L Lᵀ, of the measurements that claim their covariance R, in place.
+
+    The residual of a point is the point's own in the plane (`landmark_kernel.innovation_of`).
+    """
+    for k in range(len(residual)):
+        if own[k, 3] < 0.0:
+            continue
+        distance = residual[k, 0] + z[k, 0]
+        of_range, of_bearing, rr, rb, bb = innovation_of(
+            z[k], own[k], (0.0, 0.0, 0.0), distance, -residual[k, 1]
+        )
+        residual[k, 0], residual[k, 1] = -of_range, -of_bearing
+        slope, first = rb / rr, math.sqrt(rr)
+        second = math.sqrt(bb - slope * rb)
+        residual[k, 1] = (residual[k, 1] - slope * residual[k, 0]) / second
+        residual[k, 0] /= first
+        for i in range(3):
+            of_pose[k, 1, i] = (of_pose[k, 1, i] - slope * of_pose[k, 0, i]) / second
+            of_pose[k, 0, i] /= first
+        for i in range(2):
+            of_landmark[k, 1, i] = (of_landmark[k, 1, i] - slope * of_landmark[k, 0, i]) / second
+            of_landmark[k, 0, i] /= first
 
 
 @compiled

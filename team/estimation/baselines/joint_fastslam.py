@@ -88,6 +88,7 @@ def stepped(
             bearings=turn.bearings,
             proposal=state.proposal,
             generator=generator,
+            own=turn.own if len(turn.own) else None,
         )
         poses = state.poses.copy()
         poses[index] = after.poses

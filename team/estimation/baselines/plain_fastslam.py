@@ -18,6 +18,7 @@ from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from team.estimation.hybrid_slam.moments import moments
 from team.estimation.models import Increment
+from team.estimation.scans import Own
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ def stepped(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
     generator: np.random.Generator,
+    own: Own | None = None,
 ) -> PlainFastSlam:
     """Resample if the particles are thin, move, take the measurements
     (`propagated_and_updated`).
@@ -61,6 +63,7 @@ def stepped(
         proposal=state.proposal,
         resample_below=state.resample_below,
         generator=generator,
+        own=own,
     )
     return replace(state, particles=particles)
 

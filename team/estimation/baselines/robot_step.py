@@ -7,12 +7,14 @@ from jaxtyping import Float, UInt32
 
 from team.config import Sensor
 from team.estimation.models import Increment
+from team.estimation.scans import Own, unclaimed
 
 
 class RobotStep(NamedTuple):
     """A robot's motion since its last turn, then its measurements at the end of it.
 
-    ranges [m] and bearings [rad] are corrected by the calibration of its sensor.
+    ranges [m] and bearings [rad] are corrected by the calibration of its sensor; own: the noises
+    that they claim (`team.estimation.scans`), without rows none.
     """
 
     robot: str
@@ -21,11 +23,15 @@ class RobotStep(NamedTuple):
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
+    own: Own = unclaimed(0)
 
     @property
     def blind(self) -> "RobotStep":
         """The motion alone."""
         none = slice(0)
         return self._replace(
-            ids=self.ids[none], ranges=self.ranges[none], bearings=self.bearings[none]
+            ids=self.ids[none],
+            ranges=self.ranges[none],
+            bearings=self.bearings[none],
+            own=self.own[none],
         )

@@ -12,7 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from team.config import FrontEnd, Sensor
-from team.estimation.inter_robot import Carried, carried_back, carried_on, point_seen, reduced
+from team.estimation.inter_robot import (
+    Carried,
+    carried_back,
+    carried_on,
+    of_base,
+    point_seen,
+    reduced,
+)
 from team.estimation.models import Increment, acceptable, corrected
 from team.rejection import Rejection
 
@@ -87,6 +94,8 @@ class PoseGrid:
         for k in np.flatnonzero(mask):
             drift = self._teammate_speed * away_ns * 1e-9
             seen = point_seen(self._sensor, float(distances[k]), float(directions[k]), drift)
+            if self._sensor.is_mounted:
+                seen = of_base(seen, np.array(self._sensor.mount))
             look = _Look(stamp_ns, counter, teammates[k], seen, node_ns, Increment.identity())
             self._uncovered.append(look)
         return None if mask.any() else Rejection.SENSOR_LIMITS

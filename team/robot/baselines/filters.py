@@ -31,19 +31,23 @@ IN_POSE = "in the running pose"
 """The dispositions of a measurement that such an estimator takes."""
 
 
-Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray]
-"""The motion since the last keyframe; landmark ids, ranges [m] and bearings [rad] at its end."""
+Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""The motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the noises
+that they claim (`team.estimation.scans`) at its end."""
 Begun = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
-Judged = Callable[[Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray], Innovation]
+Judged = Callable[
+    [Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Innovation
+]
 
 
 class Filter(NamedTuple):
     """A recursive estimator over a state of its own.
 
-    looks: it takes landmarks; maps: it has a map of its own. joint: with the covariance between
-    landmarks. absorbed: the state with these landmarks in place of its own. particles: those of a
-    state, for viewers. innovation: of a step's measurements, as the state before it predicts them.
+    looks: it takes landmarks, and claims: those with covariances of their own; maps: it has a map
+    of its own. joint: with the covariance between landmarks. absorbed: the state with these
+    landmarks in place of its own. particles: those of a state, for viewers. innovation: of a step's
+    measurements, as the state before it predicts them.
     """
 
     begun: Begun
@@ -54,6 +58,7 @@ class Filter(NamedTuple):
     absorbed: Callable[[Any, np.ndarray, np.ndarray, Matrix], Any] | None = None
     used: str = IN_MAP
     looks: bool = True
+    claims: bool = False
     maps: bool = True
     joint: bool = True
     particles: Callable[[Any], Particles] | None = None
@@ -63,7 +68,7 @@ def _random(stepped: Callable[..., Any]) -> Stepped:
     """The step of an estimator that draws random numbers."""
 
     def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
-        increment, *scan = step
+        increment, *scan, _ = step
         return stepped(state, increment, config.sensor, *scan, generator)
 
     return step
@@ -78,7 +83,7 @@ def _exact(begun: Callable[..., Any], stepped: Callable[..., Any]) -> tuple[Begu
         return _with_start(begun, stepped, initial)
 
     def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
-        increment, *scan = step
+        increment, *scan, _ = step
         return stepped(state, increment, config.sensor, *scan)
 
     return start, step
@@ -97,7 +102,7 @@ def _thesis_stepped(
     step: Step,
     generator: np.random.Generator,
 ) -> hybrid_thesis.ThesisState:
-    increment, ids, ranges, bearings = step
+    increment, ids, ranges, bearings, _ = step
     particles = config.front_end.particles
     return hybrid_thesis.stepped(
         state=state,
@@ -114,6 +119,11 @@ def _thesis_stepped(
 def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
     """The innovation against the particles of a state."""
     return lambda state, *measurements: innovation(particles(state), *measurements)
+
+
+def _without_claims(judged: Callable[..., Innovation]) -> Judged:
+    """The innovation of an estimator that takes no claims."""
+    return lambda state, *measurements: judged(state, *measurements[:-1])
 
 
 def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
@@ -167,6 +177,22 @@ def _with_start(
     return stepped(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
 
 
+def _plain_stepped(
+    state: PlainFastSlam, config: RobotConfig, step: Step, generator: np.random.Generator
+) -> PlainFastSlam:
+    increment, ids, ranges, bearings, own = step
+    return plain_fastslam.stepped(
+        state=state,
+        increment=increment,
+        sensor=config.sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        generator=generator,
+        own=own,
+    )
+
+
 def _plain(proposal: Proposal) -> Filter:
     """FastSLAM over the whole stream, whatever the front end's own proposal is."""
 
@@ -182,11 +208,12 @@ def _plain(proposal: Proposal) -> Filter:
 
     return Filter(
         begun,
-        _random(plain_fastslam.stepped),
+        _plain_stepped,
         plain_fastslam.pose_gaussian,
         plain_fastslam.landmark_gaussian,
         _of_particles(lambda state: state.particles),
         particles=lambda state: state.particles,
+        claims=True,
     )
 
 
@@ -229,7 +256,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         _random(localisation.stepped),
         localisation.pose_gaussian,
         lambda state: NO_LANDMARKS,  # it was told its map, so there is nothing to say of one
-        localisation.innovation,
+        _without_claims(localisation.innovation),
         used=IN_POSE,
         maps=False,
     ),
@@ -237,7 +264,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         *_exact(ekf_slam.begun, ekf_slam.stepped),
         ekf_slam.pose_gaussian,
         ekf_slam.landmark_gaussian,
-        ekf_slam.innovation,
+        _without_claims(ekf_slam.innovation),
     ),
     "fastslam1": _plain("fastslam1"),
     "fastslam2": _plain("fastslam2"),

@@ -11,12 +11,14 @@ from team.estimation.gaussian import (
     NotACovarianceError,
     PoseGaussian,
 )
+from team.estimation.geometry import Pose, inverse
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.models import Increment
+from team.estimation.mount import moved_by
 from team.estimation.odometry import Moved
 from team.estimation.randomness import generator
-from team.estimation.scans import Scan
+from team.estimation.scans import Scan, unclaimed
 from team.pairs import FEEDBACK
 from team.rejection import Rejection
 from team.robot.baselines.filters import FILTERS, Step
@@ -46,7 +48,9 @@ class RunningEstimator:
         self._map_ns: int | None = None
         self._innovation = NOTHING
         self._unsaid = NOTHING
-        self._state: Any = self._filter.begun(config, initial, known, self._generator)
+        self._mount = np.array(config.sensor.mount)
+        start = _of_sensor(initial, self._mount) if config.sensor.is_mounted else initial
+        self._state: Any = self._filter.begun(config, start, known, self._generator)
         self.sequence = 0
         self.unsolved = 0
         self.last_keyframe_ns: int | None = None
@@ -70,6 +74,8 @@ class RunningEstimator:
         """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
         if not self._filter.looks:
             return Rejection.NO_LANDMARKS
+        if scan.own.size and not self._filter.claims:
+            return Rejection.CLAIMS
         return self._segmenter.observe(stamp_ns, *scan)
 
     def drive(
@@ -95,11 +101,12 @@ class RunningEstimator:
                 keyframe.ids,
                 keyframe.ranges,
                 keyframe.bearings,
+                keyframe.own,
             )
         if not self._filter.looks:
             _, rest = self._segmenter.cut(stamp_ns)
             nothing = np.empty(0)
-            self._advance(stamp_ns, rest, np.empty(0, np.uint32), nothing, nothing)
+            self._advance(stamp_ns, rest, np.empty(0, np.uint32), nothing, nothing, unclaimed(0))
         return self._driven(before, last=False)
 
     def _driven(self, before: int, *, last: bool) -> Estimates:
@@ -133,12 +140,13 @@ class RunningEstimator:
         ids: np.ndarray,
         ranges: np.ndarray,
         bearings: np.ndarray,
+        own: np.ndarray,
     ) -> None:
-        step = increment, ids, ranges, bearings
+        step = increment, ids, ranges, bearings, own
         after = self._stepped(step)
         if after is None:  # what was seen leads nowhere: the motion alone
             self.unsolved += bool(len(ids))
-            after = self._stepped((increment, ids[:0], ranges[:0], bearings[:0]))
+            after = self._stepped((increment, ids[:0], ranges[:0], bearings[:0], own[:0]))
         if after is not None:
             self._state, judged = after
             self._unsaid = self._unsaid.plus(judged)
@@ -176,17 +184,29 @@ class RunningEstimator:
                     keyframe.ids,
                     keyframe.ranges,
                     keyframe.bearings,
+                    keyframe.own,
                 )
         return self._driven(before, last=True), uncovered
 
     def own_pose(self) -> PoseGaussian:
         """The pose at the last keyframe."""
         pose = self._filter.pose(self._state)
+        if self._config.sensor.is_mounted:
+            pose = moved_by(pose, inverse(self._mount))
         return PoseGaussian(pose.mean, pose.covariance + POSE_FLOOR)
 
     def own_map(self) -> LandmarkGaussian:
         """The landmarks so far."""
         return self._filter.landmarks(self._state)
+
+
+def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
+    """Where the sensor begins: the filter's states are of the sensor."""
+    covariance = np.zeros((3, 3)) if initial.covariance is None else initial.covariance
+    if initial.pose is None:
+        return initial
+    found = moved_by(PoseGaussian(initial.pose, covariance), mount)
+    return InitialPose(found.mean, None if initial.covariance is None else found.covariance)
 
 
 class AbsorbingEstimator(RunningEstimator):
