@@ -1,0 +1,78 @@
+"""A ROS 2 robot live and its bag as a data set are one stream of measurements, byte for byte."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.datasets.folder import folder
+from sim.importing.bag import imported_bag
+from sim.publisher.node import WorldNode
+from sim.world.config import FolderWorld
+from team.config import RobotConfig
+from team.driver.driver import Driver
+from team.ros2.topics import RobotTopics, Topics
+from team.ros2_driver import Ros2Driver
+from team.wire import messages as m
+from team.wire.codec import encoded
+from team.wire.foreign import ForeignSample
+from tests.ros2 import messages as ros
+from tests.teams import world_of
+
+S = 10**9
+ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
+
+
+def drive() -> list[ros.Message]:
+    random = np.random.default_rng(2)
+    drove: list[ros.Message] = []
+    x = y = theta = 0.0
+    for k in range(1, 40):
+        at = 1_700_000_000 * S + k * 100_000_007
+        x, y, theta = x + random.normal(), y + random.normal(), theta + 0.3 * random.normal()
+        moved = ros.odometry(at, ros.pose(x, y, yaw=theta), random.normal(), random.normal())
+        drove.append((at, "/odom", ODOMETRY, moved))
+        if k % 3 == 0:
+            seen = [(str(i), ros.pose(*random.normal(size=2))) for i in (3, 8, 11)]
+            drove.append((at, "/tags", TAGS, ros.detections(at, "base_link", seen)))
+    return drove
+
+
+@pytest.mark.parametrize("use", ["pose", "twist"])
+def test_live_and_as_a_bag_it_is_one_stream(tmp_path: Path, use: str) -> None:
+    topics = RobotTopics(odometry="/odom", detections=("/tags",), use=use)  # type: ignore[arg-type]
+    drove = drive()
+    bag = ros.write_bag(tmp_path / "bag", drove)
+    (tables,) = imported_bag(bag, Topics(robots={"r1": topics}), None).robots
+    tables.start((1.0, 2.0, 0.5))
+    tables.write(tmp_path / "set")
+    robot = Driver(
+        "r1",
+        team="t",
+        connect="tcp/127.0.0.1:1",
+        file=tmp_path / "r1.stream",
+        start=(1.0, 2.0, 0.5),
+        patience_s=0.0,
+    )
+    live = Ros2Driver(robot, topics)
+    for _, topic, kind, message in drove:
+        package, _, name = kind.split("/")
+        key = f"0{topic}/{package}::msg::dds_::{name}_/TypeHashNotSupported"
+        live.take(ForeignSample(key, ros.cdr(kind, message)))
+    journal = robot._journal
+    journal.mark("ended")
+    sent = [journal.message(1, number) for number in range(journal.count(1))]
+    robot.close()  # nobody is there to take the stream
+    (stream,) = folder(FolderWorld(path=str(tmp_path / "set")), [RobotConfig(id="r1")]).streams
+    world = WorldNode(
+        world_of(stream),
+        frozenset(),
+        m.Configuration(
+            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
+        ),
+    )
+    out = [each.message for _ in range(4) for each in world.publish(0.0)]
+    expected = [each for each in out if isinstance(each, m.Measurement)]
+    assert live.dropped == {}
+    assert len(expected) == 1 + 38 + 13
+    assert [encoded(each) for each in sent] == [encoded(each) for each in expected]
