@@ -7,6 +7,7 @@ import numpy as np
 
 from central.fused import JOINT_LANDMARKS, receivable, version_entry
 from central.monitor import NOTHING, finding, miscalibrations
+from central.news import News
 from central.roll import Roll
 from central.rule import Inputs, Stream, Tail
 from central.submap_rule import SubmapRule
@@ -22,7 +23,7 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded, unsound
 
-PRIOR_LANDMARKS = 100
+PRIOR_LANDMARKS = 30
 """Landmarks in a robot's prior at the most: the nearest ones."""
 
 NAMED = 10
@@ -38,6 +39,7 @@ class JoinRule(SubmapRule):
         super()._begin()
         self._ticks = TickFold(self._config)
         self._quiet_ns: int | None = None
+        self._news: News | None = News(PRIOR_LANDMARKS)
         self._published: Mapping[Stream, int] = {}
         self.finding = NOTHING
         self._announced: dict[str, str] = {}
@@ -58,6 +60,7 @@ class JoinRule(SubmapRule):
         ):
             self._begin()
         self._ticks.convicts = False
+        self._news = None  # every prior that a map may have brought
         for order in inputs.withdrawals.values():
             self.take_withdrawal(order)
         for verdict in sorted(verdicts):
@@ -298,14 +301,21 @@ class JoinRule(SubmapRule):
         )
 
     def _priors(self, fold: Fold, digest: bytes, fused: m.FusedMap) -> list[Outgoing]:
-        """For the latest stream of every robot that is in the team's frame."""
+        """For the latest stream of every robot that is in the team's frame, if it has news."""
         if not fold.contributions:
             return []
         latest: dict[str, int] = {}
         for robot, incarnation in fold.home:
             latest[robot] = max(latest.get(robot, 0), incarnation)
         streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
-        priors = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, self._shown(fold))
+        shown = self._shown(fold)
+        if self._news is not None:
+            blocks = marginals.landmark_blocks(fold, shown)
+            poses = ((each, marginals.last_pose(fold, each)) for each in streams)
+            streams = [each for each, pose in poses if self._news.is_worth(each, pose, blocks)]
+        if not streams:
+            return []
+        priors = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, shown)
         stamp_ns = fold.contributions[-1].end_ns
         out = []
         for stream, prior in priors.items():

@@ -156,6 +156,12 @@ def prior_for(
     return _priors_in(island, {stream: chosen})[stream]
 
 
+def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
+    """Where the last submap of a stream ends, in the frame of its island."""
+    island = fold.islands[fold.home[stream]]
+    return _mean(island, island.graph.streams[stream][-1])
+
+
 def main_priors(
     fold: Fold,
     streams: Sequence[Stream],
