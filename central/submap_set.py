@@ -40,7 +40,9 @@ class SubmapSet:
         there = stream.get(submap.sequence)
         if there is not None:
             return None if there == submap else f"{name} differs from the one in the set"
-        for sequence in _nearest(stream, submap.sequence):
+        whole = self.count((submap.robot, submap.incarnation)) == len(stream) == submap.sequence
+        nearest = (submap.sequence - 1, None) if whole else _nearest(stream, submap.sequence)
+        for sequence in nearest if stream else ():
             if sequence is None:
                 continue
             other = stream[sequence]
@@ -107,14 +109,12 @@ class SubmapSet:
         gaps = []
         for (robot, incarnation), found in sorted(self.streams.items()):
             first = self.count((robot, incarnation))
-            if found and max(found) >= first:
+            if len(found) > first:
                 gaps.append(VersionEntry(robot=robot, incarnation=incarnation, sequence=first))
         return tuple(gaps)
 
 
 def _nearest(stream: Mapping[int, Submap], sequence: int) -> tuple[int | None, int | None]:
-    """The sequences of a stream next below and above this one; mostly the last one's and none."""
-    if sequence - 1 in stream and sequence > max(stream):
-        return sequence - 1, None
+    """The sequences of a stream next below and above this one."""
     below = max((s for s in stream if s < sequence), default=None)
     return below, min((s for s in stream if s > sequence), default=None)

@@ -9,7 +9,7 @@ and begins again without the robot. So who is withdrawn depends on the set alone
 whichever order it came.
 
 The running fold is bounded (`condensing`): what is old of it is condensed before each tick. The
-full solution is one of the raw set: it takes the ticks again that were condensed.
+full solution is one of the raw set: it takes the ticks again that were condensed (but see FULL).
 """
 
 import math
@@ -46,6 +46,9 @@ Stream = tuple[str, int]
 
 GROWTH = 1.25
 """Suspects whom nothing convicted are tried again when there are so many times the submaps."""
+FULL = 2000
+"""The full solution of so many submaps takes all ticks again; of more it is solved from where the
+running fold has them, since the ticks would take hours."""
 NEWEST = 8
 """So many checkpoints are kept of the newest ticks, and of each time as long again before."""
 
@@ -308,6 +311,10 @@ class TickFold:
         """The full solution of everything that is there, without whom it convicts."""
         self.take_until(math.inf)
         if self.fold.departed:
+            raw = self._raw(self.fold, math.inf) if self.fold.size > FULL else self.fold
+            if not raw.departed:
+                fold = converged(raw, self.settings)
+                return self.solved() if self._convict(fold, math.inf) else fold
             full = self._full()
             fold = full.solved()
             if full.convicted != self.convicted:
@@ -388,19 +395,23 @@ class TickFold:
 
     def _condensed(self, fold: Fold, tick: int) -> Fold:
         """The fold that a tick is put on; linearised again where that is due."""
-        gone = self._gone
-        if fold.departed and is_due(fold.size, fold.size + len(self._members.keys(tick, gone))):
-            keys = [
-                key
-                for before in self._members.behind(-math.inf, tick - 1)
-                for key in self._members.keys(before, gone)
-                if fold.home.get(key[1:3]) == fold.main_key
-            ]
-            contributions = [self._members.contribution(key) for key in keys]
-            seen = (each for key in keys for each in self._members.sightings(key))
-            sightings = [each for each in seen if each.teammate not in gone]
-            fold = relinearised(fold, contributions, sightings)
+        coming = len(self._members.keys(tick, self._gone))
+        if fold.departed and is_due(fold.size, fold.size + coming):
+            fold = self._raw(fold, tick - 1)
         return condensed(fold)
+
+    def _raw(self, fold: Fold, last: float) -> Fold:
+        """A fold up to a tick, solved again from where it is with nothing condensed."""
+        gone = self._gone
+        keys = [
+            key
+            for tick in self._members.behind(-math.inf, last)
+            for key in self._members.keys(tick, gone)
+            if fold.home.get(key[1:3]) == fold.main_key
+        ]
+        contributions = [self._members.contribution(key) for key in keys]
+        seen = (each for key in keys for each in self._members.sightings(key))
+        return relinearised(fold, contributions, [s for s in seen if s.teammate not in gone])
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
         """The name of the fold's set: starts and submaps in canonical order, and `more`."""

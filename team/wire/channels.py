@@ -136,7 +136,7 @@ CENTRAL_CONFIG = Channel(name="central_config", template="central/config", messa
                          recomputable=False, meaning="the centre's configuration")  # fmt: skip
 FUSED_MAP = Channel(name="fused_map", template="central/map", message=m.FusedMap, rate="one per broadcast", delivery="latest", recorded=True,
                     recomputable=True, meaning="the team's map")  # fmt: skip
-PRIOR = Channel(name="prior", template="central/prior/{robot}", message=m.Prior, rate="one per broadcast", delivery="latest", recorded=True,
+PRIOR = Channel(name="prior", template="central/prior/{robot}", message=m.Prior, rate="with news, one of 8 broadcasts at least", delivery="latest", recorded=True,
                 recomputable=True, meaning="the joint marginal that a robot needs")  # fmt: skip
 ORDER = Channel(name="order", template="operator/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
                 meaning="an operator's order: the team goes on without the robot")  # fmt: skip
@@ -200,7 +200,7 @@ TEAM_CONFIG = Channel(name="team_config", template="robot/{robot}/team/config", 
                       recomputable=False, meaning="the configuration of the peer's own fold: a centre's")  # fmt: skip
 TEAM_MAP = Channel(name="team_map", template="robot/{robot}/team/map", message=m.FusedMap, rate="one per broadcast", delivery="latest", recorded=True,
                    recomputable=True, meaning="the team's map by the peer's own fold")  # fmt: skip
-TEAM_PRIOR = Channel(name="team_prior", template="robot/{robot}/team/prior", message=m.Prior, rate="one per broadcast", delivery="latest", recorded=True,
+TEAM_PRIOR = Channel(name="team_prior", template="robot/{robot}/team/prior", message=m.Prior, rate="with news, one of 8 broadcasts at least", delivery="latest", recorded=True,
                      recomputable=True, meaning="the joint marginal that the peer needs, by its own fold")  # fmt: skip
 TEAM_FINAL = Channel(name="team_final", template="robot/{robot}/team/final", message=m.FusedMap, rate="once", delivery="latest", recorded=True,
                      recomputable=True, meaning="the final map by the peer's own fold")  # fmt: skip

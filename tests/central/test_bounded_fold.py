@@ -12,6 +12,7 @@ from central import tick_fold
 from central.config import CentralConfig
 from central.tick_fold import Checkpoint, TickFold, thinned
 from team import translate
+from team.estimation.map_joining import marginals
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.joining import EMPTY_FOLD
 from team.estimation.map_joining.relinearising import is_due
@@ -86,6 +87,19 @@ def test_the_full_solution_is_that_of_the_raw_set_to_the_bit():
     assert bits(bounded.solved()) == bits(full.solved())
     assert bounded.digest(bounded.fold) == full.digest(full.fold)
     assert bounded.members(bounded.fold) == full.members(full.fold)
+
+
+def test_the_full_solution_of_a_large_set_begins_where_the_running_fold_is(monkeypatch):
+    bounded, full = straight(), straight(bounded=False)
+    monkeypatch.setattr(tick_fold, "FULL", 10)
+    one, other = bounded.solved(), full.solved()
+    assert one.departed == 0
+    assert one.main.graph.streams.keys() == other.main.graph.streams.keys()
+    assert [c.key for c in one.contributions] == [c.key for c in other.contributions]
+    maps = [marginals.landmark_map(fold) for fold in (one, other)]
+    assert np.allclose(maps[0].means, maps[1].means, atol=1e-6)
+    assert np.allclose(maps[0].covariance, maps[1].covariance, rtol=1e-5)
+    assert bits(one) == bits(straight().solved())
 
 
 def test_a_withdrawal_gives_the_fold_without_the_robot():

@@ -51,8 +51,8 @@ class Departed(NamedTuple):
     """What the agreement keeps of factors that were taken up, as they agreed at that moment.
 
     robots: Σ w χ² and Σ dof of each robot. submaps: the newest of each stream, oldest first.
-    believed: how many submaps that are believed have each landmark. paths: while they may have to
-    be linearised again.
+    believed: how many submaps that are believed have each landmark. paths: for when they are
+    linearised again.
     """
 
     robots: Mapping[str, tuple[float, float]]

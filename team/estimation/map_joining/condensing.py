@@ -44,8 +44,6 @@ LAG = 8
 """So many submaps of each stream stay raw."""
 BEGIN = 128
 """A fold of fewer submaps is taken in full."""
-SETTLED = 1000
-"""A fold of more submaps than this is not linearised again."""
 HISTORY = 50
 """Of each stream the costs of so many departed submaps are kept."""
 
@@ -243,8 +241,6 @@ def _paths(
     island: Island, before: Departed, leaving: Bool[np.ndarray, " F"]
 ) -> Mapping[Stream, Path]:
     graph = island.graph
-    if len(graph.submaps) + (graph.condensed.submaps if graph.condensed else 0) > SETTLED:
-        return {}
     counts: dict[Stream, int] = defaultdict(int)
     for f in np.flatnonzero(leaving):
         counts[graph.submaps[f].contribution.stream] += 1

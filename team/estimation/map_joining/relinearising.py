@@ -15,7 +15,7 @@ from team.estimation.contribution import Contribution, Stream
 from team.estimation.geometry import compose
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.condensed_factor import Path
-from team.estimation.map_joining.condensing import BEGIN, SETTLED
+from team.estimation.map_joining.condensing import BEGIN
 from team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     UNSOLVABLE,
@@ -31,6 +31,8 @@ Values = Float[np.ndarray, " _"]
 
 GROWTH = 1.5
 """Of the sizes at which the fold is linearised again."""
+SETTLED = 1000
+"""A fold of more submaps than this is not linearised again."""
 SOLVED = 3
 """So many times the iterations of a tick solve what is linearised again."""
 
