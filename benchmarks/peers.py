@@ -1,0 +1,207 @@
+"""What a set that spreads costs: bytes of each robot, and the time until all agree, by topology.
+
+`python -m benchmarks.peers [--json FILE]`: peers without estimators, each of which closes a submap
+of 1.2 kB every 10 s for 300 s of team time; every second they talk. The star is what a centre would
+receive of each robot. `benchmarks/peers.json` is what was measured; a run compares itself with it.
+"""
+
+import argparse
+import heapq
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.in_memory.air import Air, Reach, always
+from team.peers.members import Member, about
+from team.peers.node import PeerNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
+
+BASELINE = Path(__file__).with_suffix(".json")
+DRIVE_S = 300
+WINDOW_S = 10
+LANDMARKS = 6
+CUT_S = (100, 200)
+TEAMS = (2, 5, 10, 50)
+SECOND_NS = 10**9
+TOLERANCE = 0.05
+
+
+def submap(robot: str, sequence: int) -> m.Submap:
+    """A submap of LANDMARKS landmarks."""
+    n = 3 + 2 * LANDMARKS
+    end_ns = (sequence + 1) * WINDOW_S * SECOND_NS
+    return m.Submap(
+        stamp_ns=end_ns,
+        robot=robot,
+        incarnation=1,
+        sequence=sequence,
+        first_measurement=20 * sequence,
+        last_measurement=20 * sequence + 19,
+        start_ns=end_ns - WINDOW_S * SECOND_NS,
+        config=bytes(8),
+        ids=from_ids(range(LANDMARKS)),
+        mean=from_floats(np.zeros(n)),
+        covariance=from_floats(np.eye(n)[np.triu_indices(n)]),
+    )
+
+
+def reach_of(topology: str, robots: int) -> Reach:
+    """Who reaches whom: all, along a line or a ring, two by two for 5 s a minute, or two halves
+    that are cut apart for 100 s.
+    """
+
+    def index(name: str) -> int:
+        return int(name[1:]) - 1
+
+    def line(one: str, other: str, now_ns: int) -> bool:
+        return abs(index(one) - index(other)) == 1
+
+    def ring(one: str, other: str, now_ns: int) -> bool:
+        return abs(index(one) - index(other)) in (1, robots - 1)
+
+    def meeting(one: str, other: str, now_ns: int) -> bool:
+        if now_ns >= DRIVE_S * SECOND_NS:
+            return line(one, other, now_ns)
+        phase = (now_ns // SECOND_NS + 7 * min(index(one), index(other))) % 60
+        return line(one, other, now_ns) and phase < 5
+
+    def halves(one: str, other: str, now_ns: int) -> bool:
+        apart = CUT_S[0] * SECOND_NS <= now_ns < CUT_S[1] * SECOND_NS
+        return not apart or (index(one) < robots / 2) == (index(other) < robots / 2)
+
+    found: dict[str, Reach] = {
+        "all": always, "line": line, "ring": ring, "meetings": meeting, "partition": halves,
+    }  # fmt: skip
+    return found[topology]
+
+
+class Team:
+    """Peers and the air between them; said: bytes of each, a broadcast once."""
+
+    def __init__(self, topology: str, robots: int) -> None:
+        self.names = [f"r{i + 1}" for i in range(robots)]
+        self.nodes = {n: PeerNode(ch.robot_node(n), self.names) for n in self.names}
+        self.air = Air(reach=reach_of(topology, robots))
+        self.said = dict.fromkeys(self.names, 0)
+        self.heard = dict.fromkeys(self.names, 0)
+        self._way: list[tuple[int, int, str, str, m.Message | Member]] = []
+        self._count = 0
+
+    def send(self, sender: str, to: str, what: m.Message | Member, now_ns: int) -> None:
+        """By the air, with 50 ms on the way."""
+        size = what.size if isinstance(what, Member) else len(encoded(what))
+        for at_ns in self.air.arrivals(sender, to, size, now_ns):
+            self._count += 1
+            self.heard[to] += size
+            heapq.heappush(self._way, (at_ns + 50_000_000, self._count, sender, to, what))
+
+    def spread(self, name: str, out: list[Outgoing], now_ns: int) -> None:
+        """What a node says: a question to one, all else to everyone in reach."""
+        for each in out:
+            self.said[name] += len(encoded(each.message))
+            asked = ch.robot_of(each.name) if each.channel is ch.MEMBERS else None
+            for other in self.names:
+                if other != name and asked in (None, other):
+                    self.send(name, other, each.message, now_ns)
+
+    def second(self, now_s: int) -> None:
+        """One second of team time."""
+        now_ns = now_s * SECOND_NS
+        if 0 < now_s <= DRIVE_S and now_s % WINDOW_S == 0:
+            for name in self.names:
+                message = submap(name, now_s // WINDOW_S - 1)
+                member = Member(ch.SUBMAP.key(name), encoded(message), message)
+                self.nodes[name].take(member, name)
+                self.said[name] += member.size
+                for other in self.names:
+                    if other != name:
+                        self.send(name, other, member, now_ns)
+        for name, node in self.nodes.items():
+            self.spread(name, node.tick(float(now_s)), now_ns)
+        while self._way and self._way[0][0] < now_ns + SECOND_NS:
+            at_ns, _, sender, to, what = heapq.heappop(self._way)
+            self._arrive(sender, to, what, at_ns)
+
+    def _arrive(self, sender: str, to: str, what: m.Message | Member, now_ns: int) -> None:
+        node = self.nodes[to]
+        match what:
+            case Member():
+                node.take(what, ch.robot_node(sender))
+            case m.SetSummary():
+                self.spread(to, node.hear(what), now_ns)
+            case m.MembersRequest():
+                for reply in node.answer(encoded(what)):
+                    self.said[to] += len(reply)
+                    self.send(to, sender, decoded(reply, m.Members), now_ns)
+            case m.Members():
+                node.take_carried(what)
+                self.spread(to, node.more_of(what.node), now_ns)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all sets are one."""
+        return len({node.replica.digest for node in self.nodes.values()}) == 1
+
+
+def measured(topology: str, robots: int) -> dict[str, float]:
+    """Bytes per robot and second against the star, and when all agree."""
+    team = Team(topology, robots)
+    start = {n: m.InitialPose(stamp_ns=0, robot=n, incarnation=1, number=0, pose=b"",
+                              covariance=b"") for n in team.names}  # fmt: skip
+    for name, pose in start.items():
+        member = Member(ch.START.key(about(pose)), encoded(pose), pose)
+        team.nodes[name].take(member, name)
+    healed_s = CUT_S[1] if topology == "partition" else DRIVE_S
+    agreed_s = None
+    for now_s in range(DRIVE_S + 600):
+        team.second(now_s)
+        if now_s >= healed_s and agreed_s is None and team.agrees:
+            agreed_s = now_s - healed_s
+            if now_s >= DRIVE_S:
+                break
+    star = DRIVE_S // WINDOW_S * len(encoded(submap("r1", 0)))
+    said, heard = list(team.said.values()), list(team.heard.values())
+    return {
+        "agree_after_s": -1.0 if agreed_s is None else float(agreed_s),
+        "said_b_s": float(np.mean(said)) / DRIVE_S,
+        "heard_b_s": float(np.mean(heard)) / DRIVE_S,
+        "star_b_s": star / DRIVE_S,
+    }
+
+
+def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
+    """Measure, print, compare with the baseline; 1 where something has become dearer."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--json", type=Path)
+    options.add_argument("--teams", type=int, nargs="*", default=list(TEAMS))
+    chosen = options.parse_args()
+    before = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
+    found, worse = {}, []
+    show("| topology | robots | agree after [s] | said [B/s] | heard [B/s] | star [B/s] |\n")
+    show("|---|---|---|---|---|---|\n")
+    for topology in ("all", "line", "ring", "meetings", "partition"):
+        for robots in chosen.teams:
+            name = f"{topology}/{robots}"
+            found[name] = figures = measured(topology, robots)
+            numbers = " | ".join(f"{value:.0f}" for value in figures.values())
+            show(f"| {topology} | {robots} | {numbers} |\n")
+            for figure, value in figures.items():
+                old = before.get(name, {}).get(figure)
+                if old is not None and value > old * (1.0 + TOLERANCE) + 1.0:
+                    worse.append(f"{name}: {figure} is {value:.1f}, was {old:.1f}")
+    if chosen.json is not None:
+        chosen.json.write_text(json.dumps(found, indent=1) + "\n")
+    show("".join(f"worse: {each}\n" for each in worse))
+    return 1 if worse else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
