@@ -162,6 +162,8 @@ def peers_examples(digest: bytes) -> Iterator[m.Message]:
         payloads=(b"bytes",),
         signatures=(b"",),
     )
+    yield m.Certificate(stamp_ns=0, robot="alpha", certificate=b"DER")
+    yield m.Signature(stamp_ns=9, robot="alpha", member=4 * digest, signature=b"ECDSA")
     yield m.RadioPlan(stamp_ns=0, robots=("alpha", "bravo"), ends_ns=(9, 8), pairs=b"\x80\x00")
     yield m.Concluded(
         stamp_ns=9, robot="alpha", serial=1, digest=digest, sha256=4 * digest, submaps=7

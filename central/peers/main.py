@@ -11,7 +11,7 @@ from central.peers.fold import FoldWhen
 from central.peers.robot import PeerRobot
 from team.config import Exchange, RobotConfig
 from team.peers.members import Member
-from team.peers.node import Proof
+from team.peers.proofs import Signs
 from team.peers.store import Store, StoreError
 from team.robot.main import SECOND_PATIENCE_S, RobotShell
 from team.shell import Shell
@@ -49,11 +49,11 @@ class PeerShell(RobotShell):
         store: Path | None = None,
         exchange: Exchange = "continuous",
         when: FoldWhen = "always",
-        proof: Proof | None = None,
+        signer: Signs | None = None,
         patience_s: float = SECOND_PATIENCE_S,
     ) -> None:
         super().__init__(bus, config, stop, patience_s, exchange)
-        self._peer = PeerRobot(config, central, robots, exchange, when, proof)
+        self._peer = PeerRobot(config, central, robots, exchange, when, signer)
         self.node = self._peer.node
         self._shell = Shell(bus, self._peer, self._peer.name, stop)
         self._store = None if store is None else Store(store)

@@ -14,7 +14,8 @@ from central.peers.fold import FoldWhen, PeerFold
 from team.config import Exchange, RobotConfig
 from team.containment import Boundary, reply_sample
 from team.peers.members import CHANNELS, Member, about
-from team.peers.node import PeerNode, Proof
+from team.peers.node import PeerNode
+from team.peers.proofs import Proofs, Signs
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -28,7 +29,7 @@ _OF_THE_FOLD = {
     ch.TRAJECTORY: ch.TEAM_TRAJECTORY,
 }
 """What the centre would say under its own name the robot says under its own."""
-_TALK = (*CHANNELS, ch.SET_SUMMARY, ch.CARRIED)
+_TALK = (*CHANNELS, ch.SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
 """What the set costs a radio; questions for it, too."""
 _NOT_HEARD = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TEAM_END)
 """What a robot hears from a centre and a peer from its own fold."""
@@ -50,14 +51,15 @@ class PeerRobot:
         robots: Sequence[str],
         exchange: Exchange = "continuous",
         when: FoldWhen = "always",
-        proof: Proof | None = None,
+        signer: Signs | None = None,
     ) -> None:
         self.config = config
         self._exchange: Exchange = exchange
         self.robot = config.id
         self.name = ch.robot_node(config.id)
         self.node = RobotNode(config, exchange)
-        self.peer = PeerNode(self.name, robots, proof)
+        proofs = None if signer is None else Proofs(config.id, signer)
+        self.peer = PeerNode(self.name, robots, proofs)
         self.fold = PeerFold(central, tuple(sorted(robots)), self.peer, when)
         self._boundary = Boundary(self.name)
         self._finals = 0
@@ -75,7 +77,8 @@ class PeerRobot:
     def overhears(self) -> tuple[ch.Channel, ...]:
         """The channels to subscribe to whoever they name: members, summaries, progress."""
         own = (each for each in self.node.overhears if each is not ch.WITHDRAWAL)
-        others = (ch.ROBOT_PROGRESS, ch.HEAD, ch.END_ORDER)
+        signed = () if self.peer.proofs is None else (ch.SIGNATURE,)
+        others = (ch.ROBOT_PROGRESS, ch.HEAD, ch.END_ORDER, *signed)
         return tuple(dict.fromkeys((*PeerNode.listens, *others, *own)))
 
     @property
@@ -99,7 +102,23 @@ class PeerRobot:
         """What it says first: its configuration, and that of its fold."""
         announced = msgspec.structs.replace(self.fold.centre.announcement, node=self.name)
         config = Outgoing(ch.TEAM_CONFIG, self.robot, announced)
-        return [config, *self._of_robot(self.node.begin())]
+        return [config, *self._certified(), *self._of_robot(self.node.begin())]
+
+    def _certified(self) -> list[Outgoing]:
+        """With keys: what its signatures are checked by."""
+        proofs = self.peer.proofs
+        if proofs is None:
+            return []
+        self.peer.take(_member(ch.CERTIFICATE, proofs.certificate()), self.name)
+        return [Outgoing(ch.CERTIFICATE, self.robot, proofs.certificate())]
+
+    def _vouched(self, member: Member) -> list[Outgoing]:
+        """Take a member of its own into the set; with keys its signature goes out behind it."""
+        self.peer.take(member, self.name)
+        proofs = self.peer.proofs
+        if proofs is None:
+            return []
+        return [Outgoing(ch.SIGNATURE, self.robot, proofs.signed(member))]
 
     def restore(self, members: Iterable[Member]) -> bool:
         """Take what an earlier life has kept, before `begin`; whether its stream goes on there."""
@@ -146,6 +165,10 @@ class PeerRobot:
             case m.Members():
                 self.carried += self.peer.take_carried(message)
                 return self._grown() + self._said(self.peer.more_of(message.node))
+            case m.Signature():
+                if self.peer.proofs is not None:
+                    self.peer.proofs.hear(message)
+                return []
             case m.SetSummary():
                 return self._said(self.peer.hear(message))
             case m.Progress():
@@ -175,12 +198,12 @@ class PeerRobot:
         out: list[Outgoing] = []
         if channel is not None and channel in CHANNELS:
             self.peer.take_sample(sample, channel.speaker(name))
-            out = self._grown()
-        elif (
-            isinstance(message, m.InitialPose) and message.robot == self.robot
-        ):  # a reply of the source: it has no key
-            self.peer.take(_member(ch.START, message), self.name)
-            out = self._grown()
+            if isinstance(message, m.InitialPose) and name == self.robot:
+                out += self._vouched(_member(ch.START, message))
+            out += self._grown()
+        elif isinstance(message, m.InitialPose) and message.robot == self.robot:
+            # a reply of the source: it has no key
+            out = self._vouched(_member(ch.START, message)) + self._grown()
         own = isinstance(message, m.Measurement) and message.robot == self.robot
         if own or isinstance(message, m.KnownMap | m.Rendezvous | m.Withdrawal):
             out = self._tell_robot(message, sample) + out
@@ -204,7 +227,7 @@ class PeerRobot:
         out = list(said)
         for each in said:
             if each.channel in CHANNELS:
-                self.peer.take(_member(each.channel, each.message), self.name)
+                out += self._vouched(_member(each.channel, each.message))
             elif isinstance(each.message, m.Progress):
                 out += self._of_fold(self.fold.note(each.message))
         return out + self._grown()
@@ -233,8 +256,8 @@ class PeerRobot:
             self._finals = self.fold.finals
             concluded = self.fold.conclusion(self.robot)
             assert concluded is not None
-            self.peer.take(_member(ch.CONCLUDED, concluded), self.name)
             out.append(Outgoing(ch.CONCLUDED, self.robot, concluded))
+            out += self._vouched(_member(ch.CONCLUDED, concluded))
         return out
 
     def answer(self, request: bytes) -> list[bytes]:

@@ -179,7 +179,7 @@ def robot(
         bus.tap = tap
         _connected(resolved, connect)
         if resolved.peers:
-            _peer_shell(bus, resolved, config, stop, kept, fold).run()
+            _peer_shell(bus, resolved, config, stop, kept, fold, keys).run()
         else:
             RobotShell(bus, config, stop, exchange=resolved.exchange).run()
 
@@ -191,13 +191,17 @@ def _peer_shell(
     stop: "threading.Event",
     kept: Path | None,
     fold: str,
+    keys: Path | None,
 ) -> "PeerShell":
     from central.peers.main import PeerShell
     from sim.radio.bus import behind_radio
+    from team.keys.signing import Signer
     from team.peers.store import StoreError
 
     if fold not in ("always", "end"):
         fail(f"--fold is always or end, not {fold!r}", WRONG_USE)
+    own = None if keys is None else own_keys(keys, f"robot-{config.id}", scenario.team)
+    signer = None if own is None else Signer(own)
     try:
         door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
         return PeerShell(
@@ -209,6 +213,7 @@ def _peer_shell(
             store=kept,
             exchange=scenario.exchange,
             when="end" if fold == "end" else "always",
+            signer=signer,
         )
     except StoreError as error:
         fail(str(error), WRONG_USE)

@@ -1,6 +1,7 @@
 """What one peer asks of another, given the other's summary, and what it answers."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 
 from team.peers.members import Member, Stream
@@ -94,11 +95,24 @@ def _contradicts(replica: Replica, holding: m.Holding) -> bool:
     return same and mine is not None and mine.digest != holding.digest
 
 
-def answered(replica: Replica, request: m.MembersRequest, node: str) -> list[m.Members]:
-    """The members that are asked for and here, by portions; the initial pose of a stream first."""
+Sign = Callable[[Member], bytes]
+"""A member's signature by who said it; empty where it has none."""
+
+
+def answered(
+    replica: Replica, request: m.MembersRequest, node: str, sign: Sign | None = None
+) -> list[m.Members]:
+    """The members that are asked for and here, by portions; the statements first.
+
+    sign: where there are keys; what has no signature yet is not given.
+    """
     batches: list[list[Member]] = [[]]
     total = size = 0
-    for member in _asked(replica, request):
+    for each in _asked(replica, request):
+        member = each if sign is None else replace(each, signature=sign(each))
+        proven = bool(member.signature) or isinstance(member.message, m.Certificate)
+        if sign is not None and not proven:
+            continue
         if total and total + member.size > ANSWER_BYTES:
             break
         if batches[-1] and size + member.size > BATCH_BYTES:
@@ -110,6 +124,9 @@ def answered(replica: Replica, request: m.MembersRequest, node: str) -> list[m.M
 
 
 def _asked(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
+    for robot in request.statements:
+        found = replica.statements.get(robot, {})
+        yield from (found[name] for name in sorted(found))
     for each in request.wanted[:MOST_WANTED]:
         share = replica.streams.get((each.robot, each.incarnation))
         if share is None:
@@ -119,8 +136,6 @@ def _asked(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
         for sequence in range(each.first, min(each.last, each.first + MOST_ASKED) + 1):
             if sequence in share.complete:
                 yield from share.parcel(sequence)
-    for robot in request.statements:
-        yield from replica.statements.get(robot, {}).values()
 
 
 def _message(node: str, stamp_ns: int, members: Sequence[Member]) -> m.Members:

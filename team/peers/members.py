@@ -16,7 +16,7 @@ from team.wire.bus import Sample, opened
 Stream = tuple[str, int]
 """(robot, incarnation)."""
 STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
-STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.CONCLUDED)
+STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.CONCLUDED, ch.CERTIFICATE)
 CHANNELS = (*STREAMED, *STATED)
 """The channels whose messages are members."""
 LARGEST_MEMBER = 4 * 2**20

@@ -7,11 +7,12 @@ the initial pose, then the submaps without a gap.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from team.peers.exchange import answered, named, wanted
 from team.peers.members import CHANNELS, Member, Stream, member_of
+from team.peers.proofs import Proofs
 from team.peers.replica import SHARE, RefusedError, Replica
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -26,8 +27,6 @@ PATIENCE_S = 3.0
 """What somebody was asked for is asked of another one after so long."""
 FRESH_S = 25.0
 """A summary that is older says nothing of who is in reach."""
-Proof = Callable[[Member], str | None]
-"""Why a member that a third node carries is not to be believed; None: it is."""
 
 
 @dataclass
@@ -41,7 +40,7 @@ class Carried:
 class PeerNode:
     """One node's copy of the set, and its talk with others about it.
 
-    proof: checks members that come over third nodes; None: there are no keys, and everyone is
+    proofs: checks members that come over third nodes; None: there are no keys, and everyone is
     believed. unsaved: what was news since somebody has last cleared it. carried: by the node
     over which it came. refused: how many members were not kept; last_refused: why.
     """
@@ -49,11 +48,11 @@ class PeerNode:
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
 
     def __init__(
-        self, node: str, robots: Sequence[str], proof: Proof | None = None, share: int = SHARE
+        self, node: str, robots: Sequence[str], proofs: Proofs | None = None, share: int = SHARE
     ) -> None:
         self.node = node
         self.replica = Replica(robots, share)
-        self._proof = proof
+        self.proofs = proofs
         self._now_s = 0.0
         self._serial = 0
         self._said: bytes | None = None
@@ -111,7 +110,8 @@ class PeerNode:
             except (WireError, ValueError) as error:
                 self._refuse(f"{key[:80]} from {carried.node}: {error}")
                 continue
-            why = None if self._proof is None else self._proof(member)
+            proofs = self.proofs
+            why = None if proofs is None else proofs.refusal(member, self.replica)
             if why is not None:
                 self._refuse(f"{key[:80]} from {carried.node}: {why}")
             elif self.take(member, carried.node):
@@ -202,7 +202,11 @@ class PeerNode:
     def answer(self, request: bytes) -> list[bytes]:
         """The answer to a `MembersRequest`; raises WireError."""
         wanted_of_us = decoded(request, m.MembersRequest)
-        return [encoded(batch) for batch in answered(self.replica, wanted_of_us, self.node)]
+        return [encoded(batch) for batch in self._answered(wanted_of_us)]
+
+    def _answered(self, request: m.MembersRequest) -> list[m.Members]:
+        sign = None if self.proofs is None else self.proofs.of
+        return answered(self.replica, request, self.node, sign)
 
     @property
     def agrees(self) -> dict[str, bool]:

@@ -298,6 +298,8 @@ def _stated(message: m.Message) -> tuple[str, int]:
             return "given_up", 0
         case m.Concluded():
             return "concluded", 0
+        case m.Certificate():
+            return "certificate", 0
         case _:
             raise RefusedError(f"a {type(message).__name__} is no member of the set")
 

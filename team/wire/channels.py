@@ -210,6 +210,10 @@ SET_SUMMARY = Channel(name="set_summary", template="{node}/set", message=m.SetSu
                       recorded=True, recomputable=False, meaning="what a peer has of the team's set")  # fmt: skip
 CONCLUDED = Channel(name="concluded", template="robot/{robot}/concluded", message=m.Concluded, rate="once", delivery="all", recorded=True, recomputable=False,
                     meaning="a peer has its final map")  # fmt: skip
+CERTIFICATE = Channel(name="certificate", template="robot/{robot}/certificate", message=m.Certificate, rate="once, with keys", delivery="all", recorded=True,
+                      recomputable=False, meaning="by what a robot's signatures are checked")  # fmt: skip
+SIGNATURE = Channel(name="signature", template="robot/{robot}/signature", message=m.Signature, rate="one per member, with keys", delivery="all", recorded=False,
+                    recomputable=False, meaning="a robot's signature of what it has said, for whoever carries it")  # fmt: skip
 MEMBERS = Channel(name="members", template="{node}/members", message=m.MembersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                   meaning="a query to a peer; the replies are members of the set, as `carried`")  # fmt: skip
 CARRIED = Channel(name="carried", template="{node}/carried", message=m.Members, rate="as asked for", delivery="stream", recorded=False, recomputable=False,

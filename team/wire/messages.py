@@ -1070,6 +1070,26 @@ class RadioPlan(Message, frozen=True, kw_only=True, array_like=True, gc=False, t
             raise ValueError("wrong length: ends_ns or pairs")
 
 
+class Certificate(
+    Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="certificate/1"
+):
+    """A robot's certificate (DER), by which its signatures can be checked: a member of the set."""
+
+    robot: Name
+    certificate: Annotated[bytes, Meta(min_length=1, max_length=8192)]
+
+
+class Signature(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="signature/1"):
+    """A robot's signature of a member that it has said, for whoever carries it.
+
+    member: 32 bytes, the BLAKE2b of the key's length (2 bytes, little-endian), key and payload.
+    """
+
+    robot: Name
+    member: Annotated[bytes, Meta(min_length=32, max_length=32)]
+    signature: Annotated[bytes, Meta(min_length=1, max_length=256)]
+
+
 class Concluded(Message, frozen=True, kw_only=True, array_like=True, gc=False, tag="concluded/1"):
     """A peer has the final map of its own fold. digest: its set's. sha256: of the map's payload.
 
