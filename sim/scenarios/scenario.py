@@ -124,6 +124,9 @@ def with_options(
         fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
     if robots is not None:
         fields["robots"] = _counted(fields["robots"], robots)
+    if world["kind"] == "unlabelled":  # its log is cut into r1, r2, …
+        numbered = enumerate(fields["robots"], start=1)
+        fields["robots"] = [robot | {"id": f"r{number}"} for number, robot in numbered]
     return _converted(fields)
 
 
@@ -139,6 +142,7 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
     kind = _kind_of(path, "utias" if isinstance(world, UtiasWorld) else "folder")
     if kind != fields["kind"]:
         common = {field.name for field in msgspec.structs.fields(WORLDS[kind])}
+        common -= {"identities"}  # what a kind of set tells is its own
         fields = {name: value for name, value in fields.items() if name in common}
     return fields | {"kind": kind, "path": path}
 

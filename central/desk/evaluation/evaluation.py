@@ -12,6 +12,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
+from central.desk.evaluation.association import (
+    AssociationResult,
+    association_json,
+    association_result,
+)
 from central.desk.evaluation.errors import (
     MapErrors,
     Path,
@@ -23,6 +28,7 @@ from central.desk.evaluation.errors import (
     pose_errors,
     rigid_alignment,
 )
+from central.desk.evaluation.gps import gps_median
 from central.desk.evaluation.log import Collected, Traffic, collected
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
@@ -128,6 +134,8 @@ class Evaluation:
     scale_by_robot: Mapping[str, float] = field(default_factory=dict)
     arbitrary_frame: bool = False
     peers: Mapping[str, PeerResult] = field(default_factory=dict)
+    association: AssociationResult | None = None
+    gps_median_m: float | None = None
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
@@ -140,7 +148,9 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         if isinstance(truth, m.TruthLandmarks)
         else (np.empty(0, np.uint32), np.empty((0, 2)))
     )
-    fused = _map_result(log, ids, positions)
+    association = association_result(log)
+    label_of = {} if association is None else association.label_of
+    fused = _map_result(log, ids, positions, label_of)
     uplink = None if scenario is None else _uplink(scenario)
     robots = {
         robot: _robot_result(
@@ -167,6 +177,8 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         scale_by_robot=_by_robot(log, "covariance_scale."),
         arbitrary_frame=_is_arbitrary(log),
         peers=peer_results(log),
+        association=association,
+        gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
     )
 
 
@@ -246,6 +258,13 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
             key: {"messages": traffic.messages, "bytes": traffic.bytes}
             for key, traffic in evaluation.channels.items()
         },
+        "association": None
+        if evaluation.association is None
+        else association_json(evaluation.association),
+        "reference_rmse_m": None
+        if errors is None or evaluation.association is None
+        else errors.aligned_rmse_m,
+        "gps_median_m": evaluation.gps_median_m,
         "unsound_messages": evaluation.unsound,
         "notes": list(evaluation.notes),
         "faults": evaluation.faults,
@@ -310,7 +329,10 @@ def _bytes(log: Collected, uplink: tuple[ch.Channel, ...] | None, robot: str) ->
 
 
 def _map_result(
-    log: Collected, true_ids: UInt32[np.ndarray, " T"], positions: Float[np.ndarray, "T 2"]
+    log: Collected,
+    true_ids: UInt32[np.ndarray, " T"],
+    positions: Float[np.ndarray, "T 2"],
+    label_of: Mapping[int, int],
 ) -> MapResult | None:
     sample = log.last(ch.FINAL_MAP)
     message = log.sound(sample)
@@ -318,7 +340,8 @@ def _map_result(
         return None
     ids, means = translate.landmarks_of(message)
     covariance = translate.landmark_covariance_of(message)
-    truth, known = _truth_of(ids, true_ids, positions)
+    labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
+    truth, known = _truth_of(labels, true_ids, positions)
     return MapResult(
         rule=message.rule,
         digest=message.digest.hex(),

@@ -27,6 +27,9 @@ _KEPT = frozenset(
     for channel in (
         ch.FAULT,
         ch.TRUTH,
+        ch.TRUTH_LABELS,
+        ch.TRUTH_POSITIONS,
+        ch.ASSOCIATION,
         ch.TRAJECTORY,
         ch.OWN_POSE,
         ch.TEAM_POSE,

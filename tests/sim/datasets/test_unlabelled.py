@@ -104,6 +104,9 @@ def test_labels_are_identities_where_they_are_asked_for(steps):
 
 
 def test_the_command_lines_options_make_the_pieces(steps):
+    assert (
+        streams_of(with_options(load("recorded"), dataset=steps, robots=2)).streams[0].start is None
+    )
     scenario = with_options(load("dlr"), dataset=steps, robots=3, identities="known")
     found = streams_of(scenario)
     assert len(found.streams) == 3

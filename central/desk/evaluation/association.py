@@ -1,0 +1,289 @@
+"""How landmarks without names were told apart, scored by labels that no estimator has seen.
+
+A landmark's label is that of the majority of its *labelled* detections; what nobody has labelled
+says nothing for or against. Pairs are counted by detections: two of one label in one landmark are a
+right pair, two of one label in two landmarks a missed one, two of two labels in one a wrong one.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+
+from central.desk.evaluation.log import Collected
+from team.config import UNNAMED
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import ids, stamps
+
+Place = tuple[str, int, int, int]
+"""Robot, incarnation, sequence of the submap, number of the landmark in it."""
+UNKNOWN = int(m.NO_LABEL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """Pairwise precision and recall over labelled detections, and how many went to a wrong one."""
+
+    right: int
+    wrong: int
+    missed: int
+    wrong_detections: int
+    detections: int
+
+    @property
+    def precision(self) -> float | None:
+        """Of the pairs that were said to be one, those that are."""
+        said = self.right + self.wrong
+        return self.right / said if said else None
+
+    @property
+    def recall(self) -> float | None:
+        """Of the pairs that are one, those that were said to be."""
+        real = self.right + self.missed
+        return self.right / real if real else None
+
+    @property
+    def f1(self) -> float | None:
+        """The harmonic mean of both."""
+        total = 2 * self.right + self.wrong + self.missed
+        return 2.0 * self.right / total if total else None
+
+    @property
+    def wrong_percent(self) -> float | None:
+        """Detections whose label is not that of their landmark, of all labelled ones."""
+        return 100.0 * self.wrong_detections / self.detections if self.detections else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssociationResult:
+    """All of a run: between all its detections, inside windows, and of the map.
+
+    label_of: of each of the map's unnamed landmarks, its label; UNKNOWN where nobody knows.
+    duplicates: landmarks beyond the first of a label; confirmed: among those of two submaps or
+    more. merges_right, merges_wrong: pairs of robots that share landmarks in the map, by whether at
+    least half of those that both have labels for are one; merges_refused: attempts that wait.
+    left_out: labelled detections that are in no submap. clutter_in_map: others that are in one.
+    """
+
+    pairs: Pairs
+    inside: Pairs
+    label_of: Mapping[int, int]
+    landmarks: int
+    duplicates: int
+    duplicates_confirmed: int
+    merges_right: int
+    merges_wrong: int
+    merges_refused: int
+    left_out: int
+    clutter_in_map: int
+
+
+def association_result(log: Collected) -> AssociationResult | None:
+    """The scores of a run; None where nothing was told without an identity, or nobody labelled."""
+    labels = _labels(log)
+    if not labels:
+        return None
+    detections = list(_detections(log, labels))
+    identity = _identities(log)
+    label = np.array([each[0] for each in detections], np.int64)
+    places = [each[1] for each in detections]
+    windows = [each[2] for each in detections]
+    local = _numbered(places)
+    joined = _numbered([None if p is None else identity.get(p, p) for p in places])
+    known = label != UNKNOWN
+    label_of, submaps = _majorities(label, places, identity)
+    named = [label_of[number] for number in label_of if label_of[number] != UNKNOWN]
+    confirmed = [
+        label_of[number]
+        for number in label_of
+        if label_of[number] != UNKNOWN and len(submaps[number]) > 1
+    ]
+    final = log.sound(log.last(ch.FINAL_MAP))
+    decisions = final.decisions if isinstance(final, m.FusedMap) else ()
+    right, wrong = _merges(label, places, identity)
+    return AssociationResult(
+        pairs=_pairs(label[known], joined[known]),
+        inside=_pairs(label[known], local[known], _windows(windows)[known]),
+        label_of=label_of,
+        landmarks=len(label_of),
+        duplicates=len(named) - len(set(named)),
+        duplicates_confirmed=len(confirmed) - len(set(confirmed)),
+        merges_right=right,
+        merges_wrong=wrong,
+        merges_refused=sum(each.kind == "waits" for each in decisions),
+        left_out=int(np.count_nonzero(known & (local < 0))),
+        clutter_in_map=int(np.count_nonzero(~known & (local >= 0))),
+    )
+
+
+def association_json(result: AssociationResult) -> dict[str, object]:
+    """The scores under the names that machines read."""
+    pairs, inside = result.pairs, result.inside
+    return {
+        "precision": pairs.precision,
+        "recall": pairs.recall,
+        "f1": pairs.f1,
+        "wrong_percent": pairs.wrong_percent,
+        "windows": {
+            "precision": inside.precision,
+            "recall": inside.recall,
+            "f1": inside.f1,
+            "wrong_percent": inside.wrong_percent,
+        },
+        "landmarks": result.landmarks,
+        "duplicates": result.duplicates,
+        "duplicates_confirmed": result.duplicates_confirmed,
+        "merges_right": result.merges_right,
+        "merges_wrong": result.merges_wrong,
+        "merges_refused": result.merges_refused,
+        "labelled_detections": pairs.detections,
+        "labelled_detections_left_out": result.left_out,
+        "unlabelled_detections_in_the_map": result.clutter_in_map,
+    }
+
+
+def _robots(log: Collected, channel: ch.Channel) -> list[str]:
+    """Of whom there is something on a channel."""
+    return sorted(name for key in log.kept if (name := channel.owner(key)) is not None)
+
+
+def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
+    """By robot, stamp of the scan and row in it."""
+    found: dict[tuple[str, int, int], int] = {}
+    for robot in _robots(log, ch.TRUTH_LABELS):
+        for message in log.messages(ch.TRUTH_LABELS, robot):
+            if not isinstance(message, m.TruthLabels):
+                continue
+            counts = ids(message.counts, "counts").tolist()
+            labels = iter(ids(message.labels, "labels").tolist())
+            for stamp, count in zip(stamps(message.stamps, "stamps").tolist(), counts, strict=True):
+                for row in range(count):
+                    found[robot, stamp, row] = next(labels)
+    return found
+
+
+def _detections(
+    log: Collected, labels: Mapping[tuple[str, int, int], int]
+) -> Iterable[tuple[int, Place | None, tuple[str, int, int]]]:
+    """Of each detection its label, its place in a submap (None: in none) and its window."""
+    for robot in _robots(log, ch.ASSOCIATION):
+        seen: set[tuple[int, int]] = set()
+        for message in log.messages(ch.ASSOCIATION, robot):
+            if not isinstance(message, m.Association):
+                continue
+            window = (message.incarnation, message.sequence)
+            if window in seen:
+                continue
+            seen.add(window)
+            scans = np.repeat(stamps(message.stamps, "stamps"), ids(message.counts, "counts"))
+            rows = ids(message.rows, "rows").tolist()
+            numbers = ids(message.landmarks, "landmarks").tolist()
+            for stamp, row, number in zip(scans.tolist(), rows, numbers, strict=True):
+                label = labels.get((robot, stamp, row), UNKNOWN)
+                place = (robot, *window, number) if number >= UNNAMED else None
+                yield label, place, (robot, *window)
+
+
+def _identities(log: Collected) -> dict[Place, int]:
+    """The number in the final map of each local landmark."""
+    final = log.sound(log.last(ch.FINAL_MAP))
+    found: dict[Place, int] = {}
+    if not isinstance(final, m.FusedMap):
+        return found
+    for each in final.memberships:
+        columns = (each.sequences, each.locals, each.identities)
+        rows = zip(*(ids(column, "members").tolist() for column in columns), strict=True)
+        for sequence, local, identity in rows:
+            found[each.robot, each.incarnation, sequence, UNNAMED + local] = identity
+    return found
+
+
+def _numbered(values: Sequence[object]) -> Int64[np.ndarray, " n"]:
+    """Equal values have equal numbers from 0 on; None has −1."""
+    numbers: dict[object, int] = {}
+    return np.array(
+        [-1 if v is None else numbers.setdefault(v, len(numbers)) for v in values], np.int64
+    )
+
+
+def _windows(windows: list[tuple[str, int, int]]) -> Int64[np.ndarray, " n"]:
+    return _numbered(windows)
+
+
+def _pairs(
+    label: Int64[np.ndarray, " n"],
+    landmark: Int64[np.ndarray, " n"],
+    window: Int64[np.ndarray, " n"] | None = None,
+) -> Pairs:
+    """Of labelled detections; with windows, of the pairs inside one."""
+    window = np.zeros(len(label), np.int64) if window is None else window
+    used = landmark >= 0
+    real = _choose_two(np.column_stack((window, label)))
+    said = _choose_two(landmark[used][:, None])
+    right = _choose_two(np.column_stack((window, label, landmark))[used])
+    members, counts = np.unique(
+        np.column_stack((landmark, label))[used], axis=0, return_counts=True
+    )
+    most: dict[int, int] = {}
+    for (of, _), count in zip(members.tolist(), counts.tolist(), strict=True):
+        most[of] = max(most.get(of, 0), count)
+    return Pairs(
+        right=right,
+        wrong=said - right,
+        missed=real - right,
+        wrong_detections=int(used.sum()) - sum(most.values()),
+        detections=len(label),
+    )
+
+
+def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
+    """How many pairs of equal rows there are."""
+    if not len(rows):
+        return 0
+    _, counts = np.unique(rows, axis=0, return_counts=True)
+    return int((counts * (counts - 1) // 2).sum())
+
+
+def _majorities(
+    label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
+) -> tuple[dict[int, int], dict[int, set[Place]]]:
+    """The label of each of the map's landmarks, and the submaps that it is in."""
+    votes: dict[int, dict[int, int]] = {}
+    submaps: dict[int, set[Place]] = {}
+    for own, place in zip(label.tolist(), places, strict=True):
+        number = None if place is None else identity.get(place)
+        if place is None or number is None:
+            continue
+        of = votes.setdefault(number, {})
+        submaps.setdefault(number, set()).add((*place[:3], 0))
+        if own != UNKNOWN:
+            of[own] = of.get(own, 0) + 1
+    chosen = {
+        number: max(sorted(of), key=of.__getitem__) if of else UNKNOWN
+        for number, of in votes.items()
+    }
+    return chosen, submaps
+
+
+def _merges(
+    label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
+) -> tuple[int, int]:
+    """Pairs of robots that share landmarks, rightly and wrongly."""
+    votes: dict[int, dict[str, dict[int, int]]] = {}
+    for own, place in zip(label.tolist(), places, strict=True):
+        number = None if place is None else identity.get(place)
+        if place is None or number is None or own == UNKNOWN:
+            continue
+        of = votes.setdefault(number, {}).setdefault(place[0], {})
+        of[own] = of.get(own, 0) + 1
+    agreed: dict[tuple[str, str], list[bool]] = {}
+    for by_robot in votes.values():
+        best = {robot: max(sorted(of), key=of.__getitem__) for robot, of in by_robot.items()}
+        robots = sorted(best)
+        for i, a in enumerate(robots):
+            for b in robots[i + 1 :]:
+                agreed.setdefault((a, b), []).append(best[a] == best[b])
+    right = sum(2 * sum(each) >= len(each) for each in agreed.values())
+    return right, len(agreed) - right

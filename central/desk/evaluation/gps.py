@@ -1,0 +1,89 @@
+"""A path against the positions of another sensor, such as a GPS, whose frame and clock differ."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from central.desk.evaluation.errors import Path
+from central.desk.evaluation.log import Collected
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats, stamps
+
+LEAST = 10
+"""Positions that a comparison needs."""
+GAP_NS = 1_500_000_000
+"""Between two fixes that are farther apart nothing is interpolated."""
+SHIFTS_S = np.arange(-1.0, 1.01, 0.25)
+ROUNDS = 20
+NEAREST_M = 0.1
+"""A distance that is smaller counts as this where weights are taken from distances."""
+
+Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
+
+
+def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
+    """The median distance [m] of the smoothed poses from the other sensor's positions.
+
+    One rigid motion, lever arm and time shift are fitted for the team, by least absolute distances
+    (weights 1/d again and again), since fixes may be wrong by metres. None without such positions.
+    """
+    fixes = {robot: found for robot in paths if (found := _fixes(log, robot)) is not None}
+    if not fixes:
+        return None
+    medians = [_median(fixes, paths, float(shift)) for shift in SHIFTS_S]
+    return min((each for each in medians if each is not None), default=None)
+
+
+def _fixes(log: Collected, robot: str) -> Fixes | None:
+    for message in log.messages(ch.TRUTH_POSITIONS, robot):
+        if isinstance(message, m.TruthPositions):
+            places = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
+            at_ns = stamps(message.stamps, "stamps").astype(np.int64)
+            return (at_ns, places) if len(at_ns) > 1 else None
+    return None
+
+
+def _median(fixes: Mapping[str, Fixes], paths: Mapping[str, Path], shift_s: float) -> float | None:
+    poses, there = [], []
+    for robot, (at_ns, places) in fixes.items():
+        path = paths[robot]
+        wanted = path.stamps_ns + round(shift_s * 1e9)
+        after = np.searchsorted(at_ns, wanted)
+        inside = (after > 0) & (after < len(at_ns))
+        after = np.clip(after, 1, len(at_ns) - 1)
+        inside &= at_ns[after] - at_ns[after - 1] <= GAP_NS
+        columns = [np.interp(wanted[inside], at_ns, places[:, i]) for i in range(2)]
+        there.append(np.column_stack(columns))
+        poses.append(path.poses[inside])
+    if sum(map(len, poses)) < LEAST:
+        return None
+    return float(np.median(distances(np.concatenate(poses), np.concatenate(there))))
+
+
+def distances(
+    poses: Float[np.ndarray, "n 3"], there: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, " n"]:
+    """‖there − (A (t + R(θ) lever) + b)‖ after the rigid motion (A, b) and the lever that fit best.
+
+    With A = [[u, −v], [v, u]] the model is linear in (u, v, b, A lever); Gauss-Newton is not needed
+    beyond u² + v² = 1, which is put right after each solution.
+    """
+    n = len(poses)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    one, none = np.ones(n), np.zeros(n)
+    J = np.zeros((n, 2, 6))
+    J[:, 0] = np.column_stack((poses[:, 0], -poses[:, 1], one, none, c, -s))
+    J[:, 1] = np.column_stack((poses[:, 1], poses[:, 0], none, one, s, c))
+    weights, found = np.ones(n), np.zeros(n)
+    for _ in range(ROUNDS):
+        root = np.sqrt(weights)[:, None]
+        A = (J * root[:, :, None]).reshape(2 * n, 6)
+        solved = np.linalg.lstsq(A, (there * root).ravel(), rcond=None)[0]
+        turn = solved[:2] / max(float(np.hypot(*solved[:2])), 1e-9)
+        rest = there - J[:, :, :2] @ turn
+        solved = np.linalg.lstsq(A[:, 2:], (rest * root).ravel(), rcond=None)[0]
+        found = np.hypot(*(rest - J[:, :, 2:] @ solved).T)
+        weights = 1.0 / np.maximum(found, NEAREST_M)
+    return found

@@ -1,0 +1,142 @@
+"""Scores of association against labels, and a path against a GPS: by runs made up by hand."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from central.desk.evaluation.association import association_json, association_result
+from central.desk.evaluation.gps import distances
+from central.desk.evaluation.log import collected
+from team.config import UNNAMED
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import Outgoing, Sample
+from team.wire.codec import encoded
+
+NONE = m.NO_LABEL
+TEN, UNKNOWN = 10**9, m.UNCONFIRMED
+
+
+def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
+    return Sample(Outgoing(channel, name, message).key, encoded(message), message.stamp_ns, 1, 0)
+
+
+def truth(robot: str, labels: list[int]) -> Sample:
+    """One scan of each second; its only detection has this label."""
+    n = len(labels)
+    stamps = from_stamps(np.arange(n) * TEN)
+    message = m.TruthLabels(
+        stamp_ns=0, robot=robot, stamps=stamps, counts=from_ids([1] * n), labels=from_ids(labels)
+    )
+    return sample(ch.TRUTH_LABELS, robot, message)
+
+
+def window(robot: str, sequence: int, first: int, landmarks: list[int]) -> Sample:
+    n = len(landmarks)
+    numbers = [UNNAMED + x if x >= 0 else UNKNOWN for x in landmarks]
+    message = m.Association(
+        stamp_ns=(first + n) * TEN,
+        robot=robot,
+        incarnation=1,
+        sequence=sequence,
+        stamps=from_stamps((first + np.arange(n)) * TEN),
+        counts=from_ids([1] * n),
+        rows=from_ids([0] * n),
+        landmarks=from_ids(numbers),
+    )
+    return sample(ch.ASSOCIATION, robot, message)
+
+
+def final(table: dict[str, list[tuple[int, int, int]]]) -> Sample:
+    """By robot: (sequence, local, identity less 2³¹)."""
+    memberships = tuple(
+        m.Membership(
+            robot=robot,
+            incarnation=1,
+            sequences=from_ids([row[0] for row in rows]),
+            locals=from_ids([row[1] for row in rows]),
+            identities=from_ids([UNNAMED + row[2] for row in rows]),
+            steps=bytes(len(rows)),
+            figures=from_floats(np.zeros(3 * len(rows))),
+        )
+        for robot, rows in table.items()
+    )
+    message = m.FusedMap(
+        stamp_ns=0, rule="join", digest=bytes(8), frame="r1/1", final=True, provisional=False,
+        exchange=0, members=(), missing=(), joint=False, ids=b"", means=b"", covariance=b"",
+        chi2=0.0, dof=0, memberships=memberships,
+    )  # fmt: skip
+    return sample(ch.FINAL_MAP, "", message)
+
+
+def scores(samples: list[Sample]) -> dict[str, Any]:
+    result = association_result(collected(samples))
+    assert result is not None
+    return association_json(result)
+
+
+def test_a_run_without_an_error_is_scored_as_one() -> None:
+    found = scores(
+        [
+            truth("r1", [7, 7, 8, 7, 8, NONE]),
+            window("r1", 0, 0, [0, 0, 1]),
+            window("r1", 1, 3, [0, 1, 1]),
+            final({"r1": [(0, 0, 5), (0, 1, 6), (1, 0, 5), (1, 1, 6)]}),
+        ]
+    )
+    assert (found["precision"], found["recall"], found["f1"]) == (1.0, 1.0, 1.0)
+    assert (found["wrong_percent"], found["duplicates"], found["landmarks"]) == (0.0, 0, 2)
+    assert found["unlabelled_detections_in_the_map"] == 1
+
+
+def test_duplicates_wrong_members_and_what_is_left_out_are_counted() -> None:
+    found = scores(
+        [
+            truth("r1", [7, 7, 8, 7, 7, 7]),
+            window("r1", 0, 0, [0, 0, 0]),
+            window("r1", 1, 3, [0, 0, -1]),
+            final({"r1": [(0, 0, 5), (1, 0, 6)]}),
+        ]
+    )
+    assert found["duplicates"] == 1
+    assert found["duplicates_confirmed"] == 0
+    assert found["labelled_detections_left_out"] == 1
+    assert found["wrong_percent"] == pytest.approx(100.0 / 6.0)
+    assert found["precision"] == pytest.approx(2.0 / 4.0)  # of 3 + 1 pairs 1 + 1 are right
+    assert found["recall"] == pytest.approx(2.0 / 10.0)  # of the pairs of five sevens
+    assert found["windows"]["recall"] == pytest.approx(2.0 / 4.0)
+
+
+@pytest.mark.parametrize(("label", "right", "wrong"), [(7, 1, 0), (9, 0, 1)])
+def test_a_merge_of_robots_is_judged_by_the_landmarks_that_they_share(
+    label: int, right: int, wrong: int
+) -> None:
+    found = scores(
+        [
+            truth("r1", [7, 7]),
+            truth("r2", [label, label]),
+            window("r1", 0, 0, [0, 0]),
+            window("r2", 0, 0, [0, 0]),
+            final({"r1": [(0, 0, 5)], "r2": [(0, 0, 5)]}),
+        ]
+    )
+    assert (found["merges_right"], found["merges_wrong"]) == (right, wrong)
+
+
+def test_a_run_without_labels_has_no_scores() -> None:
+    assert association_result(collected([window("r1", 0, 0, [0])])) is None
+
+
+def test_a_path_fits_a_gps_of_another_frame_with_a_lever_and_some_fixes_that_are_wrong() -> None:
+    rng = np.random.default_rng(0)
+    headings = np.cumsum(rng.normal(size=200) * 0.2)
+    steps = np.column_stack((np.cos(headings), np.sin(headings)))
+    poses = np.column_stack((np.cumsum(steps, axis=0), headings))
+    c, s = np.cos(headings), np.sin(headings)
+    antenna = poses[:, :2] + np.column_stack((3.0 * c - 0.5 * s, 3.0 * s + 0.5 * c))
+    turned = antenna @ np.array([[0.6, 0.8], [-0.8, 0.6]]) + [5.0, -7.0]
+    turned[::10] += rng.normal(size=(20, 2)) * 20.0
+    assert np.median(distances(poses, turned)) < 1e-2
+    assert np.median(distances(1.1 * poses, turned)) > 0.1, "no scale is fitted"
