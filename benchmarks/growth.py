@@ -1,7 +1,6 @@
 """How the centre's cost grows with the length of a run: time, memory and bytes per broadcast.
 
-    python benchmarks/growth.py [--robots 5] [--landmarks 50] [--at 250,500,1000,2500]
-                                [--tolerance X] [--json FILE] [--picture FILE.svg]
+    python benchmarks/growth.py [--robots 5] [--landmarks 50] [--at 250,500,1000,2500] [--json FILE]
 
 Synthetic submaps, drawn about a known truth, go through the rule `join` without a network: all
 robots end a window in each tick, then comes a broadcast. At each size: CPU per tick with its
