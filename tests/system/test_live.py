@@ -51,7 +51,7 @@ async def test_robots_join_live_and_deaths_and_cuts_change_no_bit_of_the_map(
         *("launch", "lab.toml", "--listen", "tcp/127.0.0.2:0", "--output", "run"),
         *("--no-report", "--no-views", "--json", "result.json"),
     )
-    endpoint = await endpoint_of(team.folder / "run")
+    endpoint = await endpoint_of(team.folder / "run", "robot-r2")
     with Link(endpoint) as link:
 
         async def driver(robot: str, life: int):
