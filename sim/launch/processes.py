@@ -122,7 +122,7 @@ class Starter:
         said: Path,
         compiled: Callable[[int, int], None] = lambda done, of: None,
     ) -> None:
-        self._compiled = compiled
+        self._compiled, self._done = compiled, 0
         self._environment = _environment(os.environ, since_ns)
         self._template: Process | None = None
         self._asks: socket.socket | None = None
@@ -164,8 +164,9 @@ class Starter:
             match answer.decode().split():
                 case ["started", pid]:
                     return int(pid)
-                case ["compiled", done, of]:
-                    self._compiled(int(done), int(of))
+                case ["compiled", of]:
+                    self._done += 1
+                    self._compiled(self._done, max(self._done, int(of)))
         raise ConnectionResetError("the template has ended")
 
     def _start_template(self, warm: tuple[str, str], said: Path) -> None:

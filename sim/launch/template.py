@@ -17,6 +17,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -27,7 +28,7 @@ LARGEST_REQUEST = 65_536
 LIGHT = ("team.keys.roster", "team.shell", "team.wire.zenoh_bus")
 """What the router needs: it is forked before anything else is imported."""
 HEAVY = (
-    "central.desk.view.node",
+    "central.desk.view.viewer",
     "central.main",
     "sim.in_memory.team",
     "sim.publisher.main",
@@ -66,17 +67,30 @@ def become_a_process(prepare: Callable[[], object]) -> None:
             return
     for module in HEAVY:
         importlib.import_module(module)
-    from sim.launch.warm_up import run_small_team
-    from team.estimation.compiling import compilations
-
-    with compilations(lambda done, of: asked.sendall(f"compiled {done} {of}".encode())):
-        run_small_team(estimator, rule)
+    _load_kernels(estimator, rule, asked)
     # What lives now stays where it is: the collector of a forked process does not touch it.
     gc.collect()
     gc.freeze()
     while True:
         if _serve(asked, launch):
             return
+
+
+def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
+    """Load all kernels; if that was never done, two processes compile them and tell how far."""
+    from sim.launch import warm_up
+    from team.estimation.compiling import compilations
+
+    with compilations(lambda done, of: asked.sendall(f"compiled {of}".encode())):
+        if (estimator, rule) == ("hybrid", "join") and not warm_up.is_warm(estimator, rule):
+            if (centre := os.fork()) == 0:
+                with suppress(Exception):  # then this process compiles what is lacking
+                    warm_up.fold_made_up_submaps()
+                os._exit(0)
+            warm_up.run_to_the_first_submap(estimator, rule)
+            os.waitpid(centre, 0)
+        warm_up.run_small_team(estimator, rule)
+    warm_up.note_warm(estimator, rule)
 
 
 def end_by(run: Callable[[], None]) -> NoReturn:

@@ -2,6 +2,7 @@
 
 import hashlib
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,11 +16,20 @@ import team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld
+from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.geometry import inverse, logarithm, wrapped
+from team.estimation.map_joining.gauss_newton import JoinSettings
+from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, converged, folded, started
+from team.estimation.map_joining.marginals import joint_cost, landmark_blocks, landmark_map
+from team.estimation.submap import LocalMap
+from team.wire.bus import Sample
+from team.wire.channels import SUBMAP, channel_of
 
 _VERSIONS = (sys.version, numba.__version__, binding.get_host_cpu_name())
 _STEPS = 48
 """So many seconds that robots take maps with submaps of theirs that are not in them."""
+PLACES = np.array([[10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0], [10.0, 20.0]])
+"""Landmarks that nobody saw [m]."""
 
 
 def warm_up(estimator: str, fusion: str) -> None:
@@ -27,14 +37,30 @@ def warm_up(estimator: str, fusion: str) -> None:
 
     They move by different models, and the centre's loss is robust: kernels of both kinds are ready.
     """
-    cached = getattr(wrapped, "stats", None)
-    if cached is None:
-        return  # with NUMBA_DISABLE_JIT nothing is compiled
-    done = Path(cached.cache_path) / f"ready-{_program(estimator, fusion)}"
-    if not done.exists():
+    if not is_warm(estimator, fusion):
         run_small_team(estimator, fusion)
-        with suppress(OSError):  # then the next launch does it again
-            done.touch()
+        note_warm(estimator, fusion)
+
+
+def is_warm(estimator: str, fusion: str) -> bool:
+    """Whether the kernels of the two have been compiled by this program."""
+    stamp = _stamp(estimator, fusion)
+    return stamp is None or stamp.exists()
+
+
+def note_warm(estimator: str, fusion: str) -> None:
+    """Say so beside the kernels."""
+    stamp = _stamp(estimator, fusion)
+    with suppress(OSError):  # then the next launch does it again
+        if stamp is not None:
+            stamp.touch()
+
+
+def _stamp(estimator: str, fusion: str) -> Path | None:
+    cached = getattr(wrapped, "stats", None)  # with NUMBA_DISABLE_JIT nothing is compiled
+    return (
+        None if cached is None else Path(cached.cache_path) / f"ready-{_program(estimator, fusion)}"
+    )
 
 
 def _program(estimator: str, fusion: str) -> str:
@@ -54,6 +80,39 @@ def run_small_team(estimator: str, fusion: str) -> None:
 
     They move by different models, and the centre's loss is robust: kernels of both kinds are ready.
     """
+    for _ in _small_team(estimator, fusion):
+        pass
+    logarithm(inverse(np.zeros(3)))  # the centre asks this of robots without an initial pose
+
+
+def run_to_the_first_submap(estimator: str, fusion: str) -> None:
+    """The same until the centre has something to do: most kernels of the robots."""
+    for sample in _small_team(estimator, fusion):
+        if channel_of(sample.key) == (SUBMAP, "r1"):
+            return
+
+
+def fold_made_up_submaps() -> Fold:
+    """Six submaps of two robots that nobody drove, folded: the kernels of the centre alone."""
+    ids = np.arange(5, dtype=np.uint32)
+    fold = EMPTY_FOLD
+    for robot in ("r1", "r2"):
+        fold = started(fold, InitialPoseFactor(robot, 1, np.zeros(3)))
+    settings = JoinSettings(robust_c=2.0)
+    for k in range(3):
+        mean = np.concatenate([[1.0, 0.0, 0.0], (PLACES - [k, 0.0]).ravel()])
+        local = LocalMap(ids, mean, np.diag(np.full(len(mean), 0.01)))
+        end_ns = (k + 1) * 10**9
+        taken = [Contribution(robot, 1, k, end_ns, local) for robot in ("r1", "r2")]
+        fold = folded(fold, taken, settings)
+    fold = converged(fold, settings)
+    landmark_map(fold)
+    landmark_blocks(fold)
+    joint_cost(fold)
+    return fold
+
+
+def _small_team(estimator: str, fusion: str) -> Iterator[Sample]:
     from sim.in_memory.team import run_team
 
     scenario = with_options(load("thesis"), estimator=estimator, fusion=fusion)
@@ -67,6 +126,4 @@ def run_small_team(estimator: str, fusion: str) -> None:
         robots=(msgspec.structs.replace(first, motion=motion), *others),
         central=msgspec.structs.replace(scenario.central, robust_c=2.0),
     )
-    for _ in run_team(small, streams_of(small)):
-        pass
-    logarithm(inverse(np.zeros(3)))  # the centre asks this of robots without an initial pose
+    yield from run_team(small, streams_of(small))

@@ -6,6 +6,12 @@ import pytest
 
 from sim.launch import warm_up
 from team.estimation.geometry import wrapped
+from team.estimation.map_joining.marginals import landmark_map
+
+
+def test_the_submaps_that_are_made_up_to_compile_the_centre_make_a_map() -> None:
+    fold = warm_up.fold_made_up_submaps()
+    assert landmark_map(fold).means == pytest.approx(warm_up.PLACES, abs=1e-6)
 
 
 def stamps() -> set[Path]:

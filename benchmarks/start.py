@@ -1,0 +1,111 @@
+"""What the processes of a launch cost: forked from the warm template, and each from scratch.
+
+    python benchmarks/start.py [--scenario waypoints] [--robots N] [--json FILE]
+
+The same team is launched twice, without views. first_s: from the start of the template to the first
+measurement on the bus. cpu_s, pss_mb, peak_rss_mb: of the processes, the launch's own JSON. Only
+ratios of the two launches and the first measurement in units of a bare start of Python with NumPy
+are held against benchmarks/start.json: the machine is in both of their halves.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from sim.launch.launch import launch
+from sim.launch.plan import Plan
+from sim.launch.processes import Starter
+from sim.scenarios.scenario import Scenario, load, with_options
+from team.recording.reader import open_log
+from team.wire.channels import SENSORS
+
+BASELINE = Path(__file__).with_suffix(".json")
+
+
+def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> dict[str, Any]:
+    """What one launch took."""
+    folder.mkdir()
+    plan = Plan(
+        scenario=scenario,
+        folder=folder,
+        log=folder / "log.mcap",
+        speed=float("inf"),
+        listen="tcp/127.0.0.1:0",
+        views=False,
+    )
+    began_ns = time.time_ns()
+    with Starter(began_ns, warm, folder / "template.log") as starter:
+        outcome = launch(plan, starter, lambda watch: None)
+    assert outcome.failures == [], outcome.failures
+    first = min(sample.wall_ns for sample in open_log(plan.log).samples(SENSORS))
+    robots = [used for name, used in outcome.used.items() if name.startswith("robot-")]
+    return {
+        "first_s": 1e-9 * (first - began_ns),
+        "cpu_s": sum(used.cpu_s for used in outcome.used.values()),
+        "robot_cpu_s": mean(used.cpu_s for used in robots),
+        "robot_pss_mb": mean(used.pss_mb or 0.0 for used in robots),
+        "peak_rss_mb": {name: used.peak_rss_mb for name, used in outcome.used.items()},
+    }
+
+
+def bare_s() -> float:
+    """The least wall time of three starts of Python with NumPy."""
+    took = []
+    for _ in range(3):
+        began = time.monotonic()
+        subprocess.run([sys.executable, "-c", "import numpy"], check=True)
+        took.append(time.monotonic() - began)
+    return min(took)
+
+
+def measured(scenario: Scenario) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        pair = (scenario.estimator, scenario.fusion)
+        launched(scenario, Path(folder) / "first", pair)  # compiles what is not compiled
+        forked = launched(scenario, Path(folder) / "forked", pair)
+        scratch = launched(scenario, Path(folder) / "scratch", None)
+        bare = bare_s()
+    return {
+        "robots": len(scenario.robots),
+        "forked": forked,
+        "scratch": scratch,
+        "first_in_bare_starts": forked["first_s"] / bare,
+        "cpu_ratio": forked["cpu_s"] / scratch["cpu_s"],
+        "robot_cpu_ratio": forked["robot_cpu_s"] / scratch["robot_cpu_s"],
+        "robot_pss_ratio": forked["robot_pss_mb"] / scratch["robot_pss_mb"],
+    }
+
+
+def worse(figures: dict[str, Any]) -> list[str]:
+    """What is worse than the baseline allows, in words."""
+    found = []
+    for name, of in json.loads(BASELINE.read_text())["figures"].items():
+        bound = of["value"] * (1.0 + of["tolerance"])
+        if figures[name] > bound:
+            found.append(f"{name} is {figures[name]:.4g}, it was {of['value']:.4g}")
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--scenario", default="waypoints")
+    parser.add_argument("--robots", type=int)
+    parser.add_argument("--json", type=Path)
+    told = parser.parse_args()
+    figures = measured(with_options(load(told.scenario), robots=told.robots))
+    print(json.dumps(figures, indent=1))
+    if told.json:
+        told.json.write_text(json.dumps(figures, indent=1) + "\n")
+    problems = worse(figures) if BASELINE.exists() else []
+    print("\n".join(problems) or "nothing worse", file=sys.stderr)
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
