@@ -34,6 +34,7 @@ def test_the_built_in_scenarios_are_the_documented_ones() -> None:
         "random-10",
         "random-3",
         "random-5",
+        "random-50",
         "recorded",
         "thesis",
         "thesis-b",
