@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable
 from hashlib import blake2b
 from typing import cast
 
-from sim.world.radio import Radio, Reach
+from sim.world.config import Radio
+from sim.world.radio import Reach
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Answer, Bus, Outgoing, Sample

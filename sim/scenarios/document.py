@@ -6,7 +6,7 @@ name, team, seed, estimator, fusion, exchange, peers, centre
 [defaults]   fields of every robot (team.config.RobotConfig)
 [[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS
              world: its five; in a world of a folder: those that it has
-[radio]      fields of sim.world.radio.Radio: who reaches whom where there is no centre
+[radio]      fields of sim.world.config.Radio: who reaches whom where there is no centre
 [central]    fields of central.config.CentralConfig
 """
 

@@ -25,12 +25,12 @@ from sim.scenarios.document import (
 from sim.world.config import (
     FolderWorld,
     LiveWorld,
+    Radio,
     SimulatedWorld,
     UnlabelledWorld,
     UtiasWorld,
     World,
 )
-from sim.world.radio import Radio
 from team.config import Estimator, Exchange, FusionRule, RobotConfig
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from team.registry import absence

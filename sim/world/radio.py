@@ -3,47 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Annotated
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-from msgspec import Meta
 
+from sim.world.config import Radio
 from sim.world.streams import RobotStream
-from team.config import NonNegative, Positive
 
 PERIOD_NS = 1_000_000_000
 """Who is in reach is looked at so often [ns of team time]."""
-
-
-class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """These robots reach each other from from_s until to_s of team time since the beginning."""
-
-    robots: tuple[str, ...]
-    from_s: NonNegative
-    to_s: Positive
-
-
-class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What robots without a centre reach each other by; the default is everyone, at once.
-
-    comm_range_m: by true distance; absent: any. windows: if there are any, only then, and within
-    the range. loss: the share of messages that never arrive. delay_s: until one does. bytes_per_s:
-    what each link carries; absent: anything. Once a robot's stream has ended it reaches everyone
-    whose stream has ended, too: robots are collected, and what is not known yet spreads.
-    """
-
-    comm_range_m: Positive | None = None
-    windows: tuple[RadioWindow, ...] = ()
-    loss: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
-    delay_s: NonNegative = 0.0
-    bytes_per_s: Positive | None = None
-
-    @property
-    def is_perfect(self) -> bool:
-        """Whether everyone reaches everyone at once."""
-        return self == Radio()
 
 
 @dataclass(frozen=True)

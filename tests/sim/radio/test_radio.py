@@ -4,7 +4,8 @@ import msgspec
 import numpy as np
 
 from sim.radio.bus import behind_radio, plan_of, reach_in
-from sim.world.radio import Radio, RadioWindow, reach_of
+from sim.world.config import Radio, RadioWindow
+from sim.world.radio import reach_of
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats
