@@ -4,7 +4,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from team.estimation.map_joining.association.profile import AssociationProfile
+from team.association import AssociationProfile
 
 from central.config import CentralConfig
 from central.join_rule import JoinRule

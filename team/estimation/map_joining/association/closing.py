@@ -17,13 +17,15 @@ from team.estimation.map_joining.association.voting import Points, Vote, moved, 
 
 BEND = 8.0
 """So many radii of one object may two maps be bent against each other within a patch."""
+LARGE = 3
+"""So many times the pairs that are needed are a pattern that tells its place by itself."""
 WIDE = 3.0
 """So many spacings around a closure's places does an audit look."""
 WEAK = 2
 """An alignment with so many times fewer votes than the best one has pairs is no rival of it."""
-TRIED = 6
+TRIED = 24
 """So many alignments are grown, those with the most matched points."""
-SEEDS = 3
+SEEDS = 1
 """So many pairs of seeds are tried for each."""
 NO_PAIRS: tuple[Pair, ...] = ()
 
@@ -152,14 +154,14 @@ def failed(closure: Closure, outside: int, profile: AssociationProfile, tests: T
         )
     if closure.share < profile.share:
         return f"share {closure.share:.2f} < {profile.share:g} of what lies there is matched"
-    if outside < tests.context * pairs:
+    if pairs < LARGE * tests.pairs and outside < tests.context * pairs:
         return f"context {outside} < {tests.context * pairs:.0f} landmarks: nothing to tell it from"
     return ""
 
 
 def tolerance(profile: AssociationProfile) -> float:
     """How far matched points may lie apart in a proposal [m]."""
-    return 0.6 * profile.same
+    return 0.4 * profile.same
 
 
 def reach(profile: AssociationProfile) -> float:
@@ -256,11 +258,11 @@ def matched_share(
 ) -> float:
     """Pairs / the fewer of the points of the two sides near the matched places.
 
-    Near: not farther from one than twice the median distance between neighbouring places.
+    Near: not farther from one than the median distance between neighbouring places.
     """
     if len(places) < 2:
         return 0.0
-    radius = spacing(places, profile)
+    radius = 0.5 * spacing(places, profile)
     counts = [int((_distance(side, places) <= radius).sum()) for side in (one, two)]
     return pairs / max(min(counts), 1)
 
