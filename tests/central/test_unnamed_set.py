@@ -4,12 +4,12 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from team.association import AssociationProfile
 
 from central.config import CentralConfig
 from central.join_rule import JoinRule
 from central.rule import Inputs
 from team import translate
+from team.association import AssociationProfile
 from team.wire import messages as m
 from team.wire.codec import encoded
 from tests.estimation.map_joining.association.unnamed_worlds import circle, drive

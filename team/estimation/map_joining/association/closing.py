@@ -17,8 +17,6 @@ from team.estimation.map_joining.association.voting import Points, Vote, moved, 
 
 BEND = 8.0
 """So many radii of one object may two maps be bent against each other within a patch."""
-LARGE = 3
-"""So many times the pairs that are needed are a pattern that tells its place by itself."""
 WIDE = 3.0
 """So many spacings around a closure's places does an audit look."""
 WEAK = 2
@@ -154,7 +152,7 @@ def failed(closure: Closure, outside: int, profile: AssociationProfile, tests: T
         )
     if closure.share < profile.share:
         return f"share {closure.share:.2f} < {profile.share:g} of what lies there is matched"
-    if pairs < LARGE * tests.pairs and outside < tests.context * pairs:
+    if outside < tests.context * pairs:
         return f"context {outside} < {tests.context * pairs:.0f} landmarks: nothing to tell it from"
     return ""
 
