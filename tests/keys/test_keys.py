@@ -138,7 +138,7 @@ def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors() ->
     for channel in ch.CHANNELS:
         name = "robot/r1" if "{node}" in channel.template else "r1"
         found = owners(channel.key(name))
-        sensors = channel in ch.SENSORS or channel is ch.MEASUREMENTS
+        sensors = channel in (*ch.SENSORS, ch.MEASUREMENTS, ch.HEAD)
         assert len(found) == (2 if sensors else 1), (channel.template, found)
     assert owners(ch.ODOMETRY.key("r1")) == ["world", "source-r1"]
     assert owners(ch.ORDER.key("r1")) == ["operator"]
