@@ -33,7 +33,8 @@ def batch_reference(
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
     from sim.recorded.data_set import log_or_run
     from sim.studies.batch_reference.g2o import g2o_lines
-    from sim.studies.batch_reference.reference import LimitError, batch_map
+    from sim.studies.batch_reference.measurements import LimitError
+    from sim.studies.batch_reference.reference import batch_map
 
     if g2o is not None:
         try:

@@ -8,8 +8,9 @@ from central.desk.verification.verification import verify
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import streams_of
+from sim.studies.batch_reference.measurements import LimitError, Scan, chains_of
 from team import translate
-from team.config import MotionModel, MotionNoise
+from team.config import MotionModel, MotionNoise, Sensor
 from team.rejection import Rejection
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -75,6 +76,16 @@ def test_a_team_of_mounted_sensors_that_claim_is_mapped(estimator: str, fusion: 
 def test_what_they_said_is_computed_again_to_the_last_bit(tmp_path) -> None:
     of = scenario()
     assert verify(written(tmp_path / "log.mcap", run(of))).first is None
+
+
+def test_the_batch_reference_takes_claims_and_refuses_a_mount_by_name() -> None:
+    seen = np.array([7], np.uint32), np.ones(1), np.zeros(1)
+    claimed = Scan(*seen, np.array([[0.1, 0.02, 0.3, 0.0]]))
+    np.testing.assert_array_equal(claimed.noise(0, Sensor(), 1.0), [[0.1, 0.02], [0.02, 0.3]])
+    plain = Scan(*seen)
+    np.testing.assert_allclose(plain.noise(0, Sensor(), 1.0), np.diag([0.01, 4e-4]))
+    with pytest.raises(LimitError, match=r"r1, r2: sensor.mount .* --fusion batch"):
+        chains_of([], scenario())
 
 
 def test_an_estimator_that_takes_no_claims_says_so() -> None:

@@ -15,12 +15,12 @@ from jaxtyping import Float
 
 from central.desk.evaluation.evaluation import evaluate
 from sim.studies.batch_reference.graph import landmark_starts
-from sim.studies.batch_reference.measurements import Chain, anchored, chains_of
-from sim.studies.batch_reference.reference import LimitError, placed
+from sim.studies.batch_reference.measurements import Chain, LimitError, anchored, chains_of
+from sim.studies.batch_reference.reference import placed
 from team.estimation.baselines.batch import FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Point
-from team.estimation.models import noise, predicted
+from team.estimation.models import predicted
 from team.wire.bus import Sample
 
 Poses = Float[np.ndarray, "K 3"]
@@ -68,11 +68,12 @@ def _measurements(
     vertex: dict[int, int],
 ) -> Iterator[str]:
     for k, scan in enumerate(chain.scans, 1):
-        for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+        seen = zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True)
+        for i, (landmark, r, b) in enumerate(seen):
             distance, _ = predicted(path[k], landmarks[landmark])
             c, s = np.cos(b), np.sin(b)
             J = np.array([[c, -r * s], [s, r * c]])
-            R = np.diag(noise(chain.config.sensor, distance))
+            R = scan.noise(i, chain.config.sensor, distance)
             information = np.linalg.inv(J @ R @ J.T)
             point = _numbers((r * c, r * s))
             yield f"EDGE_SE2_XY {first + k} {vertex[landmark]} {point} {_upper(information)}"

@@ -14,7 +14,7 @@ from sim.studies.batch_reference.measurements import Chain
 from team.estimation.baselines.batch import EXACT_SIGMA, FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Point, Pose, tangent
-from team.estimation.models import located, noise, predicted
+from team.estimation.models import located, predicted
 
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32
@@ -54,10 +54,15 @@ def factor_graph(
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
         first = pose_key(c, 0)
         for i, scan in enumerate(chain.scans, 1):
-            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+            seen = zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True)
+            for k, (landmark, r, b) in enumerate(seen):
                 distance, _ = predicted(path[i], landmarks[landmark])
-                range_var, bearing_var = noise(chain.config.sensor, distance)
-                model = gtsam.noiseModel.Diagonal.Variances(np.array([bearing_var, range_var]))
+                R = scan.noise(k, chain.config.sensor, distance)[::-1, ::-1]
+                model = (
+                    gtsam.noiseModel.Gaussian.Covariance(R)
+                    if scan.own.size
+                    else gtsam.noiseModel.Diagonal.Variances(np.diag(R))
+                )
                 model = under_loss(gtsam, model, robust_c)
                 graph.push_back(
                     gtsam.BearingRangeFactor2D(first + i, landmark, gtsam.Rot2(b), r, model)

@@ -11,12 +11,13 @@ from msgspec import structs
 from central.desk.evaluation.errors import Path, on_circle
 from central.team_config import TeamConfig
 from team import translate
-from team.config import RobotConfig
+from team.config import RobotConfig, Sensor
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Pose, between, compose
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
-from team.estimation.models import Increment
+from team.estimation.models import Increment, noise
+from team.estimation.scans import Own, unclaimed
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -29,12 +30,30 @@ _ENDLESS_S = 1e9
 """The batch has one window."""
 
 
+class LimitError(RuntimeError):
+    """The limit can not be computed: what is missing and what to do."""
+
+
 class Scan(NamedTuple):
-    """What is seen from one pose: accepted and calibrated ranges [m] and bearings [rad]."""
+    """What is seen from one pose: accepted and calibrated ranges [m] and bearings [rad].
+
+    own: the noises that they claim (`team.estimation.scans`).
+    """
 
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
+    own: Own = unclaimed(0)
+
+    def noise(self, k: int, sensor: Sensor, distance: float) -> Matrix:
+        """The covariance of (range, bearing) of measurement k at this predicted range.
+
+        A point's is that of its range and bearing to first order, at what was measured.
+        """
+        if not self.own.size:
+            return np.diag(noise(sensor, distance))
+        rr, rb, bb = self.own[k, :3]
+        return np.array([[rr, rb], [rb, bb]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +90,7 @@ def chains_of(
     once.
 
     With sightings there is a pose at each time of the team's grid (`front_end.node_s`) too.
-    Raises WireError for a measurement that is not sound.
+    Raises WireError for a measurement that is not sound, LimitError for a mounted sensor.
     """
     streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:
@@ -82,6 +101,12 @@ def chains_of(
                 stream = streams.setdefault((message.robot, message.incarnation), {})
                 stream[message.number] = message
     configs = {robot.id: robot for robot in scenario.robots}
+    mounted = sorted(robot.id for robot in scenario.robots if robot.sensor.is_mounted)
+    if mounted:
+        raise LimitError(
+            f"{', '.join(mounted)}: sensor.mount is not that of the base, whose poses the batch "
+            "reference links; the rule `batch` takes it: teamslam rerun LOG --fusion batch"
+        )
     chains = [
         _chain(
             configs[robot], incarnation, [measurements[i] for i in sorted(measurements)], sightings
@@ -134,7 +159,7 @@ def _chain(
         start_covariance=start[1],
         stamps_ns=np.array([first_ns, *(e.stamp_ns for e in keyframes)]),
         increments=tuple(e.increment for e in keyframes),
-        scans=tuple(Scan(e.ids, e.ranges, e.bearings) for e in keyframes),
+        scans=tuple(Scan(e.ids, e.ranges, e.bearings, e.own) for e in keyframes),
         sightings=() if grid is None else grid.sightings(),
     )
 

@@ -30,7 +30,7 @@ from central.desk.evaluation.errors import (
 from central.desk.evaluation.evaluation import Evaluation, evaluate
 from sim.studies.batch_reference.errors import add_errors, bias_key, has_biases, profile_graph
 from sim.studies.batch_reference.graph import factor_graph, landmark_starts, pose_key, values_of
-from sim.studies.batch_reference.measurements import Chain, anchored, chains_of
+from sim.studies.batch_reference.measurements import Chain, LimitError, anchored, chains_of
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import tangent
 from team.wire.bus import Sample
@@ -42,10 +42,6 @@ A robust loss is minimised by weighting again and again, which converges by a co
 ITERATIONS = 1000
 NoiseKind = Literal["white", "profile"]
 NO_BIASES = (None, None, None)
-
-
-class LimitError(RuntimeError):
-    """The limit can not be computed: what is missing and what to do."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from central.node import CentralNode
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, loads, with_options
 from sim.scenarios.source import streams_of
-from sim.studies.batch_reference.reference import Limit, LimitError, NoiseKind, batch_map
+from sim.studies.batch_reference.measurements import LimitError
+from sim.studies.batch_reference.reference import Limit, NoiseKind, batch_map
 from sim.studies.experiments.experiment import Dataset
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.true_minimum import true_minimum

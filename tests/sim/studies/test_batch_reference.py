@@ -14,8 +14,8 @@ from scipy.stats import chi2
 from central.desk.evaluation.errors import Path
 from sim.scenarios.scenario import Scenario
 from sim.studies.batch_reference.graph import factor_graph, values_of
-from sim.studies.batch_reference.measurements import Chain, Scan, anchored, chains_of
-from sim.studies.batch_reference.reference import Limit, LimitError, batch_map
+from sim.studies.batch_reference.measurements import Chain, LimitError, Scan, anchored, chains_of
+from sim.studies.batch_reference.reference import Limit, batch_map
 from team.config import MotionModel, MotionNoise, RobotConfig
 from team.estimation.baselines.batch import FLOOR_SIGMAS
 from team.estimation.geometry import between, compose, exponential, tangent
