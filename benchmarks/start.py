@@ -3,9 +3,8 @@
     python benchmarks/start.py [--scenario waypoints] [--robots N] [--json FILE]
 
 The same team is launched twice, without views. first_s: from the start of the template to the first
-measurement on the bus. cpu_s, pss_mb, peak_rss_mb: of the processes, the launch's own JSON. Only
-ratios of the two launches and the first measurement in units of a bare start of Python with NumPy
-are held against benchmarks/start.json: the machine is in both of their halves.
+measurement on the bus. cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. Only
+ratios of the two launches are held against benchmarks/start.json: the machine is in both halves.
 """
 
 import argparse
