@@ -76,7 +76,8 @@ async def test_robots_join_live_and_deaths_and_cuts_change_no_bit_of_the_map(
     log = open_log(team.folder / "run" / "log.mcap")
     (found,) = [sample.payload for sample in log.samples([FINAL_MAP])]
     assert found == expected
-    assert holes(log) == []
+    killed = ("robot/r1/tally", "source/r1/tally")  # their last words are missing, nothing else
+    assert [each for each in holes(log) if each.where not in killed] == []
     result = json.loads((team.folder / "result.json").read_text())
     assert result["scenario"] == "lab"
     assert all(robot["measurements_used_once"] for robot in result["robots"].values())
