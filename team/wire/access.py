@@ -13,7 +13,7 @@ from team.keys.roster import REPLAY, Roster
 _SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
 _LISTENS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 _HEARS = ("put", "reply", "liveliness_token", "declare_subscriber", "query")
-TRUTH = ("truth/**", "truth_landmarks")
+TRUTH = ("truth/**", "truth_landmarks", "truth_labels/**", "truth_positions/**")
 """What no estimator may hear."""
 
 
