@@ -193,15 +193,15 @@ def _scans(
         raise table.fault("a range is negative")
     first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
     return Detections(
-        stamps[first],
-        np.append(first, len(stamps)).astype(np.int64),
-        labels,
-        polar[:, 0].copy(),
-        np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi),
-        None,
-        covariances,
-        np.ones(len(first), np.bool_),
-        signatures,
+        stamps_ns=stamps[first],
+        offsets=np.append(first, len(stamps)).astype(np.int64),
+        ids=labels,
+        ranges=polar[:, 0].copy(),
+        bearings=np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi),
+        points=None,
+        covariances=covariances,
+        hidden=np.ones(len(first), np.bool_),
+        signatures=signatures,
     )
 
 

@@ -92,14 +92,14 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         names = ", ".join(watch.fused.lost)
         failures.append(f"the final map is provisional: {names} lost, and not wholly in it")
     return Outcome(
-        plan.log,
-        plan.folder,
-        time.monotonic() - began,
-        ended,
-        failures,
-        watch.restarts,
-        watch.given_up,
-        {s.name: s.used.and_later(e.used) for s, e in zip(services, ended, strict=True)},
+        log=plan.log,
+        folder=plan.folder,
+        wall_s=time.monotonic() - began,
+        processes=ended,
+        failures=failures,
+        restarts=watch.restarts,
+        given_up=watch.given_up,
+        used={s.name: s.used.and_later(e.used) for s, e in zip(services, ended, strict=True)},
     )
 
 

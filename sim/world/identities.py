@@ -83,15 +83,15 @@ def _rows(
     offsets = np.concatenate(([0], np.cumsum(np.bincount(message[chosen], minlength=count))))
     was = seen.hidden
     return Detections(
-        seen.stamps_ns,
-        offsets.astype(np.int64),
-        seen.ids[chosen],
-        seen.ranges[chosen],
-        seen.bearings[chosen],
-        None if seen.points is None or hidden else seen.points[chosen],
-        None if seen.covariances is None else seen.covariances[chosen],
-        np.full(count, hidden) if was is None else was | hidden,
-        None if seen.signatures is None else seen.signatures[chosen],
+        stamps_ns=seen.stamps_ns,
+        offsets=offsets.astype(np.int64),
+        ids=seen.ids[chosen],
+        ranges=seen.ranges[chosen],
+        bearings=seen.bearings[chosen],
+        points=None if seen.points is None or hidden else seen.points[chosen],
+        covariances=None if seen.covariances is None else seen.covariances[chosen],
+        hidden=np.full(count, hidden) if was is None else was | hidden,
+        signatures=None if seen.signatures is None else seen.signatures[chosen],
     )
 
 
@@ -142,13 +142,13 @@ def _in_order(parts: list[Detections]) -> Detections:
         return None if any(value is None for value in values) else joined(values)
 
     return Detections(
-        np.concatenate([piece.stamps_ns for piece in chosen]),
-        np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        np.concatenate([piece.ids for piece in chosen]),
-        joined([piece.ranges for piece in chosen]),
-        joined([piece.bearings for piece in chosen]),
-        None,
-        optional("covariances"),
-        np.concatenate([piece.hidden for piece in chosen if piece.hidden is not None]),
-        None,
+        stamps_ns=np.concatenate([piece.stamps_ns for piece in chosen]),
+        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        ids=np.concatenate([piece.ids for piece in chosen]),
+        ranges=joined([piece.ranges for piece in chosen]),
+        bearings=joined([piece.bearings for piece in chosen]),
+        points=None,
+        covariances=optional("covariances"),
+        hidden=np.concatenate([piece.hidden for piece in chosen if piece.hidden is not None]),
+        signatures=None,
     )

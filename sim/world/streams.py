@@ -91,15 +91,15 @@ class Detections:
         """The messages first … last − 1."""
         rows = slice(int(self.offsets[first]), int(self.offsets[last]))
         return Detections(
-            self.stamps_ns[first:last],
-            self.offsets[first : last + 1] - self.offsets[first],
-            self.ids[rows],
-            self.ranges[rows],
-            self.bearings[rows],
-            None if self.points is None else self.points[rows],
-            None if self.covariances is None else self.covariances[rows],
-            None if self.hidden is None else self.hidden[first:last],
-            None if self.signatures is None else self.signatures[rows],
+            stamps_ns=self.stamps_ns[first:last],
+            offsets=self.offsets[first : last + 1] - self.offsets[first],
+            ids=self.ids[rows],
+            ranges=self.ranges[rows],
+            bearings=self.bearings[rows],
+            points=None if self.points is None else self.points[rows],
+            covariances=None if self.covariances is None else self.covariances[rows],
+            hidden=None if self.hidden is None else self.hidden[first:last],
+            signatures=None if self.signatures is None else self.signatures[rows],
         )
 
 
@@ -192,14 +192,14 @@ class RobotStream:
         row = self._row(counter, OBSERVATIONS)
         at = seen.rows(row)
         return ObservationMeasurement(
-            int(self.stamps_ns[counter]),
-            seen.ids[at],
-            seen.ranges[at],
-            seen.bearings[at],
-            None if seen.points is None else seen.points[at],
-            None if seen.covariances is None else seen.covariances[at],
-            seen.hidden is not None and bool(seen.hidden[row]),
-            None if seen.signatures is None else seen.signatures[at],
+            stamp_ns=int(self.stamps_ns[counter]),
+            ids=seen.ids[at],
+            ranges=seen.ranges[at],
+            bearings=seen.bearings[at],
+            points=None if seen.points is None else seen.points[at],
+            covariances=None if seen.covariances is None else seen.covariances[at],
+            hidden=seen.hidden is not None and bool(seen.hidden[row]),
+            signatures=None if seen.signatures is None else seen.signatures[at],
         )
 
     def sightings(self, counter: int) -> SightingMeasurement:

@@ -55,7 +55,7 @@ def _cell(name: str, kind: object, value: object) -> str:
             return " ".join(map(repr, numbers_of(name, value).tolist()))
         case str():
             return value
-        case bool() | tuple() | dict():
+        case bool() | tuple() | dict() | msgspec.Struct():
             return json.dumps(msgspec.to_builtins(value))
         case _:
             return repr(value)

@@ -102,7 +102,7 @@ def _value(name: str, kind: object, value: object) -> object:
             return value.hex()
         case bytes():
             return numbers_of(name, value)
-        case tuple() | dict():
+        case tuple() | dict() | msgspec.Struct():
             return json.dumps(msgspec.to_builtins(value))
         case _:
             return value

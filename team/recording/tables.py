@@ -27,6 +27,10 @@ _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "landmarks": ids,
     "rows": ids,
     "seen": octets,
+    "pairs": octets,
+    "certificate": octets,
+    "signature": octets,
+    "sha256": octets,
 }
 """How the bytes of a field are read by its name; all others are floats."""
 

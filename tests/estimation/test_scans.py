@@ -98,7 +98,8 @@ def test_points_near_with_much_noise_place_a_landmark_without_a_bias() -> None:
         own = np.column_stack((scan.own[:, :3], np.full(count, form)))
         means, covariances = landmarks_along_paths(
             truth.reshape(1, 1, 2).copy(), np.array([[[1.0, 0.0, 1.0]]]), np.zeros((1, 1, 3)),
-            np.array([0, count]), np.zeros(count, np.int64), polar, own, noise_of(Sensor()),
+            np.array([0, count]), np.zeros(count, np.int64), polar, own=own,
+            noise=noise_of(Sensor()),
         )  # fmt: skip
         error = means[0, 0] - truth
         found[form] = error @ np.linalg.inv(full(covariances[0, 0])) @ error
@@ -119,7 +120,7 @@ def test_landmarks_along_paths_with_own_noises_are_least_squares(whites) -> None
     noise = noise_of(Sensor(range_white=whites[0], bearing_white=whites[1]))
     means, covariances = landmarks_along_paths(
         truth.reshape(1, 1, 2) + 0.02, np.array([[[1.0, 0.0, 1.0]]]), path[:, None, :],
-        np.array([0, 5]), np.arange(5), z, own, noise,
+        np.array([0, 5]), np.arange(5), z, own=own, noise=noise,
     )  # fmt: skip
     share = np.sqrt(np.array(whites))
     W = np.zeros((10, 10))

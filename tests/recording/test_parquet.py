@@ -61,7 +61,7 @@ def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
                 assert back == value.hex()
             elif isinstance(value, bytes):
                 assert np.array_equal(back, numbers_of(field.name, value))
-            elif isinstance(value, tuple | dict):
+            elif isinstance(value, tuple | dict | msgspec.Struct):
                 assert json.loads(back) == json.loads(msgspec.json.encode(value))
             else:
                 assert back == value

@@ -184,7 +184,14 @@ def test_an_empty_detection_says_that_it_looked() -> None:
 
 def test_odometry_is_a_pose_or_speeds_or_a_transform() -> None:
     record = d.OdometryRecord(
-        AT, "odom", "base_link", (1.0, 2.0, 0.0), (0.0, 0.0, 0.0, 1.0), 3, 0, 4
+        stamp_ns=AT,
+        frame="odom",
+        child="base_link",
+        position=(1.0, 2.0, 0.0),
+        rotation=(0.0, 0.0, 0.0, 1.0),
+        forward=3,
+        left=0,
+        yaw_rate=4,
     )
     assert translator().take("/odom", record) == [Pose(AT, 1.0, 2.0, 0.0)]
     assert translator(use="twist").take("/odom", record) == [Speeds(AT, 3, 4)]

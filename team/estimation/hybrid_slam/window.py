@@ -213,8 +213,8 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
         bounds,
         window.keyframes[by_slot],
         window.measurements[by_slot],
-        window.own[by_slot],
-        noise_of(window.sensor),
+        own=window.own[by_slot],
+        noise=noise_of(window.sensor),
     )
     return ParticleLandmarks(ids, means, covariances)
 

@@ -186,16 +186,16 @@ def _side(view: View, at: Indices) -> Side:
 
 def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
     return Decision(
-        view.stamp_ns,
-        kind,
-        about,
-        len(found.pairs),
-        found.llr,
-        found.rival_pairs,
-        found.rival_llr,
-        found.share,
-        found.sd,
-        found.why,
+        stamp_ns=view.stamp_ns,
+        kind=kind,
+        about=about,
+        pairs=len(found.pairs),
+        llr=found.llr,
+        rival_pairs=found.rival_pairs,
+        rival_llr=found.rival_llr,
+        share=found.share,
+        sd=found.sd,
+        why=found.why,
     )
 
 

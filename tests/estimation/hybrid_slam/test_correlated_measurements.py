@@ -50,8 +50,8 @@ def test_a_constant_error_within_a_window_equals_least_squares_with_its_correlat
         np.array([0, 4]),
         np.arange(4),
         seen,
-        unclaimed(4),
-        noise,
+        own=unclaimed(4),
+        noise=noise,
     )
     point, covariance = dense(noise, seen)
     np.testing.assert_allclose(means[0, 0], point, atol=1e-4)
@@ -69,8 +69,8 @@ def test_repeating_a_measurement_leaves_the_constant_part_of_its_error() -> None
             np.array([0, repeats]),
             np.zeros(repeats, dtype=np.int64),
             np.tile(predicted(PATH[0], LANDMARK), (repeats, 1)),
-            unclaimed(repeats),
-            Noise(0.0125, 0.0, 0.2, 5e-4, 0.5),
+            own=unclaimed(repeats),
+            noise=Noise(0.0125, 0.0, 0.2, 5e-4, 0.5),
         )
         xx, xy, yy = covariances[0, 0]
         sizes.append(xx * yy - xy * xy)

@@ -113,17 +113,17 @@ def closure(
         profile,
     )
     closure = Closure(
-        tuple(
+        pairs=tuple(
             pair._replace(first=one, second=two)
             for pair, (one, two) in zip(best.pairs, _named(best, target_there), strict=True)
         ),
-        best.llr,
-        rival_pairs,
-        rival_llr,
-        share,
-        max(pair.sd for pair in best.pairs),
-        vote.motion,
-        "",
+        llr=best.llr,
+        rival_pairs=rival_pairs,
+        rival_llr=rival_llr,
+        share=share,
+        sd=max(pair.sd for pair in best.pairs),
+        motion=vote.motion,
+        why="",
     )
     outside = len(target.at) - len(best.pairs)
     return closure._replace(why=failed(closure, outside, profile, tests))
