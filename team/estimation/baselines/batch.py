@@ -299,7 +299,7 @@ def _variances(turns: Sequence[RobotStep], counts: Sequence[int]) -> Float[np.nd
     """Of each measurement; ones of those that claim their own, whose residuals are whitened."""
     found = np.array([variances(turn.sensor) for turn in turns]).reshape(-1, 3)
     found = np.repeat(found, counts, axis=0)
-    claims = np.repeat([turn.own.shape[1] > 0 for turn in turns], counts)
+    claims = np.repeat(np.array([turn.own.shape[1] > 0 for turn in turns], np.bool_), counts)
     found[claims] = 1.0, 0.0, 1.0
     return found
 

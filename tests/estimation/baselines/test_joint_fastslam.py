@@ -40,7 +40,7 @@ def test_a_team_of_one_is_plain_fastslam_bit_for_bit(proposal, resample_below):
         np.random.default_rng(0),
     )
     for ((_, *turn),) in rounds:
-        plain = plain_fastslam.stepped(plain, *turn, random)
+        plain = plain_fastslam.stepped(plain, *turn[:-1], random)
     for name in ("poses", "log_weights", "ids", "means", "covariances"):
         ours = getattr(joint, name)
         assert ours.tobytes() == getattr(plain.particles, name).tobytes()
@@ -64,7 +64,7 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
     alone = {robot: plain_fastslam.begun(pose, 40, proposal, 0.0) for robot, pose in STARTS.items()}
     for turns in rounds:
         for robot, *turn in turns:
-            alone[robot] = plain_fastslam.stepped(alone[robot], *turn, random)
+            alone[robot] = plain_fastslam.stepped(alone[robot], *turn[:-1], random)
     product = sum(state.particles.log_weights for state in alone.values())
     np.testing.assert_allclose(joint.log_weights, fastslam.normalised(product)[0], atol=1e-9)
     for index, state in enumerate(alone.values()):
