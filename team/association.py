@@ -1,11 +1,12 @@
 """The thresholds of data association between submaps: one profile for each kind of sensor."""
 
+from math import hypot
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
-from team.config import NonNegative, Positive, Share
+from team.config import NonNegative, Positive, Sensor, Share
 
 Few = Annotated[int, Meta(ge=1, le=1000)]
 
@@ -52,3 +53,25 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
 
 DEFAULT_PROFILE = AssociationProfile()
+
+SCALE_M = 0.03
+"""What the sensor of the default profile mismeasures a landmark by, at the far end of its view."""
+
+
+def profile_for(sensor: Sensor, farthest_m: float) -> AssociationProfile:
+    """The default profile in the lengths of a sensor: times its error at the far end of its view.
+
+    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m; in units of it the sensors that the
+    default thresholds were found with, and simulated ones, need the same thresholds.
+    """
+    along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
+    scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)
+    default = DEFAULT_PROFILE
+    return msgspec.structs.replace(
+        default,
+        slack=default.slack * scale,
+        density=default.density / scale**2,
+        tight=default.tight * scale,
+        near=default.near * scale,
+        same=default.same * scale,
+    )

@@ -39,12 +39,12 @@ def brittle(monkeypatch: pytest.MonkeyPatch) -> None:
     """An estimator that raises at one odometry, in the middle of what it changes."""
     whole = HybridEstimator.drive
 
-    def drive(self, stamp_ns, duration_ns, forward, yaw_rate, **how):  # type: ignore[no-untyped-def]
+    def drive(self, stamp_ns, *motion, **how):  # type: ignore[no-untyped-def]
         if stamp_ns == BROKEN_NS:
             self._slam.sequence += 7
             self._slam._segmenter = None
             raise ZeroDivisionError("no way")
-        return whole(self, stamp_ns, duration_ns, forward, yaw_rate, **how)
+        return whole(self, stamp_ns, *motion, **how)
 
     monkeypatch.setattr(HybridEstimator, "drive", drive)
 

@@ -199,7 +199,7 @@ def test_the_notebook_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]
 
 def test_examples_use_nothing_of_ours_but_the_library() -> None:
     programs = sorted(EXAMPLES.glob("*.py"))
-    assert len(programs) == 5
+    assert len(programs) == 7
     for program in programs:
         names = {
             node.module

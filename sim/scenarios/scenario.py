@@ -31,6 +31,7 @@ from sim.world.config import (
     UtiasWorld,
     World,
 )
+from team.association import DEFAULT_PROFILE, AssociationProfile, profile_for
 from team.config import Estimator, Exchange, FusionRule, RobotConfig
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from team.registry import absence
@@ -38,6 +39,8 @@ from team.registry import absence
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
            "with_options"]  # fmt: skip
 
+FAR_M = 10.0
+"""The end of a sensor's view where nothing says it."""
 WORLDS: dict[str, type[World]] = {
     "simulated": SimulatedWorld,
     "utias": UtiasWorld,
@@ -118,6 +121,8 @@ def with_options(
     world = fields["world"]
     if identities is not None:
         world["identities"] = identities
+        if identities == "hidden" and scenario.central.association == DEFAULT_PROFILE:
+            fields["central"]["association"] = msgspec.to_builtins(_profile_of(scenario))
     if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
         from sim.datasets.folder import robots_of
 
@@ -128,6 +133,15 @@ def with_options(
         numbered = enumerate(fields["robots"], start=1)
         fields["robots"] = [robot | {"id": f"r{number}"} for number, robot in numbered]
     return _converted(fields)
+
+
+def _profile_of(scenario: Scenario) -> AssociationProfile:
+    """The thresholds of association in the lengths of the coarsest of the robots' sensors."""
+    world = scenario.world
+    seen_m = world.visible_to_m if isinstance(world, SimulatedWorld) else None
+    far_m = FAR_M if seen_m is None else seen_m
+    of_each = [profile_for(r.sensor, min(r.sensor.max_range, far_m)) for r in scenario.robots]
+    return max(of_each, key=lambda profile: profile.tight, default=DEFAULT_PROFILE)
 
 
 def _world_of(scenario: Scenario, path: str) -> Fields:

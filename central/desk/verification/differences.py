@@ -19,6 +19,10 @@ _IDS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "ids": arrays.ids,
     "stamps": arrays.stamps,
     "nodes": arrays.stamps,
+    "counts": arrays.ids,
+    "rows": arrays.ids,
+    "landmarks": arrays.ids,
+    "seen": arrays.octets,
 }
 _FLOATS = (
     "pose",
@@ -29,6 +33,9 @@ _FLOATS = (
     "covariances",
     "sensitivity",
     "weights",
+    "start",
+    "start_covariance",
+    "crosses",
 )
 ARRAYS = frozenset({*_IDS, *_FLOATS})
 """The fields that are compared number by number."""

@@ -332,8 +332,9 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
     assert shifted(10.0 * sigma).prior_weight[k] == pytest.approx(1.0 / 101.0)
     plain = replace(shifted(10.0 * sigma), settings=replace(options, robust_c=None))
     assert plain.prior_weight[k] == 1.0
-    h = 1e-4 * sigma
+    h, everyone = 1e-4 * sigma, np.ones(len(island.graph.priors), np.bool_)
     for by in (0.5 * sigma, 10.0 * sigma):
-        slope = (shifted(by + h)._prior_cost - shifted(by - h)._prior_cost) / (2.0 * h)
+        above, below = (shifted(by + d)._prior_cost(everyone) for d in (h, -h))
+        slope = (above - below) / (2.0 * h)
         weighted = shifted(by).prior_weight[k] * prior.information[0, 0] * by
         assert slope == pytest.approx(2.0 * weighted, rel=1e-5)

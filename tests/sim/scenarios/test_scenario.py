@@ -9,6 +9,7 @@ from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import builtin_names, doubts, dumps, load, loads, with_options
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld, UtiasWorld
+from team.association import AssociationProfile
 from team.pairs import PAIRS
 
 SMALL = """
@@ -300,3 +301,14 @@ def test_a_simulated_robot_whose_odometry_has_no_noise_is_doubted(tmp_path: Path
 @pytest.mark.parametrize("name", builtin_names())
 def test_a_built_in_scenario_is_not_doubted(name: str) -> None:
     assert doubts(load(name)) == []
+
+
+def test_hidden_identities_take_thresholds_in_the_lengths_of_the_sensor() -> None:
+    coarse, fine = (
+        with_options(load(name), identities="hidden") for name in ("thesis", "thesis-b")
+    )
+    assert coarse.central.association.tight > 3.0 * fine.central.association.tight > 0.45
+    assert fine.central.association.gate == AssociationProfile().gate
+    assert with_options(load("thesis"), seed=2).central.association == AssociationProfile()
+    given = with_options(load("victoria"), identities="hidden").central.association
+    assert given == load("victoria").central.association
