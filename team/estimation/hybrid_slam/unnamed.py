@@ -63,7 +63,7 @@ def settled(
     kept = np.isin(found.landmark_of, order) & (found.landmark_of != NOBODY)
     kept |= ~is_detection
     local = np.nonzero((found.names == NOBODY) & np.isin(np.arange(len(found.names)), order))[0]
-    number = np.zeros(len(found.names), np.int64)
+    number = np.zeros(len(found.names) + 1, np.int64)  # the last is that of NOBODY
     number[local] = UNNAMED + np.arange(len(local))
     ids = np.where(is_detection, number[found.landmark_of], scans.names).astype(np.uint32)
     with_detections = np.array([len(each.ids) > 0 for each in unnamed], np.bool_)

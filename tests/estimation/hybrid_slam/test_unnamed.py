@@ -1,0 +1,30 @@
+"""What a window's detections without identities are at its end."""
+
+import numpy as np
+
+from team.config import UNNAMED, Association, Sensor
+from team.estimation.hybrid_slam.keyframes import Keyframe
+from team.estimation.hybrid_slam.unnamed import settled
+from team.estimation.models import Increment
+from team.estimation.scans import unclaimed
+
+SECOND = 10**9
+FORWARD = Increment(np.array([1.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
+
+
+def keyframe(k: int, ranges: list[float]) -> Keyframe:
+    ids = UNNAMED + np.arange(len(ranges), dtype=np.uint32)
+    bearings = np.linspace(-1.0, 1.0, len(ranges)) if ranges else np.empty(0)
+    seen = ids.astype(np.uint32), np.array(ranges), bearings
+    return Keyframe(k * SECOND, FORWARD, *seen, unclaimed(len(ranges)))
+
+
+def test_a_window_that_confirms_no_detection_has_none() -> None:
+    named = [keyframe(k, []) for k in range(3)]
+    unnamed = [keyframe(0, [3.0]), keyframe(1, []), keyframe(2, [30.0])]
+    found = settled(named, unnamed, Association(least_seen=2), Sensor(), 100)
+    assert [len(each.ids) for each in found.keyframes] == [0, 0, 0]
+    assert (found.gated, found.unconfirmed + found.clutter) == (2, 2)
+    assert len(found.unnamed.counts) == 0
+    assert found.became is not None
+    assert found.became.landmarks.tolist() == [0, 0]
