@@ -3,13 +3,11 @@
 import re
 import time
 
-from sim.launch.withdraw import LOOK_S, WithdrawError
+from sim.launch.withdraw import LOOK_S, WithdrawError, await_centre
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, Outgoing, opened
 
-CENTRE_S = 10.0
-"""A living centre is heard of within this time."""
 _NAME = re.compile(r"([a-z][a-z0-9_]{0,31})/(\d+)/(\d+)/(\d+)")
 
 
@@ -31,13 +29,7 @@ def judge(bus: Bus, judgement: m.Judgement, reason: str, patience_s: float) -> m
     for channel in (ch.FUSED_MAP, ch.FINAL_MAP):
         bus.subscribe(channel)
     bus.watch_alive()
-    until = time.monotonic() + CENTRE_S
-    while not bus.is_alive("central"):
-        if time.monotonic() > until:
-            raise WithdrawError(
-                "no centre answers; is the team running there? see --team, --connect"
-            )
-        bus.receive(LOOK_S)
+    await_centre(bus)
     robot = judgement.first.robot
     verdict = m.Verdict(stamp_ns=0, robot=robot, judgement=judgement, by="operator", reason=reason)
     bus.publish(Outgoing(ch.VERDICT, robot, verdict))

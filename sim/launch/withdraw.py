@@ -9,6 +9,7 @@ from team.wire.bus import Bus, Outgoing, opened
 CENTRE_S = 10.0
 """A living centre and robot are heard of within this time."""
 LOOK_S = 0.05
+NO_CENTRE = "no centre answers; is the team running there? see --team, --connect"
 
 
 class WithdrawError(RuntimeError):
@@ -74,13 +75,7 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
     for channel in (ch.TEAM_END, ch.FINAL_MAP):
         bus.subscribe(channel)
     bus.watch_alive()
-    until = time.monotonic() + CENTRE_S
-    while not bus.is_alive("central"):
-        if time.monotonic() > until:
-            raise WithdrawError(
-                "no centre answers; is the team running there? see --team, --connect"
-            )
-        bus.receive(LOOK_S)
+    await_centre(bus)
     if bus.is_alive("world"):
         raise WithdrawError(
             "this team has a world, which ends by itself; `teamslam end --without ROBOT` lets it "
@@ -96,6 +91,15 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
     raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
 
 
+def await_centre(bus: Bus) -> None:
+    """Wait until a centre is alive; raises WithdrawError where none is within CENTRE_S."""
+    until = time.monotonic() + CENTRE_S
+    while not bus.is_alive("central"):
+        if time.monotonic() > until:
+            raise WithdrawError(NO_CENTRE)
+        bus.receive(LOOK_S)
+
+
 def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
     until = time.monotonic() + CENTRE_S
     while time.monotonic() < until:
@@ -103,7 +107,7 @@ def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
         if bus.is_alive("central") and robot in robots:
             return
     if not bus.is_alive("central"):
-        raise WithdrawError("no centre answers; is the team running there? see --team, --connect")
+        raise WithdrawError(NO_CENTRE)
     known = ", ".join(sorted(robots)) or "none"
     raise WithdrawError(f"the team has no robot {robot}; heard of: {known}")
 
