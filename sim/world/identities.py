@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams, robot_stream
+from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams, with_observations
 
 
 @dataclass(frozen=True)
@@ -54,21 +54,7 @@ def _hidden(
         untagged = _with_clutter(untagged, hiding, rng)
     both = _in_order([*parts, untagged])
     # A scan that saw nothing stays a measurement, whichever kind it is.
-    return robot_stream(
-        robot=stream.robot,
-        start_ns=int(stream.stamps_ns[0]),
-        start=stream.start,
-        intervals=stream.intervals,
-        observations=both,
-        sightings=stream.teammate_detections,
-        teammates=stream.teammates,
-        truth_ns=stream.truth_ns,
-        truth=stream.truth,
-        notes=stream.notes,
-        clock_offset_ns=stream.clock_offset_ns,
-        positions_ns=stream.positions_ns,
-        positions=stream.positions,
-    )
+    return with_observations(stream, both)
 
 
 def _rows(

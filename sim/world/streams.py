@@ -297,6 +297,25 @@ def robot_stream(
     )
 
 
+def with_observations(stream: RobotStream, observations: Detections) -> RobotStream:
+    """The stream with other measurements of landmarks, numbered anew."""
+    return robot_stream(
+        robot=stream.robot,
+        start_ns=int(stream.stamps_ns[0]),
+        start=stream.start,
+        intervals=stream.intervals,
+        observations=observations,
+        sightings=stream.teammate_detections,
+        teammates=stream.teammates,
+        truth_ns=stream.truth_ns,
+        truth=stream.truth,
+        notes=stream.notes,
+        clock_offset_ns=stream.clock_offset_ns,
+        positions_ns=stream.positions_ns,
+        positions=stream.positions,
+    )
+
+
 def grouped(
     stamps_ns: Int64[np.ndarray, " R"],
     ids: UInt32[np.ndarray, " R"],

@@ -18,7 +18,7 @@ from sim.scenarios.scenario import Scenario, loads
 from sim.scenarios.source import streams_of
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, named
-from sim.world.streams import Detections, RobotStream, WorldStreams, robot_stream
+from sim.world.streams import Detections, RobotStream, WorldStreams, with_observations
 from team import translate
 from team.pairs import PAIRS
 from team.wire import channels as ch
@@ -121,19 +121,7 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
         seen.stamps_ns[1:], seen.offsets[:-1], seen.ids[:rows], seen.ranges[:rows],
         seen.bearings[:rows],
     )  # fmt: skip
-    return robot_stream(
-        robot=stream.robot,
-        start_ns=int(stream.stamps_ns[0]),
-        start=stream.start,
-        intervals=stream.intervals,
-        observations=late,
-        sightings=stream.teammate_detections,
-        teammates=stream.teammates,
-        truth_ns=stream.truth_ns,
-        truth=stream.truth,
-        notes=stream.notes,
-        clock_offset_ns=stream.clock_offset_ns,
-    )
+    return with_observations(stream, late)
 
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
