@@ -47,20 +47,23 @@ def view_table() -> str:
 
 
 def message_table() -> str:
-    """Every message's fields by position, with the types that messages.py spells."""
+    """Every message's fields by position, with the types that `team.wire.messages` spells."""
     spelt = _annotations()
     rows = ["| message | fields after the tag |", "|---|---|"]
     for tag, message in sorted(m.BY_TAG.items()):
         rows.append(f"| `{tag}` | {_fields(message, spelt)} |")
     parts = [cls for _, cls in inspect.getmembers(m, inspect.isclass) if _is_part(cls)]
-    rows += [f"| *{part.__name__}* | {_fields(part, spelt)} |" for part in parts]
+    rows += [
+        f"| *{part.__name__}* | {_fields(part, spelt)} |"
+        for part in sorted(parts, key=lambda part: part.__name__)
+    ]
     return "\n".join(rows)
 
 
 def _is_part(cls: type) -> bool:
     return (
         issubclass(cls, msgspec.Struct)
-        and cls.__module__ == m.__name__
+        and cls.__module__.startswith(m.__name__)
         and not issubclass(cls, m.Message)
     )
 
@@ -71,14 +74,18 @@ def _fields(cls: type[msgspec.Struct], spelt: dict[str, dict[str, str]]) -> str:
 
 
 def _annotations() -> dict[str, dict[str, str]]:
-    tree = ast.parse(Path(m.__file__).read_text())
+    nodes = [
+        node
+        for module in sorted(Path(m.__file__).parent.glob("*.py"))
+        for node in ast.parse(module.read_text()).body
+    ]
     return {
         node.name: {
             field.target.id: _plain(ast.unparse(field.annotation))
             for field in node.body
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
         }
-        for node in tree.body
+        for node in nodes
         if isinstance(node, ast.ClassDef)
     }
 

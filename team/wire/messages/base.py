@@ -1,0 +1,56 @@
+"""What every message has, and what its numbers are checked for."""
+
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from team.wire.arrays import (
+    check_ascending,
+    check_blocks,
+    check_finite,
+    check_packed_covariance,
+    ids,
+)
+
+Name = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
+Text = Annotated[str, Meta(max_length=20_000)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+StampNs = Annotated[int, Meta(ge=-(2**62), lt=2**62)]
+Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
+Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
+Real = Annotated[float, Meta(ge=-1e300, le=1e300)]
+"""A finite number: the bounds reject NaN and the infinities."""
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
+    """What every message has: the team time that it is about."""
+
+    stamp_ns: StampNs
+
+    def check(self) -> None:
+        """Raise ValueError where the arrays do not fit together; nothing to check here."""
+
+
+def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: bool) -> None:
+    """Raise ValueError unless ids ascend and means and covariance fit them (joint or blocks)."""
+    check_ascending(id_bytes, "ids")
+    n = len(ids(id_bytes, "ids"))
+    check_finite(means, "means", 2 * n)
+    if joint:
+        check_packed_covariance(covariance, 2 * n, "covariance")
+        return
+    check_blocks(covariance, n, "covariance")
+
+
+def check_counts(count_bytes: bytes, groups: int, total: int) -> None:
+    """Raise ValueError unless there is a count for each group and they sum to the total."""
+    counts = ids(count_bytes, "counts")
+    if len(counts) != groups or int(counts.sum(dtype=np.int64)) != total:
+        raise ValueError(f"wrong length: counts, {groups} groups of together {total} expected")
+
+
+def tag_of(message: type[Message]) -> str:
+    """A message's tag, "name/version"."""
+    return str(message.__struct_config__.tag)

@@ -1,0 +1,223 @@
+"""What a robot's sensors say, and where its stream ends."""
+
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from team.wire.arrays import (
+    Floats,
+    Ids,
+    check_angles,
+    check_blocks,
+    check_covariance,
+    check_finite,
+    check_semidefinite,
+    floats,
+    ids,
+)
+from team.wire.messages.base import Count, Message, Name, Real, Text
+
+
+class Measurement(Message, frozen=True, kw_only=True):
+    """What every measurement of a sensor stream has: robot, incarnation and the robot's measurement
+    counter.
+    """
+
+    robot: Name
+    incarnation: Count
+    number: Count
+
+
+class InitialPose(Measurement, frozen=True, kw_only=True, tag="start/1"):
+    """Measurement 0 of an incarnation: the start pose in the team's frame, if it is known.
+
+    pose: 3 floats (x, y, theta), or empty when unknown. covariance: 3 × 3 floats, row by row; empty
+    for a pose that is exactly known.
+    """
+
+    pose: Floats
+    covariance: Floats
+
+    def check(self) -> None:  # noqa: D102 - the base class says what a check is
+        if len(floats(self.pose, "pose")) not in (0, 3):
+            raise ValueError("wrong length: pose has neither 0 nor 3 numbers")
+        check_finite(self.pose, "pose")
+        if self.covariance:
+            check_covariance(self.covariance, 3, "covariance")
+
+
+class Odometry(Measurement, frozen=True, kw_only=True, tag="odometry/1"):
+    """One odometry interval that ends at stamp_ns: mean forward speed and yaw rate over it."""
+
+    duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
+    forward: Real
+    yaw_rate: Real
+
+
+class Increment(Measurement, frozen=True, kw_only=True, tag="increment/1"):
+    """One odometry interval that ends at stamp_ns, as the motion over it.
+
+    increment: 3 floats (forward [m], left [m], turn [rad]), the pose of its end in the frame of its
+    start. covariance: 3 × 3 floats, row by row, of an error in the frame of its end (pose ∘
+    Exp(error)), of any rank; empty where the source claims none.
+    """
+
+    duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
+    increment: Floats
+    covariance: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.increment, "increment", 3)
+        if not abs(float(floats(self.increment, "increment")[2])) <= np.pi:
+            raise ValueError("out of bounds: increment turns outside (−π, π]")
+        if self.covariance:
+            check_semidefinite(self.covariance, 3, "covariance")
+
+
+class Steering(Measurement, frozen=True, kw_only=True, tag="steering/1"):
+    """One odometry interval of a car that ends at stamp_ns, as its encoders read it.
+
+    wheel_speed [m/s]: of the rear wheel that carries the encoder. steering [rad]: the angle of the
+    front wheels, left is positive. What the two mean is the robot's motion model's to say.
+    """
+
+    duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
+    wheel_speed: Real
+    steering: Real
+
+    def check(self) -> None:  # noqa: D102
+        if not abs(self.steering) < 0.5 * np.pi:
+            raise ValueError("out of bounds: steering is not within a quarter turn")
+
+
+class Observations(Measurement, frozen=True, kw_only=True, tag="observations/1"):
+    """Range [m] and bearing [rad] of landmarks with known identities, seen at stamp_ns.
+
+    covariances: of each its own, 3 floats (range-range, range-bearing, bearing-bearing); empty
+    where they have the sensor's.
+    """
+
+    ids: Ids
+    ranges: Floats
+    bearings: Floats
+    covariances: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        n = len(ids(self.ids, "ids"))
+        check_finite(self.ranges, "ranges", n)
+        if n and floats(self.ranges, "ranges").min() < 0.0:
+            raise ValueError("out of bounds: a range is negative")
+        check_angles(self.bearings, "bearings", n)
+        if self.covariances:
+            check_blocks(self.covariances, n, "covariances")
+
+
+class Points(Measurement, frozen=True, kw_only=True, tag="points/1"):
+    """Places of landmarks with known identities in the sensor's frame, seen at stamp_ns.
+
+    positions: L × 2 floats (ahead [m], left [m]). covariances: of each its own, 3 floats (xx, xy,
+    yy); empty where they have the sensor's noise of range and bearing.
+    """
+
+    ids: Ids
+    positions: Floats
+    covariances: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        n = len(ids(self.ids, "ids"))
+        check_finite(self.positions, "positions", 2 * n)
+        if self.covariances:
+            check_blocks(self.covariances, n, "covariances")
+
+
+AnyOdometry = Odometry | Increment | Steering
+"""What tells of one odometry interval."""
+AnyScan = Observations | Points
+"""What tells of landmarks with known identities."""
+
+
+class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
+    """Range [m] and bearing [rad] of L landmarks without identities, seen at stamp_ns in one scan.
+
+    Some may be clutter, that is no landmark at all. Two of one scan are never the same landmark.
+    covariances: L × 3 floats, packed 2 × 2 of (range, bearing), or empty: the sensor's own.
+    signatures: L floats that look alike for the same landmark, such as a trunk's diameter [m], or
+    empty.
+    """
+
+    ranges: Floats
+    bearings: Floats
+    covariances: Floats = b""
+    signatures: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        n = len(floats(self.ranges, "ranges"))
+        check_finite(self.ranges, "ranges")
+        if n and floats(self.ranges, "ranges").min() < 0.0:
+            raise ValueError("out of bounds: a range is negative")
+        check_angles(self.bearings, "bearings", n)
+        if self.covariances:
+            check_blocks(self.covariances, n, "covariances")
+        if self.signatures:
+            check_finite(self.signatures, "signatures", n)
+
+
+class Sightings(Measurement, frozen=True, kw_only=True, tag="sightings/1"):
+    """Range [m] and bearing [rad] of teammates, seen at stamp_ns."""
+
+    teammates: tuple[Name, ...]
+    ranges: Floats
+    bearings: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.ranges, "ranges", len(self.teammates))
+        if self.teammates and floats(self.ranges, "ranges").min() < 0.0:
+            raise ValueError("out of bounds: a range is negative")
+        check_angles(self.bearings, "bearings", len(self.teammates))
+
+
+class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """The last counters of one robot's stream: its measurements are numbered 0 … measurements −
+    1.
+    """
+
+    robot: Name
+    incarnation: Count
+    measurements: Count
+
+
+class End(Message, frozen=True, kw_only=True, tag="end/1"):
+    """The world has published everything; its last counters."""
+
+    streams: tuple[StreamEnd, ...]
+    notes: tuple[Text, ...] = ()
+
+
+class StreamHead(Message, frozen=True, kw_only=True, tag="stream_head/1"):
+    """How far a robot's own source is: it has numbered 0 … measurements − 1; stamp_ns is the last
+    one's.
+
+    state: "open" while more is measured; "left" when the driver has stopped and may come back;
+    "ended" when this incarnation has no more.
+    """
+
+    robot: Name
+    incarnation: Count
+    measurements: Count
+    state: Literal["open", "left", "ended"]
+
+
+class MeasurementsRequest(Message, frozen=True, kw_only=True, tag="readings_wanted/1"):
+    """A query to a source: measurements first … last of (robot, incarnation); last −1: all there
+    are.
+
+    only: the source gives what it has, and does not begin the stream anew for what it has not.
+    """
+
+    robot: Name
+    incarnation: Count
+    first: Count
+    last: int
+    only: bool = False

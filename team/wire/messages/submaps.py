@@ -1,0 +1,154 @@
+"""What robots send in for fusion: submaps and inter-robot factors."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from team.config import UNNAMED
+from team.wire.arrays import (
+    Floats,
+    Ids,
+    Stamps,
+    check_ascending,
+    check_finite,
+    check_packed_covariance,
+    ids,
+    stamps,
+)
+from team.wire.messages.base import Bias, Count, Digest, Message, Name, Real, StampNs, check_counts
+
+
+class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
+    """One window's Gaussian, the only input of the rule `join`; stamp_ns is its end pose's stamp.
+
+    It names its inputs: the measurements first_measurement … last_measurement of (robot,
+    incarnation), and the configuration by digest (the seed is in it). ids: L, ascending. mean: 3 +
+    3K + 2L floats (end pose, pose nodes, landmarks) in the frame of the start pose. covariance:
+    packed upper triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending.
+    sightings: how many SightingFactor messages belong to it. biases: errors that the robot's
+    submaps share, B of them, ascending; sensitivity: B × n floats, the mean's derivative by each:
+    given the error b of the bearings [rad], of the scale of the ranges or of the speed, the mean is
+    mean + b · sensitivity. gated: so many of its landmark measurements no others of the window
+    confirmed; they are not in it.
+
+    ids from 2³¹ on are landmarks without a name, which the window associated itself: 2³¹ + a local
+    index. counts: of each of these, ascending, by how many measurements. keyframes: the window's
+    keyframes with detections; seen: a row of ⌈keyframes/8⌉ bytes of each unnamed landmark, bit k of
+    it (the least of byte k // 8 first) says that keyframe k saw it: two that one keyframe saw are
+    two landmarks.
+    """
+
+    robot: Name
+    incarnation: Count
+    sequence: Count
+    first_measurement: Count
+    last_measurement: Count
+    start_ns: StampNs
+    config: Digest
+    ids: Ids
+    mean: Floats
+    covariance: Floats
+    nodes: Stamps = b""
+    sightings: Count = 0
+    biases: tuple[Bias, ...] = ()
+    sensitivity: Floats = b""
+    gated: Count = 0
+    counts: Ids = b""
+    seen: bytes = b""
+    keyframes: Count = 0
+
+    def check(self) -> None:  # noqa: D102
+        check_ascending(self.ids, "ids")
+        times = stamps(self.nodes, "nodes")
+        n = 3 + 3 * len(times) + 2 * len(ids(self.ids, "ids"))
+        check_finite(self.mean, "mean", n)
+        check_packed_covariance(self.covariance, n, "covariance")
+        check_finite(self.sensitivity, "sensitivity", n * len(self.biases))
+        if any(a >= b for a, b in pairwise(self.biases)):
+            raise ValueError("not ascending: biases")
+        if not (times[1:] > times[:-1]).all():
+            raise ValueError("not ascending: nodes")
+        if len(times) and not self.start_ns < times[0] <= times[-1] <= self.stamp_ns:
+            raise ValueError("out of bounds: a node is not in the submap's time")
+        if self.last_measurement < self.first_measurement or self.stamp_ns < self.start_ns:
+            raise ValueError("out of bounds: the interval of measurements or of time is empty")
+        self._check_unnamed()
+
+    def _check_unnamed(self) -> None:
+        numbers, counts = ids(self.ids, "ids"), ids(self.counts, "counts")
+        unnamed = int((numbers >= UNNAMED).sum())
+        if len(counts) != unnamed:
+            raise ValueError(f"wrong length: counts has {len(counts)} numbers, {unnamed} expected")
+        rows = -(-self.keyframes // 8) * unnamed
+        if len(self.seen) != rows:
+            raise ValueError(f"wrong length: seen has {len(self.seen)} bytes, {rows} expected")
+        if unnamed and not counts.min():
+            raise ValueError("out of bounds: a landmark of no measurement, by counts")
+
+
+class Association(Message, frozen=True, kw_only=True, tag="association/1"):
+    """What became of each detection without identity of a submap's window.
+
+    stamps: of M scans of detections; counts: the detections of each that came through the door;
+    rows: their places in the scan's message; landmarks: the submap's number of the landmark of each
+    (2³¹ + local), UNCONFIRMED or CLUTTER of what is in no submap.
+    """
+
+    robot: Name
+    incarnation: Count
+    sequence: Count
+    stamps: Stamps
+    counts: Ids
+    rows: Ids
+    landmarks: Ids
+
+    def check(self) -> None:  # noqa: D102
+        detections = len(ids(self.landmarks, "landmarks"))
+        check_counts(self.counts, len(stamps(self.stamps, "stamps")), detections)
+        if len(ids(self.rows, "rows")) != detections:
+            raise ValueError("wrong length: rows are not one for each of landmarks")
+
+
+UNCONFIRMED, CLUTTER = 0, 1
+"""In `Association.landmarks`: too rarely seen for a landmark, and so rarely that it is none."""
+
+
+class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"):
+    """A teammate seen from a pose node of submap (robot, incarnation, sequence); stamp_ns is the
+    node's.
+
+    range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed
+    2 × 2 (range, bearing). measurements: the counters of the sightings that went into it,
+    ascending; with the submap's odometry and configuration they are its inputs.
+    """
+
+    robot: Name
+    incarnation: Count
+    sequence: Count
+    config: Digest
+    teammate: Name
+    range: Real
+    bearing: Real
+    covariance: Floats
+    measurements: tuple[Count, ...]
+
+    def check(self) -> None:  # noqa: D102
+        check_packed_covariance(self.covariance, 2, "covariance")
+        if self.range <= 0.0 or abs(self.bearing) > np.pi:
+            raise ValueError("out of bounds: the range is not positive or the bearing not an angle")
+        if not self.measurements or any(a >= b for a, b in pairwise(self.measurements)):
+            raise ValueError("not ascending: measurements, or none")
+        if self.teammate == self.robot:
+            raise ValueError("out of bounds: a robot sees itself")
+
+
+class SubmapsRequest(Message, frozen=True, kw_only=True, tag="submaps_wanted/1"):
+    """A query for the submaps of one robot: to the centre for those in its set, or to the robot.
+
+    incarnation: whose alone; 0: of every incarnation. first: of that incarnation, those from this
+    sequence on.
+    """
+
+    robot: Name
+    incarnation: Count = 0
+    first: Count = 0

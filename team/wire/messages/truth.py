@@ -1,0 +1,90 @@
+"""What only an evaluator, a robot that localises itself, or a simulated radio is told."""
+
+from team.wire.arrays import Floats, Ids, Stamps, check_ascending, check_finite, ids, stamps
+from team.wire.messages.base import Message, Name, StampNs, check_counts
+
+
+class Truth(Message, frozen=True, kw_only=True, tag="truth/1"):
+    """True poses of a robot, for the evaluator only: T stamps and T × 3 floats (x, y, theta)."""
+
+    robot: Name
+    stamps: Stamps
+    poses: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.poses, "poses", 3 * len(stamps(self.stamps, "stamps")))
+
+
+class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"):
+    """True landmark positions, for the evaluator only: L ids and L × 2 floats."""
+
+    ids: Ids
+    positions: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_ascending(self.ids, "ids")
+        check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
+
+
+class TruthLabels(Message, frozen=True, kw_only=True, tag="truth_labels/1"):
+    """Which landmarks a robot's detections are of, for the evaluator only.
+
+    stamps: of M scans of detections; counts: the detections of each; labels: by detection, the
+    landmark's number or NO_LABEL where it is clutter, or nobody knows.
+    """
+
+    robot: Name
+    stamps: Stamps
+    counts: Ids
+    labels: Ids
+
+    def check(self) -> None:  # noqa: D102
+        check_counts(self.counts, len(stamps(self.stamps, "stamps")), len(self.labels) // 4)
+        ids(self.labels, "labels")
+
+
+NO_LABEL = 2**32 - 1
+"""The label of a detection that is clutter, or of which nobody knows the landmark."""
+
+
+class TruthPositions(Message, frozen=True, kw_only=True, tag="truth_positions/1"):
+    """Where another sensor, such as a GPS, says that a robot was, for the evaluator only.
+
+    T stamps and T × 2 floats (x, y) in a frame of its own; some may be wrong by metres.
+    """
+
+    robot: Name
+    stamps: Stamps
+    positions: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.positions, "positions", 2 * len(stamps(self.stamps, "stamps")))
+
+
+class KnownMap(Message, frozen=True, kw_only=True, tag="known_map/1"):
+    """Prior map for localisation-only robots: L ids, L × 2 floats in the team's frame."""
+
+    ids: Ids
+    positions: Floats
+
+    def check(self) -> None:  # noqa: D102
+        check_ascending(self.ids, "ids")
+        check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
+
+
+class RadioPlan(Message, frozen=True, kw_only=True, tag="radio/1"):
+    """Of a simulated radio: who reaches whom, by seconds of team time from stamp_ns on.
+
+    pairs: a row of bits for each second, of the robots two by two in their order, padded to bytes.
+    ends_ns: when each robot's stream ends.
+    """
+
+    robots: tuple[Name, ...]
+    ends_ns: tuple[StampNs, ...]
+    pairs: bytes
+
+    def check(self) -> None:  # noqa: D102
+        n = len(self.robots)
+        width = max((n * (n - 1) // 2 + 7) // 8, 1)
+        if len(self.ends_ns) != n or not self.pairs or len(self.pairs) % width:
+            raise ValueError("wrong length: ends_ns or pairs")
