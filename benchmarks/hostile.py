@@ -36,7 +36,7 @@ from team.keys.roster import nodes_of
 from team.wire import channels as ch
 from team.wire.bus import BusError, Sample, opened
 from team.wire.codec import WireError
-from team.wire.zenoh_bus import ZenohBus
+from team.wire.zenoh.bus import ZenohBus
 from tests.hostile_team import OF_THE_RUN, PAIR, mutated, payloads
 
 PATIENCE_S = 600.0

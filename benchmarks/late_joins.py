@@ -19,7 +19,8 @@ from collections.abc import Sequence
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 
 MESSAGES = 24
 """That each publisher sends, some before the join and some after it."""
@@ -84,7 +85,7 @@ def storm(joins: int, publishers: int, seed: int) -> tuple[int, int, float]:
     """Keys that stayed partial, keys that were asked for, the longest time of a join [s]."""
     rng = random.Random(seed)
     questions = Questions()
-    log = logging.getLogger("team.wire.zenoh_bus")
+    log = logging.getLogger("team.wire.zenoh.recovery")
     log.addHandler(questions)
     log.setLevel(logging.INFO)
     partial = asked = 0

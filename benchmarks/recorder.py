@@ -28,7 +28,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
-from team.wire.zenoh_bus import ZenohBus
+from team.wire.zenoh.bus import ZenohBus
 
 BASELINE = Path(__file__).with_suffix(".json")
 PUBLISHERS = 2

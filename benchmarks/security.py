@@ -33,7 +33,8 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 
 BASELINE = Path(__file__).with_suffix(".json")
 TEAM = "bench"

@@ -19,7 +19,7 @@ from team.ros2.decoding import READERS, DamagedError, Record, TransformsRecord, 
 from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token
 from team.ros2.topics import RobotTopics
 from team.ros2.translator import Measured, Pose, Seen, Speeds, Translator
-from team.wire.foreign import ForeignSample
+from team.wire.zenoh.foreign import ForeignSample
 
 STATIC = "/tf_static"
 ODOMETRY = "nav_msgs/msg/Odometry"

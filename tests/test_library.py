@@ -15,7 +15,8 @@ import team
 from team import library
 from team.wire import channels as ch
 from team.wire.bus import Outgoing, opened
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import ROOT, submap
 

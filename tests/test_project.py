@@ -267,10 +267,10 @@ HEAVY = (
 COMPUTES = {"asyncio", "jaxtyping", "llvmlite", "numba", "scipy"}
 PROCESSES: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "any command": (("sim.cli.main",), set()),
-    "router": (("sim.cli.main", "team.shell", "team.wire.zenoh_bus"), {"zenoh"}),
+    "router": (("sim.cli.main", "team.shell", "team.wire.zenoh.bus"), {"zenoh"}),
     "recorder": (
         ("sim.cli.main", "team.recording.parts", "team.recording.provenance",
-         "team.recording.shell", "team.shell", "team.wire.zenoh_bus"),
+         "team.recording.shell", "team.shell", "team.wire.zenoh.bus"),
         {"mcap", "zenoh"},
     ),
     "robot": (("team.robot.main",), COMPUTES),

@@ -48,7 +48,7 @@ def driver(
     from team.ros2.topics import TopicsError, load_topics
     from team.ros2_driver import Ros2Driver
     from team.shell import process
-    from team.wire.foreign import ForeignKeys
+    from team.wire.zenoh.foreign import ForeignKeys
 
     logging.captureWarnings(True)
     # A detector names its tags in any order, and the measurements stay with their names.

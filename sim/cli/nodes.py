@@ -67,7 +67,7 @@ def router(
     """
     from team.keys.roster import load_roster
     from team.shell import process
-    from team.wire.zenoh_bus import router as zenoh_router
+    from team.wire.zenoh.router import router as zenoh_router
 
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     own = None if keys is None else (own_keys(keys, "router"), load_roster(keys))

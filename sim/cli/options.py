@@ -17,7 +17,7 @@ from team.config import Estimator, FusionRule
 if TYPE_CHECKING:
     from team.keys.credentials import Credentials
     from team.recording.reader import Log
-    from team.wire.zenoh_bus import ZenohBus
+    from team.wire.zenoh.bus import ZenohBus
 
 MOST_HOLES = 5
 """Findings of what a log lacks that a command names; `teamslam log check` names all."""
@@ -103,7 +103,7 @@ def check_pieces(scenario: Scenario) -> None:
 
 def connected(team: str, connect: str, keys: Path | None, node: str) -> "ZenohBus":
     """A bus of the team at the router's endpoint; with keys over TLS, by the node's certificate."""
-    from team.wire.zenoh_bus import ZenohBus
+    from team.wire.zenoh.bus import ZenohBus
 
     own = None if keys is None else own_keys(keys, node, team)
     return ZenohBus(team, over_tls(connect) if keys else connect, keys=own)

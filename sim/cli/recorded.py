@@ -55,7 +55,7 @@ def replay(
     from team.recording.reader import open_log
     from team.recording.shell import replay as replay_samples
     from team.shell import process
-    from team.wire.zenoh_bus import router
+    from team.wire.zenoh.router import router
 
     pace = parsed_speed(speed)
     if connect is None:

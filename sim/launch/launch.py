@@ -16,7 +16,7 @@ from sim.scenarios.scenario import dumps
 from team.keys.credentials import credentials_of
 from team.wire import channels as ch
 from team.wire.bus import BusError
-from team.wire.zenoh_bus import ZenohBus
+from team.wire.zenoh.bus import ZenohBus
 
 ROUTER_PATIENCE_S = 20.0
 """The router must say where it listens within this time; a busy machine starts Python slowly."""

@@ -25,7 +25,7 @@ from sim.launch.linux import end_with_parent, threads, write_command_line
 from sim.launch.processes import TEMPLATE
 
 LARGEST_REQUEST = 65_536
-LIGHT = ("team.keys.roster", "team.shell", "team.wire.zenoh_bus")
+LIGHT = ("team.keys.roster", "team.shell", "team.wire.zenoh.bus")
 """What the router needs: it is forked before anything else is imported."""
 HEAVY = (
     "central.desk.view.viewer",

@@ -15,7 +15,7 @@ from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import BusError
-from team.wire.zenoh_bus import ZenohBus
+from team.wire.zenoh.bus import ZenohBus
 
 HEAD_S = 1.0
 """Wall time between two words on how far the stream is."""

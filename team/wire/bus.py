@@ -1,4 +1,4 @@
-"""A bus carries payloads by key. Two implementations: here in memory, and `zenoh_bus`.
+"""A bus carries payloads by key. Two implementations: here in memory, and `team.wire.zenoh`.
 
 A `Sample` is what arrives: the relative key, the payload as it was published, and beside it the
 team time, the publisher's wall clock and its counter of this key. A node never sees a bus: its

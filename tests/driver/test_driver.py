@@ -17,7 +17,8 @@ from team.wire import messages as m
 from team.wire.arrays import floats, ids
 from team.wire.bus import Outgoing, opened
 from team.wire.codec import decoded, encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.support import ROOT, wait_until
 
 

@@ -19,10 +19,11 @@ from team.keys.credentials import credentials_of
 from team.keys.roster import load_roster, nodes_of
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire import zenoh_bus
 from team.wire.bus import BusError, Outgoing, Sample
 from team.wire.codec import encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh import session
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.keys.certificates import TEAM, Folders
 from tests.support import examples, odometry, submap, wait_until
 
@@ -245,7 +246,7 @@ def test_each_side_names_a_certificate_that_it_refuses(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(zenoh_bus, "FIRST_LOOK_S", 0.3)
+    monkeypatch.setattr(session, "FIRST_LOOK_S", 0.3)
     own = credentials_of(keys.own, "router"), load_roster(keys.own)
     with router("tls/127.0.0.1:0", own) as endpoint:
         told, took = refusal(endpoint, keys.strange)
@@ -289,7 +290,7 @@ def shut_out(bus: ZenohBus) -> tuple[str, float]:
 def test_a_router_whose_certificate_ends_is_named_by_who_is_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(zenoh_bus, "FIRST_LOOK_S", 0.3)
+    monkeypatch.setattr(session, "FIRST_LOOK_S", 0.3)
     make_keys(tmp_path, TEAM, nodes_of(["r1"]))
     ended = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=4)
     make_keys(tmp_path, TEAM, [], renew=["router"], days=1.0, now=ended)
@@ -307,7 +308,7 @@ def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its link comes up again, and it hears nothing: the others, who are not revoked, do."""
-    monkeypatch.setattr(zenoh_bus, "LINK_S", 0.3)
+    monkeypatch.setattr(session, "LINK_S", 0.3)
     home, carried = tmp_path / "home", tmp_path / "carried"
     make_keys(home, TEAM, nodes_of(["r1", "r2"]))
     copytree(home, carried)

@@ -14,7 +14,7 @@ from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
 from team.keys.roster import KeysError, load_roster, nodes_of
 from team.wire import channels as ch
-from team.wire.access import owned
+from team.wire.zenoh.access import owned
 from tests.keys.certificates import TEAM, Folders
 
 

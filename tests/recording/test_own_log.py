@@ -7,7 +7,8 @@ from team.recording.own_log import own_log
 from team.recording.reader import open_log
 from team.wire import channels as c
 from team.wire.bus import Outgoing
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.support import odometry, received, submap
 
 

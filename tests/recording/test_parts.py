@@ -17,7 +17,8 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 from team.wire.codec import decoded, encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.recording.test_shell import FINAL, POSE, Team, logged
 from tests.support import odometry, received, wait_until
 

@@ -19,7 +19,8 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.codec import decoded, encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.support import Link, examples, odometry, received, submap, wait_until
 
 FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))

@@ -14,7 +14,7 @@ from team.driver.measured import MeasurementError
 from team.ros2.keys import of_rmw, of_token
 from team.ros2.topics import RobotTopics, TopicsError, load_topics
 from team.ros2_driver import Ros2Driver
-from team.wire.foreign import ForeignKeys, ForeignSample
+from team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
 

@@ -15,7 +15,7 @@ from team.ros2.topics import RobotTopics, Topics
 from team.ros2_driver import Ros2Driver
 from team.wire import messages as m
 from team.wire.codec import encoded
-from team.wire.foreign import ForeignSample
+from team.wire.zenoh.foreign import ForeignSample
 from tests.ros2 import messages as ros
 from tests.teams import world_of
 

@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Self
 
 from team.wire.channels import Channel
-from team.wire.zenoh_bus import ZenohBus
+from team.wire.zenoh.bus import ZenohBus
 from tests.system.processes import until
 
 

@@ -8,7 +8,7 @@ from sim.scenarios.scenario import load
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
-from team.wire.zenoh_bus import ZenohBus
+from team.wire.zenoh.bus import ZenohBus
 from tests.hostile_team import OF_THE_RUN, mutated, payloads
 from tests.system.processes import Processes, until
 from tests.system.scenarios import short

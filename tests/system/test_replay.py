@@ -9,7 +9,7 @@ import zenoh
 
 from team.recording.reader import open_log
 from team.wire.bus import Sample
-from team.wire.zenoh_bus import ZenohBus
+from team.wire.zenoh.bus import ZenohBus
 from tests.system.conftest import Launched
 from tests.system.processes import Processes, until
 

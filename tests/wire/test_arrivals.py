@@ -5,7 +5,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from team.wire.arrivals import HELD_S, PATIENCE_S, Arrivals
+from team.wire.zenoh.arrivals import HELD_S, PATIENCE_S, Arrivals
 
 
 @given(st.permutations(range(8)), st.lists(st.integers(0, 7), max_size=8))

@@ -21,7 +21,8 @@ from team.wire.bus import (
     replied,
 )
 from team.wire.codec import WireError, decoded, encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.support import odometry, received, submap, wait_until
 
 Joined = Callable[[], Bus]

@@ -13,7 +13,8 @@ from team.wire import messages as m
 from team.wire import views as v
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.support import ROOT, submap
 
 PAGE = ROOT / "docs" / "wire.md"

@@ -1,6 +1,6 @@
 """What a router keeps of a team, without a network."""
 
-from team.wire.kept import Kept
+from team.wire.zenoh.kept import Kept
 
 
 def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone() -> None:

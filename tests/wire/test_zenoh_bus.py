@@ -17,7 +17,8 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import MAPS_KEPT, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
-from team.wire.zenoh_bus import ZenohBus, router
+from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from tests.support import ROOT, Link, examples, odometry, received, submap, wait_until
 
 FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))
@@ -155,7 +156,7 @@ def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None
 
 def test_a_killed_process_loses_its_token(endpoint: str) -> None:
     program = (
-        "import sys; from team.wire.zenoh_bus import ZenohBus\n"
+        "import sys; from team.wire.zenoh.bus import ZenohBus\n"
         f"bus = ZenohBus('t', {endpoint!r}); bus.declare_alive('robot/alpha')\n"
         "print('ready', flush=True); sys.stdin.read()"
     )
@@ -184,7 +185,7 @@ def python(program: str) -> subprocess.Popen[str]:
 def test_a_process_that_dies_of_an_exception_ends(endpoint: str) -> None:
     program = (
         "from team.wire import channels as c\n"
-        "from team.wire.zenoh_bus import ZenohBus\n"
+        "from team.wire.zenoh.bus import ZenohBus\n"
         f"bus = ZenohBus('t', {endpoint!r})\n"
         "for channel in c.CHANNELS: bus.subscribe(channel)\n"
         "bus.answer(c.SUBMAPS, '', lambda request: []); bus.watch_alive()\n"

@@ -1,0 +1,305 @@
+"""The bus over Zenoh: what a process of the team publishes, receives, asks and answers.
+
+Beside each payload travels an attachment of 24 bytes, `<qqq`: team time [ns], the publisher's wall
+clock [ns], the publisher's counter of this key. `team.wire.zenoh.delivery` says how a channel's
+delivery is kept; what Zenoh itself does not recover is asked for (`team.wire.zenoh.recovery`).
+
+Samples, queries and liveliness go from Zenoh's receiving thread straight into one unbounded queue:
+no thread is ours, the order of arrival is kept across subscriptions, and a slow node never stops
+the link (the team's credit bounds the queue). A bus does not receive what it publishes itself.
+"""
+
+import logging
+import struct
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import zenoh
+from zenoh.handlers import Callback
+
+from team.wire.bus import Answer, BusError, Outgoing, Sample
+from team.wire.channels import ALIVE, TALLY, Channel
+from team.wire.codec import LARGEST_PAYLOAD, encoded
+from team.wire.messages import Liveliness, Message, Tally
+from team.wire.zenoh.delivery import Publisher, declared, subscribe
+from team.wire.zenoh.queries import Queries, Question, Reply
+from team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
+from team.wire.zenoh.session import Door, client
+
+if TYPE_CHECKING:  # a node without keys needs none of it
+    from team.keys.credentials import Credentials
+
+_ATTACHMENT = struct.Struct("<qqq")
+_ALIVE_TIMEOUT_S = 5.0
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Token:
+    sample: zenoh.Sample
+
+
+_Item = Reply | zenoh.Sample | _Token | Question | Heartbeat | CacheAnswer | None
+"""What the receiving thread hands over; None wakes a receiver when the bus closes."""
+
+
+class ZenohBus:
+    """A bus over one Zenoh session: a client of the router at `connect`.
+
+    keys: what this node shows the router, over TLS; None: nothing, over TCP. Raises `BusError` when
+    no router answers there within `patience_s`, or one that refuses us or that we refuse. One
+    thread publishes and receives; `close` may come from any.
+    """
+
+    def __init__(
+        self,
+        team: str,
+        connect: str,
+        patience_s: float = 10.0,
+        keys: "Credentials | None" = None,
+    ) -> None:
+        self._prefix = f"team/{team}/"
+        self._queue: SimpleQueue[_Item] = SimpleQueue()
+        self._publishers: dict[str, Publisher] = {}
+        self._counters: dict[str, int] = {}
+        self._wanted: set[tuple[str, str]] = set()
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._published: dict[str, int] = {}
+        self._newest_ns = 0
+        self._since_ns = time.time_ns()
+        self.tap: Callable[[list[Sample]], None] | None = None
+        """Is handed what this bus publishes and receives."""
+        self._closed = threading.Event()
+        self._keys = keys
+        self._session = client(connect, patience_s, keys)
+        self._recovery = Recovery(self._session, self._prefix, self._queue.put)
+        self._queries = Queries(self._session, self._prefix, self._queue.put)
+        self._door = None if keys is None else Door(self._session, connect, keys)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave: what was published is sent first, the tokens go, a waiting receiver returns."""
+        if not self._closed.is_set():
+            with suppress(BusError):
+                self._tell_tally()
+            self._closed.set()
+            self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
+            self._queue.put(None)
+
+    def _tell_tally(self) -> None:
+        """Whoever records is told how much there was of each key: a tail may have been lost."""
+        if self._tokens:
+            node = next(iter(self._tokens))
+            counts = dict(sorted(self._published.items()))
+            keys = tuple(counts)
+            tally = Tally(
+                stamp_ns=self._newest_ns,
+                node=node,
+                since_ns=self._since_ns,
+                keys=keys,
+                counts=tuple(counts.values()),
+            )
+            self.publish(Outgoing(TALLY, node, tally))
+
+    def publish(self, out: Outgoing) -> int:
+        """Encode and publish, stamped with this machine's wall clock; the payload's bytes.
+
+        Blocks while the link is busy; after ten seconds Zenoh gives the link up and connects anew.
+        """
+        counter = self._counters.get(out.key, 0)
+        self._counters[out.key] = counter + 1
+        stamp_ns = out.message.stamp_ns
+        payload = encoded(out.message)
+        self.publish_raw(Sample(out.key, payload, stamp_ns, time.time_ns(), counter))
+        return len(payload)
+
+    def publish_raw(self, sample: Sample) -> None:
+        """Publish a sample as it is, with the delivery that the table promises for its key.
+
+        A key that is not in the table is a stream.
+        """
+        self._check_open()
+        if len(sample.payload) > LARGEST_PAYLOAD:
+            raise BusError(
+                f"{sample.key}: {len(sample.payload)} bytes, {LARGEST_PAYLOAD} at most; "
+                "split the map or send blocks instead of the joint covariance"
+            )
+        attachment = _ATTACHMENT.pack(sample.stamp_ns, sample.wall_ns, sample.counter)
+        try:
+            publisher = self._publishers.get(sample.key)
+            if publisher is None:
+                publisher = self._publishers[sample.key] = declared(
+                    self._session, self._prefix, sample.key
+                )
+            publisher.put(sample.payload, attachment=attachment)
+            self._published[sample.key] = max(
+                self._published.get(sample.key, 0), sample.counter + 1
+            )
+            self._newest_ns = max(self._newest_ns, sample.stamp_ns)
+            if self.tap is not None:
+                self.tap([sample])
+        except zenoh.ZError as error:
+            raise BusError(f"{sample.key}: not published, {error}") from error
+
+    def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
+        """From now on `receive` returns what is published there; asking twice changes nothing.
+
+        whole: of a `latest` channel not the newest one, but all that the publishers still have.
+        """
+        self._check_open()
+        if {(channel.name, "*"), (channel.name, name)} & self._wanted:
+            return
+        if name == "*" and any(wanted == channel.name for wanted, _ in self._wanted):
+            raise BusError(
+                f"{channel.name}: subscribed by name already, so `*` would deliver twice"
+            )
+        self._wanted.add((channel.name, name))
+        if whole:
+            self._recovery.take_whole(channel.name)
+        key = self._prefix + channel.key(_every(channel, name))
+        subscribe(self._session, key, channel, self._queue.put, whole=whole)
+        if channel.delivery != "stream":
+            self._recovery.watch(key)
+
+    def receive(self, timeout_s: float = 0.0) -> list[Sample]:
+        """All that has arrived, in order; waits at most `timeout_s` for the first.
+
+        Queries are answered here, on the caller's thread: a node's state needs no lock. What has
+        been missing for a while is asked for; it comes as it arrives, behind what came after it.
+        """
+        self._check_open()
+        if self._door is not None:
+            self._door.look(time.monotonic())
+        samples: list[Sample] = []
+        until = time.monotonic() + timeout_s
+        with suppress(Empty):
+            while True:
+                wait = 0.0 if samples else until - time.monotonic()
+                item = self._queue.get(timeout=wait) if wait > 0.0 else self._queue.get_nowait()
+                if item is None:
+                    break
+                self._take(item, samples)
+        samples += self._recovery.overdue(time.monotonic())
+        if self.tap is not None and samples:
+            self.tap(samples)
+        return samples
+
+    def _take(self, item: _Item, samples: list[Sample]) -> None:
+        match item:
+            case Question():
+                item.reply()
+            case _Token():
+                node = ALIVE.owner(str(item.sample.key_expr).removeprefix(self._prefix))
+                if node is not None and node not in self._tokens:
+                    alive = item.sample.kind == zenoh.SampleKind.PUT
+                    payload = encoded(Liveliness(stamp_ns=0, node=node, alive=alive))
+                    samples.append(Sample(ALIVE.key(node), payload, 0, time.time_ns(), 0))
+            case Heartbeat():
+                self._recovery.heard(item)
+            case CacheAnswer():
+                samples += self._recovery.answered(item)
+            case Reply():
+                samples += self._queries.taken(item)
+            case zenoh.Sample():
+                self._take_sample(item, samples)
+
+    def _take_sample(self, item: zenoh.Sample, samples: list[Sample]) -> None:
+        if item.attachment is None or len(item.attachment) != _ATTACHMENT.size:
+            _LOG.warning("%s: dropped, no attachment of 24 bytes beside it", item.key_expr)
+            return
+        key = str(item.key_expr).removeprefix(self._prefix)
+        stamp_ns, wall_ns, counter = _ATTACHMENT.unpack(item.attachment.to_bytes())
+        sample = Sample(key, item.payload.to_bytes(), stamp_ns, wall_ns, counter)
+        if item.source_info is None:  # of a plain publisher
+            samples.append(sample)
+        else:
+            samples += self._recovery.arrived(sample, item.source_info)
+
+    def again(self) -> None:
+        """What was delivered of `all` and whole channels is asked for and delivered once more."""
+        self._recovery.again()
+
+    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+        """What is known of and has not arrived: by key, intervals of a publisher's numbers.
+
+        Of what a publisher does not have any more, too.
+        """
+        return self._recovery.lacking()
+
+    def answer(self, channel: Channel, name: str, answer: Answer) -> None:
+        """Answer the queries of `channel`, within `receive`; a ValueError is told to the asker."""
+        self._check_open()
+        self._queries.answer(channel, name, answer)
+
+    def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
+        """The replies' payloads in the order of the answer; empty when nobody answers.
+
+        Raises `BusError` when an answer does not end within `timeout_s`, or is an error. This
+        bus answers nobody meanwhile: two nodes must not ask one another at once.
+        """
+        self._check_open()
+        return self._queries.ask(channel, name, request, timeout_s)
+
+    def request(self, channel: Channel, name: str, request: Message) -> None:
+        """Ask without waiting: the replies come out of `receive`, as samples of their channels.
+
+        While the same is being asked nothing happens.
+        """
+        self._check_open()
+        self._queries.request(channel, name, request)
+
+    def declare_alive(self, node: str) -> None:
+        """Hold a liveliness token until the bus is closed or its process dies."""
+        self._check_open()
+        if node not in self._tokens:
+            key = self._prefix + ALIVE.key(node)
+            self._tokens[node] = self._session.liveliness().declare_token(key)
+
+    def watch_alive(self, node: str = "**") -> None:
+        """Receive `Liveliness` samples when others' tokens appear and go, present ones first."""
+        self._check_open()
+
+        def notice(sample: zenoh.Sample) -> None:
+            self._queue.put(_Token(sample))
+
+        self._session.liveliness().declare_subscriber(
+            self._prefix + ALIVE.key(node), Callback(notice, indirect=False), history=True
+        )
+
+    def is_alive(self, node: str) -> bool:
+        """Whether anyone holds the node's liveliness token, as far as the router knows."""
+        self._check_open()
+        key = self._prefix + ALIVE.key(node)
+        replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
+        return any(reply.ok is not None for reply in replies)
+
+    def _check_open(self) -> None:
+        if self._closed.is_set():
+            raise BusError("the bus is closed")
+        if self._keys is not None and time.time() > self._keys.ends.timestamp():
+            raise BusError(
+                f"{self._keys.certificate} has expired, so the router has closed the link: renew "
+                f"it by `teamslam keys {self._keys.team} -o DIR --renew {self._keys.node}`, copy "
+                "it, and start this process again"
+            )
+
+
+def _every(channel: Channel, name: str) -> str:
+    """All names: a node's or a view's may have several parts."""
+    return "**" if name == "*" and "{robot}" not in channel.template else name

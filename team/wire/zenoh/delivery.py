@@ -1,0 +1,80 @@
+"""A channel's delivery, as the table of channels promises it, by Zenoh's own means.
+
+stream: a plain publisher that blocks and never drops; a cut link loses what was sent meanwhile.
+latest: a cache and heartbeats; a late joiner asks for the newest one, after a cut the receiver asks
+        for what the heartbeat says it missed, as far back as the cache goes.
+all:    as `latest` with everything cached, and a late joiner asks for everything.
+"""
+
+from collections.abc import Callable
+
+import zenoh
+from zenoh import ext
+from zenoh.handlers import Callback
+
+from team.wire.bus import ALL_KEPT, kept_of
+from team.wire.channels import Channel, row_of
+
+_HEARTBEAT_S = 0.25
+_BLOCK = zenoh.CongestionControl.BLOCK
+_RELIABLE = zenoh.Reliability.RELIABLE
+_PRIORITY = zenoh.Priority.DATA  # one for all, so that the order across keys is kept
+_REPLIES = ext.RepliesConfig(congestion_control=_BLOCK, priority=_PRIORITY)
+Publisher = zenoh.Publisher | ext.AdvancedPublisher
+
+
+def declared(session: zenoh.Session, prefix: str, key: str) -> Publisher:
+    """A publisher of the key's row of the table; a key that is not in the table is a stream."""
+    row = row_of(key)
+    if row is None or row.delivery == "stream":
+        return session.declare_publisher(
+            prefix + key,
+            congestion_control=_BLOCK,
+            priority=_PRIORITY,
+            reliability=_RELIABLE,
+        )
+    return ext.declare_advanced_publisher(
+        session,
+        prefix + key,
+        congestion_control=_BLOCK,
+        priority=_PRIORITY,
+        reliability=_RELIABLE,
+        cache=ext.CacheConfig(max_samples=kept_of(row), replies_config=_REPLIES),
+        # Periodic, not sporadic: a sporadic heartbeat that falls into a cut is never repeated.
+        sample_miss_detection=ext.MissDetectionConfig(
+            heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
+        ),
+        publisher_detection=True,
+    )
+
+
+def subscribe(
+    session: zenoh.Session,
+    key: str,
+    channel: Channel,
+    put: Callable[[zenoh.Sample], None],
+    *,
+    whole: bool,
+) -> None:
+    """Hand on what others publish there, on Zenoh's thread. whole: as `ZenohBus.subscribe`."""
+    callback = Callback(put, indirect=False)
+    remote = zenoh.Locality.REMOTE
+    if channel.delivery == "stream":
+        session.declare_subscriber(key, callback, allowed_origin=remote)
+        return
+    ext.declare_advanced_subscriber(
+        session,
+        key,
+        callback,
+        allowed_origin=remote,
+        history=_history(channel, whole=whole),
+        recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+    )
+
+
+def _history(channel: Channel, *, whole: bool) -> ext.HistoryConfig:
+    # Where one is wanted, no detection of late publishers: after a cut the publisher counts as
+    # late, and a query for one sample would take the place of the recovery of all.
+    if channel.delivery == "latest" and not whole:
+        return ext.HistoryConfig(max_samples=1, detect_late_publishers=False)
+    return ext.HistoryConfig(max_samples=ALL_KEPT, detect_late_publishers=True)

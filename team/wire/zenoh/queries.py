@@ -1,0 +1,126 @@
+"""Questions and answers over a session: what a node answers, and what it asks others."""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import zenoh
+from zenoh.handlers import Callback
+
+from team.wire.bus import Answer, BusError, Sample, replied
+from team.wire.channels import Channel
+from team.wire.codec import WireError, encoded
+from team.wire.messages import Message
+
+_ANSWER_S = 10.0
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, repr=False)
+class Question:
+    """A query that has come, and who answers it."""
+
+    query: zenoh.Query
+    answer: Answer
+
+    def reply(self) -> None:
+        """Answer it; where the request is not sound its sender is told."""
+        request = b"" if self.query.payload is None else self.query.payload.to_bytes()
+        with self.query as query:
+            try:
+                for payload in self.answer(request):
+                    query.reply(query.key_expr, payload)  # blocks as its query does
+            except ValueError as error:
+                query.reply_err(str(error))
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A reply to a request; without a payload: that was all, or why there is none."""
+
+    channel: Channel
+    name: str
+    payload: bytes | None
+    wrong: str = ""
+
+
+class Queries:
+    """Of one session. Questions and replies go into `put` on Zenoh's thread; all else is one's."""
+
+    def __init__(
+        self, session: zenoh.Session, prefix: str, put: Callable[[Question | Reply], None]
+    ) -> None:
+        self._session = session
+        self._prefix = prefix
+        self._put = put
+        self._requests: set[tuple[str, str]] = set()
+
+    def answer(self, channel: Channel, name: str, answer: Answer) -> None:
+        """From now on questions of this channel are put, with who answers them."""
+
+        def take(query: zenoh.Query) -> None:
+            self._put(Question(query, answer))
+
+        self._session.declare_queryable(
+            self._prefix + channel.key(name), Callback(take, indirect=False)
+        )
+
+    def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
+        """The replies' payloads in the order of the answer; raises `BusError` as the bus does."""
+        key = self._prefix + channel.key(name)
+        replies = self._session.get(
+            key,
+            payload=encoded(request),
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,  # each reply, not the newest per key
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        payloads: list[bytes] = []
+        for reply in replies:
+            if reply.ok is None:
+                text = _reason(reply.err)
+                raise BusError(f"{key}: {text} (waited at most {timeout_s} s)")
+            payloads.append(reply.ok.payload.to_bytes())
+        return payloads
+
+    def request(self, channel: Channel, name: str, request: Message) -> None:
+        """Ask without waiting: replies are put. While the same is being asked nothing happens."""
+        if (channel.name, name) in self._requests:
+            return
+        self._requests.add((channel.name, name))
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._put(Reply(channel, name, reply.ok.payload.to_bytes()))
+            elif reply.err is not None:
+                self._put(Reply(channel, name, None, _reason(reply.err)))
+
+        self._session.get(
+            self._prefix + channel.key(name),
+            Callback(take, drop=lambda: self._put(Reply(channel, name, None)), indirect=False),
+            payload=encoded(request),
+            timeout=_ANSWER_S,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+
+    def taken(self, reply: Reply) -> list[Sample]:
+        """A reply as a sample of its channel; nothing where it ends, or is none."""
+        key = reply.channel.key(reply.name)
+        if reply.payload is None:
+            self._requests.discard((reply.channel.name, reply.name))
+            if reply.wrong:
+                _LOG.warning("%s: %s (waited at most %s s)", key, reply.wrong, _ANSWER_S)
+            return []
+        try:
+            return [replied(reply.channel, reply.name, reply.payload, time.time_ns())]
+        except WireError as error:
+            _LOG.warning("%s: dropped a reply: %s", key, error)
+            return []
+
+
+def _reason(error: zenoh.ReplyError | None) -> str:
+    """Why there is no reply."""
+    text = "" if error is None else error.payload.to_bytes().decode("utf-8", "replace")
+    return text or "no answer"

@@ -1,0 +1,140 @@
+"""The router of a team, and what it keeps for who comes later."""
+
+import json
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+import zenoh
+from zenoh.handlers import Callback
+
+from team.keys.roster import Roster
+from team.wire.bus import BusError
+from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, GIVEN_UP, ORDERS_KEPT, TALLY
+from team.wire.codec import WireError, decoded, encoded
+from team.wire.messages import FinalMapRequest
+from team.wire.zenoh.access import access_control
+from team.wire.zenoh.kept import Kept
+from team.wire.zenoh.session import DOOR, opened
+
+if TYPE_CHECKING:  # a router without keys needs none of it
+    from team.keys.credentials import Credentials
+
+REFUSALS = "error,zenoh_link_tls=warn"
+"""What of Zenoh's log a router with keys shows: whom it refuses, and why."""
+_LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def router(
+    listen: str = "tcp/127.0.0.1:0", keys: "tuple[Credentials, Roster] | None" = None
+) -> Iterator[str]:
+    """A router in this process; yields the endpoint that it is bound to.
+
+    keys: the router's own, and whom it lets in: then it speaks TLS alone, and says on stderr or
+    stdout why it refuses whom. Raises `BusError` when it can not listen there.
+    """
+    settings: dict[str, object] = {
+        "mode": "router",
+        "listen/endpoints": [listen],
+        "adminspace/enabled": True,
+    }
+    if keys is not None:
+        if not listen.startswith("tls/"):
+            raise BusError(f"{listen}: with keys a router listens at tls/HOST:PORT")
+        zenoh.init_log_from_env_or(REFUSALS)
+        settings |= _router_tls(*keys)
+    try:
+        session = opened(settings)
+    except zenoh.ZError as error:
+        raise BusError(
+            f"can not listen at {listen}: the port is taken or the address is not this machine's; "
+            f"choose another, or port 0 for any free one"
+        ) from error
+    with session:
+        _Keeper(session)
+        door = keys and session.liveliness().declare_token(f"team/{keys[1].team}/{DOOR}")
+        replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
+        locators = [json.loads(r.ok.payload.to_string())["locators"] for r in replies if r.ok]
+        if not (locators and locators[0]):
+            raise BusError(f"the router at {listen} does not tell its endpoint")
+        yield str(locators[0][0])
+        del door  # held until here
+
+
+class _Keeper:
+    """Keeps each team's final map and orders at the router, and answers for who has left."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._teams: defaultdict[str, Kept] = defaultdict(Kept)
+        for channel in (FINAL_MAP, GIVEN_UP, TALLY):
+            key = f"team/*/{channel.key('**')}"
+            session.declare_subscriber(key, Callback(self._take, indirect=False))
+        session.liveliness().declare_subscriber(
+            f"team/*/{ALIVE.key('**')}", Callback(self._token, indirect=False), history=True
+        )
+        for channel, answer in ((FINAL_KEPT, self._final), (ORDERS_KEPT, self._orders)):
+            key = f"team/*/{channel.key()}"
+            session.declare_queryable(key, Callback(answer, indirect=False))
+
+    def _of(self, key: zenoh.KeyExpr) -> tuple[Kept, str]:
+        """What is kept of a key's team, and the key within the team."""
+        _, team, rest = str(key).split("/", 2)
+        return self._teams[team], rest
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        kept, key = self._of(sample.key_expr)
+        if key == FINAL_MAP.key():
+            kept.end(sample.payload.to_bytes(), time.monotonic())
+        elif (node := GIVEN_UP.owner(key)) is not None:
+            kept.order(node, sample.payload.to_bytes())
+        elif (node := TALLY.owner(key)) is not None:
+            kept.last_word(node)
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        kept, key = self._of(sample.key_expr)
+        node = ALIVE.owner(key)
+        if node is not None and kept.token(node, alive=sample.kind == zenoh.SampleKind.PUT):
+            _LOG.warning(
+                "%s of %s has gone without a last word: it was killed or cut off, or its "
+                "certificate has ended or is revoked",
+                node,
+                str(sample.key_expr).split("/", 2)[1],
+            )
+
+    def _final(self, query: zenoh.Query) -> None:
+        with query:
+            kept, _ = self._of(query.key_expr)
+            found = kept.answer(_asker(query), time.monotonic())
+            if found is not None:
+                query.reply(query.key_expr, encoded(found))
+
+    def _orders(self, query: zenoh.Query) -> None:
+        with query:
+            for order in self._of(query.key_expr)[0].orders():
+                query.reply(query.key_expr, order)
+
+
+def _asker(query: zenoh.Query) -> str:
+    """The node that asks for a final map; nobody's name where it does not say."""
+    with suppress(WireError):
+        request = b"" if query.payload is None else query.payload.to_bytes()
+        return decoded(request, FinalMapRequest).node
+    return ""
+
+
+def _router_tls(keys: "Credentials", roster: Roster) -> dict[str, object]:
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(keys.authority),
+            "enable_mtls": True,
+            "listen_certificate": str(keys.certificate),
+            "listen_private_key": str(keys.key),
+            "close_link_on_expiration": True,
+        },
+        "access_control": access_control(roster),
+    }
