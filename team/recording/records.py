@@ -9,6 +9,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, NamedTuple, cast
 
@@ -146,17 +147,17 @@ def records(data: bytes) -> Iterator[Frame]:
 
     Small records grow many times as Python's objects, so their number is bounded as the bytes are.
     """
-    offset = count = 0
-    while offset < len(data):
-        count += 1
-        if count > MOST_RECORDS:
+    starts: list[int] = []
+    offset, size = 0, len(data)
+    while offset < size:
+        if len(starts) == MOST_RECORDS:
             raise ValueError(f"more than {MOST_RECORDS} records, which no recorder writes")
-        opcode, length = _FRAME.unpack_from(data, offset)
-        start = offset + _FRAME.size
-        if start + length > len(data):
-            raise ValueError("a record ends beyond its chunk")
-        yield Frame(offset, opcode, data[start : start + length])
-        offset = start + length
+        starts.append(offset)
+        offset += _FRAME.size + _FRAME.unpack_from(data, offset)[1]
+    if offset > size:
+        raise ValueError("a record ends beyond its chunk")
+    for start, end in pairwise([*starts, size]):
+        yield Frame(start, data[start], data[start + _FRAME.size : end])
 
 
 def expanded(body: bytes) -> bytes:
