@@ -4,8 +4,10 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 from central.config import CentralConfig
+from central.kept import KeptSet
 from central.node import CentralNode
 from team.shell import WAIT_S, Shell
 from team.wire import channels as ch
@@ -29,7 +31,8 @@ class CentralShell:
     """The centre's process: subscribe, answer for its set, run, leave last.
 
     patience_s: a robot that is lost for so long is given up; None: nobody is, unless by an order.
-    admit: robots that are not named are taken into the team.
+    admit: robots that are not named are taken into the team. store: the file that keeps what the
+    robots and operators have sent for the set; a centre that is started again goes on from it.
     """
 
     def __init__(
@@ -41,8 +44,10 @@ class CentralShell:
         patience_s: float | None = None,
         *,
         admit: bool = False,
+        store: Path | None = None,
     ) -> None:
         self._bus = bus
+        self._kept = None if store is None else KeptSet(store)
         self.node = CentralNode(config, robots, admit=admit)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
@@ -63,10 +68,14 @@ class CentralShell:
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
         self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
         self._shell.look_for_the_end()
+        self._restore()
         self._shell.begin()
         while self._shell.going:
             self._shell.look_for_the_end()
-            self._shell.take(self._patient(self._bus.receive(WAIT_S)))
+            samples = self._bus.receive(WAIT_S)
+            if self._kept is not None:
+                self._kept.note(samples)
+            self._shell.take(self._patient(samples))
             self._shell.take(self._long_lost())
             self._give_up()
             self._shell.contained("wanted", self._mend)
@@ -82,6 +91,15 @@ class CentralShell:
         self._leave_last()
         self._shell.wait_for_recorder(lambda: False)
         self._shell.end(final)
+
+    def _restore(self) -> None:
+        """Take what an earlier life has kept; nobody has to send it again."""
+        if self._kept is None or not self._shell.going:
+            return
+        kept = self._kept.samples()
+        self._shell.take(kept)
+        if kept:
+            _LOG.info("%d members of the set are kept in %s", len(kept), self._kept.path)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
         """The samples, less the news of lost robots: they may come back within LOST_S."""

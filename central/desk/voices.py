@@ -2,7 +2,7 @@
 
 The running maps are those of one peer, the first that speaks; the final one is anybody's, since
 they are the same; a prior and a smoothed path are their own robot's. While a centre speaks for
-itself nobody speaks in its place.
+itself nobody speaks in its place; when it has gone, a peer does.
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,6 +16,7 @@ from team.wire.bus import Sample
 from team.wire.codec import WireError, decoded, encoded
 
 _CENTRE = frozenset({ch.FUSED_MAP.key(), ch.FINAL_MAP.key()})
+_TOKEN = ch.ALIVE.key("central")
 _AS = {
     ch.TEAM_CONFIG.name: ch.CENTRAL_CONFIG,
     ch.TEAM_MAP.name: ch.FUSED_MAP,
@@ -39,6 +40,8 @@ class Voices:
         """The sample as a centre would have said it; None: nothing of the kind."""
         if sample.key in _CENTRE:
             self._centre = True
+        elif sample.key == _TOKEN:
+            self._centre = self._centre and _is_alive(sample)
         found = ch.channel_of(sample.key)
         if self._centre or found is None:
             return None
@@ -80,6 +83,13 @@ class Voices:
             stamp_ns=status.stamp_ns, node="central", state=status.state, figures=figures
         )
         return replace(sample, key=ch.STATUS.key("central"), payload=encoded(own))
+
+
+def _is_alive(token: Sample) -> bool:
+    try:
+        return decoded(token.payload, m.Liveliness).alive
+    except WireError:
+        return True
 
 
 def with_voices(voices: Voices, samples: Iterable[Sample]) -> Iterator[Sample]:

@@ -80,13 +80,32 @@ class PeerFold:
                 return []
         return [*self._give(message), *self.grow()]
 
+    def _end_by_others(self) -> list[Outgoing]:
+        """Who missed the word that all streams have ended knows it from others' conclusions."""
+        stated = self._peer.replica.statements
+        here = [r for r in stated if not {("given_up", 0), ("withdrawal", 0)} & stated[r].keys()]
+        if self._end is not None or not here:
+            return []
+        if not set(here) <= self._peer.replica.concluded.keys():
+            return []
+        streams = []
+        for robot in stated:
+            said = (each.message for each in stated[robot].values())
+            last = [(d.incarnation, d.measurements) for d in said if isinstance(d, m.Done)]
+            if last:
+                incarnation, count = max(last)
+                end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
+                streams.append(end)
+        self._end = m.End(stamp_ns=0, streams=tuple(streams))
+        return self._give(self._end)
+
     def grow(self) -> list[Outgoing]:
         """Fold what the set has more; what there is to say of it."""
         if self._waits:
             if not self._whole:
                 return []
             self._waits = False
-        out: list[Outgoing] = []
+        out = self._end_by_others()
         again = self._peer.rebuild
         news = [] if again else list(self._peer.news())
         if self.centre.finished and not again:

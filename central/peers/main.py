@@ -1,4 +1,6 @@
-"""The process of a robot that is its own centre: a robot's shell, with its set on disk."""
+"""The processes of peers, a robot that is its own centre and a centre among peers, with their sets
+on disk.
+"""
 
 import logging
 import threading
@@ -7,7 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from central.config import CentralConfig
+from central.peers.centre import PeerCentre
 from central.peers.fold import FoldWhen
+from central.peers.peer import CENTRE, Peer
 from central.peers.robot import PeerRobot
 from team.config import Exchange, RobotConfig
 from team.peers.members import Member
@@ -29,6 +33,35 @@ _LOG = logging.getLogger("teamslam")
 def _as_heard(member: Member) -> Sample:
     stamp_ns = member.message.stamp_ns
     return Sample(member.key, member.payload, stamp_ns, time.time_ns(), NO_COUNTER)
+
+
+class Keeper:
+    """Keeps a peer's set in its file; `kept`: what was there. Raises StoreError."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._store = None if path is None else Store(path)
+
+    @property
+    def kept(self) -> list[Member]:
+        """What an earlier life has kept."""
+        return [] if self._store is None else self._store.kept
+
+    def save(self, peer: Peer) -> None:
+        """Keep what was news since the last time."""
+        members, peer.peer.unsaved = peer.peer.unsaved, []
+        if self._store is None or not members:
+            return
+        try:
+            self._store.append(members)
+        except StoreError as error:
+            _LOG.error("the set is not kept any more: %s", error)
+            self.close()
+
+    def close(self) -> None:
+        """Nothing more is kept."""
+        if self._store is not None:
+            self._store.close()
+            self._store = None
 
 
 class PeerShell(RobotShell):
@@ -56,7 +89,7 @@ class PeerShell(RobotShell):
         self._peer = PeerRobot(config, central, robots, exchange, when, signer)
         self.node = self._peer.node
         self._shell = Shell(bus, self._peer, self._peer.name, stop)
-        self._store = None if store is None else Store(store)
+        self._keeper = Keeper(store)
         self._over_since: float | None = None
 
     def run(self) -> None:
@@ -64,8 +97,7 @@ class PeerShell(RobotShell):
         try:
             super().run()
         finally:
-            if self._store is not None:
-                self._store.close()
+            self._keeper.close()
 
     def _subscribe(self) -> None:
         everyones = self._peer.overhears
@@ -79,15 +111,15 @@ class PeerShell(RobotShell):
 
     def _resume(self) -> bool:
         """Take over what is on disk; whether the stream goes on behind it."""
-        if self._store is None or not self._store.kept:
+        kept = self._keeper.kept
+        if not kept:
             return False
-        goes_on = self._peer.restore(self._store.kept)
+        goes_on = self._peer.restore(kept)
         self._peer.peer.unsaved.clear()
         self.node = self._peer.node
         _LOG.info(
-            "%d members of the set from %s, of this robot %d submaps",
-            len(self._store.kept),
-            self._store.path,
+            "%d members of the set are kept, of this robot %d submaps",
+            len(kept),
             self.node.submaps,
         )
         return goes_on
@@ -101,7 +133,7 @@ class PeerShell(RobotShell):
         now = time.monotonic()
         self._shell.publish(self._peer.tick(now))
         self._log_carried()
-        self._save()
+        self._keeper.save(self._peer)
         self._peer.finished = self._may_leave(now)
 
     def _log_carried(self) -> None:
@@ -112,17 +144,6 @@ class PeerShell(RobotShell):
         tap = getattr(self._bus, "tap", None)
         if tap is not None and members:
             tap([_as_heard(member) for member in members])
-
-    def _save(self) -> None:
-        members, self._peer.peer.unsaved = self._peer.peer.unsaved, []
-        if self._store is None or not members:
-            return
-        try:
-            self._store.append(members)
-        except StoreError as error:
-            _LOG.error("the set is not kept any more: %s", error)
-            self._store.close()
-            self._store = None
 
     def _may_leave(self, now: float) -> bool:
         """Nobody needs this peer any more: all have concluded, or the world has left."""
@@ -136,3 +157,48 @@ class PeerShell(RobotShell):
         self._over_since = now if self._over_since is None else self._over_since
         gone = self._peer.world_alive is False
         return now - self._over_since >= (WORLD_GONE_S if gone else LINGER_S)
+
+
+class CentreShell:
+    """The process of a centre among peers: go on with what is on disk, run, leave when all agree.
+
+    Raises BusError when the bus is lost.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        config: CentralConfig,
+        robots: Sequence[str],
+        stop: threading.Event,
+        *,
+        store: Path | None = None,
+        signer: Signs | None = None,
+    ) -> None:
+        self._bus = bus
+        self._peer = PeerCentre(config, robots, signer)
+        self._shell = Shell(bus, self._peer, CENTRE, stop)
+        self._keeper = Keeper(store)
+
+    def run(self) -> None:
+        """Until every peer has the final map that is here."""
+        for channel in self._peer.overhears:
+            self._bus.subscribe(channel)
+        self._bus.watch_alive()
+        self._shell.answer(ch.MEMBERS, CENTRE, self._peer.answer)
+        self._peer.keep(self._keeper.kept)
+        self._peer.peer.unsaved.clear()
+        if self._keeper.kept:
+            _LOG.info("%d members of the set are kept", len(self._keeper.kept))
+        try:
+            self._shell.run(self._duty)
+        finally:
+            self._keeper.close()
+        self._shell.wait_for_recorder(lambda: False)
+        self._shell.end(self._peer.final)
+
+    def _duty(self) -> None:
+        now = time.monotonic()
+        self._shell.publish(self._peer.tick(now))
+        self._keeper.save(self._peer)
+        self._peer.finished = self._peer.all_concluded

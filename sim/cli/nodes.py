@@ -40,7 +40,8 @@ NAME = "[a-z][a-z0-9_]{0,31}"
 if TYPE_CHECKING:
     import threading
 
-    from central.peers.main import PeerShell
+    from central.main import CentralShell
+    from central.peers.main import CentreShell, PeerShell
     from team.config import RobotConfig
     from team.wire.bus import Bus
 
@@ -195,13 +196,11 @@ def _peer_shell(
 ) -> "PeerShell":
     from central.peers.main import PeerShell
     from sim.radio.bus import behind_radio
-    from team.keys.signing import Signer
     from team.peers.store import StoreError
 
     if fold not in ("always", "end"):
         fail(f"--fold is always or end, not {fold!r}", WRONG_USE)
-    own = None if keys is None else own_keys(keys, f"robot-{config.id}", scenario.team)
-    signer = None if own is None else Signer(own)
+    signer = _signer(keys, f"robot-{config.id}", scenario.team)
     try:
         door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
         return PeerShell(
@@ -236,18 +235,70 @@ def central(
     seed: Seed = None,
     estimator: EstimatorOption = None,
     fusion: FusionOption = None,
+    peers: Peers = False,
+    kept: Annotated[
+        Path | None,
+        typer.Option(
+            "--set",
+            help="The file that keeps the team's set: started again, it goes on from there.",
+            metavar="FILE",
+        ),
+    ] = None,
 ) -> None:
-    """The central computer: fuses the robots' maps and broadcasts the fused map back."""
-    from central.main import CentralShell
+    """The central computer: fuses the robots' maps and broadcasts the fused map back.
+
+    With --peers it is one more peer, which may come and go as it likes.
+    """
+    from team.peers.store import StoreError
     from team.shell import process
 
     resolved = with_options(
-        scenario_of(scenario), robots=robots, seed=seed, estimator=estimator, fusion=fusion
+        scenario_of(scenario),
+        robots=robots,
+        seed=seed,
+        estimator=estimator,
+        fusion=fusion,
+        peers=peers,
     )
-    names = [config.id for config in resolved.robots]
     with process("central") as stop, connected(resolved.team, connect, keys, "central") as bus:
         _connected(resolved, connect)
-        CentralShell(bus, resolved.central, names, stop, patience, admit=resolved.admits).run()
+        try:
+            _central_shell(bus, resolved, stop, kept, patience, keys).run()
+        except StoreError as error:
+            fail(str(error), WRONG_USE)
+
+
+def _central_shell(
+    bus: "Bus",
+    scenario: Scenario,
+    stop: "threading.Event",
+    kept: Path | None,
+    patience: float | None,
+    keys: Path | None,
+) -> "CentralShell | CentreShell":
+    from central.main import CentralShell
+    from central.peers.main import CentreShell
+
+    names = [config.id for config in scenario.robots]
+    if not scenario.peers:
+        return CentralShell(
+            bus,
+            scenario.central,
+            names,
+            stop,
+            patience,
+            admit=scenario.admits,
+            store=kept,
+        )
+    signer = _signer(keys, "central", scenario.team)
+    return CentreShell(bus, scenario.central, names, stop, store=kept, signer=signer)
+
+
+def _signer(keys: Path | None, node: str, team: str) -> "Signer | None":
+    from team.keys.signing import Signer
+
+    own = None if keys is None else own_keys(keys, node, team)
+    return None if own is None else Signer(own)
 
 
 @app.command()

@@ -7,6 +7,8 @@ import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+from central.peers.centre import PeerCentre
+from central.peers.peer import CENTRE
 from central.peers.robot import PeerRobot
 from sim.in_memory.air import Air
 from sim.in_memory.team import ROUND_S, World
@@ -36,7 +38,7 @@ def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
 
 @dataclass
 class _Seat:
-    node: PeerRobot
+    node: PeerRobot | PeerCentre
     boundary: Boundary
     bytes_up: int = 0
     bytes_down: int = 0
@@ -46,7 +48,8 @@ class _Seat:
 class PeerTeam:
     """Peers in a world, and the air between them; `run` yields what a recorder would take.
 
-    seats: by robot. complete_ns: when each robot had its final map, in team time.
+    seats: by robot, and that of a centre if there is one. complete_ns: when each robot had its
+    final map, in team time.
     """
 
     def __init__(self, scenario: Scenario, air: Air, make: Make = peer_of) -> None:
@@ -67,6 +70,21 @@ class PeerTeam:
         """Put a robot there that knows nothing yet: at the start, or after a death."""
         node = self._make(self.scenario, config)
         self.seats[config.id] = _Seat(node, Boundary(node.name))
+
+    def seat_centre(self, restored: Iterable[Member] = ()) -> None:
+        """A centre comes, with what it has kept on disk: one more peer."""
+        names = [each.id for each in self.scenario.robots]
+        seat = _Seat(PeerCentre(self.scenario.central, names), Boundary(CENTRE))
+        seat.node.keep(restored)
+        self.seats[CENTRE] = seat
+        self._enter(CENTRE, seat)
+
+    def leave(self, name: str) -> list[Member]:
+        """A robot or the centre dies; what it had kept."""
+        seat = self.seats.pop(name)
+        for other in self.seats.values():
+            other.reached.discard(name)
+        return list(seat.node.peer.replica.members())
 
     def run(
         self, world: World, steps: Callable[["PeerTeam"], None] | None = None
@@ -112,6 +130,7 @@ class PeerTeam:
         assert isinstance(world, WorldNode)
         self.seat(config)
         seat = self.seats[config.id]
+        assert isinstance(seat.node, PeerRobot)
         seat.node.restore(restored)
         self._enter(config.id, seat)
         incarnation = max(1, seat.node.node.incarnation)
@@ -135,8 +154,11 @@ class PeerTeam:
             self._log.append(sample)
             found = ch.channel_of(sample.key)
             assert found is not None
-            for robot, seat in self.seats.items():
-                mine = found[0] in seat.node.listens and found[1] in ("", robot)
+            for robot, seat in list(self.seats.items()):
+                listens = (
+                    seat.node.listens if isinstance(seat.node, PeerRobot) else seat.node.overhears
+                )
+                mine = found[0] in listens and (robot == CENTRE or found[1] in ("", robot))
                 if mine:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
@@ -151,7 +173,7 @@ class PeerTeam:
         for out in said:
             if out.channel is ch.MEMBERS:
                 request = Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, -1)
-                to = ch.robot_of(out.name)
+                to = ch.robot_of(out.name) or out.name
                 if to in self.seats:
                     self._send(robot, to, request)
                 continue
@@ -195,7 +217,7 @@ class PeerTeam:
                 there = self.air.reach(robot, other, self.now_ns)
                 if there != (other in seat.reached):
                     (seat.reached.add if there else seat.reached.discard)(other)
-                    node = ch.robot_node(other)
+                    node = self.seats[other].node.name
                     token = m.Liveliness(stamp_ns=0, node=node, alive=there)
                     sample = Sample(ch.ALIVE.key(node), encoded(token), 0, 0, 0)
                     self._say(robot, seat.boundary.take(seat.node, sample))
@@ -204,6 +226,8 @@ class PeerTeam:
     def _agree(self) -> bool:
         """All have a final map of one set and know that of each other; nothing is on its way."""
         finals = [seat.node.final for seat in self.seats.values()]
+        if len(self.seats) < len(self.scenario.robots):
+            return False
         digests = {final.digest for final in finals if final is not None}
         return not self._heap and len(digests) == 1 and all(f is not None for f in finals)
 

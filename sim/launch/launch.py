@@ -75,6 +75,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
                 watch.peers = frozenset(each.id for each in plan.scenario.robots)
                 for channel in (ch.CONCLUDED, ch.TEAM_MAP, ch.TEAM_FINAL):
                     bus.subscribe(channel)
+                bus.watch_alive("central")
             for channel in watch.errors.listens:
                 bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):
@@ -148,8 +149,10 @@ def _endpoint(service: Supervised) -> str:
     raise LaunchError(f"the router did not come up within {ROUTER_PATIENCE_S:g} s")
 
 
-def _kept(plan: Plan, robot: str) -> list[str]:
-    return ["--set", str(plan.folder / f"{robot}.set")] if plan.scenario.peers else []
+def _kept(plan: Plan, node: str) -> list[str]:
+    """Where a node keeps its set: robots that are peers, and a centre."""
+    keeps = plan.scenario.peers or (node == "central" and plan.scenario.central.fusion == "join")
+    return ["--set", str(plan.folder / f"{node}.set")] if keeps else []
 
 
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
@@ -161,7 +164,11 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
     ]
     return [
         ("recorder", ["record", *common, "--output", str(plan.log)]),
-        *([("central", ["central", *common])] if plan.scenario.centre else []),
+        *(
+            [("central", ["central", *common, *_kept(plan, "central")])]
+            if plan.scenario.centre
+            else []
+        ),
         *robots,
         *([("viewer", ["viewer", *common])] if plan.views else []),
         *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),

@@ -2,7 +2,7 @@
 
 Recorder and viewer are not essential to the map: where they are given up the team goes on, and the
 run fails in the end. A robot that is given up is named as lost in the final map. Without router,
-world or centre there is no map: then the run ends.
+world or centre there is no map: then the run ends. Peers do without a centre.
 """
 
 import time
@@ -31,6 +31,11 @@ def node_of(name: str) -> str:
     return f"robot/{name.removeprefix('robot-')}" if name.startswith("robot-") else name
 
 
+def _is_needed(name: str, watch: Watch) -> bool:
+    """Whether there is no map without a process."""
+    return name in _WITHOUT_IT_NO_MAP and not (name == "central" and watch.peers)
+
+
 def supervise(
     services: Sequence[Supervised],
     bus: Bus,
@@ -54,7 +59,7 @@ def supervise(
         memory.look(services, is_final=is_final)
         for service in services:
             _look_after(service, bus, watch, is_final=is_final)
-        if any(s.given_up and s.name in _WITHOUT_IT_NO_MAP for s in services):
+        if any(s.given_up and _is_needed(s.name, watch) for s in services):
             return
         silence.look(services, watch)
         show(watch)
@@ -92,7 +97,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     watch.failures.append(f"{failure(ended)}; {deaths}")
     node = node_of(service.name)
     order = m.GivenUp(stamp_ns=0, node=node, by="launch", reason=f"{ended.how}; {deaths}")
-    if service.name not in _WITHOUT_IT_NO_MAP:
+    if not _is_needed(service.name, watch):
         bus.publish(Outgoing(ch.GIVEN_UP, node, order))
 
 

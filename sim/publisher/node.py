@@ -328,6 +328,7 @@ class WorldNode:
                 self._finish()
             case m.GivenUp():
                 self.expected -= {message.node}
+                self.centre = self.centre and not (self.peers and message.node == "central")
                 self.peers -= {ch.robot_of(message.node) or ""}
                 self._finish()
             case _:
@@ -335,10 +336,14 @@ class WorldNode:
         return []
 
     def _finish(self) -> None:
-        """The centre, if there is to be one, and every peer have their final maps."""
+        """The centre, if there is to be one, and every peer have their final maps.
+
+        Peers do without a centre: one that is not there is not waited for.
+        """
         said = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
         agreed = len(said) == len(self.peers) and len({each.digest for each in said}) <= 1
-        central = self.final is not None or (bool(said) and not self.centre)
+        waits = self.centre and (not said or "central" in self._alive)
+        central = self.final is not None or not waits
         self.finished = self.finished or (agreed and central)
 
     def _note_consumed(self, progress: m.Progress) -> None:
@@ -356,6 +361,8 @@ class WorldNode:
         self._recorder = "recorder" in self._alive
         for name, source in self._sources.items():
             source.alive = ch.robot_node(name) in self._alive
+        if message.node == "central" and not message.alive:
+            self._finish()
 
     def _going_on(self, clock_s: float) -> bool:
         """Whether an earlier life of this world had begun, and it is known how far everyone is.

@@ -1,0 +1,41 @@
+"""A centre among peers: one that has no estimator, and keeps and folds the set as they do.
+
+It may come when it likes, go, and come back: nobody waits for it, and what it lacks it asks of
+whoever has it. What it says are a centre's maps; peers do not need them.
+"""
+
+from collections.abc import Sequence
+
+import msgspec
+
+from central.config import CentralConfig
+from central.peers.peer import CENTRE, Peer
+from team.peers.proofs import Proofs, Signs
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+
+class PeerCentre(Peer):
+    """The centre's peer: `begin`, then `handle_sample` and `tick`, until `finished`."""
+
+    def __init__(
+        self, central: CentralConfig, robots: Sequence[str], signer: Signs | None = None
+    ) -> None:
+        proofs = None if signer is None else Proofs("", signer)
+        super().__init__(CENTRE, central, robots, proofs=proofs)
+
+    def begin(self) -> list[Outgoing]:
+        """What it says first: its configuration."""
+        return self.fold.centre.begin()
+
+    def _of_fold(self, said: Sequence[Outgoing]) -> list[Outgoing]:
+        """A centre's maps and orders; nobody waits for its credit."""
+        return [each for each in said if each.channel is not ch.CENTRAL_PROGRESS]
+
+    def status(self) -> m.Status:
+        """A centre's status with how much of the set is here."""
+        own = self.fold.centre.status()
+        faults = (*self._boundary.warnings, *self.fold.boundary.warnings)
+        figures = {**own.figures, **self.set_figures()}
+        return msgspec.structs.replace(own, figures=figures, warnings=(*own.warnings, *faults))
