@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from central.main import CentralShell
     from central.peers.main import CentreShell, PeerShell
     from team.config import RobotConfig
+    from team.keys.signing import Signer
     from team.wire.bus import Bus
 
 _LOG = logging.getLogger("teamslam")

@@ -4,7 +4,7 @@ The world reaches every robot, as its own sensors do; robots reach each other as
 """
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from central.peers.centre import PeerCentre
@@ -146,6 +146,11 @@ class PeerTeam:
             if seat.node.node.next_measurement == first:
                 return
 
+    def hear(self, name: str, sample: Sample) -> None:
+        """One robot alone hears what an operator says."""
+        seat = self.seats[name]
+        self._say(name, seat.boundary.take(seat.node, sample))
+
     # The world.
 
     def _source(self, said: Sequence[Outgoing]) -> None:
@@ -241,9 +246,9 @@ class PeerTeam:
         return taken
 
 
-def peer_world(scenario: Scenario, streams: WorldStreams) -> WorldNode:
-    """The world of a team without a centre."""
-    names = [each.id for each in scenario.robots]
+def peer_world(scenario: Scenario, streams: WorldStreams, late: Collection[str] = ()) -> WorldNode:
+    """The world of a team without a centre; it does not wait for robots that join late."""
+    names = [each.id for each in scenario.robots if each.id not in late]
     announced = translate.configured("world", 0, 0, scenario)
     return WorldNode(
         streams,

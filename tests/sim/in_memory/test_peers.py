@@ -8,6 +8,7 @@ from sim.in_memory.peers import PeerTeam, peer_world
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
+from team.peers.members import Member, about
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
@@ -59,19 +60,30 @@ def test_every_peers_final_map_is_the_central_runs_though_it_meets_one_teammate_
 
 
 def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(central):
-    """Robots meet two by two, r2 carries; r2 dies and has lost what it kept last."""
+    """Robots meet two by two, r2 carries; r2 dies and has lost what it kept last.
+
+    A centre is there for a while, meets r1 only, dies, and comes back with what it kept.
+    """
     windows = meetings(
         [
             Meeting(frozenset({"r1", "r2"}), 10 * SECOND, 14 * SECOND),
             Meeting(frozenset({"r2", "r3"}), 22 * SECOND, 25 * SECOND),
-            Meeting(frozenset({"r1", "r2", "r3"}), 60 * SECOND, 10**6 * SECOND),
+            Meeting(frozenset({"r1", "central"}), 8 * SECOND, 20 * SECOND),
+            Meeting(frozenset({"r1", "r2", "r3", "central"}), 60 * SECOND, 10**6 * SECOND),
         ]
     )
     deaths = iter([16, 27])
     due = next(deaths)
 
+    disk: list[Member] = []
+
     def die(team: PeerTeam) -> None:
         nonlocal due
+        at_s = team.now_ns // SECOND
+        if "central" not in team.seats and (at_s < 18 or at_s > 50):
+            team.seat_centre(disk)
+        elif "central" in team.seats and 18 < at_s < 50:
+            disk.extend(team.leave("central"))
         if team.now_ns >= due * SECOND:
             due = next(deaths, 10**9)
             kept = list(team.seats["r2"].node.peer.replica.members())
@@ -82,6 +94,8 @@ def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(cen
     expected = encoded(final_map(central))
     assert all(encoded(seat.node.final) == expected for seat in team.seats.values())
     assert min(team.complete_ns.values()) >= 60 * SECOND
+    assert any(about(each.message) == "r1" for each in disk)
+    assert sorted(team.seats) == ["central", "r1", "r2", "r3"]
 
 
 def test_the_fold_of_a_set_that_changed_or_grew_is_the_fold_of_what_it_is_now(central):
