@@ -7,7 +7,7 @@ from pathlib import Path
 from random import Random
 
 LANDMARKS = {7: (2.0, 1.0), 12: (-3.0, 2.0), 13: (1.0, -4.0), 20: (5.0, 3.0), 31: (-2.0, -5.0)}
-STEP_S, STEPS, SPEED, YAW_RATE = 0.1, 600, 0.5, 0.125
+STEP_S, STEPS, SPEED, YAW_RATE = 0.1, 2400, 0.5, 0.125
 
 
 def write(file, columns, rows):

@@ -45,7 +45,7 @@ def import_(
     """Turn logs into a data set that launch, calibrate, rerun and batch-reference take."""
     import re
 
-    from sim.datasets.folder import ROBOT_NAME
+    from sim.datasets.folder_files import ROBOT_NAME
     from sim.importing.source import Request, imported, proposal
 
     if output is None:
@@ -65,7 +65,7 @@ def import_(
     )
     report = imported(request, output)
     elapsed_s = time.monotonic() - began
-    for note in [*report.said, *_as_read(output)]:
+    for note in dict.fromkeys([*report.said, *_as_read(output)]):  # each once
         typer.echo(note)
     if report.messages:
         rate = report.messages / elapsed_s

@@ -60,6 +60,17 @@ class CsvTable:
         columns = {name: [cells[i] for i in kept] for name, cells in self.columns.items()}
         return CsvTable(self.name, columns, [self.lines[i] for i in kept])
 
+    def filled(self, needed: Sequence[str]) -> "CsvTable":
+        """Without columns that have nothing in any row; those that are needed stay.
+
+        So they do where no row has more than its first needed column: a time alone says something.
+        """
+        empty = {name for name, cells in self.columns.items() if not any(cells)}
+        if not set(self.columns) - empty - {*needed[:1]}:
+            return self
+        kept = {n: cells for n, cells in self.columns.items() if n in needed or n not in empty}
+        return CsvTable(self.name, kept, self.lines)
+
     def error(self, row: int, column: str, problem: str) -> DatasetError:
         """What is wrong in one cell."""
         return DatasetError(f"{self.name}, line {self.lines[row]}, column {column}: {problem}")
@@ -78,7 +89,8 @@ class CsvTable:
             try:
                 parse(cell)
             except ValueError as error:
-                raise self.error(row, column, str(error)) from None
+                remedy = "correct it, or take the row out"
+                raise self.error(row, column, f"{error}; {remedy}") from None
         raise AssertionError(column)
 
 
@@ -96,12 +108,15 @@ def read_table(file: File, name: str, known: Sequence[str] | None = None) -> Csv
         header = _header(rows, name)
         lines, cells = [], []
         for row in rows:
-            if row and not row[0].startswith("#"):
+            stripped = [cell.strip() for cell in row]
+            if any(stripped) and not stripped[0].startswith("#"):
                 lines.append(rows.line_num)
-                cells.append(row)
+                cells.append(stripped)
     except csv.Error as error:
         raise DatasetError(f"{name}, line {rows.line_num}: {error}; check its quotes") from None
     _check_header(header, name, known)
+    if not header[-1] and all(len(row) == len(header) and not row[-1] for row in cells):
+        header, cells = header[:-1], [row[:-1] for row in cells]  # each line ends with a comma
     for line, row in zip(lines, cells, strict=True):
         if len(row) != len(header):
             raise DatasetError(
@@ -126,11 +141,26 @@ def _check_header(header: list[str], name: str, known: Sequence[str] | None) -> 
     for i, column in enumerate(header):
         if column in header[:i]:
             raise DatasetError(f"{name}, line 1: two columns are called {column!r}")
-        if known is not None and column not in known:
+        if not column and i + 1 < len(header):
+            raise DatasetError(f"{name}, line 1: column {i + 1} has no name; give it one")
+        if known is not None and column and column not in known:
+            if _is_number(column):
+                raise DatasetError(
+                    f"{name}, line 1: {column!r} is a number, and the first line names the "
+                    f"columns; put a line above it, as {','.join(known[:4])}"
+                )
             raise DatasetError(
                 f"{name}, line 1: unknown column {column!r}; known: {', '.join(known)}. "
                 "`teamslam import` takes other names by a map of columns"
             )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _number(text: str) -> float:
@@ -152,14 +182,15 @@ def _stamp_ns(text: str, scale: Decimal) -> int:
         raise ValueError(f"{text[:SHOWN]!r} is not a time in numbers") from None
     if not value.is_finite() or abs(value) > LARGEST * 1e9:
         raise ValueError(
-            f"{text[:SHOWN]} is out of bounds: a time is finite and at most {LARGEST:g} s"
+            f"{text[:SHOWN]} is out of bounds: a time is finite and at most {LARGEST:g} s; of "
+            "nanoseconds a map of columns makes seconds (scale = 1e-9)"
         )
     return int(value.to_integral_value())
 
 
 def _landmark(text: str) -> int:
     try:
-        value = int(text)
+        value = int(text.removesuffix(".0"))
     except ValueError:
         raise ValueError(f"{text[:SHOWN]!r} is not a whole number") from None
     if not 0 <= value <= LARGEST_NAME:

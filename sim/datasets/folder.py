@@ -12,10 +12,7 @@ landmarks.csv         landmark,x_m,y_m: the true ones                     (optio
 scenario.toml         what the team is told                               (optional)
 """
 
-import re
-import zipfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +21,8 @@ from jaxtyping import Float, Int64
 
 from sim.datasets import folder_tables as rows
 from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.folder_files import EXPECTED, left_out, opened_folder
+from sim.datasets.folder_odometry import intervals_of
 from sim.datasets.tables import DatasetError, File
 from sim.world.config import FolderWorld, starts_unknown
 from sim.world.streams import (
@@ -36,16 +35,7 @@ from sim.world.streams import (
 )
 from team.config import RobotConfig
 
-ROBOT_NAME = "[a-z][a-z0-9_]{0,31}"
-STREAM_FILES = ("odometry.csv", "observations.csv")
-"""A folder with one of these is a robot's."""
-ONE_ROBOT = "r1"
-"""The name of a robot whose tables lie in the data set's folder itself."""
-SCENARIO = "scenario.toml"
-EXPECTED = (
-    "expected a folder with a sub-folder for each robot, named as in r1, with odometry.csv and "
-    "observations.csv (docs/your_data.md)"
-)
+DAY_NS = 86_400 * 10**9
 COVARIANCE = rows.POSE_COVARIANCE
 TABLES = {
     "odometry": (
@@ -57,7 +47,7 @@ TABLES = {
         *rows.POINT_COVARIANCE,
     ),
     "sightings": ("t_s", "teammate", *rows.POLAR, *rows.POINTS),
-    "start": (*rows.POSES, *COVARIANCE),
+    "start": ("t_s", *rows.POSES, *COVARIANCE),
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
 }  # fmt: skip
@@ -70,64 +60,6 @@ REQUIRED = {
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
 }
-
-
-@contextmanager
-def opened_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
-    """The data set's folder, and each robot's by name; raises DatasetError."""
-    place = Path(path)
-    if not place.exists():
-        raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
-    if place.is_dir():
-        yield place, _robots_in(place, path)
-        return
-    try:
-        with zipfile.ZipFile(place) as archive:
-            root = zipfile.Path(archive)
-            entries = list(root.iterdir())
-            only = entries[0] if len(entries) == 1 and entries[0].is_dir() else root
-            yield only, _robots_in(only, path)
-    except zipfile.BadZipFile as error:
-        raise DatasetError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
-
-
-def is_folder(path: str | Path) -> bool:
-    """Whether there is a data set of CSV tables."""
-    try:
-        with opened_folder(str(path)):
-            return True
-    except (DatasetError, OSError):
-        return False
-
-
-def robots_of(path: str) -> tuple[str, ...]:
-    """The names of a folder's robots: r2 before r10; raises DatasetError."""
-    with opened_folder(path) as (_, robots):
-        return tuple(robots)
-
-
-def _robots_in(root: File, path: str) -> Mapping[str, File]:
-    if any((root / name).is_file() for name in STREAM_FILES):
-        return {ONE_ROBOT: root}
-    entries: dict[str, File] = {entry.name: entry for entry in root.iterdir()}
-    found = {
-        name: entry
-        for name, entry in entries.items()
-        if entry.is_dir() and any((entry / each).is_file() for each in STREAM_FILES)
-    }
-    if not found:
-        raise DatasetError(f"{path}: no robot in it; {EXPECTED}")
-    for name in found:
-        if not re.fullmatch(ROBOT_NAME, name):
-            raise DatasetError(
-                f"{path}: the folder {name!r} can not be a robot's name: a small letter, then "
-                "small letters, digits and _ (32 at most); rename it"
-            )
-    return {name: found[name] for name in sorted(found, key=_natural)}
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
@@ -147,19 +79,21 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
             )
         read = [_robot_rows(name, folders[name], clocks) for name in clocks]
         surveyed = _table(root, "landmarks", "")
+        said = left_out(root, folders)
     if world.duration_s is not None:
         end_ns = min(each.start_ns for each in read) + round(world.duration_s * 1e9)
         read = [each.until(end_ns) for each in read]
     ids, positions = (
         (np.empty(0, np.uint32), None) if surveyed is None else rows.landmarks_of(surveyed)
     )
-    notes = () if len(ids) else ("no landmarks.csv: the map's error can not be computed",)
+    notes = [] if len(ids) else ["no landmarks.csv: the map's error can not be computed"]
+    notes += [*said, *_apart(read)]
     return WorldStreams(
         streams=tuple(_stream(each, world, clocks) for each in read),
         landmark_ids=ids,
         landmarks=positions if len(ids) else None,
         source=f"data set {Path(world.path).resolve().name}",
-        notes=notes,
+        notes=tuple(notes),
     )
 
 
@@ -210,17 +144,19 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
         _table(place, kind, robot)
         for kind in ("odometry", "observations", "sightings", "truth", "start")
     )
-    intervals, notes = rows.intervals_of(odometry, clocks[robot])
-    end_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else None
-    if end_ns is None:
+    intervals, notes = intervals_of(odometry, clocks[robot])
+    driven = None
+    if len(intervals.end_ns):
+        driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
+    else:
         notes.append("no odometry: only what it saw is given")
-    seen, looked, said = rows.measurements_of(observed, "measurement", None, end_ns)
+    seen, looked, said = rows.measurements_of(observed, "measurement", None, driven)
     notes += said
     if not len(seen.stamps_ns):
         notes.append("no observations: only its odometry is given")
-    met, _, said = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), end_ns)
+    met, _, said = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
     notes += said
-    if end_ns is None and not len(seen.stamps_ns) and not len(met.stamps_ns):
+    if driven is None and not len(seen.stamps_ns) and not len(met.stamps_ns):
         raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
     truth_ns, poses, said = rows.truth_of(truth)
     notes += said if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
@@ -237,6 +173,17 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
     )
 
 
+def _apart(read: Sequence[RobotRows]) -> list[str]:
+    """A word about robots that were never there at once: their clocks may be two."""
+    first = min(read, key=lambda each: each.start_ns)
+    return [
+        f"{each.robot} begins {(each.start_ns - first.start_ns) / DAY_NS:.1f} days after "
+        f"{first.robot}: all robots of a team are to have one clock"
+        for each in read
+        if each.start_ns - first.start_ns > DAY_NS
+    ]
+
+
 def _table(place: File, kind: str, robot: str) -> CsvTable | None:
     """A table with the columns that it needs; None where it is missing or has no row."""
     file = place / f"{kind}.csv"
@@ -246,7 +193,7 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
     for column in REQUIRED[kind]:
         if not table.has(column):
             raise table.fault(f"no column {column}; known: {', '.join(TABLES[kind])}")
-    return table if len(table) else None
+    return table.filled(REQUIRED[kind]) if len(table) else None
 
 
 def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:

@@ -11,21 +11,24 @@ from jaxtyping import Bool, Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable
 from sim.datasets.utias_rows import counted, first_of_each, on_circle
-from sim.world.streams import Detections, Intervals, StartPose, grouped, moved
+from sim.world.streams import Detections, StartPose, grouped
 
 SPEEDS = ("forward_m_s", "yaw_rate_rad_s")
 POSES = ("x_m", "y_m", "theta_rad")
 INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
 STEERED = ("wheel_speed_m_s", "steering_rad")
-ODOMETRY_FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
 POLAR = ("range_m", "bearing_rad")
 POINTS = ("x_m", "y_m")
 POSE_COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
 POINT_COVARIANCE = ("c_xx", "c_xy", "c_yy")
 POLAR_COVARIANCE = ("c_rr", "c_rb", "c_bb")
 NOT_A_COVARIANCE = "its covariance is not positive definite"
+EARLY = "more than 2 s before its first odometry, where its motion is not known"
 LATE = "after its last odometry, where its motion is not known"
-LONG_GAP_NS = 2_000_000_000
+EARLY_NS = 2_000_000_000
+"""What is seen may come so long before the odometry: the robot stood."""
+MOST_RAD = 2.0 * np.pi + 1e-3
+"""The largest bearing, whichever way round: beyond are no radians."""
 
 
 class Rows:
@@ -67,96 +70,21 @@ class Rows:
         among = set(names)
         return np.array([cell in among for cell in self.table.columns[column]], dtype=np.bool_)
 
+    def note(self, chosen: Bool[np.ndarray, " rows"], what: str) -> None:
+        """A word about these rows, which stay."""
+        if chosen.any():
+            first = int(np.flatnonzero(chosen)[0])
+            self._note(int(np.count_nonzero(chosen)), what, self.table, first)
+
     def _note(self, count: int, what: str, table: CsvTable, row: int) -> None:
         where = "first at" if count > 1 else "at"
         note = counted(count, self.thing, what)
         self.notes.append(f"{note} ({table.name}, {where} line {table.lines[row]})")
 
 
-def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, list[str]]:
-    """Odometry in any of its forms; stamps are moved by offset_ns, the offset of its clock.
-
-    Speeds hold from t_s to the next row's, and the last row only ends the last interval; with a
-    column duration_s they are the means over the time that ends at t_s. Poses are of t_s; an
-    increment ends at t_s and begins at the row before; its covariance is of an error in the frame
-    of its end. A car's wheel speed and steering hold as speeds do.
-    """
-    if table is None:
-        none = np.empty(0, np.int64)
-        return Intervals(none, none, np.empty(0), np.empty(0)), []
-    rows = Rows(table, "odometry row")
-    form = _form(table)
-    rows.drop(
-        np.diff(rows.stamps_ns, prepend=rows.stamps_ns[:1] - 1) <= 0,
-        "another row has the same time, so it lasts no time",
-    )
-    stamps = rows.stamps_ns + offset_ns
-    numbers = rows.table.numbers(*form)
-    duration = np.diff(stamps)
-    if form == POSES:
-        steps = between(numbers)
-        ends = stamps[1:]
-    elif form in (SPEEDS, STEERED) and not table.has("duration_s"):
-        steps, ends = numbers[:-1], stamps[1:]
-    else:
-        steps, ends = numbers, stamps
-        duration = np.concatenate([_first_duration(rows, duration), duration])[: len(stamps)]
-    if len(duration) and duration.max() > LONG_GAP_NS:
-        seconds = duration.max() * 1e-9
-        rows.notes.append(f"odometry has a gap of {seconds:.1f} s: one interval lasts as long")
-    if form in (SPEEDS, STEERED):
-        forward, yaw_rate = steps.T.copy() if len(steps) else np.zeros((2, 0))
-        intervals = Intervals(ends, duration, forward, yaw_rate, steered=form == STEERED)
-    else:
-        intervals = moved(ends, duration, steps, _claimed(rows, form))
-    return intervals, rows.notes
-
-
-def _claimed(rows: Rows, form: tuple[str, ...]) -> Float[np.ndarray, "N 3 3"] | None:
-    """The increments' own covariances; None where they claim none."""
-    table = rows.table
-    if not any(table.has(column) for column in POSE_COVARIANCE):
-        return None
-    if form != INCREMENTS or not table.has(*POSE_COVARIANCE):
-        raise table.fault(
-            f"covariances ({','.join(POSE_COVARIANCE)}) come with {','.join(INCREMENTS)}, all six"
-        )
-    covariances = matrices(table.numbers(*POSE_COVARIANCE))
-    for row in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0.0)[:1].tolist():
-        raise table.error(row, "c_xx", NOT_A_COVARIANCE)
-    return covariances
-
-
 def matrices(packed: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 3 3"]:
     """Of (xx, xy, yy, xt, yt, tt)."""
     return packed[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
-
-
-def _form(table: CsvTable) -> tuple[str, ...]:
-    found = [form for form in ODOMETRY_FORMS if table.has(*form)]
-    if len(found) == 1:
-        return found[0]
-    forms = " or ".join(",".join(form) for form in ODOMETRY_FORMS)
-    what = "more than one form of odometry" if found else "no odometry"
-    raise table.fault(f"{what} in its columns; give t_s with one of {forms}")
-
-
-def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, "1"]:
-    """How long the first row's interval lasts; as long as the second's where nothing says so."""
-    if rows.table.has("duration_s") and len(rows.table):
-        first = rows.table.rows([True]).stamps("duration_s")
-        if first[0] <= 0:
-            raise rows.table.error(0, "duration_s", "not above 0")
-        return first
-    rows.notes.append("the first increment is taken to last as long as the second")
-    return others[:1] if len(others) else np.array([10**9])
-
-
-def between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
-    """Each pose but the first in the frame of the pose before: (forward, left, turn)."""
-    dx, dy, turn = np.diff(poses, axis=0).T if len(poses) > 1 else np.zeros((3, 0))
-    c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx, on_circle(turn)])
 
 
 @dataclass(frozen=True)
@@ -192,17 +120,21 @@ def measurements_of(
     table: CsvTable | None,
     thing: str,
     team: tuple[str, Sequence[str]] | None,
-    end_ns: int | None,
+    driven: tuple[int, int] | None,
 ) -> tuple[Scans, Int64[np.ndarray, " E"], list[str]]:
-    """Measurements up to end_ns of landmarks, or of teammates as indices into the team's names
-    (team: the robot itself, and all of them); and when the robot looked and saw nothing, which a
-    row says that has a time alone.
+    """Measurements of landmarks, or of teammates as indices into the team's names (team: the robot
+    itself, and all of them); and when the robot looked and saw nothing, which a row says that has a
+    time alone.
+
+    driven: when its odometry begins and ends; None: it has none. Raises DatasetError.
     """
     if table is None:
         none = np.empty(0, np.int64)
         empty = Scans(none, none.astype(np.uint32), np.empty(0), np.empty(0))
         return empty, none, []
     rows = Rows(table, thing)
+    if driven is not None:
+        _check_clock(rows, driven)
     looked = rows.take_out(
         ~np.array([any(cells[1:]) for cells in _cells(rows.table)], dtype=np.bool_)
     )
@@ -227,10 +159,26 @@ def measurements_of(
         found = keep((aa > 0.0) & (aa * bb > ab * ab), NOT_A_COVARIANCE)
     single = first_of_each(found.stamps_ns, found.ids, np.ones(len(found.ids), np.bool_))
     found = keep(single, f"a second one of the same {column} at the same time")
-    if end_ns is not None:
+    if driven is not None:
+        begin_ns, end_ns = driven
         found = keep(found.stamps_ns <= end_ns, LATE)
-        looked = looked[looked <= end_ns]
+        found = keep(found.stamps_ns >= begin_ns - EARLY_NS, EARLY)
+        looked = looked[(looked <= end_ns) & (looked >= begin_ns - EARLY_NS)]
     return found, looked, rows.notes
+
+
+def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
+    """Raises DatasetError where none of the rows lies in the time of the odometry."""
+    first_ns, last_ns = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
+    begin_ns, end_ns = driven
+    if first_ns > end_ns or last_ns < begin_ns - EARLY_NS:
+        raise rows.table.error(
+            0,
+            "t_s",
+            f"its times, {first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s, are not those of the "
+            f"odometry, {begin_ns * 1e-9:.3f} to {end_ns * 1e-9:.3f} s; all tables of a team have "
+            "one clock: put them on it by a map of columns (offset, scale)",
+        )
 
 
 def _cells(table: CsvTable) -> list[tuple[str, ...]]:
@@ -242,8 +190,19 @@ def _cells(table: CsvTable) -> list[tuple[str, ...]]:
 def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
     """Ranges and bearings or points, with what the detector claims of them if it may."""
     table, stamps = rows.table, rows.stamps_ns
+    if table.has(*POLAR) and table.has(*POINTS):
+        raise table.fault(
+            f"two forms of measurements; give {','.join(POLAR)} or {','.join(POINTS)}, not both"
+        )
     if table.has(*POLAR):
         ranges, bearings = table.numbers(*POLAR).T
+        for row in np.flatnonzero(np.abs(bearings) > MOST_RAD)[:1].tolist():
+            raise table.error(
+                row,
+                "bearing_rad",
+                f"{bearings[row]:g} is more than a whole turn; bearings are in radians: of degrees "
+                "a map of columns makes them (scale = 0.017453292519943295)",
+            )
         claimed = _own(table, POLAR_COVARIANCE) if claims else None
         return Scans(stamps, ids, ranges.copy(), on_circle(bearings), None, claimed)
     if not table.has(*POINTS):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from sim.datasets import folder, tables, unlabelled
+from sim.datasets import folder_files, tables, unlabelled
 from sim.datasets.tables import DatasetError
 
 Kind = Literal["utias", "folder", "unlabelled"]
@@ -14,7 +14,7 @@ def kind_of(path: str | Path) -> Kind:
     """UTIAS files, CSV tables by robot or of detections; raises DatasetError for what is none."""
     if unlabelled.is_unlabelled(path):
         return "unlabelled"
-    if folder.is_folder(path):
+    if folder_files.has_tables(path):
         return "folder"
     try:
         with tables.opened(str(path), UTIAS_MARKER):
@@ -22,4 +22,6 @@ def kind_of(path: str | Path) -> Kind:
     except DatasetError as error:
         if not Path(path).exists() or UTIAS_MARKER not in str(error):
             raise
-        raise DatasetError(f"{error}; or {folder.EXPECTED.removeprefix('expected ')}") from None
+        raise DatasetError(
+            f"{error}; or {folder_files.EXPECTED.removeprefix('expected ')}"
+        ) from None

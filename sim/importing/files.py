@@ -1,6 +1,6 @@
 """CSV files with columns of their own names, and trajectories, → tables."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import atan2
 from pathlib import Path
 
@@ -16,11 +16,12 @@ QUATERNION = 8
 
 
 def imported_files(
-    paths: Sequence[Path], columns: Map | None, robot: str
+    paths: Sequence[Path], columns: Map | None, robot: str, everyones: Collection[str] = ()
 ) -> tuple[RobotTables, list[str]]:
     """One robot's tables from CSV files; what was taken and left out, in words.
 
-    Raises DatasetError; without a map it proposes one, unless every name is ours.
+    everyones: the names of all robots' files; a table that only others have is left out. Raises
+    DatasetError; without a map it proposes one, unless every name is ours.
     """
     files = {path.name: read_table(path, str(path)) for path in paths}
     if len(files) < len(paths):
@@ -30,6 +31,10 @@ def imported_files(
     said: list[str] = []
     used: set[str] = set()
     for kind, table in chosen.items():
+        lacking = [each for each in table.files if not any(n.endswith(each) for n in files)]
+        if lacking and all(any(n.endswith(each) for n in everyones) for each in lacking):
+            said.append(f"no {', '.join(lacking)}: no {kind}")
+            continue
         said += _take(kind, table, files, tables, used)
     said += [f"{name}: not used: the map does not name it" for name in files if name not in used]
     return tables, said

@@ -1,12 +1,14 @@
 """Whatever a user has → a data set's folder."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import tomli_w
 
-from sim.datasets.folder import ONE_ROBOT, SCENARIO, is_folder
+from sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO
 from sim.datasets.folder_tables import POSES
 from sim.datasets.folder_writer import write_folder
 from sim.datasets.kinds import kind_of
@@ -15,19 +17,14 @@ from sim.importing.bag import imported_bag, proposed_topics
 from sim.importing.columns import load_map
 from sim.importing.files import imported_files, trajectory
 from sim.importing.tables import RobotTables
-from sim.recorded.streams import recorded_streams
-from sim.scenarios.scenario import Scenario, load, loads, with_options
+from sim.recorded.streams import measurements_in
+from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from sim.scenarios.toml import folder_scenario
-from sim.world.streams import WorldStreams
-from team.recording.reader import LogError, open_log
+from sim.world.streams import StartPose, WorldStreams
 from team.ros2.bags import BagError, is_bag
 from team.ros2.topics import TopicsError, load_topics
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
 
-LOG_CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
 TEAM_PROFILE = b"teamslam"
 HEAD = 64
 
@@ -65,17 +62,92 @@ def imported(request: Request, folder: Path) -> Report:
     if bags:
         return _bags(request, folder)
     if source.is_file() and source.suffix in (".csv", ".txt", ".tsv"):
-        robot = request.robot or ONE_ROBOT
-        columns = load_map(request.columns) if request.columns else None
-        tables, said = imported_files(request.sources, columns, robot)
-        return _written([tables], said, request, folder)
+        return _csv({request.robot or ONE_ROBOT: list(request.sources)}, request, folder)
+    if source.is_dir() and (request.columns or len(request.sources) > 1 or _is_foreign(source)):
+        return _csv(_files_by_robot(request), request, folder)
     if len(request.sources) > 1:
         raise DatasetError(f"{request.sources[1]}: one data set or log at a time")
-    streams, scenario = _log(source) if is_own_log(source) else _data_set(source)
-    write_folder(streams, folder)
+    return _kept(request, folder)
+
+
+def _kept(request: Request, folder: Path) -> Report:
+    """What is a data set or a log already, with the initial poses that are given."""
+    source = request.sources[0]
+    given = {"--robot": request.robot, "--columns": request.columns, "--truth": request.truth}
+    for option in (name for name, value in given.items() if value is not None):
+        raise DatasetError(
+            f"{option}: {source} has its robots' names and tables already; it goes with CSV files "
+            "of other columns and with bags"
+        )
+    streams, scenario, said = _log(source) if is_own_log(source) else _data_set(source)
+    robots = {stream.robot: stream for stream in streams.streams}
+    for name, (x, y, theta, *sigmas) in request.starts.items():
+        robot = _started(name, robots)
+        pose = np.array([x, y, theta])
+        variances = [sigmas[0] ** 2, sigmas[0] ** 2, sigmas[1] ** 2] if sigmas else None
+        start = StartPose(pose, None if variances is None else np.diag(variances))
+        robots[robot] = replace(robots[robot], start=start)
+    write_folder(replace(streams, streams=tuple(robots.values())), folder)
     (folder / SCENARIO).write_text(folder_scenario(scenario), "utf-8")
-    said = [*streams.notes, *(f"{s.robot}: {note}" for s in streams.streams for note in s.notes)]
-    return Report([stream.robot for stream in streams.streams], said)
+    said += [*streams.notes, *(f"{s.robot}: {note}" for s in streams.streams for note in s.notes)]
+    return Report(list(robots), said)
+
+
+def _started(name: str, robots: Collection[str]) -> str:
+    """Whose initial pose `--start` gives; raises DatasetError."""
+    robot = name or (next(iter(robots)) if len(robots) == 1 else "")
+    if robot not in robots:
+        raise DatasetError(
+            f"--start: which robot's? Give ROBOT:x,y,theta with one of {', '.join(robots)}"
+        )
+    return robot
+
+
+def _is_foreign(source: Path) -> bool:
+    """A folder of CSV files with names of their own, in it or in one folder for each robot."""
+    try:
+        kind_of(source)
+    except DatasetError:
+        return bool([*source.glob("*.csv"), *source.glob("*/*.csv")])
+    return False
+
+
+def _files_by_robot(request: Request) -> dict[str, list[Path]]:
+    """The CSV files of each robot: of a folder, of each of its folders, or of each one given.
+
+    Files that lie beside the robots' folders (the true landmarks') are everyone's.
+    """
+    found: dict[str, list[Path]] = {}
+    for source in request.sources:
+        if not source.is_dir():
+            raise DatasetError(f"{source}: give folders, one for each robot, or files of one robot")
+        inner = {each.name: sorted(each.glob("*.csv")) for each in sorted(source.iterdir())}
+        inner = {name: files for name, files in inner.items() if files}
+        beside = sorted(source.glob("*.csv"))
+        if inner:
+            found |= {name: [*files, *beside] for name, files in inner.items()}
+        elif len(request.sources) == 1:
+            found[request.robot or ONE_ROBOT] = beside
+        else:
+            found[source.name] = beside
+    for name in found:
+        if not re.fullmatch(ROBOT_NAME, name):
+            raise DatasetError(
+                f"{name}: no robot's name: a small letter, then small letters, digits and _ (32 at "
+                "most); rename the folder"
+            )
+    return found
+
+
+def _csv(files: Mapping[str, Sequence[Path]], request: Request, folder: Path) -> Report:
+    columns = load_map(request.columns) if request.columns else None
+    everyones = {path.name for paths in files.values() for path in paths}
+    tables, said = [], []
+    for robot, paths in files.items():
+        of, notes = imported_files(paths, columns, robot, everyones)
+        tables.append(of)
+        said += notes if len(files) == 1 else [f"{robot}: {note}" for note in notes]
+    return _written(tables, said, request, folder)
 
 
 def proposal(path: Path) -> str:
@@ -96,22 +168,14 @@ def is_own_log(path: Path) -> bool:
         return TEAM_PROFILE in file.read(HEAD)
 
 
-def _log(path: Path) -> tuple[WorldStreams, Scenario]:
-    messages = [opened(sample)[2] for sample in open_log(path).samples(LOG_CHANNELS)]
-    configured = [each for each in messages if isinstance(each, m.Configuration)]
-    if not configured:
-        raise LogError(path, "it has no scenario", "import what it was recorded from")
-    scenario = loads(configured[-1].configuration)
-    clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
-    return recorded_streams(messages, path.name, clocks), scenario
+def _log(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:
+    return *measurements_in(path), []
 
 
-def _data_set(path: Path) -> tuple[WorldStreams, Scenario]:
-    if not is_folder(path):
-        kind_of(path)
+def _data_set(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:
     scenario = with_options(load(scenario_beside(path)), dataset=path)
-    scenario, _ = with_present_robots(scenario)
-    return streams_of(scenario), scenario
+    scenario, missing = with_present_robots(scenario)
+    return streams_of(scenario), scenario, [] if missing is None else [missing]
 
 
 def _bags(request: Request, folder: Path) -> Report:
@@ -140,12 +204,7 @@ def _written(
 ) -> Report:
     by_name = {each.robot: each for each in tables}
     for name, (x, y, theta, *sigmas) in request.starts.items():
-        robot = name or (tables[0].robot if len(tables) == 1 else "")
-        if robot not in by_name:
-            raise DatasetError(
-                f"--start: which robot's? Give ROBOT:x,y,theta with one of {', '.join(by_name)}"
-            )
-        by_name[robot].start((x, y, theta), sigmas)
+        by_name[_started(name, by_name)].start((x, y, theta), sigmas)
     if request.truth is not None:
         if len(tables) != 1:
             raise DatasetError("--truth is the path of one robot: import the robots one by one")

@@ -1,9 +1,11 @@
 """The measurement streams of a log, as a world has them."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from sim.scenarios.scenario import Scenario, ScenarioError, loads
 from sim.world.streams import (
     Detections,
     Intervals,
@@ -15,8 +17,30 @@ from sim.world.streams import (
     robot_stream,
 )
 from team import translate
+from team.recording.reader import open_log
+from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats, ids, stamps
+from team.wire.bus import opened
+
+CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
+
+
+def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
+    """The measurements of a log with its scenario: its world's, or as the recorder was told it.
+
+    Of each robot the first incarnation is taken. Raises LogError, ScenarioError.
+    """
+    log = open_log(path)
+    messages = [opened(sample)[2] for sample in log.samples(CHANNELS)]
+    told = [each.configuration for each in messages if isinstance(each, m.Configuration)]
+    by_recorder = log.metadata.get("scenario")  # of a team without a world
+    told = told or ([] if by_recorder is None else [by_recorder])
+    if not told:
+        raise ScenarioError(f"{path}: the log does not say the world's scenario")
+    scenario = loads(told[-1])
+    clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
+    return recorded_streams(messages, path.name, clocks), scenario
 
 
 def recorded_streams(

@@ -101,7 +101,7 @@ def _unnamed(world: Fields, count: object) -> list[Fields]:
     if count is not None:
         return [{}] * checked_count(count)
     if world.get("kind") == "folder":
-        from sim.datasets.folder import robots_of
+        from sim.datasets.folder_files import robots_of
 
         path = world.get("path")
         named = robots_of(path) if isinstance(path, str) and path else (ANY_ROBOT,)

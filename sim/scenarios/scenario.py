@@ -124,7 +124,7 @@ def with_options(
         if identities == "hidden" and scenario.central.association == DEFAULT_PROFILE:
             fields["central"]["association"] = msgspec.to_builtins(_profile_of(scenario))
     if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
-        from sim.datasets.folder import robots_of
+        from sim.datasets.folder_files import robots_of
 
         fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
     if robots is not None:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import msgspec
 
-from sim.datasets.folder import SCENARIO, folder, robots_of
+from sim.datasets.folder import folder
+from sim.datasets.folder_files import SCENARIO, robots_of
 from sim.datasets.kinds import UTIAS_MARKER, kind_of
 from sim.datasets.tables import opened
 from sim.datasets.unlabelled import is_car, unlabelled

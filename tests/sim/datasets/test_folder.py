@@ -144,6 +144,59 @@ def test_points_stay_points_and_have_their_range_and_bearing(tmp_path: Path) -> 
     assert "1 measurement dropped: its covariance is not positive definite" in stream.notes[1]
 
 
+def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path: Path) -> None:
+    """A mark at the beginning, CRLF, quotes, spaces, empty rows and columns, numbers as pandas'."""
+    plain = only(data_set(tmp_path / "plain", odometry=SPEEDS, observations=SEEN))
+    odd = tmp_path / "odd" / "r1"
+    odd.mkdir(parents=True)
+    rows = [line.split(",") for line in SPEEDS.splitlines()]
+    quoted = [",".join(f'"{cell}"' for cell in row) + ',""' for row in rows]
+    (odd / "odometry.csv").write_bytes(b"\xef\xbb\xbf" + "\r\n".join([*quoted, ",,,"]).encode())
+    spaced = "t_s , landmark, range_m,bearing_rad ,c_rr,x_m,\n"
+    spaced += " 1,7.0 , 2.5,0.5, , ,\n1,3,1.5, -0.5 ,,,\n2,7.0,2.4,0.4,,,\n"
+    (odd / "observations.csv").write_text(spaced)
+    (odd / "start.csv").write_text("t_s,x_m,y_m,theta_rad\n0,1,2,3\n")
+    found = only(tmp_path / "odd")
+    assert found.start is not None
+    assert found.start.pose.tolist() == [1, 2, 3]
+    assert same(dataclasses.replace(found, start=None), plain)
+
+
+CLAIM = "0.04,0,0.05,0,0.01,0.06"
+
+
+def test_any_odometry_may_claim_its_covariance(tmp_path: Path) -> None:
+    columns = ",c_xx,c_xy,c_yy,c_xt,c_yt,c_tt"
+    speeds = f"t_s,forward_m_s,yaw_rate_rad_s{columns}\n0,1,0.5,{CLAIM}\n2,0,0,0,0,0,0,0,0\n"
+    held = only(data_set(tmp_path / "a", odometry=speeds)).intervals
+    poses = f"t_s,x_m,y_m,theta_rad{columns}\n0,0,0,0,0,0,0,0,0,0\n2,{2 * np.sin(1)},"
+    poses += f"{2 - 2 * np.cos(1)},1,{CLAIM}\n"
+    between = only(data_set(tmp_path / "b", odometry=poses)).intervals
+    for found in (held, between):
+        assert found.increments is not None
+        assert found.covariances is not None
+        expected = [[2 * np.sin(1), 2 - 2 * np.cos(1), 1.0]]  # an arc of 2 m and 1 rad
+        np.testing.assert_allclose(found.increments, expected, rtol=1e-14)
+        assert found.covariances[0, [0, 1, 2], [0, 1, 2]].tolist() == [0.04, 0.05, 0.06]
+    with pytest.raises(DatasetError, match="line 2, column c_xx: its covariance is not"):
+        only(data_set(tmp_path / "c", odometry=speeds.replace("0.04", "0")))
+
+
+def test_what_is_hardly_meant_is_noted(tmp_path: Path) -> None:
+    data_set(tmp_path, odometry=SPEEDS + "4,1,200\n5,0,0\n", observations=SEEN + "-9,7,1,0\n")
+    place = tmp_path / "r2"
+    place.mkdir()
+    (place / "odometry.csv").write_text(SPEEDS.splitlines()[0] + "\n900000,1,0\n900001,0,0\n")
+    (tmp_path / "r3").mkdir()
+    (tmp_path / "r3" / "odom.csv").write_text(SPEEDS)
+    world = read(tmp_path, "r1", "r2")
+    said = "\n".join([*world.notes, *world.streams[0].notes])
+    assert "1 odometry row beyond 300 m/s or 100 rad/s" in said
+    assert "more than 2 s before its first odometry" in said
+    assert "r2 begins 10.4 days after r1" in said
+    assert "r3: neither odometry.csv nor observations.csv in it: left out" in said
+
+
 def general(robot: RobotStream, form: str) -> RobotStream:
     """The robot with measurements in a general form."""
     intervals, seen = robot.intervals, robot.landmark_detections
@@ -237,11 +290,37 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
             INCREMENTS + "1,1,0,0,1,2,1,0,0,1\n",
             "line 2, column c_xx: its covariance is",
         ),
-        ("odometry", "t_s,x_m,y_m,theta_rad,c_xx\n0,0,0,0,1\n", "come with dx_m,dy_m,dtheta_rad"),
+        ("odometry", "t_s,x_m,y_m,theta_rad,c_xx\n0,0,0,0,1\n", "c_xt, c_yt, c_tt missing; give 0"),
         (
             "observations",
             "t_s,landmark,x_m,y_m,c_rr\n1,1,1,1,1\n",
             "has the columns c_xx,c_xy,c_yy",
+        ),
+        (
+            "observations",
+            SEEN + "3,7,1,170\n",
+            "line 5, column bearing_rad: 170 is more than a whole",
+        ),
+        (
+            "observations",
+            SEEN.replace("_rad", "_rad,x_m,y_m").replace("5\n", "5,1,1\n"),
+            "line 4: 4",
+        ),
+        (
+            "observations",
+            "t_s,landmark,range_m,bearing_rad\n99,7,1,0\n",
+            "are not those of the odo",
+        ),
+        ("odometry", "0,1,0\n1,1,0\n", "line 1: '0' is a number, and the first line names the"),
+        ("odometry", "t_s,,x_m\n0,1,0\n", "line 1: column 2 has no name"),
+        ("odometry", SPEEDS + "17e18,1,0\n", "of nanoseconds a map of columns makes seconds"),
+        (
+            "odometry",
+            SPEEDS.replace("t_s", "t_s,duration_s")
+            .replace("\n0,", "\n0,-1,")
+            .replace("\n1,", "\n1,1,")
+            .replace("\n3,", "\n3,2,"),
+            "column duration_s: not above 0",
         ),
         ("start", "x_m,y_m,theta_rad\n0,0,0\n1,1,1\n", "2 rows: one pose is where"),
         ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),

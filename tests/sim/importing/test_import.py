@@ -219,6 +219,50 @@ def test_a_mistake_in_a_map_is_named(tmp_path: Path, old: str, new: str, words: 
     assert words in str(result.exception)
 
 
+def test_folders_of_csv_files_with_other_names_are_robots(tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    for name in ("ann", "bob"):
+        (logs / name).mkdir(parents=True)
+        files(logs / name)
+    (logs / "bob" / "meets.csv").write_text("t_s,teammate,range_m,bearing_rad\n1,ann,2,0\n")
+    (logs / "poles.csv").write_text("landmark,x_m,y_m\n7,1,2\n")
+    assert "Which are what?" in str(run(logs, "-o", tmp_path / "set").exception)
+    further = '[sightings]\nfiles = ["meets.csv"]\n[sightings.columns]\n'
+    further += "".join(f'{c} = "{c}"\n' for c in ("t_s", "teammate", "range_m", "bearing_rad"))
+    further += '[landmarks]\nfiles = ["poles.csv"]\n[landmarks.columns]\n'
+    further += "".join(f'{c} = "{c}"\n' for c in ("landmark", "x_m", "y_m"))
+    columns = tmp_path / "columns.toml"
+    columns.write_text(MAP + further)
+    mapped = ("--columns", columns, "--start", "ann:1,2,3")
+    result = run(logs, "-o", tmp_path / "set", *mapped)
+    assert result.exit_code == 0, result.output
+    assert "ann: no meets.csv: no sightings" in result.output
+    world = read(tmp_path / "set")
+    ann, bob = world.streams
+    assert (ann.robot, bob.robot, ann.start is None, bob.start is None) == (
+        "ann", "bob", False, True,
+    )  # fmt: skip
+    assert world.landmark_ids.tolist() == [7]
+    assert len(bob.teammate_detections.ids) == 1
+    one_by_one = run(logs / "ann", logs / "bob", "-o", tmp_path / "again", "--columns", columns)
+    assert "poles.csv" in str(one_by_one.exception)  # it lies in neither folder
+    (logs / "ann").rename(logs / "Ann")
+    assert "Ann: no robot's name" in str(run(logs, "-o", tmp_path / "x", *mapped).exception)
+
+
+def test_a_data_set_keeps_its_tables_and_takes_an_initial_pose(tmp_path: Path) -> None:
+    write_folder(teams.world_of(teams.stream("r1", 3)), tmp_path / "set")
+    result = run(tmp_path / "set", "-o", tmp_path / "again", "--start", "1,2,3,0.5,0.1")
+    assert result.exit_code == 0, result.output
+    (stream,) = read(tmp_path / "again").streams
+    assert stream.start is not None
+    assert stream.start.covariance is not None
+    assert stream.start.pose.tolist() == [1, 2, 3]
+    assert np.diag(stream.start.covariance).tolist() == pytest.approx([0.25, 0.25, 0.01])
+    other = run(tmp_path / "set", "-o", tmp_path / "other", "--robot", "ann")
+    assert "--robot: " in str(other.exception)
+
+
 def test_truth_comes_from_a_trajectory_of_tum(tmp_path: Path) -> None:
     bag = ros.write_bag(tmp_path / "bag", [m for m in drive() if "truth" not in m[1]])
     tum = tmp_path / "truth.txt"

@@ -37,7 +37,7 @@ def test_the_data_set_of_the_page_is_read(tmp_path: Path, monkeypatch: pytest.Mo
     scenario = with_options(load(scenario_beside("my_set")), dataset="my_set")
     world = streams_of(scenario)
     assert [stream.robot for stream in world.streams] == ["anna", "bert"]
-    assert all(len(stream.landmark_detections.ids) == 600 for stream in world.streams)
+    assert all(len(stream.landmark_detections.ids) == 2400 for stream in world.streams)
     assert world.landmarks is not None
 
 

@@ -1,0 +1,114 @@
+"""Where the tables of a data set's robots lie: in a folder or a zip, a folder for each robot."""
+
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from sim.datasets.tables import DatasetError, File
+
+ROBOT_NAME = "[a-z][a-z0-9_]{0,31}"
+STREAM_FILES = ("odometry.csv", "observations.csv")
+"""A folder with one of these is a robot's."""
+ONE_ROBOT = "r1"
+"""The name of a robot whose tables lie in the data set's folder itself."""
+SCENARIO = "scenario.toml"
+EXPECTED = (
+    "expected a folder with a sub-folder for each robot, named as in r1, with odometry.csv and "
+    "observations.csv (docs/your_data.md)"
+)
+
+
+class NoTablesError(DatasetError):
+    """There is no robot's table: it may be another kind of data set."""
+
+
+@contextmanager
+def opened_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
+    """The data set's folder, and each robot's by name; raises DatasetError."""
+    place = Path(path)
+    if not place.exists():
+        raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
+    if place.is_dir():
+        yield place, _robots_in(place, path)
+        return
+    try:
+        with zipfile.ZipFile(place) as archive:
+            root = zipfile.Path(archive)
+            entries = list(root.iterdir())
+            only = entries[0] if len(entries) == 1 and entries[0].is_dir() else root
+            yield only, _robots_in(only, path)
+    except zipfile.BadZipFile as error:
+        raise NoTablesError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
+
+
+def is_folder(path: str | Path) -> bool:
+    """Whether there is a data set of CSV tables."""
+    try:
+        with opened_folder(str(path)):
+            return True
+    except (DatasetError, OSError):
+        return False
+
+
+def has_tables(path: str | Path) -> bool:
+    """Whether tables of robots lie there, whatever the folders are called; raises DatasetError."""
+    if not Path(path).exists():
+        raise DatasetError(f"{path}: no such file or folder; {EXPECTED}; or a UTIAS set, or a bag")
+    try:
+        with opened_folder(str(path)):
+            return True
+    except DatasetError as error:
+        if isinstance(error, NoTablesError):
+            return False
+        raise
+    except OSError:
+        return False
+
+
+def robots_of(path: str) -> tuple[str, ...]:
+    """The names of a folder's robots: r2 before r10; raises DatasetError."""
+    with opened_folder(path) as (_, robots):
+        return tuple(robots)
+
+
+def _robots_in(root: File, path: str) -> Mapping[str, File]:
+    if any((root / name).is_file() for name in STREAM_FILES):
+        return {ONE_ROBOT: root}
+    entries: dict[str, File] = {entry.name: entry for entry in root.iterdir()}
+    found = {
+        name: entry
+        for name, entry in entries.items()
+        if entry.is_dir() and any((entry / each).is_file() for each in STREAM_FILES)
+    }
+    if not found:
+        raise NoTablesError(f"{path}: no robot in it; {EXPECTED}")
+    for name in found:
+        if not re.fullmatch(ROBOT_NAME, name):
+            raise DatasetError(
+                f"{path}: the folder {name!r} can not be a robot's name: a small letter, then "
+                "small letters, digits and _ (32 at most); rename it"
+            )
+    return {name: found[name] for name in sorted(found, key=_natural)}
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def left_out(root: File, folders: Mapping[str, File]) -> list[str]:
+    """A word about folders that have tables, but none that makes them a robot's."""
+    if root in folders.values():
+        return []
+    entries: list[File] = sorted(root.iterdir(), key=lambda each: each.name)
+    lacking = [
+        entry
+        for entry in entries
+        if entry.is_dir()
+        and entry.name not in folders
+        and any(each.name.endswith(".csv") for each in entry.iterdir())
+    ]
+    return [
+        f"{entry.name}: neither {' nor '.join(STREAM_FILES)} in it: left out" for entry in lacking
+    ]

@@ -1,0 +1,163 @@
+"""A robot's odometry.csv in any of its forms → intervals in order of time."""
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from sim.datasets.csv_table import CsvTable
+from sim.datasets.folder_tables import (
+    INCREMENTS,
+    NOT_A_COVARIANCE,
+    POSE_COVARIANCE,
+    POSES,
+    SPEEDS,
+    STEERED,
+    Rows,
+    matrices,
+)
+from sim.datasets.utias_rows import on_circle
+from sim.world.streams import Intervals, moved
+from team.config import Bounds
+
+FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
+LONG_GAP_NS = 2_000_000_000
+OFF_NS = 1_000_000
+"""A duration is not the time since the row before if it differs by more, and by a hundredth."""
+
+
+def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, list[str]]:
+    """Odometry in any of its forms; stamps are moved by offset_ns, the offset of its clock.
+
+    Speeds hold from t_s to the next row's, and the last row only ends the last interval; with a
+    column duration_s they are the means over the time that ends at t_s. Poses are of t_s; an
+    increment ends at t_s and begins at the row before. A car's wheel speed and steering hold as
+    speeds do. A covariance is of the motion that its row tells (a pose's: of the motion since the
+    row before), of an error in the frame of its end; speeds that have one become increments.
+    """
+    if table is None:
+        none = np.empty(0, np.int64)
+        return Intervals(none, none, np.empty(0), np.empty(0)), []
+    rows = Rows(table, "odometry row")
+    form = _form(table)
+    rows.drop(
+        np.diff(rows.stamps_ns, prepend=rows.stamps_ns[:1] - 1) <= 0,
+        "another row has the same time, so it lasts no time",
+    )
+    stamps = rows.stamps_ns + offset_ns
+    numbers = rows.table.numbers(*form)
+    duration = np.diff(stamps)
+    used = slice(None)
+    if form == POSES:
+        steps, ends, used = between(numbers), stamps[1:], slice(1, None)
+    elif form in (SPEEDS, STEERED) and not table.has("duration_s"):
+        steps, ends, used = numbers[:-1], stamps[1:], slice(0, -1)
+    else:
+        steps, ends = numbers, stamps
+        duration = np.concatenate([_first_duration(rows, duration), duration])[: len(stamps)]
+        _judge_durations(rows, duration)
+    if len(duration) and duration.max() > LONG_GAP_NS:
+        seconds = duration.max() * 1e-9
+        rows.notes.append(f"odometry has a gap of {seconds:.1f} s: one interval lasts as long")
+    claims = _claimed(rows, form, used)
+    if form == SPEEDS and claims is not None:
+        steps = arcs(steps, duration)
+    if form in (SPEEDS, STEERED) and claims is None:
+        forward, yaw_rate = steps.T.copy() if len(steps) else np.zeros((2, 0))
+        intervals = Intervals(ends, duration, forward, yaw_rate, steered=form == STEERED)
+    else:
+        intervals = moved(ends, duration, steps, claims)
+    _judge_speeds(rows, form, steps, duration)
+    return intervals, rows.notes
+
+
+def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray, "N 3 3"] | None:
+    """The motions' own covariances, of the rows that tell one; None where they claim none."""
+    table = rows.table
+    if not any(table.has(column) for column in POSE_COVARIANCE):
+        return None
+    if not table.has(*POSE_COVARIANCE):
+        missing = ", ".join(column for column in POSE_COVARIANCE if not table.has(column))
+        raise table.fault(
+            f"a covariance has all of {','.join(POSE_COVARIANCE)}: {missing} missing; give 0 where "
+            "nothing is correlated"
+        )
+    if form == STEERED:
+        raise table.fault(
+            f"covariances come with {','.join(SPEEDS)} or {','.join(POSES)} or "
+            f"{','.join(INCREMENTS)}; a car's noise stands in the scenario"
+        )
+    covariances = matrices(table.numbers(*POSE_COVARIANCE))[used]
+    for row in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0.0)[:1].tolist():
+        raise table.error(row + (used.start or 0), "c_xx", NOT_A_COVARIANCE)
+    return covariances
+
+
+def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
+    """Raises DatasetError for what is no duration; a note where it is not the time between rows."""
+    if not rows.table.has("duration_s"):
+        return
+    told = rows.table.stamps("duration_s")
+    for row in np.flatnonzero(told <= 0)[:1].tolist():
+        raise rows.table.error(row, "duration_s", "not above 0")
+    off = np.abs(told - duration) > np.maximum(OFF_NS, duration // 100)
+    rows.note(
+        off, "whose duration_s is not the time since the row before: it is taken to last as long"
+    )
+
+
+def _judge_speeds(
+    rows: Rows,
+    form: tuple[str, ...],
+    steps: Float[np.ndarray, "N _"],
+    duration: Int64[np.ndarray, " N"],
+) -> None:
+    """A note about motions that no robot makes: the robots refuse them."""
+    if form == STEERED or not len(steps):
+        return
+    seconds = duration * 1e-9
+    if steps.shape[1] == 2:
+        speed, rate = np.abs(steps).T
+    else:
+        speed, rate = np.hypot(*steps[:, :2].T) / seconds, np.abs(steps[:, 2]) / seconds
+    bounds = Bounds()
+    fast = (speed > bounds.speed_m_s) | (rate > bounds.yaw_rate_rad_s)
+    first = 1 if form == POSES else 0
+    told = np.zeros(len(rows.table), np.bool_)
+    told[first : first + len(fast)] = fast
+    rows.note(
+        told,
+        f"beyond {bounds.speed_m_s:g} m/s or {bounds.yaw_rate_rad_s:g} rad/s, which a robot "
+        "refuses: metres, radians and seconds are meant",
+    )
+
+
+def _form(table: CsvTable) -> tuple[str, ...]:
+    found = [form for form in FORMS if table.has(*form)]
+    if len(found) == 1:
+        return found[0]
+    forms = " or ".join(",".join(form) for form in FORMS)
+    what = "more than one form of odometry" if found else "no odometry"
+    raise table.fault(f"{what} in its columns; give t_s with one of {forms}")
+
+
+def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, "1"]:
+    """How long the first row's interval lasts; as long as the second's where nothing says so."""
+    if rows.table.has("duration_s") and len(rows.table):
+        return rows.table.rows([True]).stamps("duration_s")
+    rows.notes.append("the first increment is taken to last as long as the second")
+    return others[:1] if len(others) else np.array([10**9])
+
+
+def arcs(
+    speeds: Float[np.ndarray, "N 2"], duration_ns: Int64[np.ndarray, " N"]
+) -> Float[np.ndarray, "N 3"]:
+    """The motion (forward, left, turn) at constant speed and yaw rate: the chord of the arc."""
+    ahead, turn = (speeds * (duration_ns * 1e-9)[:, np.newaxis]).T
+    chord = ahead * np.sinc(0.5 * turn / np.pi)
+    return np.column_stack([chord * np.cos(0.5 * turn), chord * np.sin(0.5 * turn), turn])
+
+
+def between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
+    """Each pose but the first in the frame of the pose before: (forward, left, turn)."""
+    dx, dy, turn = np.diff(poses, axis=0).T if len(poses) > 1 else np.zeros((3, 0))
+    c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx, on_circle(turn)])
