@@ -14,10 +14,12 @@ import hashlib
 import inspect
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
+from team.estimation.compiled_once import compile_once
 from team.sources import sources_of
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -32,7 +34,10 @@ def compiled(function: F) -> F:
     kernel = inspect.unwrap(function)
     dispatcher: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel)
     if dispatcher is not kernel:  # with NUMBA_DISABLE_JIT it is the function itself
-        _name_cache(dispatcher._cache, program_of(kernel.__module__))
+        cache, program = dispatcher._cache, program_of(kernel.__module__)
+        _name_cache(cache, program)
+        name = f"{cache._impl.filename_base}-{program}.lock"
+        compile_once(dispatcher, Path(cache._cache_path) / name)
     return cast(F, dispatcher)
 
 
