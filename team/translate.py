@@ -111,17 +111,18 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
     )
 
 
-def end_of(message: m.AnyOdometry, clock_offset_s: float) -> int:
-    """When an interval of odometry ends in team time [ns].
+def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
+    """A measurement's team time [ns]; that of an interval of odometry is its end's.
 
     What the odometry's clock stamps t happened at t + clock_offset_s.
     """
-    return message.stamp_ns + round(clock_offset_s * 1e9)
+    offset_s = clock_offset_s if isinstance(message, m.AnyOdometry) else 0.0
+    return message.stamp_ns + round(offset_s * 1e9)
 
 
 def motion_of(message: m.AnyOdometry, config: RobotConfig) -> Interval:
     """One interval of odometry as the robot's motion model reads it."""
-    end_ns, duration_ns = end_of(message, config.clock_offset_s), message.duration_ns
+    end_ns, duration_ns = team_time_of(message, config.clock_offset_s), message.duration_ns
     match message:
         case m.Odometry():
             return Interval(end_ns, duration_ns, message.forward, message.yaw_rate)

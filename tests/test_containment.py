@@ -67,7 +67,7 @@ def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_n
         ("ZeroDivisionError", "no way", BROKEN_NS)
     }
     for fault in told:
-        assert re.fullmatch(r"team\.robot\.node:RobotNode\._go:\d+", fault.place)
+        assert re.fullmatch(r"team\.robot\.front_end:FrontEnd\.drive:\d+", fault.place)
     assert_each_measurement_once(samples)
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)

@@ -10,7 +10,8 @@ from central.desk.ledger import ledger
 from central.desk.verification.recorded import recorded
 from central.desk.verification.verification import verify
 from sim.scenarios.source import streams_of
-from team.robot.node import IN_SIGHTING, RobotNode
+from team.robot.ledger import IN_SIGHTING
+from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import encoded

@@ -13,7 +13,7 @@ from typing import Any
 
 from central.desk.verification.recorded import Recorded, RerunError, Stream
 from central.desk.verification.robot import dispositions
-from team.robot.node import IN_SIGHTING
+from team.robot.ledger import IN_SIGHTING
 from team.wire import channels as ch
 from team.wire import messages as m
 

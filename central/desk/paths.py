@@ -14,7 +14,6 @@ from jaxtyping import Float, Int64
 
 from central.desk.verification.recorded import Recorded, RerunError
 from team import translate
-from team.config import RobotConfig
 from team.containment import Boundary
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.window_path import Ends, placed, window_path
@@ -35,18 +34,6 @@ class SmoothedPath:
     poses: Float[np.ndarray, "K 3"]
     covariances: Float[np.ndarray, "K 3 3"]
     at_keyframes: bool
-
-
-class _Windows(RobotNode):
-    """The robot's node over its recorded measurements, which keeps what its windows became."""
-
-    def __init__(self, config: RobotConfig) -> None:
-        super().__init__(config)
-        self.closed: list[ClosedWindow] = []
-
-    def window_closed(self, closed: ClosedWindow) -> None:
-        """Keep it."""
-        self.closed.append(closed)
 
 
 def smoothed_paths(
@@ -73,7 +60,12 @@ def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, Clos
         return {}
     if config.estimator != "hybrid":
         return {}
-    node, boundary = _Windows(config), Boundary(ch.robot_node(robot))
+    windows: dict[int, ClosedWindow] = {}
+
+    def keep(closed: ClosedWindow) -> None:
+        windows[closed.end_ns] = closed
+
+    node, boundary = RobotNode(config, on_window=keep), Boundary(ch.robot_node(robot))
     boundary.give(node, m.Liveliness(stamp_ns=0, node="central", alive=False))
     measurements = found.measurements.get((robot, incarnation), {})
     whole = range(max(measurements, default=-1) + 1)
@@ -81,7 +73,7 @@ def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, Clos
         boundary.give(node, measurements[number])
     end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(whole))
     boundary.give(node, m.End(stamp_ns=0, streams=(end,)))
-    return {closed.end_ns: closed for closed in node.closed}
+    return windows
 
 
 def _between_ends(

@@ -8,7 +8,7 @@ from sim.in_memory.links import Conditions, Partition
 from sim.in_memory.team import run_nodes
 from sim.recorded.changes import Changes, Span
 from sim.recorded.noise import with_noise
-from sim.recorded.unsafe import UnsafeRobot
+from sim.recorded.unsafe import unsafe_robot
 from sim.recorded.world import RecordedWorld, Samples
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario, with_options
@@ -27,7 +27,7 @@ def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     scenario = changed_scenario(world.scenario, changes)
     world.announce(scenario)
     conditions = _conditions(scenario, changes, world.first_ns)
-    node = UnsafeRobot if changes.unsafe_feedback else RobotNode
+    node = unsafe_robot if changes.unsafe_feedback else RobotNode
     return list(run_nodes(scenario, world, conditions, node))
 
 

@@ -12,7 +12,7 @@ class Changes:
 
     without: robots that were not there. seed: of the estimators and of the losses. loss, delay_s:
     of submaps on their way to the centre. no_centre: when there is none. partitions: robots that
-    the centre can not reach, and when. unsafe_feedback: see `UnsafeRobot`. noise: factors on the
+    the centre can not reach, and when. unsafe_feedback: see `unsafe_robot`. noise: factors on the
     standard deviations that the robots assume, by kind (`sim.recorded.noise`).
     """
 

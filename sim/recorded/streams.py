@@ -117,7 +117,9 @@ def _one_kind(robot: str, messages: Sequence[m.Message]) -> type[m.Message] | No
 
 
 def _intervals(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: float) -> Intervals:
-    ends = np.array([translate.end_of(each, clock_offset_s) for each in odometry], dtype=np.int64)
+    ends = np.array(
+        [translate.team_time_of(each, clock_offset_s) for each in odometry], dtype=np.int64
+    )
     durations = np.array([each.duration_ns for each in odometry], dtype=np.int64)
     kind = _one_kind(robot, odometry)
     if kind is m.Increment:

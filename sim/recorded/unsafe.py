@@ -1,37 +1,42 @@
 """What happens without law 1: a robot that sends what it took from the team's map as its own."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from team import translate
+from team.config import Exchange, RobotConfig
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.map_joining.conditioning import RobotPrior
 from team.estimation.map_joining.whole_map import WholeMap, begun, joined
 from team.estimation.submap import LocalMap
 from team.robot.node import RobotNode
+from team.wire import messages as m
 from team.wire.arrays import check_packed_covariance
-from team.wire.bus import Outgoing
 
 
-class UnsafeRobot(RobotNode):
-    """Its submaps begin with the team's map instead of with nothing.
+def unsafe_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
+    """A robot whose submaps begin with the team's map instead of with nothing.
 
     The map holds the robot's earlier measurements, and everyone's; each submap sends them again, so
     they are counted again with every exchange. The mean hardly moves; the covariance loses its
     meaning. Kept for demonstration: no scenario can choose it.
     """
-
-    def _send(self, closed: ClosedWindow) -> list[Outgoing]:
-        prior = self._prior
-        if prior is not None and prior.incarnation == self.incarnation:
-            pending = self._locals[max(prior.sequence + 1, 0) :]
-            fed = _fed(translate.prior_of(prior), pending, closed.local)
-            closed = replace(closed, local=fed, sightings=())  # of its pose nodes none is left
-        return super()._send(closed)
+    return RobotNode(config, exchange, replaced=_with_the_map)
 
 
-def _fed(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> LocalMap:
+def _with_the_map(
+    closed: ClosedWindow, prior: m.Prior | None, submaps: Sequence[LocalMap]
+) -> ClosedWindow:
+    if prior is None:
+        return closed
+    pending = submaps[max(prior.sequence + 1, 0) :]
+    fed = _fed(translate.prior_of(prior), pending, closed.local)
+    return replace(closed, local=fed, sightings=())  # of its pose nodes none is left
+
+
+def _fed(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:
     """As `with_prior`; the window alone once the covariance has been counted down to nothing."""
     try:
         fed = with_prior(prior, pending, local)
@@ -41,7 +46,7 @@ def _fed(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> LocalMa
     return fed
 
 
-def with_prior(prior: RobotPrior, pending: list[LocalMap], local: LocalMap) -> LocalMap:
+def with_prior(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:
     """The window's Gaussian times the team's marginal of its landmarks, both in its start frame.
 
     `pending` leads from the prior's pose to the start of the window.

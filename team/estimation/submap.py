@@ -109,22 +109,6 @@ class LocalMap:
         return LocalMap(self.ids[:0], self.mean[:3], self.covariance[:3, :3])
 
     @property
-    def with_names(self) -> "LocalMap":
-        """The marginal without the landmarks that have no name; itself where all have one."""
-        if not len(self.ids) or self.ids[-1] < UNNAMED:
-            return self
-        kept = int(np.searchsorted(self.ids, UNNAMED))
-        n = len(self.mean) - 2 * (len(self.ids) - kept)
-        return LocalMap(
-            self.ids[:kept],
-            self.mean[:n],
-            self.covariance[:n, :n],
-            self.node_stamps,
-            self.biases,
-            self.sensitivity[:, :n] if self.biases else NO_COLUMNS,
-        )
-
-    @property
     def without_biases(self) -> "LocalMap":
         """The same, the errors that the robot's submaps share taken as zero."""
         return LocalMap(

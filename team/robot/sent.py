@@ -1,10 +1,9 @@
 """What a robot has sent for fusion, in this life or an earlier one: whoever lacks it may ask."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from team.wire import messages as m
-from team.wire.bus import Outgoing
 
 
 @dataclass
@@ -18,11 +17,6 @@ class Sent:
     starts: dict[int, m.InitialPose] = field(default_factory=dict)
     submaps: dict[int, dict[int, m.Submap]] = field(default_factory=dict)
     factors: dict[int, dict[tuple[int, int, str], m.SightingFactor]] = field(default_factory=dict)
-
-    def note(self, out: Iterable[Outgoing]) -> None:
-        """What is being published."""
-        for each in out:
-            self.take(each.message)
 
     def take(self, message: m.Message) -> None:
         """Keep what is for fusion."""

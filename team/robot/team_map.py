@@ -35,7 +35,7 @@ class TeamMap:
     def pose(self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None) -> Posed:
         """The robot's pose in the team's frame; `window`: the one in progress, if it has begun."""
         given = self.given(prior, submaps)
-        open_window = None if window is None else self._shared.taken(window.with_names)
+        open_window = None if window is None else self._shared.taken(window.named)
         posed = pose_now(given.whole, open_window)
         self.known = posed.known + sum(given.known[-1:])
         self.refused = posed.refused + sum(given.refused[-1:])
@@ -66,7 +66,7 @@ class TeamMap:
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             told = translate.prior_of(prior)
             pending = [
-                told.shared.taken(each.with_names) for each in submaps[max(0, prior.sequence + 1) :]
+                told.shared.taken(each.named) for each in submaps[max(0, prior.sequence + 1) :]
             ]
             self._prior, self._shared, self._submaps = prior, told.shared, len(submaps)
             try:

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import takewhile
 
-import msgspec
 import numpy as np
 
 from central.desk.verification.recorded import Identity, Recorded, identity
@@ -12,43 +11,53 @@ from team.config import UNNAMED, RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
 from team.rejection import Rejection
+from team.robot.front_end import FrontEnd
 from team.robot.hybrid import HybridEstimator
 from team.robot.node import RobotNode
+from team.robot.poses import RunningPoses
+from team.robot.statements import Speaker
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids, stamps
 from team.wire.bus import Outgoing
 
-PosesSaid = Mapping[tuple[int, int], Sequence[m.Prior | None]]
+PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
 """By (incarnation, stamp): the priors that the recorded poses name; None: none of them."""
 
 
-class RetoldRobot(RobotNode):
-    """The robot's node, but its poses are those of the log: same stamps, from the named priors.
+class RecordedPoses(RunningPoses):
+    """Poses at the stamps of the log, each given the prior that it names.
 
-    Which prior a running pose found depends on what had arrived, so the pose names it. The
-    configuration keeps the digest under which it was announced.
+    Which prior a running pose found depends on what had arrived, so the pose names it.
     """
 
-    def __init__(self, config: RobotConfig, digest: bytes, said: PosesSaid) -> None:
-        super().__init__(config)
-        self._boundary = Boundary(ch.robot_node(config.id))
-        self._announcement = msgspec.structs.replace(self._announcement, digest=digest)
-        self._said = said
-        self._associated: m.Association | None = None
+    def __init__(self, config: RobotConfig, recorded: PriorsNamed) -> None:
+        super().__init__(config, [])
+        self._recorded = recorded
 
-    def _poses(self, stamp_ns: int | None) -> list[Outgoing]:
-        if stamp_ns is None:
-            return []
+    def at(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+        """The poses of this stamp, by every prior that one of them names."""
         out: list[Outgoing] = []
-        for prior in self._said.get((self._incarnation, stamp_ns), ()):
-            self._pose_ns, self._prior = None, prior
-            out += super()._poses(stamp_ns)
+        for prior in self._recorded.get((speaker.incarnation, stamp_ns), ()):
+            here = prior if prior is not None and prior.incarnation == speaker.incarnation else None
+            out += self.posed(stamp_ns, here, front, speaker)
         return out
+
+
+class RecomputedRobot:
+    """A robot's node over recorded messages, its poses those of the log.
+
+    The configuration keeps the digest under which it was announced.
+    """
+
+    def __init__(self, config: RobotConfig, digest: bytes, recorded: PriorsNamed) -> None:
+        self.node = RobotNode(config, announced=digest, poses=RecordedPoses(config, recorded))
+        self._boundary = Boundary(ch.robot_node(config.id))
+        self._associated: m.Association | None = None
 
     def given(self, message: m.Message) -> list[Outgoing]:
         """Handle a message as the shell did: one that raises is set aside."""
-        out = self._boundary.give(self, message)
+        out = self._boundary.give(self.node, message)
         for each in out:
             if isinstance(each.message, m.Association):
                 self._associated = each.message
@@ -71,33 +80,34 @@ class RetoldRobot(RobotNode):
 
     def took(self, message: m.Message) -> Counter[str]:
         """Take a measurement or the end; the dispositions that it gave, how many of each."""
-        before = Counter[str]() if isinstance(message, m.InitialPose) else Counter(self._ledger)
+        begins = isinstance(message, m.InitialPose)
+        before = Counter[str]() if begins else Counter(self.node.ledger.counts)
         self.given(message)
-        return self._ledger - before
+        return self.node.ledger.counts - before
 
 
-Born = Callable[[], RetoldRobot]
+NewRobot = Callable[[], RecomputedRobot]
 
 
-def retold_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
+def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
     """Every message that the robot's measurements give, under the names of its inputs."""
     config, digest = log.robot_config(robot)
-    said = _poses_said(log, robot)
+    named = _priors_named(log, robot)
 
-    def born() -> RetoldRobot:
-        node = RetoldRobot(config, digest, said)
+    def new() -> RecomputedRobot:
+        robot = RecomputedRobot(config, digest, named)
         if log.known_map is not None:
-            node.given(log.known_map)
-        return node
+            robot.given(log.known_map)
+        return robot
 
     lives = _in_lockstep if config.fusion in FEEDBACK else _alone
     found: dict[Identity, m.Message] = {}
-    for out in lives(log, robot, born):
+    for out in lives(log, robot, new):
         found.setdefault(identity(out.key, out.message), out.message)
     return found
 
 
-def _poses_said(log: Recorded, robot: str) -> PosesSaid:
+def _priors_named(log: Recorded, robot: str) -> PriorsNamed:
     heard = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
     priors = {p.digest: p for p in heard if isinstance(p, m.Prior) and p.robot == robot}
     said: dict[tuple[int, int], list[m.Prior | None]] = {}
@@ -112,7 +122,7 @@ def _poses_said(log: Recorded, robot: str) -> PosesSaid:
     return said
 
 
-def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
+def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
     """Without feedback nothing from outside matters: each incarnation by itself, each life that
     ended.
 
@@ -126,9 +136,9 @@ def _alone(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
         dones = _dones(log, robot, incarnation)
         lives = [(_first_of(done, chain, measurements), done.measurements) for done in dones]
         if not any(first == 0 for first, _ in lives):
-            yield from _life(born, measurements, chain, 0, None)
+            yield from _life(new, measurements, chain, 0, None)
         for first, until in lives:
-            yield from _life(born, measurements, chain, first, until)
+            yield from _life(new, measurements, chain, first, until)
 
 
 def _dones(log: Recorded, robot: str, incarnation: int) -> list[m.Done]:
@@ -157,7 +167,7 @@ def _first_of(
 
 
 def _life(
-    born: Born,
+    new: NewRobot,
     measurements: Mapping[int, m.Measurement],
     chain: Sequence[m.Submap],
     first: int,
@@ -171,9 +181,9 @@ def _life(
         return
     last = max(measurements) + 1 if until is None else until
     while True:
-        node = born()
+        node = new()
         if first:
-            node.resume(start, [s for s in chain if s.last_measurement < first])
+            node.node.resume(start, [s for s in chain if s.last_measurement < first])
         counter = first
         while counter < last and counter in measurements:
             yield from node.given(measurements[counter])
@@ -188,13 +198,13 @@ def _life(
         first = following
 
 
-def _in_lockstep(log: Recorded, robot: str, born: Born) -> Iterator[Outgoing]:
+def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
     """Under a rule with feedback a robot waits for each round's map: it is the recorded one.
 
     A round that has no map in the log had no centre: the robot went on without it.
     """
     fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
-    node = born()
+    node = new()
     incarnations = log.incarnations(robot)
     inputs: list[m.Message] = [
         log.measurements[(robot, incarnation)][counter]
@@ -225,7 +235,7 @@ SILENT = {Rejection.UNCONFIRMED.disposition, Rejection.CLUTTER.disposition}
 
 
 def _silent(
-    node: RetoldRobot, scans: Iterable[int], measurements: Mapping[int, m.Measurement]
+    node: RecomputedRobot, scans: Iterable[int], measurements: Mapping[int, m.Measurement]
 ) -> dict[int, str]:
     """What the last window has found out about these scans."""
     said = node.silent()
@@ -241,7 +251,7 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     node did not come are known at the end only.
     """
     config, digest = log.robot_config(robot)
-    node = RetoldRobot(config, digest, {})
+    node = RecomputedRobot(config, digest, {})
     if log.known_map is not None:
         node.given(log.known_map)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from central.desk.verification.centre import retold_centre, retold_peer
 from central.desk.verification.differences import first_difference
 from central.desk.verification.recorded import Identity, Recorded, Said, identity, recorded
-from central.desk.verification.robot import retold_robot
+from central.desk.verification.robot import recomputed_robot
 from team.recording.own_log import OWN
 from team.recording.provenance import provenance
 from team.recording.reader import Log
@@ -115,7 +115,7 @@ def verify(log: Log) -> Verification:
     others = _others(log, found)
     for robot in found.robots:
         if robot not in others:
-            retold |= retold_robot(found, robot)
+            retold |= recomputed_robot(found, robot)
     retold |= retold_centre(found)
     for robot in found.robots:
         if robot not in others:

@@ -1,0 +1,89 @@
+"""A robot's running map: for viewers, or exchanged where the rule fuses whole maps."""
+
+import numpy as np
+
+from team import translate
+from team.config import RobotConfig
+from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
+from team.pairs import PAIRS
+from team.robot.estimator import AbsorbsMaps
+from team.robot.front_end import FrontEnd
+from team.robot.pace import Pace
+from team.robot.statements import Speaker
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+JOINT_LANDMARKS = 2000
+"""An own map of more landmarks carries their own covariances only: a message has 64 MiB at most."""
+
+
+class RunningMaps:
+    """When the own map goes out. last: the sequence of the last one that was exchanged; −1: none.
+
+    Under a rule on whole maps one goes out every `exchange_s`, with its joint covariance; under one
+    with feedback the robot then waits for the answer (`Pace`).
+    """
+
+    def __init__(self, config: RobotConfig, pace: Pace, warnings: list[str]) -> None:
+        self._config = config
+        self._pace = pace
+        self._warnings = warnings
+        self._exchanges = PAIRS[config.estimator, config.fusion] == "own/map"
+        self._map_ns: int | None = None
+        self._exchange_ns: int | None = None
+        self.last = -1
+
+    def begin_incarnation(self) -> None:
+        """Its maps are numbered anew."""
+        self.last = -1
+
+    def at(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+        """A new running map is there: for viewers, or for an exchange that is due."""
+        self._map_ns = stamp_ns
+        if not self._exchanges:
+            return [self._own_map(stamp_ns, front, speaker)]
+        since = None if self._exchange_ns is None else stamp_ns - self._exchange_ns
+        if since is not None and since < self._config.exchange_s * 1e9:
+            return []
+        return self._exchange(stamp_ns, front, speaker)
+
+    def finish(self, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+        """The stream has ended: the last map, if no exchange had it."""
+        if self._map_ns is None or not self._exchanges or self._map_ns == self._exchange_ns:
+            return []
+        return self._exchange(self._map_ns, front, speaker)
+
+    def _exchange(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+        self._exchange_ns = stamp_ns
+        self.last = front.estimator.sequence
+        if self._pace.lockstep:
+            self._pace.sent_map()
+        return [self._own_map(stamp_ns, front, speaker)]
+
+    def _own_map(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> Outgoing:
+        estimator = front.estimator
+        landmarks = estimator.own_map()
+        joint = self._exchanges and estimator.joint
+        if joint and len(landmarks.ids) > JOINT_LANDMARKS:
+            joint = False
+            self._warnings.append("the own map is too large for a joint covariance")
+        return speaker.own_map(
+            stamp_ns,
+            estimator.sequence,
+            self._pace.awaited,
+            landmarks,
+            "joint" if joint else "blocks",
+        )
+
+    def absorb(self, fused: m.FusedMap, front: FrontEnd) -> None:
+        """The answer of an exchange: under a rule with feedback the own map takes it in."""
+        estimator: object = front.estimator
+        if self._pace.answered(fused.exchange):
+            if not isinstance(estimator, AbsorbsMaps):
+                raise ValueError(f"the estimator {self._config.estimator} absorbs no map")
+            ids, means = translate.landmarks_of(fused)
+            joint = translate.landmark_covariance_of(fused)
+            try:
+                estimator.absorb(LandmarkGaussian(ids, means, joint))
+            except (NotACovarianceError, np.linalg.LinAlgError) as error:
+                self._warnings.append(f"the fused map can not be absorbed: {error}")

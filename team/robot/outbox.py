@@ -1,0 +1,90 @@
+"""What a robot sends for fusion, on its way: buffered until an encounter, and kept for who asks.
+
+Under `rendezvous` closed submaps are buffered until the robot encounters a teammate (Xu, 5.1;
+Downs, 4.3). Of the two only the one that sees knows of it: it says so, and both release what they
+have buffered. This changes when a submap is sent, never what is in it: the final map is that of a
+continuous exchange.
+"""
+
+from collections.abc import Sequence
+
+from team.config import Exchange
+from team.robot.sent import Sent
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from team.wire.codec import decoded, encoded
+
+
+class Outbox:
+    """Initial poses, submaps and inter-robot factors of one robot, in their order.
+
+    buffers: whether anything waits for an encounter at all.
+    """
+
+    def __init__(self, robot: str, exchange: Exchange) -> None:
+        self.buffers = exchange == "rendezvous"
+        self._robot = robot
+        self._sent = Sent()
+        self._greeted: set[str] = set()  # told of an encounter since the last window ended
+        self._buffered: list[Outgoing] = []
+
+    @property
+    def _submaps(self) -> list[m.Submap]:
+        found = (out.message for out in self._buffered)
+        return [message for message in found if isinstance(message, m.Submap)]
+
+    @property
+    def submaps(self) -> int:
+        """How many submaps are buffered."""
+        return len(self._submaps)
+
+    @property
+    def since_ns(self) -> int | None:
+        """When the window of the oldest one began; None: nothing is buffered."""
+        return next((submap.start_ns for submap in self._submaps), None)
+
+    def put(self, out: list[Outgoing]) -> list[Outgoing]:
+        """A window's messages; what of it goes out now."""
+        if self.buffers:
+            self._buffered += out
+            self._greeted.clear()
+            return []
+        self._note(out)
+        return out
+
+    def release(self, seen: tuple[str, ...], now_ns: int, incarnation: int) -> list[Outgoing]:
+        """An encounter, or the end: what is buffered goes out, behind an announcement.
+
+        seen: the teammates that are to release theirs, too. Nothing where nobody would hear news.
+        """
+        submaps = self._submaps
+        if not self.buffers or not (submaps or set(seen) - self._greeted):
+            return []
+        self._greeted.update(seen)
+        announced = m.Rendezvous(
+            stamp_ns=now_ns,
+            robot=self._robot,
+            incarnation=incarnation,
+            teammates=seen,
+            submaps=len(submaps),
+            waited_s=max(0.0, 1e-9 * (now_ns - submaps[0].stamp_ns)) if submaps else 0.0,
+        )
+        released, self._buffered = self._buffered, []
+        self._note(released)
+        return [Outgoing(ch.RENDEZVOUS, self._robot, announced), *released]
+
+    def keep(self, message: m.Message) -> None:
+        """Something for fusion that is sent otherwise, or was in an earlier life."""
+        self._sent.take(message)
+
+    def _note(self, out: Sequence[Outgoing]) -> None:
+        for each in out:
+            self._sent.take(each.message)
+
+    def answer(self, request: bytes) -> list[bytes]:
+        """The answer to `SubmapsRequest`: all that was sent, of an earlier life too."""
+        wanted = decoded(request, m.SubmapsRequest)
+        if wanted.robot != self._robot:
+            return []
+        return [encoded(message) for message in self._sent.wanted(wanted)]

@@ -1,0 +1,83 @@
+"""A robot's running poses: from its own measurements, and given the team's map."""
+
+import numpy as np
+
+from team import translate
+from team.config import RobotConfig
+from team.estimation.gaussian import NotACovarianceError
+from team.estimation.map_joining.gauss_newton import NotDeterminedError
+from team.estimation.plausible import prior_beyond
+from team.robot.front_end import FrontEnd
+from team.robot.statements import Speaker
+from team.robot.team_map import TeamMap
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from team.wire.newer import is_newer_prior
+
+
+class RunningPoses:
+    """What the robot says of where it is, every `pose_s`.
+
+    sigma_m: standard deviation of the last pose in the team's frame; 0 before there is one.
+    """
+
+    def __init__(self, config: RobotConfig, warnings: list[str]) -> None:
+        self._bounds = config.bounds
+        self._period_ns = config.pose_s * 1e9
+        self._warnings = warnings
+        self._prior: m.Prior | None = None
+        self._posed_ns: int | None = None
+        self.team_map = TeamMap()
+        self.sigma_m = 0.0
+
+    def take(self, prior: m.Prior) -> None:
+        """The team's map, as far as the robot needs it; the newest one counts."""
+        if not is_newer_prior(prior, self._prior):
+            return
+        whole = translate.prior_of(prior).whole
+        why = prior_beyond(whole.mean, whole.covariance, self._bounds)
+        if why is None:
+            self._prior = prior
+        else:
+            self._warnings.append(f"the team's map is refused: {why}")
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether the team's map has been heard."""
+        return self._prior is not None
+
+    def prior_of(self, incarnation: int) -> m.Prior | None:
+        """The team's map with a pose of this incarnation."""
+        prior = self._prior
+        return prior if prior is not None and prior.incarnation == incarnation else None
+
+    def begin_incarnation(self, incarnation: int) -> None:
+        """A prior of an earlier incarnation is of no use any more."""
+        if self._prior is not None and self._prior.incarnation < incarnation:
+            self._prior = None
+
+    def at(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+        """A new pose is known: what is said of it, if that is due."""
+        if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
+            return []
+        self._posed_ns = stamp_ns
+        return self.posed(stamp_ns, self.prior_of(speaker.incarnation), front, speaker)
+
+    def posed(
+        self, stamp_ns: int, prior: m.Prior | None, front: FrontEnd, speaker: Speaker
+    ) -> list[Outgoing]:
+        """The own pose, and given a prior the pose in the team's map."""
+        sequence = front.estimator.sequence
+        own = front.estimator.own_pose()
+        out = [speaker.pose(ch.OWN_POSE, stamp_ns, sequence, translate.NO_MAP, own)]
+        if prior is None:
+            return out
+        try:
+            with np.errstate(all="ignore"):  # what is no number is withheld
+                posed = self.team_map.pose(prior, front.submaps, front.open_window()).pose
+        except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
+            self._warnings.append(f"no team pose from the fused map: {error}")
+            return out
+        self.sigma_m = max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0) ** 0.5
+        return [*out, speaker.pose(ch.TEAM_POSE, stamp_ns, sequence, prior.digest, posed)]

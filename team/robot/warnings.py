@@ -1,0 +1,48 @@
+"""What a robot says in words of what it finds odd."""
+
+import numpy as np
+
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.submap import Slipped
+
+UNEXPECTED = 3.0
+"""NIS per degree of freedom above which measurements are not what the models say: 1 is right, and
+5 % of outliers give 3 with a coarse sensor, a hundred with an accurate one."""
+UNEXPECTED_DOF = 60
+"""… judged from so many degrees of freedom on."""
+
+
+def unexpected(nis: Innovation, outliers: float) -> tuple[str, ...]:
+    """Warns that measurements lie far from their predictions, and says what to configure then.
+
+    outliers: the share of measurements that the robot is configured to take for wrong.
+    """
+    ratio = nis.per_dof
+    if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
+        return ()
+    remedy = (
+        f"is front_end.garbage = {outliers:g} too few, or the sensor's noise too small?"
+        if outliers
+        else "outliers, or noise that is larger than the sensor's sigmas? Outliers need "
+        "front_end.garbage (their share), central.robust_c = 2, central.landmark_submaps = 2"
+    )
+    return (
+        f"measurements lie far from their predictions, NIS {ratio:.0f} per degree of freedom "
+        f"(1 is right): {remedy}",
+    )
+
+
+def slipped(slip: Slipped) -> str:
+    """A slip of the odometry in words."""
+    metres, turn = float(np.hypot(*slip.by[:2])), float(np.degrees(slip.by[2]))
+    return (
+        f"the odometry slipped by {metres:.2f} m, {turn:.0f}° before {slip.stamp_ns * 1e-9:.2f} s"
+    )
+
+
+def driver_away(last: int) -> str:
+    """A live robot waits for measurements; `last`: the counter of the last one that came."""
+    return (
+        f"its driver is away after measurement {last}: start it again, or end the team by "
+        "`teamslam end`"
+    )
