@@ -315,7 +315,6 @@ def record(
     missed; at the end the parts are joined.
     """
     from sim.scenarios.scenario import dumps
-    from team import translate
     from team.recording.parts import check_continues, join, next_part
     from team.recording.provenance import provenance
     from team.recording.reader import LogError
@@ -341,7 +340,11 @@ def record(
     expected = [robot_node(r.id) for r in resolved.robots]
     expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
-    told = [translate.configured("world", 0, 0, resolved)] if resolved.is_live else []
+    told = []
+    if resolved.is_live:  # what a recorder of other teams does not need: it takes 105 MB
+        from team import translate
+
+        told = [translate.configured("world", 0, 0, resolved)]
     with (
         process("recorder", endless=True) as stop,
         connected(resolved.team, connect, keys, "recorder") as bus,
