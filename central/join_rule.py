@@ -87,7 +87,7 @@ class JoinRule(SubmapRule):
         self._ticks.add(submap, named, sightings)
 
     def _judges(self, verdict: m.Verdict) -> None:
-        self._ticks.judge(translate.verdict_of(verdict.judgement))
+        self._ticks.judge(translate.verdict_of(verdict.judgement), verdict.withdrawn)
 
     def _goes(self, robot: str) -> None:
         self._ticks.withdraw(robot)
@@ -131,7 +131,7 @@ class JoinRule(SubmapRule):
     @property
     def _heard(self) -> int:
         """Submaps in the fold's reach, robots that were withdrawn by an order, and verdicts."""
-        return sum(self._entered.values()) + len(self._orders) + len(self._ticks.verdicts)
+        return sum(self._entered.values()) + len(self._orders) + self._ticks.judged
 
     def _lacks(self, members: Mapping[Stream, int], watermark_ns: float) -> bool:
         """Whether the watermark has passed a submap that is in reach and not among these."""

@@ -108,7 +108,7 @@ class TickFold:
     convicted: whom the fold found to be wrong, with the reason in words; nobody, unless `convicts`.
     bounded: what is old is condensed, but for the ticks up to `_raw_until`, behind which an island
     whose frame had to turn was found to be condensed.
-    verdicts: an operator's on unnamed landmarks.
+    verdicts: an operator's on unnamed landmarks that hold; `_no_more`: those that were withdrawn.
     """
 
     def __init__(self, config: CentralConfig, bounded: bool = True) -> None:
@@ -125,6 +125,7 @@ class TickFold:
         self._members = Members(self._tick_ns)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self.verdicts: set[Verdict] = set()
+        self._no_more: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
         self._taken: list[Checkpoint] = []
         self._agreed: tuple[Fold, Agreement] | None = None
@@ -143,19 +144,28 @@ class TickFold:
         if submap.robot not in self._gone or tick <= self._convicted_at:
             self._roll_back(tick)
 
-    def judge(self, verdict: Verdict) -> None:
+    def judge(self, verdict: Verdict, withdrawn: bool = False) -> None:
         """What an operator says of two unnamed landmarks, in whichever submaps, here or to come.
 
-        The fold goes back to before the tick that has both.
+        withdrawn: that it holds no more, whichever of the two comes first. The fold goes back to
+        before the tick that has both.
         """
-        if verdict in self.verdicts:
+        held = verdict in self.verdicts
+        if withdrawn:
+            self._no_more.add(verdict)
+        if held is not withdrawn or (not withdrawn and verdict in self._no_more):
             return
         until_ns = self._until_ns
-        self.verdicts.add(verdict)
+        self.verdicts ^= {verdict}
         tick = self._tick_judging(verdict)
         if tick is not None:
             self._roll_back(tick)
             self.take_until(until_ns)
+
+    @property
+    def judged(self) -> int:
+        """Verdicts that have come, and withdrawals of verdicts."""
+        return len(self.verdicts | self._no_more) + len(self._no_more)
 
     def _tick_judging(self, verdict: Verdict) -> int | None:
         """The first tick with both landmarks' submaps behind it or in it; None: one is not here."""

@@ -21,13 +21,15 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     its best rival. near: up to this standard deviation old landmarks are candidates without a
     closure. same: two landmarks nearer than this may be one that was split.
     recent: so many last submaps of a robot are followed by tracking, and are the patch for which a
-    closure is searched. closure_pairs, closure_llr, margin, ratio: what a closure needs: pairs, the
-    sum of their log-likelihood ratios, how much more of it and how many times the pairs of the best
-    other alignment. island_pairs, island_llr: the same between robots with unknown initial poses.
-    context: landmarks outside the matched place, as a part of the pairs, without which it is not
-    known whether the place is unlike any other. share: of the landmarks of either side near the
-    matched places (of the side that has fewer), how many are matched. A closure whose share falls
-    below undone_below within `audited` ticks is undone.
+    closure is searched. absent: what a landmark costs that one side has and the other, which looked
+    there, has not: −ln of how rarely that is. closure_pairs, closure_llr, margin, ratio: what a
+    closure needs: pairs, evidence (the sum of their log-likelihood ratios less what is absent), how
+    much more and how many times the evidence of the best other alignment. island_pairs, island_llr:
+    the same between robots with unknown initial poses. context: landmarks of both outside the
+    matched place, as a part of the pairs, without which it is not known whether the place is unlike
+    any other. share: of the landmarks of either side near the matched places (of the side that has
+    fewer), how many are matched. A closure whose share falls below undone_below within `audited`
+    ticks is undone.
     """
 
     gate: Positive = 13.8
@@ -40,12 +42,13 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     near: Positive = 0.35
     same: Positive = 0.5
     recent: Few = 6
+    absent: NonNegative = 1.5
     closure_pairs: Few = 10
     closure_llr: float = 25.0
     margin: NonNegative = 10.0
     ratio: Annotated[float, Meta(ge=1.0)] = 1.5
     island_pairs: Few = 8
-    island_llr: float = 20.0
+    island_llr: float = 12.0
     context: NonNegative = 1.0
     share: Share = 0.7
     undone_below: Share = 0.5

@@ -1,6 +1,7 @@
 """What a robot sends: one Gaussian over poses and landmarks in the submap's own frame."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,16 @@ class Unnamed:
 
     counts: UInt32[np.ndarray, " U"]
     seen: Bool[np.ndarray, "U keyframes"]
+
+    @cached_property
+    def views(self) -> tuple[Int64[np.ndarray, " _"], ...]:
+        """The largest sets of three landmarks or more that one keyframe saw, ascending."""
+        seen = np.unique(self.seen.astype(np.float64), axis=1)
+        count = seen.sum(axis=0)
+        inside = seen.T @ seen == count[:, None]
+        np.fill_diagonal(inside, False)
+        kept = (count >= 3) & ~inside.any(axis=1)
+        return tuple(np.flatnonzero(column) for column in seen[:, kept].T)
 
 
 class Slipped(NamedTuple):

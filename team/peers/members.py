@@ -1,8 +1,8 @@
 """A member of the team's set: the very bytes of who first said it, and its name in the set.
 
 What a map rests on: initial poses, submaps with the inter-robot measurements from them, orders
-(withdrawals, robots that are given up) and last words. A verdict on identities would be a further
-statement. That a peer has concluded is one on which no map rests.
+(withdrawals, robots that are given up), verdicts on identities and last words. That a peer has
+concluded is one on which no map rests.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from team.wire.bus import Sample, opened
 Stream = tuple[str, int]
 """(robot, incarnation)."""
 STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
-STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.CONCLUDED, ch.CERTIFICATE)
+STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.CONCLUDED, ch.CERTIFICATE)
 CHANNELS = (*STREAMED, *STATED)
 """The channels whose messages are members."""
 LARGEST_MEMBER = 4 * 2**20

@@ -74,7 +74,7 @@ class Proofs:
         robot, message = about(member.message), member.message
         if isinstance(message, m.Certificate):
             return self._signer.refusal(f"robot-{robot}", message.certificate)
-        if isinstance(message, m.Withdrawal | m.GivenUp):
+        if isinstance(message, m.Withdrawal | m.GivenUp | m.Verdict):
             return "an order is not carried where there are keys"
         known = replica.statements.get(robot, {}).get(("certificate", 0))
         if known is None or not isinstance(known.message, m.Certificate):

@@ -20,6 +20,8 @@ MOST_STREAMS = 64
 """Incarnations of one robot that are kept at the most."""
 MOST_STATEMENTS = 2 * MOST_STREAMS + 8
 """Orders and last words about one robot at the most."""
+MOST_VERDICTS = 4096
+"""Verdicts on landmarks of one robot, and withdrawals of verdicts, at the most."""
 SHARE = 256 * 2**20
 """Bytes about one robot at the most: 8 h of a submap of 4 kB every half second."""
 MOST_INTERVALS = 64
@@ -171,8 +173,12 @@ class Replica:
         there = among.get(name)
         if there is not None and _rank(there) >= _rank(member):
             return "known"
-        if there is None and len(among) >= MOST_STATEMENTS:
-            raise RefusedError(f"{MOST_STATEMENTS} statements about {robot} are here already")
+        verdict = name[0] == "verdict"
+        most = MOST_VERDICTS if verdict else MOST_STATEMENTS
+        alike = sum((kind == "verdict") == verdict for kind, _ in among)
+        if there is None and alike >= most:
+            what = "verdicts" if verdict else "statements"
+            raise RefusedError(f"{most} {what} about {robot} are here already")
         among[name] = member
         return "new" if there is None else "replaced"
 
@@ -300,6 +306,9 @@ def _stated(message: m.Message) -> tuple[str, int]:
             return "concluded", 0
         case m.Certificate():
             return "certificate", 0
+        case m.Verdict():
+            said = f"{message.judgement} {message.withdrawn}".encode()
+            return "verdict", int.from_bytes(hashlib.blake2b(said, digest_size=16).digest())
         case _:
             raise RefusedError(f"a {type(message).__name__} is no member of the set")
 

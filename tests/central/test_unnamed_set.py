@@ -55,7 +55,7 @@ def _rule() -> JoinRule:
     return rule
 
 
-def _verdict(same: bool = False) -> m.Verdict:
+def _verdict(same: bool = False, withdrawn: bool = False) -> m.Verdict:
     first = m.LocalLandmark(robot="r1", incarnation=1, sequence=3, local=0)
     second = m.LocalLandmark(robot="r1", incarnation=1, sequence=4, local=0)
     return m.Verdict(
@@ -64,6 +64,7 @@ def _verdict(same: bool = False) -> m.Verdict:
         judgement=m.Judgement(first=first, second=second, same=same),
         by="operator",
         reason="",
+        withdrawn=withdrawn,
     )
 
 
@@ -108,6 +109,18 @@ def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map() 
             maps.append(_final(rule))
     assert len({encoded(each) for each in maps}) == 1
     assert maps[0].verdicts == (_verdict().judgement,)
+
+
+def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said(
+    final: m.FusedMap,
+) -> None:
+    for order in ((_verdict(), _verdict(withdrawn=True)), (_verdict(withdrawn=True), _verdict())):
+        rule = _rule()
+        for message in (*TEAM["r1"], order[0], *TEAM["r2"], order[1]):
+            rule.take(message, 0)
+        found = _final(rule)
+        assert found.verdicts == ()
+        assert (found.means, found.digest) == (final.means, final.digest)
 
 
 def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedMap) -> None:

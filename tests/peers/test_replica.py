@@ -139,3 +139,27 @@ def test_what_is_no_member_is_refused_at_the_door() -> None:
 def test_intervals_are_closed_and_part_by_gaps() -> None:
     assert intervals({0, 1, 2, 5, 7, 8}, 3) == (0, 2, 5, 5, 7, 8)
     assert intervals(set(), 0) == ()
+
+
+def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn() -> None:
+    first, second = (
+        m.LocalLandmark(robot=robot, incarnation=1, sequence=0, local=3) for robot in ROBOTS
+    )
+    told = [
+        member(
+            ch.VERDICT,
+            m.Verdict(
+                stamp_ns=0,
+                robot="r1",
+                judgement=m.Judgement(first=first, second=second, same=same),
+                by="operator",
+                reason="",
+                withdrawn=withdrawn,
+            ),
+        )
+        for same, withdrawn in ((True, False), (False, False), (True, True))
+    ]
+    one, other = replica_of(*told), replica_of(*reversed(told), told[0])
+    assert digest_of(one) == digest_of(other)
+    assert {each.payload for each in one.members()} == {each.payload for each in told}
+    assert wanted(replica_of(*told[:2]), one.summary("n", 0, 0)) is not None

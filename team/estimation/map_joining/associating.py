@@ -55,6 +55,12 @@ class View:
         self.ties: list[tuple[int, Tie]] = []
         self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
 
+    def views(self, k: int) -> list[Indices]:
+        """The unnamed landmarks that keyframes of a submap saw together, by their places."""
+        local = self.island.graph.submaps[k].contribution.local
+        places = self.seen_by[k][local.ids >= UNNAMED]
+        return [places[each] for each in local.unnamed.views]
+
     def take(self, pairs: Iterable[Pair], joint: Joint, kind: str) -> None:
         """Note pairs that have become one."""
         self.joint = joint

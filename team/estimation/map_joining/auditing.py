@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from team.estimation.map_joining import refusal
-from team.estimation.map_joining.association.closing import overlap_share
 from team.estimation.map_joining.association.landmarks import OPEN, Opened
+from team.estimation.map_joining.association.shares import overlap_share
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings
 from team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
 

@@ -5,7 +5,7 @@ every other island, in which its place is unknown. An alignment that passes all 
 landmarks one (and the islands); one that does not waits, and its record says which test failed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +15,13 @@ from team.association import AssociationProfile
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.geometry import compose, inverse
 from team.estimation.map_joining.associating import View, applied, associated, union
+from team.estimation.map_joining.association.absence import renumbered, rows
 from team.estimation.map_joining.association.closing import (
+    Alignment,
     Closure,
     Side,
     Tests,
+    aligned,
     closure,
     free_joint,
 )
@@ -38,7 +41,7 @@ from team.estimation.map_joining.association.landmarks import (
     between,
     united,
 )
-from team.estimation.map_joining.association.voting import Points
+from team.estimation.map_joining.association.voting import Points, Vote
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, is_solvable, settled
 from team.estimation.map_joining.joining import Fold, merged_islands
 from team.estimation.map_joining.merging import Merge, placed
@@ -62,21 +65,36 @@ def matched(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
             last[each.stream] = each.sequence
     for stream in sorted(last):
         fold = _closed(fold, stream, last[stream])
+    views = Views()
     for stream in sorted(last):
         for key in sorted(fold.islands):
             if key in fold.islands and key != fold.home[stream]:
-                fold = _joined(fold, stream, last[stream], key)
+                fold = _joined(fold, stream, last[stream], key, views)
     return fold
 
 
-def _patch(view: View, stream: Stream, last: int) -> Indices:
-    """The places of the landmarks of a stream's submaps up to `last`."""
+class Views:
+    """The views of a tick's islands, made once of each as long as it stays as it is."""
+
+    def __init__(self) -> None:
+        self._of: dict[Stream, View] = {}
+
+    def of(self, fold: Fold, key: Stream) -> View:
+        """Of an island."""
+        known = self._of.get(key)
+        if known is None or known.island is not fold.islands[key]:
+            known = self._of[key] = View(fold.islands[key], fold.landmarks)
+        return known
+
+
+def _patch(view: View, stream: Stream, last: int) -> list[int]:
+    """The places in the graph of the submaps of a stream up to `last` that are to be matched."""
     first = last - view.profile.recent
-    return union(
-        places
-        for places, submap in zip(view.seen_by, view.island.graph.submaps, strict=True)
+    return [
+        k
+        for k, submap in enumerate(view.island.graph.submaps)
         if submap.contribution.stream == stream and first < submap.contribution.sequence <= last
-    )
+    ]
 
 
 def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
@@ -84,11 +102,13 @@ def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
     key = fold.home[stream]
     view = View(fold.islands[key], fold.landmarks)
     profile = view.profile
-    patch = _patch(view, stream, last)
+    submaps = _patch(view, stream, last)
+    patch = union(view.seen_by[k] for k in submaps)
     target = _reachable(view, patch)
     if min(len(patch), len(target)) < profile.closure_pairs:
         return fold
-    sides = _side(view, patch), _side(view, target)
+    others = sorted({*range(len(view.seen_by))}.difference(submaps))
+    sides = _side(view, patch, submaps), _side(view, target, others)
     found = closure(
         *sides,
         lambda _: (view.joint, sides[1]),
@@ -176,12 +196,16 @@ def _tidied(fold: Fold, key: Stream) -> Fold:
     return applied(fold, key, view)
 
 
-def _side(view: View, at: Indices) -> Side:
+def _side(view: View, at: Indices, submaps: Sequence[int]) -> Side:
+    """Landmarks of an island, and what the keyframes of some of its submaps saw of them."""
     P = view.joint.covariance.reshape(len(view.ids), 2, len(view.ids), 2)
     own = P[at, :, at]
     sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))
     points = Points(view.joint.mean[at], np.minimum(sd, view.profile.tight))
-    return Side(at, points, at, np.arange(len(at)))
+    place = np.full(len(view.ids), -1)
+    place[at] = np.arange(len(at))
+    seen = rows(each for k in submaps for each in view.views(k))
+    return Side(at, points, at, np.arange(len(at)), renumbered(seen, place))
 
 
 def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
@@ -196,15 +220,17 @@ def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
         share=found.share,
         sd=found.sd,
         why=found.why,
+        absent=found.absent,
     )
 
 
-def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream) -> Fold:
+def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Views) -> Fold:
     """The stream's island and another one as one, if the stream's last submaps are found there."""
     key = fold.home[stream]
-    mine, theirs = (View(fold.islands[at], fold.landmarks) for at in (key, other_key))
+    mine, theirs = (views.of(fold, at) for at in (key, other_key))
     profile = mine.profile
-    patch = _patch(mine, stream, last)
+    submaps = _patch(mine, stream, last)
+    patch = union(mine.seen_by[k] for k in submaps)
     if min(len(patch), len(theirs.ids)) < profile.island_pairs:
         return fold
     n = len(patch)
@@ -215,15 +241,23 @@ def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream) -> Fold:
         ),
         mine.joint.apart[np.ix_(patch, patch)],
     )
-    of_patch, of_target = _side(mine, patch), _side(theirs, np.arange(len(theirs.ids)))
-    elsewhere = np.setdiff1d(np.arange(len(mine.ids)), patch)
+    of_patch = _side(mine, patch, submaps)._replace(at=np.arange(n))
+
+    def laid_on(view: View) -> tuple[Side, Callable[[Vote], tuple[Joint, Side]]]:
+        side = _side(view, np.arange(len(view.ids)), range(len(view.seen_by)))
+        return side, lambda vote: free_joint(own, view.joint, side, vote, profile)
+
+    def aliases() -> list[Alignment]:
+        found = aligned(of_patch, *laid_on(mine), profile)
+        return [each for each in found if not _is_identity(each, patch)]
+
+    known = len(mine.ids) + len(theirs.ids)
     found = closure(
-        of_patch._replace(at=np.arange(n)),
-        of_target,
-        lambda vote: free_joint(own, theirs.joint, of_target, vote, profile),
+        of_patch,
+        *laid_on(theirs),
         profile,
-        Tests(profile.island_pairs, profile.island_llr, profile.context),
-        [_side(mine, elsewhere).points],
+        Tests(profile.island_pairs, profile.island_llr, profile.context, known),
+        aliases,
     )
     if found is None:
         return fold
@@ -241,6 +275,14 @@ def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream) -> Fold:
     centroid = own.mean.mean(axis=0)
     their_from_mine = compose(found.motion, np.array([*-centroid, 0.0]))
     return _merged(fold, (key, mine), (other_key, theirs), pairs, their_from_mine, decision)
+
+
+def _is_identity(found: Alignment, patch: Indices) -> bool:
+    """Whether an alignment of a patch with its own map lays a third of it on itself."""
+    of = dict(zip(found.there.at.tolist(), found.there.names.tolist(), strict=True))
+    pairs = found.grown.pairs
+    same = sum(of[pair.second] == int(patch[pair.first]) for pair in pairs)
+    return 3 * same >= len(pairs)
 
 
 def _merged(
@@ -282,7 +324,7 @@ def _merged(
     words = (
         f"{gone[0]} (incarnation {gone[1]}) joined by its map: {decision.pairs} landmarks, "
         f"log-likelihood ratio {decision.llr:.0f} against {decision.rival_llr:.0f}, share "
-        f"{decision.share:.2f}"
+        f"{decision.share:.2f}, {decision.absent} absent"
     )
     fold = replace(fold, landmarks=landmarks.decided(decision))
     streams = sorted(renamed[goes].graph.streams)

@@ -78,7 +78,8 @@ class AssociationDecision(msgspec.Struct, frozen=True, kw_only=True, array_like=
     rests on. about: between whom. pairs, llr: landmarks that are one, and the sum of their
     log-likelihood ratios; rival_pairs, rival_llr: of the best other alignment. share: of the
     landmarks there, of the side that has fewer. sd: the largest standard deviation of a pair [m].
-    why: the test that failed.
+    why: the test that failed. absent: landmarks that one side has where the other looked and has
+    none.
     """
 
     stamp_ns: StampNs
@@ -91,6 +92,7 @@ class AssociationDecision(msgspec.Struct, frozen=True, kw_only=True, array_like=
     share: Real
     sd: Real
     why: Text
+    absent: Count = 0
 
 
 class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):

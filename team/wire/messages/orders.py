@@ -54,13 +54,15 @@ class Verdict(Message, frozen=True, kw_only=True, tag="verdict/1"):
     """An operator says of two local landmarks that they are one, or two. A member of the set like a
     submap; of a pair of which both were said they are two.
 
-    robot: that of the first landmark. by: who says so. reason: in words.
+    robot: that of the first landmark. by: who says so. reason: in words. withdrawn: this very
+    judgement holds no more, whenever it was said, and for good.
     """
 
     robot: Name
     judgement: Judgement
     by: Text
     reason: Text
+    withdrawn: bool = False
 
     def check(self) -> None:  # noqa: D102
         if self.judgement.first == self.judgement.second:

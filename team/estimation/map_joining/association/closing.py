@@ -1,8 +1,10 @@
 """Whether a patch of landmarks lies at a place of another part of the map: map matching.
 
 Pair voting proposes alignments; each is grown from two of its pairs under the real joint
-covariance. The best one is taken only if no other alignment comes near it and most of what lies
-there, on the side that has less, is matched; else it waits, and the test that failed is named.
+covariance. Its evidence is the log-likelihood ratio of its pairs less what is absent: landmarks
+that one side has where the other looked and has none. The best one is taken only if no other
+alignment comes near it and most of what lies there, on the side that has less, is matched; else it
+waits, and the test that failed is named.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,17 +14,21 @@ import numpy as np
 from jaxtyping import Float
 
 from team.association import AssociationProfile
+from team.estimation.map_joining.association.absence import Views, covered, renumbered
 from team.estimation.map_joining.association.growing import Grown, Indices, Joint, Pair, grow
+from team.estimation.map_joining.association.shares import distance, matched_share
 from team.estimation.map_joining.association.voting import Points, Vote, moved, voted
 
 BEND = 8.0
 """So many radii of one object may two maps be bent against each other within a patch."""
-WIDE = 3.0
-"""So many spacings around a closure's places does an audit look."""
 WEAK = 2
 """An alignment with so many times fewer votes than the best one has pairs is no rival of it."""
-TRIED = 24
-"""So many alignments are grown, those with the most matched points."""
+LOOKED_AT = 24
+"""So many alignments are looked at, those with the most matched points."""
+TRIED = 8
+"""So many of them are grown: those of which the least is absent for what is matched."""
+WORTH = 3.0
+"""About what a matched point adds to the log-likelihood ratio, for which are grown."""
 SEEDS = 1
 """So many pairs of seeds are tried for each."""
 NO_PAIRS: tuple[Pair, ...] = ()
@@ -32,24 +38,41 @@ class Side(NamedTuple):
     """Landmarks of one side: where they are in the joint Gaussian, their places and spreads.
 
     names: what they are called, for who asks. within: which of the whole side's they are.
+    views: which of the whole side's were seen together.
     """
 
     at: Indices
     points: Points
     names: Indices
     within: Indices
+    views: Views
+
+
+class Alignment(NamedTuple):
+    """A way to lay the patch on the target: its pairs, what of the target it was grown on.
+
+    absent: landmarks that one side has where the other looked and has none. evidence: for it.
+    """
+
+    grown: Grown
+    there: Side
+    motion: Float[np.ndarray, "3"]
+    absent: int
+    evidence: float
 
 
 class Closure(NamedTuple):
     """The best alignment with its figures. why: the test that failed; empty: it is accepted.
 
-    rival_pairs, rival_llr: of the best other alignment. share: of the landmarks near the matched
-    places, of the side that has fewer. sd: the largest one of the pairs' differences as they were
-    taken [m]. motion: of the patch's centroid, as voted.
+    llr: of its pairs. absent: what speaks against it. rival_pairs, rival_llr: pairs and evidence of
+    the best other alignment. share: of the landmarks near the matched places, of the side that has
+    fewer. sd: the largest one of the pairs' differences as they were taken [m]. motion: of the
+    patch's centroid, as voted.
     """
 
     pairs: tuple[Pair, ...]
     llr: float
+    absent: int
     rival_pairs: int
     rival_llr: float
     share: float
@@ -59,11 +82,40 @@ class Closure(NamedTuple):
 
 
 class Tests(NamedTuple):
-    """What a closure needs: pairs, log-likelihood ratio, and `context` (islands only)."""
+    """What a closure needs: pairs, evidence, and `context` of what both know (islands only)."""
 
     pairs: int
     llr: float
     context: float = 0.0
+    known: int = 0
+
+
+def aligned(
+    patch: Side,
+    target: Side,
+    joint_of: Callable[[Vote], tuple[Joint, Side]],
+    profile: AssociationProfile,
+) -> list[Alignment]:
+    """The alignments of a patch with a target, the one with the most evidence first.
+
+    joint_of: the joint Gaussian of both given a proposed alignment, and what of the target is in
+    it.
+    """
+    votes = voted(patch.points, target.points, tolerance(profile), reach(profile))[:LOOKED_AT]
+    votes.sort(key=lambda vote: -_promise(vote, patch, target, profile))
+    found: list[Alignment] = []
+    most = 0
+    for vote in votes[:TRIED]:
+        if WEAK * len(vote.first) < most:
+            continue
+        joint, there = joint_of(vote)
+        grown = _grown(patch, there, joint, vote, profile)
+        if grown is not None:
+            absent = _absent(grown, patch, there, profile)
+            evidence = grown.llr - profile.absent * absent
+            found.append(Alignment(grown, there, vote.motion, absent, evidence))
+            most = max(most, len(grown.pairs))
+    return sorted(found, key=lambda each: -each.evidence)
 
 
 def closure(
@@ -72,61 +124,101 @@ def closure(
     joint_of: Callable[[Vote], tuple[Joint, Side]],
     profile: AssociationProfile,
     tests: Tests,
-    elsewhere: Sequence[Points] = (),
+    aliases: Callable[[], Sequence[Alignment]] = tuple,
 ) -> Closure | None:
     """The best alignment of a patch with a target; None where there is none of two pairs.
 
-    joint_of: the joint Gaussian of both given a proposed alignment, and what of the target is in
-    it. elsewhere: places that the patch certainly does not lie at: what fits there as well is no
-    sign of a place.
+    aliases: alignments of the patch that are certainly wrong: evidence for them is none of a place.
+    Asked only for what passes all else.
     """
-    grown: list[tuple[Grown, Side, Vote]] = []
-    most = 0
-    for vote in voted(patch.points, target.points, tolerance(profile), reach(profile)):
-        if len(grown) == TRIED or WEAK * len(vote.first) < most:
-            break
-        joint, there = joint_of(vote)
-        found = _grown(patch, there, joint, vote, profile)
-        if found is not None:
-            grown.append((found, there, vote))
-            most = max(most, len(found.pairs))
-    if not grown:
+    found = aligned(patch, target, joint_of, profile)
+    if not found:
         return None
-    grown.sort(key=lambda each: -each[0].llr)
-    best, target_there, vote = grown[0]
-    mine = set(_named(best, target_there))
+    best = found[0]
+    mine = set(_named(best.grown, best.there))
     others = [
         each
-        for each, there, _ in grown[1:]
-        if 2 * len(mine.intersection(_named(each, there))) < len(each.pairs)
+        for each in found[1:]
+        if 2 * len(mine.intersection(_named(each.grown, each.there))) < len(each.grown.pairs)
     ]
-    rival_pairs = max((len(each.pairs) for each in others), default=0)
-    rival_llr = max((each.llr for each in others), default=0.0)
-    for points in elsewhere:
-        fitting = voted(patch.points, points, tolerance(profile), reach(profile))
-        rival_pairs = max(rival_pairs, len(fitting[0].first) if fitting else 0)
     share = matched_share(
-        best.joint.mean[patch.at],
-        best.joint.mean[target_there.at],
-        _places(best),
-        len(best.pairs),
+        best.grown.joint.mean[patch.at],
+        best.grown.joint.mean[best.there.at],
+        _places(best.grown),
+        len(best.grown.pairs),
         profile,
     )
     closure = Closure(
         pairs=tuple(
             pair._replace(first=one, second=two)
-            for pair, (one, two) in zip(best.pairs, _named(best, target_there), strict=True)
+            for pair, (one, two) in zip(
+                best.grown.pairs, _named(best.grown, best.there), strict=True
+            )
         ),
-        llr=best.llr,
-        rival_pairs=rival_pairs,
-        rival_llr=rival_llr,
+        llr=best.grown.llr,
+        absent=best.absent,
+        rival_pairs=0,
+        rival_llr=0.0,
         share=share,
-        sd=max(pair.sd for pair in best.pairs),
-        motion=vote.motion,
+        sd=max(pair.sd for pair in best.grown.pairs),
+        motion=best.motion,
         why="",
     )
-    outside = len(target.at) - len(best.pairs)
-    return closure._replace(why=failed(closure, outside, profile, tests))
+    closure = _against(closure, others)
+    closure = closure._replace(why=failed(closure, profile, tests))
+    if closure.why:
+        return closure
+    closure = _against(closure, aliases())
+    return closure._replace(why=failed(closure, profile, tests))
+
+
+def _against(closure: Closure, others: Sequence[Alignment]) -> Closure:
+    """The closure with the figures of the best rival, if one of these is better."""
+    best = max(others, key=lambda each: each.evidence, default=None)
+    if best is None or best.evidence <= closure.rival_llr:
+        return closure
+    return closure._replace(rival_pairs=len(best.grown.pairs), rival_llr=best.evidence)
+
+
+def _promise(vote: Vote, patch: Side, target: Side, profile: AssociationProfile) -> float:
+    """What the evidence for an alignment may be, from where the points lie as it is voted."""
+    local = patch.points.mean - patch.points.mean.mean(axis=0)
+    sides = (moved(vote.motion, local), vote.first), (target.points.mean, vote.second)
+    absent = _missing(*sides, (patch.views, target.views), profile)
+    return WORTH * len(vote.first) - profile.absent * absent
+
+
+def _absent(grown: Grown, patch: Side, there: Side, profile: AssociationProfile) -> int:
+    """Landmarks of either side that are not matched where the other looked."""
+    mean = grown.joint.mean
+    here = np.full(int(max(there.views.max(initial=-1), there.within.max())) + 1, -1)
+    here[there.within] = np.arange(len(there.within))
+    first, second = np.array([(pair.first, pair.second) for pair in grown.pairs]).T
+    return _missing(
+        (mean[patch.at], np.flatnonzero(np.isin(patch.at, first))),
+        (mean[there.at], np.flatnonzero(np.isin(there.at, second))),
+        (patch.views, renumbered(there.views, here)),
+        profile,
+    )
+
+
+def _missing(
+    one: tuple[Float[np.ndarray, "n 2"], Indices],
+    two: tuple[Float[np.ndarray, "m 2"], Indices],
+    views: tuple[Views, Views],
+    profile: AssociationProfile,
+) -> int:
+    """Points of two sides, given with the matched ones' places, where the other's views are.
+
+    What lies at a matched place may be a part of it that was split off, and is not counted.
+    """
+    count = 0
+    for (points, matched), (own, theirs), seen in ((one, two, views[1]), (two, one, views[0])):
+        left = np.delete(points, matched, axis=0)
+        if len(left):
+            left = left[distance(left, own[theirs]) >= profile.same]
+            count += int(covered(left, own, seen).sum())
+    return count
 
 
 def _named(grown: Grown, there: Side) -> list[tuple[int, int]]:
@@ -135,24 +227,27 @@ def _named(grown: Grown, there: Side) -> list[tuple[int, int]]:
     return [(pair.first, of[pair.second]) for pair in grown.pairs]
 
 
-def failed(closure: Closure, outside: int, profile: AssociationProfile, tests: Tests) -> str:
+def failed(closure: Closure, profile: AssociationProfile, tests: Tests) -> str:
     """The first test that a closure does not pass, in words; empty: it passes all."""
     pairs = len(closure.pairs)
+    evidence = closure.llr - profile.absent * closure.absent
     if pairs < tests.pairs:
         return f"pairs {pairs} < {tests.pairs}"
-    if closure.llr < tests.llr:
-        return f"log-likelihood ratio {closure.llr:.0f} < {tests.llr:g}"
-    if closure.llr - closure.rival_llr < profile.margin:
-        margin = closure.llr - closure.rival_llr
+    if evidence < tests.llr:
+        absent = f" ({closure.absent} landmarks are absent)" if closure.absent else ""
+        return f"evidence {evidence:.0f} < {tests.llr:g}{absent}"
+    if evidence - closure.rival_llr < profile.margin:
+        margin = evidence - closure.rival_llr
         return f"margin {margin:.0f} < {profile.margin:g} to another alignment"
-    if pairs < profile.ratio * closure.rival_pairs:
+    if evidence < profile.ratio * closure.rival_llr:
         return (
-            f"ratio {pairs / closure.rival_pairs:.2f} < {profile.ratio:g}: "
+            f"ratio {evidence / closure.rival_llr:.2f} < {profile.ratio:g}: "
             f"another alignment has {closure.rival_pairs} pairs"
         )
     if closure.share < profile.share:
         return f"share {closure.share:.2f} < {profile.share:g} of what lies there is matched"
-    if outside < tests.context * pairs:
+    outside = tests.known - 2 * pairs
+    if tests.context and outside < tests.context * pairs:
         return f"context {outside} < {tests.context * pairs:.0f} landmarks: nothing to tell it from"
     return ""
 
@@ -204,7 +299,7 @@ def free_joint(
     apart = np.zeros((n + m, n + m), np.bool_)
     apart[:n, :n], apart[n:, n:] = patch.apart, target.apart
     both = Joint(np.concatenate([there, target.mean]), covariance, apart)
-    return both, Side(n + np.arange(m), side.points, side.names[kept], kept)
+    return both, Side(n + np.arange(m), side.points, side.names[kept], kept, side.views)
 
 
 def _grown(
@@ -245,59 +340,3 @@ def _grown(
 
 def _places(grown: Grown) -> Float[np.ndarray, "k 2"]:
     return grown.joint.mean[[pair.second for pair in grown.pairs]]
-
-
-def matched_share(
-    one: Float[np.ndarray, "n 2"],
-    two: Float[np.ndarray, "m 2"],
-    places: Float[np.ndarray, "k 2"],
-    pairs: int,
-    profile: AssociationProfile,
-) -> float:
-    """Pairs / the fewer of the points of the two sides near the matched places.
-
-    Near: not farther from one than the median distance between neighbouring places.
-    """
-    if len(places) < 2:
-        return 0.0
-    radius = 0.5 * spacing(places, profile)
-    counts = [int((_distance(side, places) <= radius).sum()) for side in (one, two)]
-    return pairs / max(min(counts), 1)
-
-
-def overlap_share(
-    one: Float[np.ndarray, "n 2"],
-    two: Float[np.ndarray, "m 2"],
-    places: Float[np.ndarray, "k 2"],
-    profile: AssociationProfile,
-) -> float:
-    """Matched places / the fewer of the points of the two sides where both sides know the area.
-
-    one, two: all points of either side, the matched ones among them. That is within WIDE spacings
-    of a matched place, with a point of the other side within one: where two robots have been at
-    different places their maps go on differently.
-    """
-    if len(places) < 2 or not len(one) or not len(two):
-        return 0.0
-    radius = spacing(places, profile)
-    counts = [
-        int(((_distance(a, places) <= WIDE * radius) & (_distance(a, b) <= radius)).sum())
-        for a, b in ((one, two), (two, one))
-    ]
-    return len(places) / max(min(counts), 1)
-
-
-def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> float:
-    """Twice the median distance between neighbouring places, and twice `same` at least [m]."""
-    away = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
-    np.fill_diagonal(away, np.inf)
-    return max(2.0 * float(np.median(away.min(axis=0))), 2.0 * profile.same)
-
-
-def _distance(
-    points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
-) -> Float[np.ndarray, " n"]:
-    away: Float[np.ndarray, " n"] = np.hypot(
-        *(points[:, None] - others[None]).transpose(2, 0, 1)
-    ).min(axis=1)
-    return away

@@ -170,15 +170,21 @@ def _rivals(
     """
     rival = np.full(len(first), -np.inf)
     for mine, other in ((first, second), (second, first)):
-        order = np.argsort(mine, kind="stable")
-        starts = np.flatnonzero(np.diff(mine[order], prepend=-1))
-        for group in np.split(order, starts[1:]):
-            if len(group) < 2:
-                continue
-            partners = other[group]
-            away = np.hypot(*(joint.mean[partners, None] - joint.mean[None, partners]).T)
-            alike = (away < profile.same) & ~joint.apart[np.ix_(partners, partners)]
-            np.fill_diagonal(alike, True)
-            against = np.where(alike, -np.inf, at.llr[group][None, :])
-            rival[group] = np.maximum(rival[group], against.max(axis=1))
+        each, against = _of_one(mine)
+        p, q = other[each], other[against]
+        x, y = (joint.mean[p] - joint.mean[q]).T
+        differ = (x * x + y * y >= profile.same**2) | joint.apart[p, q]
+        np.maximum.at(rival, each[differ], at.llr[against[differ]])
     return rival
+
+
+def _of_one(landmarks: Indices) -> tuple[Indices, Indices]:
+    """Every two candidates of one landmark, both ways round."""
+    order = np.argsort(landmarks, kind="stable")
+    ordered = landmarks[order]
+    begin = np.searchsorted(ordered, ordered, side="left")
+    count = np.searchsorted(ordered, ordered, side="right") - begin
+    each = np.repeat(np.arange(len(order)), count)
+    against = np.arange(len(each)) - np.repeat(np.cumsum(count) - count - begin, count)
+    two = each != against
+    return order[each[two]], order[against[two]]

@@ -51,7 +51,8 @@ class Decision(NamedTuple):
     """A closure, or a merge of robots, that was accepted, undone or waits.
 
     kind: "closure", "merge", "undone", "waits". about: in words, between whom. why: the test that
-    failed; empty where it was accepted.
+    failed; empty where it was accepted. absent: landmarks that one side has where the other looked
+    and has none. rival_llr: the evidence for the best other alignment.
     """
 
     stamp_ns: int
@@ -64,6 +65,7 @@ class Decision(NamedTuple):
     share: float
     sd: float
     why: str
+    absent: int = 0
 
 
 class Verdict(NamedTuple):

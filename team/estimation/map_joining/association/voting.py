@@ -49,9 +49,12 @@ def voted(a: Points, b: Points, tolerance: float, longest: float) -> list[Vote]:
     ]
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
+    paired: list[Int64[np.ndarray, " n"]] = []
     for vote in found:
-        if len(vote.first) >= 2 and not any(_is_variant(vote, other) for other in distinct):
+        if len(vote.first) >= 2 and not any(_is_variant(vote, other) for other in paired):
             distinct.append(vote)
+            paired.append(np.full(len(a.mean), -1))
+            paired[-1][vote.first] = vote.second
     return distinct
 
 
@@ -166,8 +169,9 @@ def _neighbours(
     return index[mutual], to_b[mutual]
 
 
-def _is_variant(vote: Vote, other: Vote) -> bool:
-    """Whether most of its pairs are those of another alignment: then it is no rival of it."""
-    theirs = dict(zip(other.first.tolist(), other.second.tolist(), strict=True))
-    pairs = zip(vote.first.tolist(), vote.second.tolist(), strict=True)
-    return bool(2 * sum(theirs.get(one) == two for one, two in pairs) >= len(vote.first))
+def _is_variant(vote: Vote, other: Int64[np.ndarray, " n"]) -> bool:
+    """Whether most of its pairs are those of another alignment: then it is no rival of it.
+
+    other: of each point the one that the other alignment pairs it with, or −1.
+    """
+    return bool(2 * np.count_nonzero(other[vote.first] == vote.second) >= len(vote.first))

@@ -1,0 +1,54 @@
+"""Landmarks that one side has and the other, which looked there, has not: negative evidence.
+
+What one keyframe saw together spans a polygon inside its view, since a view is convex. A landmark
+of the other side that lies in it and is not matched should have been seen, and was not.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+Views = Int64[np.ndarray, "_ _"]
+"""Of each keyframe, the landmarks that each saw together; rows are filled up with −1."""
+
+
+def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
+    """Lists of landmarks as the rows of one array."""
+    each = list(views)
+    out = np.full((len(each), max(map(len, each), default=0)), -1)
+    for row, view in zip(out, each, strict=True):
+        row[: len(view)] = view
+    return out
+
+
+def renumbered(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
+    """The views with other numbers for their landmarks; −1 leaves one out."""
+    if not views.size:
+        return views
+    now = np.where(views >= 0, to[views], -1)
+    return now[(now >= 0).sum(axis=1) >= 3]
+
+
+def covered(
+    points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: Views
+) -> Bool[np.ndarray, " n"]:
+    """Which points lie in the convex hull of the landmarks of one view, at their places `own`.
+
+    A point lies in a hull when the hull's points, seen from it, leave no gap of half a turn.
+    """
+    inside = np.zeros(len(points), np.bool_)
+    if not len(points) or not views.size:
+        return inside
+    at = np.where((views >= 0)[..., None], own[views], np.nan)
+    low, high = np.nanmin(at, axis=1), np.nanmax(at, axis=1)
+    near = (points[:, None] >= low) & (points[:, None] <= high)
+    point, view = np.nonzero(near.all(axis=2))
+    if not len(point):
+        return inside
+    x, y = (at[view] - points[point, None]).transpose(2, 0, 1)
+    angle = np.sort(np.arctan2(y, x), axis=1)  # what is filled up is last
+    last = np.nanmax(angle, axis=1)
+    gap = np.fmax(np.nanmax(np.diff(angle, axis=1), axis=1), angle[:, 0] + 2.0 * np.pi - last)
+    inside[point[gap < np.pi]] = True
+    return inside

@@ -1,0 +1,66 @@
+"""How much of what lies at a matched place is matched: a share of the landmarks there."""
+
+import numpy as np
+from jaxtyping import Float
+
+from team.association import AssociationProfile
+
+WIDE = 3.0
+"""So many spacings around a closure's places does an audit look."""
+
+
+def matched_share(
+    one: Float[np.ndarray, "n 2"],
+    two: Float[np.ndarray, "m 2"],
+    places: Float[np.ndarray, "k 2"],
+    pairs: int,
+    profile: AssociationProfile,
+) -> float:
+    """Pairs / the fewer of the points of the two sides near the matched places.
+
+    Near: not farther from one than the median distance between neighbouring places.
+    """
+    if len(places) < 2:
+        return 0.0
+    radius = 0.5 * spacing(places, profile)
+    counts = [int((distance(side, places) <= radius).sum()) for side in (one, two)]
+    return pairs / max(min(counts), 1)
+
+
+def overlap_share(
+    one: Float[np.ndarray, "n 2"],
+    two: Float[np.ndarray, "m 2"],
+    places: Float[np.ndarray, "k 2"],
+    profile: AssociationProfile,
+) -> float:
+    """Matched places / the fewer of the points of the two sides where both sides know the area.
+
+    one, two: all points of either side, the matched ones among them. That is within WIDE spacings
+    of a matched place, with a point of the other side within one: where two robots have been at
+    different places their maps go on differently.
+    """
+    if len(places) < 2 or not len(one) or not len(two):
+        return 0.0
+    radius = spacing(places, profile)
+    counts = [
+        int(((distance(a, places) <= WIDE * radius) & (distance(a, b) <= radius)).sum())
+        for a, b in ((one, two), (two, one))
+    ]
+    return len(places) / max(min(counts), 1)
+
+
+def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> float:
+    """Twice the median distance between neighbouring places, and twice `same` at least [m]."""
+    away = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    np.fill_diagonal(away, np.inf)
+    return max(2.0 * float(np.median(away.min(axis=0))), 2.0 * profile.same)
+
+
+def distance(
+    points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, " n"]:
+    """From each point to the nearest of others [m]."""
+    away: Float[np.ndarray, " n"] = np.hypot(
+        *(points[:, None] - others[None]).transpose(2, 0, 1)
+    ).min(axis=1)
+    return away
