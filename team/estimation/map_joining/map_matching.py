@@ -282,7 +282,7 @@ def _is_identity(found: Alignment, patch: Indices) -> bool:
     of = dict(zip(found.there.at.tolist(), found.there.names.tolist(), strict=True))
     pairs = found.grown.pairs
     same = sum(of[pair.second] == int(patch[pair.first]) for pair in pairs)
-    return 3 * same >= len(pairs)
+    return bool(3 * same >= len(pairs))
 
 
 def _merged(

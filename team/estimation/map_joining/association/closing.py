@@ -31,7 +31,6 @@ WORTH = 3.0
 """About what a matched point adds to the log-likelihood ratio, for which are grown."""
 SEEDS = 1
 """So many pairs of seeds are tried for each."""
-NO_PAIRS: tuple[Pair, ...] = ()
 
 
 class Side(NamedTuple):
