@@ -22,6 +22,7 @@ from team.estimation.baselines.batch_factors import Factors, Linear, Measurement
 from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian, information
 from team.estimation.geometry import Pose, compose, tangent
+from team.estimation.map_joining.least_squares import STUCK, Values, iterated, robust_scale
 from team.estimation.models import located, variances
 from team.estimation.scans import of_each
 from team.estimation.sparse_cholesky import sparse
@@ -34,14 +35,6 @@ EXACT_SIGMA = 1e-5
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
 """A measurement's robust scale begins at 8 c and narrows with each iteration that it lives through,
 until it is c: what is far off since a pose was dead-reckoned is not taken for an outlier."""
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
-"""Of an undamped step, tried before damping: the odometry makes long curved valleys, in which a
-damped step crawls."""
-LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e8
-ROUNDING = 1e-10
-"""A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
-
-Values = Float[np.ndarray, " _"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +58,8 @@ class Batch:
     robust_c: float | None
 
     @cached_property
-    def _seen(self) -> Linear:
+    def seen(self) -> Linear:
+        """The residuals of the measurements and their Jacobians."""
         return factors_of.measurement_residuals(
             self.factors.measurements, self.poses, self.landmarks
         )
@@ -74,38 +68,33 @@ class Batch:
     def _precision(self) -> Float[np.ndarray, "n 2"]:
         """1/σ² of (range, bearing) of each measurement at the range that the estimate predicts."""
         measurements = self.factors.measurements
-        distance = self._seen.residual[:, 0] + measurements.ranges
+        distance = self.seen.residual[:, 0] + measurements.ranges
         at_zero, per_m, bearing = measurements.variances.T
         return 1.0 / np.column_stack([at_zero + per_m * distance**2, bearing])
 
     @property
     def narrow(self) -> bool:
         """Whether every measurement's robust scale has come to its end."""
-        return self.robust_c is None or bool((self._widening <= 1.0).all())
+        return self.robust_c is None or bool((self._scale == self.robust_c).all())
 
     @property
-    def _widening(self) -> Values:
-        widening: Values = ROBUST_START * ROBUST_DECAY ** self.age.astype(np.float64)
-        return widening
+    def _scale(self) -> Values:
+        return robust_scale(self.age, self.robust_c, ROBUST_START, ROBUST_DECAY)
 
     @cached_property
     def _weight(self) -> Values:
         """Robust weight of each measurement, 1/(1 + χ²/c²); 1 without a robust loss."""
         if self.robust_c is None:
             return np.ones(len(self.age))
-        scale = self.robust_c * np.maximum(self._widening, 1.0)
-        chi2 = np.sum(self._seen.residual**2 * self._precision, axis=1)
-        weight: Values = 1.0 / (1.0 + chi2 / scale**2)
+        chi2 = np.sum(self.seen.residual**2 * self._precision, axis=1)
+        weight: Values = 1.0 / (1.0 + chi2 / self._scale**2)
         return weight
 
     def cost_of(self, other: "Batch") -> float:
-        """Σ w χ² of another estimate with this one's noise and weights: what a step lowers.
-
-        Its fall is a fall of the robust cost too, since each loss lies below its parabola.
-        """
+        """Σ w χ² of another estimate with this one's noise and weights: what a step lowers."""
         told, _ = factors_of.start_residuals(self.factors.starts, other.poses)
         moved = factors_of.motion_residuals(self.factors.motions, other.poses).residual
-        chi2 = np.sum(other._seen.residual**2 * self._precision, axis=1)
+        chi2 = np.sum(other.seen.residual**2 * self._precision, axis=1)
         return (
             float(np.einsum("ni,nij,nj->", told, self.factors.starts.information, told))
             + float(np.einsum("ni,nij,nj->", moved, self.factors.motions.information, moved))
@@ -133,7 +122,7 @@ class Batch:
         starts, motions = self.factors.starts, self.factors.motions
         told, of_start = factors_of.start_residuals(starts, self.poses)
         moved, before, after = factors_of.motion_residuals(motions, self.poses)
-        seen, of_pose, of_landmark = self._seen
+        seen, of_pose, of_landmark = self.seen
         start = of_start.transpose(0, 2, 1) @ starts.information
         before_, after_ = (J.transpose(0, 2, 1) @ motions.information for J in (before, after))
         precision = self._weight[:, None, None] * self._precision[:, None, :]
@@ -161,10 +150,30 @@ class Batch:
         )
         return values, gradient
 
+    @property
+    def diagonal(self) -> Int64[np.ndarray, " n"]:
+        """The places of the information matrix' diagonal among its values."""
+        return self.factors.pattern.diagonal
+
     @cached_property
     def posterior(self) -> sparse.Cholesky:
         """Cholesky factor of the information matrix at this estimate."""
-        return sparse.factorised(self.factors.analysis, self.normal_equations[0])
+        return self.factorised(self.normal_equations[0])
+
+    def factorised(self, values: Values) -> sparse.Cholesky:
+        """Cholesky factor of a matrix in the layout of the factors' pattern."""
+        return sparse.factorised(self.factors.analysis, values)
+
+    def moved(self, step: Values) -> "Batch":
+        """Pose ∘ Exp(ξ), landmark + δ: one iteration later."""
+        split = 3 * len(self.poses)
+        motions = factors_of.exponentials(step[:split].reshape(-1, 3))
+        return replace(
+            self,
+            poses=factors_of.composed(self.poses, motions),
+            landmarks=self.landmarks + step[split:].reshape(-1, 2),
+            age=self.age + 1,
+        )
 
     @cached_property
     def newton_step(self) -> Values:
@@ -312,43 +321,10 @@ def solved(batch: Batch, iterations: int, least_decrement: float) -> Batch:
     """
     damping = 0.0
     for _ in range(iterations):
-        if batch.converged(least_decrement) or damping >= MOST_DAMPING:
+        if batch.converged(least_decrement) or damping == STUCK:
             break
-        batch, damping = _iterated(batch, damping)
+        batch, (damping, _) = iterated(batch, damping)
     return batch
-
-
-def _iterated(batch: Batch, damping: float) -> tuple[Batch, float]:
-    """One step that lowers the cost, and the damping for the next one."""
-    values, gradient = batch.normal_equations
-    diagonal = batch.factors.pattern.diagonal
-    before = batch.cost
-    while damping < MOST_DAMPING:
-        step = batch.newton_step
-        if damping:
-            damped = values.copy()
-            damped[diagonal] *= 1.0 + damping
-            cholesky = sparse.factorised(batch.factors.analysis, damped)
-            step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
-        for share in (1.0,) if damping else SHARES:
-            moved = _moved(batch, share * step)
-            if batch.cost_of(moved) <= before * (1.0 + ROUNDING) + ROUNDING:
-                return moved, damping / 10.0 if damping > LEAST_DAMPING else 0.0
-        damping = max(10.0 * damping, LEAST_DAMPING)
-    return batch, damping
-
-
-def _moved(batch: Batch, step: Values) -> Batch:
-    """Pose ∘ Exp(ξ), landmark + δ."""
-    split = 3 * len(batch.poses)
-    return replace(
-        batch,
-        poses=factors_of.composed(
-            batch.poses, factors_of.exponentials(step[:split].reshape(-1, 3))
-        ),
-        landmarks=batch.landmarks + step[split:].reshape(-1, 2),
-        age=batch.age + 1,
-    )
 
 
 def landmark_gaussian(batch: Batch) -> LandmarkGaussian:

@@ -171,7 +171,7 @@ def _quadratic(
     weights = island.weight / island.settings.covariance_factor
     at_work = np.flatnonzero(leaving)
     add_submaps(H, g, place, state, graph.offset, island.factors, at_work, weights)
-    cost += island.cost_of(leaving, seen, prior)
+    cost += island.cost_of_factors(leaving, seen, prior)
     for s in np.flatnonzero(seen):
         _add_sighting(H, g, place, island, int(s))
     for k in np.flatnonzero(prior):

@@ -25,22 +25,15 @@ from team.estimation.gaussian import NotACovarianceError
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
+from team.estimation.map_joining import least_squares
+from team.estimation.map_joining.least_squares import STUCK, Values, robust_scale
 from team.estimation.map_joining.submap_graph import Graph
 from team.estimation.sparse_cholesky import sparse
 
-Values = Float[np.ndarray, " _"]
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
-"""Of an undamped step, tried before damping: a long curved valley is gone along, not shunned."""
-LEAST_DAMPING = 1e-4
-MOST_DAMPING = 1e8
-STUCK = math.inf
-"""The damping that says that no step lowers the cost."""
 LEAST_WEIGHT = 1e-6
 """No landmark is discounted more, so that each stays determined."""
 FULL_AGE = 1_000_000
 """Iterations after which every robust scale has come to its end."""
-ROUNDING = 1e-10
-"""A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +102,16 @@ class Island:
     @property
     def scale(self) -> Float[np.ndarray, " F"]:
         """The robust scale c of each submap at its age."""
-        return _scale_at(self.age, self.settings)
+        return self._scale_at(self.age)
 
     @property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
         """The robust scale c of each sighting at its age."""
-        return _scale_at(self.sighting_age, self.settings)
+        return self._scale_at(self.sighting_age)
+
+    def _scale_at(self, age: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        settings = self.settings
+        return robust_scale(age, settings.robust_c, settings.robust_start, settings.robust_decay)
 
     @cached_property
     def _submaps(self) -> kernel.Factors:
@@ -219,12 +216,9 @@ class Island:
         weight: Values = 1.0 / (1.0 + self.prior_chi2 / self.settings.robust_c**2)
         return np.where(of_bias, weight, 1.0)
 
-    def quadratic(self, state: Values) -> float:
-        """The cost of another state with the weights of this one: what an iteration lowers.
-
-        Its fall is a fall of the robust cost too, since each loss lies below its parabola.
-        """
-        other = replace(self, state=state)
+    def cost_of(self, other: "Island") -> float:
+        """The cost of another state with the weights of this one: what an iteration lowers."""
+        state = other.state
         factor, offset = self.settings.covariance_factor, self.graph.offset
         chi2 = float((self.weight * kernel.costs(state, offset, self.factors, factor)).sum())
         seen = float((self.sighting_weight * other.sighting_chi2).sum())
@@ -238,11 +232,11 @@ class Island:
         graph = self.graph
         sizes = len(self.age), len(self.sighting_age), len(graph.priors)
         submaps, seen, priors = (np.ones(size, np.bool_) for size in sizes)
-        cost = self.cost_of(submaps, seen, priors)
+        cost = self.cost_of_factors(submaps, seen, priors)
         old = graph.condensed
         return cost if old is None else cost + old.cost_at(self.state, graph.offset)
 
-    def cost_of(
+    def cost_of_factors(
         self,
         submaps: Bool[np.ndarray, " F"],
         sightings: Bool[np.ndarray, " S"],
@@ -309,22 +303,34 @@ class Island:
             pattern.diagonal_block(values, prior.node)[...] += weight * hessian
         return values, gradient
 
+    @property
+    def diagonal(self) -> Int64[np.ndarray, " n"]:
+        """The places of the information matrix' diagonal among its values."""
+        return self.graph.pattern.diagonal
+
     @cached_property
     def posterior(self) -> sparse.Cholesky:
         """Cholesky factor of the information matrix at this state."""
-        return _factorised(self.graph, self.normal_equations[0])
+        return self.factorised(self.normal_equations[0])
+
+    def factorised(self, values: Values) -> sparse.Cholesky:
+        """Cholesky factor of a matrix in the layout of the graph's pattern."""
+        try:
+            return sparse.factorised(self.graph.analysis, values)
+        except sparse.NotPositiveDefiniteError as error:
+            raise NotDeterminedError(self.graph.name(error.variable)) from error
+
+    def moved(self, step: Values) -> "Island":
+        """The state a step further, its headings in (−π, π]."""
+        state = self.state + step
+        headings = state[self.graph.headings]
+        state[self.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
+        return replace(self, state=state)
 
     @cached_property
     def selected_covariance(self) -> Values:
         """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
         return sparse.selected_inverse(self.posterior)
-
-
-def _scale_at(age: Int64[np.ndarray, " k"], settings: JoinSettings) -> Float[np.ndarray, " k"]:
-    if settings.robust_c is None:
-        return np.full(len(age), math.inf)
-    wide = settings.robust_start * settings.robust_decay ** age.astype(np.float64)
-    return settings.robust_c * np.maximum(1.0, wide)
 
 
 def aged(island: Island, iterations: int | None) -> Island:
@@ -370,54 +376,12 @@ def prior_terms(
     return slope, information, float(residual @ slope)
 
 
-def _factorised(graph: Graph, values: Values) -> sparse.Cholesky:
-    try:
-        return sparse.factorised(graph.analysis, values)
-    except sparse.NotPositiveDefiniteError as error:
-        raise NotDeterminedError(graph.name(error.variable)) from error
-
-
-def _moved(island: Island, step: Values) -> Island:
-    state = island.state + step
-    headings = state[island.graph.headings]
-    state[island.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
-    return replace(island, state=state)
-
-
-def _iterated(island: Island, damping: float) -> tuple[Island, float, float]:
-    """One iteration: the island, the damping for the next one, the whole step's largest change.
-
-    A step is taken if it lowers the cost; else, undamped, a share of it; else one more damped. None
-    is taken where no damping helps: the damping is then STUCK, the change that of the first step.
-    """
-    values, gradient = island.normal_equations
-    diagonal = island.graph.pattern.diagonal
-    before = island.quadratic(island.state)
-    refused = None
-    while damping < MOST_DAMPING:
-        damped = values.copy()
-        damped[diagonal] *= 1.0 + damping
-        cholesky = island.posterior if damping == 0.0 else _factorised(island.graph, damped)
-        step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
-        for share in SHARES if damping == 0.0 else (1.0,):
-            moved = _moved(island, share * step)
-            if island.quadratic(moved.state) <= before * (1.0 + ROUNDING) + ROUNDING:
-                eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
-                return aged(moved, 1), eased, _largest(step)
-        refused = _largest(step) if refused is None else refused
-        damping = max(10.0 * damping, LEAST_DAMPING)
-    return aged(island, 1), STUCK, math.inf if refused is None else refused
-
-
-def _largest(step: Values) -> float:
-    return float(np.abs(step).max(initial=0.0))
-
-
 def iterated(island: Island) -> Island:
     """The iterations of one tick."""
     damping = 0.0
     for _ in range(island.settings.iterations_per_tick):
-        island, damping, _ = _iterated(island, _eased(damping))
+        island, (damping, _) = least_squares.iterated(island, _eased(damping))
+        island = aged(island, 1)
     return island
 
 
@@ -438,7 +402,8 @@ def settled(island: Island) -> tuple[Island, int, float]:
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
         narrow = settings.robust_c is None or bool((scales == settings.robust_c).all())
-        island, damping, change = _iterated(island, _eased(damping))
+        island, (damping, change) = least_squares.iterated(island, _eased(damping))
+        island = aged(island, 1)
         count += 1
         if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):
             break
@@ -457,7 +422,7 @@ def solved_with_fixed(island: Island, unknown: int, by: float, iterations: int) 
         right[unknown, 1] = 1.0
         p, q = sparse.solved(island.posterior, right).T
         step = p + (missing - p[unknown]) / q[unknown] * q
-        island, missing = _moved(island, step), missing - float(step[unknown])
+        island, missing = island.moved(step), missing - float(step[unknown])
     return island
 
 

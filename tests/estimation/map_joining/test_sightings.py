@@ -63,7 +63,8 @@ def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised(
         assert gradient[k] == pytest.approx(expected, rel=1e-3, abs=1e-3)
         if expected:
             # The parabola that an iteration lowers touches the robust cost here.
-            up, down = (island.quadratic(island.state + s * shift) for s in (1, -1))
+            others = (replace(island, state=island.state + s * shift) for s in (1, -1))
+            up, down = map(island.cost_of, others)
             assert (up - down) / 4e-6 == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 

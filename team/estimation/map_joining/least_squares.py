@@ -1,0 +1,107 @@
+"""Nonlinear least squares: one iteration of Gauss-Newton, shortened or damped where the cost rises.
+
+Robust losses enter by iterated re-weighting: a point's cost is quadratic in the residuals, with the
+weights that it has itself. A robust scale begins wide and narrows with the iterations that its
+factor has lived through, so that what is far off at first is not taken for an outlier.
+"""
+
+import math
+from typing import NamedTuple, Protocol, Self, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation.sparse_cholesky import sparse
+
+Values = Float[np.ndarray, " _"]
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Of an undamped step, tried before damping: odometry makes long curved valleys, in which a damped
+step crawls."""
+LEAST_DAMPING = 1e-4
+MOST_DAMPING = 1e8
+STUCK = math.inf
+"""The damping that says that no step lowers the cost."""
+ROUNDING = 1e-10
+"""A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
+
+
+@runtime_checkable
+class Point(Protocol):
+    """An estimate of all unknowns, with the cost's parabola there."""
+
+    @property
+    def normal_equations(self) -> tuple[Values, Values]:
+        """A = Σ w JᵀP⁻¹J in the layout of a block pattern, and the gradient Σ w JᵀP⁻¹r."""
+
+    @property
+    def diagonal(self) -> Int64[np.ndarray, " n"]:
+        """The places of A's diagonal entries among its values."""
+
+    @property
+    def posterior(self) -> sparse.Cholesky:
+        """Cholesky factor of A."""
+
+    def factorised(self, values: Values) -> sparse.Cholesky:
+        """Cholesky factor of another matrix in A's layout."""
+
+    def cost_of(self, other: Self) -> float:
+        """Σ w χ² of another point with this one's weights and noise: what a step lowers.
+
+        Its fall is a fall of the robust cost too, since each loss lies below its parabola.
+        """
+
+    def moved(self, step: Values) -> Self:
+        """The point a step further."""
+
+
+P = TypeVar("P", bound=Point)
+
+
+class Iteration(NamedTuple):
+    """One step's change: damping for the next one (or STUCK), the whole step's largest change."""
+
+    damping: float
+    change: float
+
+
+def iterated(point: P, damping: float) -> tuple[P, Iteration]:
+    """The next point, and how the step went.
+
+    A step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, undamped, a share of it;
+    else one more damped. None is taken where no damping helps: the point stays, the change is that
+    of the first step.
+    """
+    values, gradient = point.normal_equations
+    before = point.cost_of(point)
+    refused = None
+    while damping < MOST_DAMPING:
+        cholesky = point.posterior
+        if damping:
+            damped = values.copy()
+            damped[point.diagonal] *= 1.0 + damping
+            cholesky = point.factorised(damped)
+        step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
+        for share in (1.0,) if damping else SHARES:
+            moved = point.moved(share * step)
+            if point.cost_of(moved) <= before * (1.0 + ROUNDING) + ROUNDING:
+                eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
+                return moved, Iteration(eased, _largest(step))
+        refused = _largest(step) if refused is None else refused
+        damping = max(10.0 * damping, LEAST_DAMPING)
+    return point, Iteration(STUCK, math.inf if refused is None else refused)
+
+
+def _largest(step: Values) -> float:
+    return float(np.abs(step).max(initial=0.0))
+
+
+def robust_scale(
+    age: Int64[np.ndarray, " k"], robust_c: float | None, start: float, decay: float
+) -> Float[np.ndarray, " k"]:
+    """Cauchy's scale c of factors after `age` iterations: c · max(1, start · decay^age).
+
+    Infinite without a robust loss.
+    """
+    if robust_c is None:
+        return np.full(len(age), math.inf)
+    return robust_c * np.maximum(1.0, start * decay ** age.astype(np.float64))
