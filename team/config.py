@@ -218,6 +218,8 @@ class Association(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slack_m: two landmarks that no scan saw together are one if they are within the gate with this
     much slack. slip_m: the largest jump of the odometry that is looked for; 0: none.
     detection_probability: of a landmark in view; what was seen too rarely for it is clutter.
+    certain: a detection that is of its landmark with a smaller probability stays out
+    (`team.estimation.association.certainty`).
     """
 
     gate: Positive = 13.8
@@ -226,6 +228,7 @@ class Association(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slack_m: NonNegative = 0.03
     slip_m: NonNegative = 0.0
     detection_probability: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.9
+    certain: Fraction = 0.9
 
 
 class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

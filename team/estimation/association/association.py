@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import Association
+from team.estimation.association.certainty import certainties
 from team.estimation.association.matching import best_pairs_first, squared_distances
 from team.estimation.association.scans import (
     NOBODY,
     Scans,
-    pose_jacobians,
     rotation,
     seen_from,
 )
-from team.estimation.association.smoothing import Smoothed, smoothed
+from team.estimation.association.smoothing import Smoothed, seen_with, smoothed
 from team.estimation.association.tracking import Slip, slip_covariance, tracked
 
 
@@ -50,9 +50,10 @@ def associated(scans: Scans, settings: Association) -> Associated:
     now = smoothed(scans, landmark_of, now.poses, points)
     landmark_of, names, points = _merged(scans, landmark_of, names, now, settings)
     now = smoothed(scans, landmark_of, now.poses, points)
+    landmark_of = _certain(scans, landmark_of, names, now, settings)
     confirmed = _confirmed(landmark_of, names, settings)
     clutter = _looked_in_vain(scans, landmark_of, confirmed, now, settings)
-    kept = np.where(confirmed[landmark_of], landmark_of, NOBODY)
+    kept = np.where(np.append(confirmed, False)[landmark_of], landmark_of, NOBODY)
     landmark_of, names, _ = _renumbered(kept, names, now.landmarks)
     seen = _seen(scans, landmark_of, len(names))
     counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(names))
@@ -111,14 +112,7 @@ def _again(
         tight = settings.variance_factor * R
         count, pose = len(known), slice(3 * i, 3 * i + 3)
         turn = rotation(now.poses[i, 2])
-        seen = (points[:count] - now.poses[i, :2]) @ turn
-        Hp = pose_jacobians(seen)
-        rows = slice(3 * k, 3 * k + 2 * count)
-        own = P[rows, rows].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
-        cross = P[pose, rows].reshape(3, count, 2).transpose(1, 0, 2)
-        mixed = Hp @ cross @ turn
-        spread = Hp @ P[pose, pose] @ Hp.transpose(0, 2, 1) + turn.T @ own @ turn
-        spread += mixed + mixed.transpose(0, 2, 1)
+        seen, spread = seen_with(now.poses[i], points[:count], P, pose, 3 * k, count)
         squared, logs = squared_distances(at[:, None] - seen[None], spread[None] + tight[:, None])
         same = named[:, None] == np.array(known)[None]
         gate = np.where(named[:, None] == NOBODY, settings.gate, np.inf)
@@ -167,11 +161,23 @@ def _merged(
     return _renumbered(root[landmark_of], names, now.landmarks)
 
 
+def _certain(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    names: Int64[np.ndarray, " L"],
+    now: Smoothed,
+    settings: Association,
+) -> Int64[np.ndarray, " N"]:
+    """The association without what may as well be of something else; names are believed."""
+    sure = certainties(scans, landmark_of, now, settings) >= settings.certain
+    return np.where(sure | (scans.names != NOBODY), landmark_of, NOBODY)
+
+
 def _confirmed(
     landmark_of: Int64[np.ndarray, " N"], names: Int64[np.ndarray, " L"], settings: Association
 ) -> Bool[np.ndarray, " L"]:
     """Named landmarks, and those that were seen often enough."""
-    counts = np.bincount(landmark_of, minlength=len(names))
+    counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(names))
     return np.asarray((counts >= settings.least_seen) | (names != NOBODY))
 
 

@@ -10,6 +10,7 @@ from team.estimation.association.scans import (
     NOBODY,
     Scans,
     pose_jacobians,
+    rotation,
     rotations,
     seen_from,
 )
@@ -34,6 +35,39 @@ class Smoothed:
     covariance: Float[np.ndarray, "n n"]
     squared: float
     dof: int
+
+
+def predicted_by(
+    now: Smoothed, k: int
+) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
+    """Each landmark as pose k sees it, and the covariance of that."""
+    poses, count = len(now.poses), len(now.landmarks)
+    return seen_with(
+        now.poses[k], now.landmarks, now.covariance, slice(3 * k, 3 * k + 3), 3 * poses, count
+    )
+
+
+def seen_with(
+    pose: Float[np.ndarray, "3"],
+    landmarks: Float[np.ndarray, "L 2"],
+    P: Float[np.ndarray, "n n"],
+    at: slice,
+    first: int,
+    count: int,
+) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
+    """The same of a joint covariance in which the pose is `at`, and `count` landmarks from `first`
+    on.
+    """
+    turn = rotation(pose[2])
+    seen = (landmarks - pose[:2]) @ turn
+    Hp = pose_jacobians(seen)
+    rows = slice(first, first + 2 * count)
+    own = P[rows, rows].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+    cross = P[at, rows].reshape(3, count, 2).transpose(1, 0, 2)
+    mixed = Hp @ cross @ turn
+    spread = Hp @ P[at, at] @ Hp.transpose(0, 2, 1) + turn.T @ own @ turn
+    spread += mixed + mixed.transpose(0, 2, 1)
+    return seen, spread
 
 
 def smoothed(

@@ -6,17 +6,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from team.config import UNNAMED, MotionModel, Sensor
+from team.config import MotionModel, Sensor
 from team.estimation import geometry
 from team.estimation.geometry import adjoint, inverse
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
+from team.estimation.hybrid_slam.reduction import Look, reduced
 from team.estimation.hybrid_slam.sensitivity import carried_on
-from team.estimation.models import Increment, acceptable, corrected, located
+from team.estimation.models import Increment, acceptable, corrected
 from team.estimation.mount import of_sensor
 from team.estimation.odometry import STANDING, Interval, Moved
-from team.estimation.scans import Own, calibrated, carried, mean_claim, together, unclaimed
+from team.estimation.scans import Own, calibrated, unclaimed
 from team.rejection import Rejection
 
+NOTHING = np.empty(0, np.uint32), np.empty(0), np.empty(0), unclaimed(0)
+"""Seen at a keyframe without measurements."""
 UNMEASURED = (1.0, 0.5)
 """Where motion was not measured it is uncertain by as much as it is, and by this [m/s, rad/s]."""
 
@@ -27,6 +30,8 @@ class Keyframe:
 
     own: the noises that the measurements claim (`team.estimation.scans`); without rows: none do.
     Poses and motions are those of the sensor, wherever on the base it is mounted.
+    looks: the scans without identities since the last keyframe, as they came. rest: the motion
+    since the last of them; None: there is none.
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
     forward: the motion's shift by an error of the scale of speed (`odometry.forward_column`).
     """
@@ -37,6 +42,8 @@ class Keyframe:
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
     own: Own = field(default_factory=lambda: unclaimed(0))
+    looks: tuple[Look, ...] = ()
+    rest: Increment | None = None
     is_node: bool = False
     forward: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
 
@@ -55,18 +62,6 @@ class Keyframe:
         )
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """One observation message; `pose` is where the robot was, since the keyframe's start."""
-
-    stamp_ns: int
-    ids: UInt32[np.ndarray, " n"]
-    ranges: Float[np.ndarray, " n"]
-    bearings: Float[np.ndarray, " n"]
-    own: Own
-    pose: Float[np.ndarray, "3"]
-
-
 class Segmenter:
     """Integrates odometry between keyframes; an interval is split where an observation falls into
     it.
@@ -74,7 +69,8 @@ class Segmenter:
     With keyframe_s = 0 every observation message is a keyframe. Otherwise the scans within
     keyframe_s are reduced to one range and bearing per landmark (the median, each scan first moved
     by the odometry to the end of the interval that closes the keyframe). With a grid each of its
-    times is a keyframe without measurements. A scan without identities is one of its own, too.
+    times is a keyframe without measurements. Scans without identities are kept as they are: which
+    of their detections are of one landmark is known at the window's end.
     """
 
     def __init__(
@@ -91,10 +87,11 @@ class Segmenter:
         self._here_ns = 0
         self._increment = Increment.identity()
         self._forward = np.zeros(3)
-        self._waiting: list[_Scan] = []
-        self._keyframe: list[_Scan] = []
+        self._waiting: list[Look] = []
+        self._keyframe: list[Look] = []
         self._keyframe_start_ns = 0
         self._scan_motion = np.zeros(3)
+        self._since_look: Increment | None = None
         self.rest_forward = np.zeros(3)
         self._mount = np.array(sensor.mount)
         self._unmount = adjoint(inverse(self._mount))
@@ -126,7 +123,7 @@ class Segmenter:
             return Rejection.SENSOR_LIMITS
         r, b = corrected(self._sensor, ranges[mask], bearings[mask])
         noises = unclaimed(len(r)) if own is None else calibrated(own[mask], self._sensor)
-        scan = _Scan(stamp_ns, ids[mask], r, b, noises, np.zeros(3))
+        scan = Look(stamp_ns, ids[mask], r, b, noises, np.zeros(3))
         insort(self._waiting, scan, key=lambda each: each.stamp_ns)
         return None
 
@@ -157,8 +154,14 @@ class Segmenter:
             scan = self._waiting.pop(0)
             keyframes += self._nodes(scan.stamp_ns - 1, over)
             at_ns = self._go_to(scan.stamp_ns, over)
-            if self._keyframe_ns and not (scan.ids >= UNNAMED).any():
-                self._keyframe.append(replace(scan, stamp_ns=at_ns, pose=self._scan_motion))
+            motion = self._increment if self._since_look is None else self._since_look
+            scan = replace(scan, at_ns=at_ns, pose=self._scan_motion, motion=motion)
+            if scan.is_unnamed:
+                self._since_look = Increment.identity()
+            if self._keyframe_ns:
+                self._keyframe.append(scan)
+            elif scan.is_unnamed:
+                keyframes.append(replace(self._keyframe_at(at_ns, *NOTHING), looks=(scan,)))
             else:
                 seen = scan.ids, scan.ranges, scan.bearings
                 keyframes.append(self._keyframe_at(at_ns, *seen, scan.own))
@@ -178,7 +181,7 @@ class Segmenter:
         rest, self.rest_forward = self._increment, self._forward
         self._increment, self._forward = Increment.identity(), np.zeros(3)
         self._keyframe_start_ns = stamp_ns
-        self._scan_motion = np.zeros(3)
+        self._scan_motion, self._since_look = np.zeros(3), None
         return keyframes, rest
 
     def leave(self) -> int:
@@ -202,9 +205,7 @@ class Segmenter:
         while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
             self._go_to(next_ns, over)
             if grid.reach():
-                nothing = np.empty(0)
-                seen = np.empty(0, np.uint32), nothing, nothing, unclaimed(0)
-                keyframes.append(replace(self._keyframe_at(next_ns, *seen), is_node=True))
+                keyframes.append(replace(self._keyframe_at(next_ns, *NOTHING), is_node=True))
         return keyframes
 
     def _go_to(self, stamp_ns: int, over: Interval) -> int:
@@ -233,6 +234,8 @@ class Segmenter:
             self._forward = carried_on(self._forward, step.mean) + column
         if self._keyframe_ns:
             self._scan_motion = geometry.compose(self._scan_motion, step.mean)
+        if self._since_look is not None:
+            self._since_look = self._since_look.then(step)
 
     def _keyframe_at(
         self,
@@ -243,32 +246,32 @@ class Segmenter:
         own: Own,
     ) -> Keyframe:
         motion = self._increment
-        keyframe = Keyframe(stamp_ns, motion, ids, ranges, bearings, own, forward=self._forward)
-        self._increment = Increment.identity()
+        keyframe = Keyframe(
+            stamp_ns=stamp_ns,
+            increment=motion,
+            ids=ids,
+            ranges=ranges,
+            bearings=bearings,
+            own=own,
+            rest=self._since_look,
+            forward=self._forward,
+        )
+        self._increment, self._since_look = Increment.identity(), None
         self._forward = np.zeros(3)
         return keyframe
 
     def _close_keyframe(self, stamp_ns: int) -> Keyframe:
-        points: dict[int, list[tuple[float, float]]] = {}
-        claims: dict[int, list[Own]] = {}
-        for scan in self._keyframe:
-            back = geometry.between(self._scan_motion, scan.pose)
-            for k, landmark in enumerate(scan.ids):
-                r, b = float(scan.ranges[k]), float(scan.bearings[k])
-                x, y = located(back, r, b)
-                points.setdefault(int(landmark), []).append((np.hypot(x, y), np.arctan2(y, x)))
-                if scan.own.size:
-                    claim = carried(scan.own[k], r, float(back[2]) + b, np.array([x, y]))
-                    claims.setdefault(int(landmark), []).append(claim)
-        ids = sorted(points)
-        ranges = [float(np.median([r for r, _ in points[i]])) for i in ids]
-        bearings = [_median_direction([b for _, b in points[i]]) for i in ids]
+        end = self._scan_motion
+        seen = reduced([scan for scan in self._keyframe if not scan.is_unnamed], end)
+        looks = tuple(
+            replace(scan, back=geometry.between(end, scan.pose))
+            for scan in self._keyframe
+            if scan.is_unnamed
+        )
         self._keyframe = []
         self._keyframe_start_ns = stamp_ns
         self._scan_motion = np.zeros(3)
-        own = together([(1, mean_claim(claims.get(i, []))) for i in ids])
-        seen = np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings)
-        return self._keyframe_at(stamp_ns, *seen, own)
+        return replace(self._keyframe_at(stamp_ns, *seen), looks=looks)
 
 
 def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most: int) -> Keyframe:
@@ -288,9 +291,3 @@ def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.
     way = max(abs(forward), UNMEASURED[0]) * duration_s
     turn = min(max(abs(yaw_rate), UNMEASURED[1]) * duration_s, np.pi)
     return np.diag([way * way, 0.01 * way * way, turn * turn]) / duration_s
-
-
-def _median_direction(angles: list[float]) -> float:
-    """The median of directions, taken about the first of them."""
-    offsets = [geometry.wrapped(angle - angles[0]) for angle in angles]
-    return geometry.wrapped(angles[0] + float(np.median(offsets)))

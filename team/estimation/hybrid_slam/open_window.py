@@ -13,7 +13,7 @@ from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
-from team.estimation.hybrid_slam.unnamed import Settled, settled, split
+from team.estimation.hybrid_slam.unnamed import Settled, settled
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.models import Increment
 from team.estimation.mount import of_base
@@ -35,8 +35,7 @@ class OpenWindow:
         self._solvable = True
         self.motion = Increment.identity()
         self.last_keyframe_ns: int | None = None
-        self._named: list[Keyframe] = []
-        self._unnamed: list[Keyframe] = []
+        self._keyframes: list[Keyframe] = []
         self.settled = Settled(())
         self._begin()
 
@@ -61,7 +60,7 @@ class OpenWindow:
         """Where there may be outliers, or there are detections without identities, the window once
         more with what all of it confirms.
         """
-        if self._gate.judges or any(len(each.ids) for each in self._unnamed):
+        if self._gate.judges or any(each.looks for each in self._keyframes):
             self._try(self._settle)
 
     def move(self, rest: Increment, forward: np.ndarray) -> None:
@@ -93,10 +92,8 @@ class OpenWindow:
 
     def _admit(self, keyframe: Keyframe) -> None:
         most = self._config.bounds.submap_landmarks
-        named, unnamed = split(keyframe)
-        bounded = nearest_landmarks(named, self.particles.particles.ids, most)
-        self._named.append(bounded)
-        self._unnamed.append(unnamed)
+        bounded = nearest_landmarks(keyframe, self.particles.particles.ids, most)
+        self._keyframes.append(bounded)
         self._take(self._gate.admitted(bounded))
 
     def _take(self, keyframe: Keyframe) -> None:
@@ -115,19 +112,18 @@ class OpenWindow:
             self.particles = windows.marked(self.particles, keyframe.stamp_ns)
 
     def _settle(self) -> None:
-        named = list(self._gate.settled()) if self._gate.judges else self._named
-        if any(len(each.ids) for each in self._unnamed):
+        keyframes = self._gate.settled() if self._gate.judges else tuple(self._keyframes)
+        if any(each.looks for each in self._keyframes):
             config = self._config
             self.settled = settled(
-                named,
-                self._unnamed,
+                keyframes,
                 config.front_end.association,
                 config.sensor,
                 config.bounds.submap_landmarks,
             )
-            named = list(self.settled.keyframes)
+            keyframes = self.settled.keyframes
         self._begin()
-        for keyframe in named:
+        for keyframe in keyframes:
             self._take(keyframe)
 
     def _go(self, rest: Increment, forward: np.ndarray) -> None:

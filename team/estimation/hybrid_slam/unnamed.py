@@ -5,18 +5,21 @@ close the detections are associated once, and the particles take the window agai
 particle has an association of its own: there is one, and nothing is averaged over many.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
+from jaxtyping import Bool, Int64
 
 from team.config import UNNAMED, Association, Sensor
 from team.estimation.association.association import associated
 from team.estimation.association.scans import NOBODY, Scans, points_of
 from team.estimation.association.tracking import Slip, slip_covariance
 from team.estimation.hybrid_slam.keyframes import Keyframe
+from team.estimation.hybrid_slam.reduction import Look, Measured, reduced, variances
 from team.estimation.models import Increment
-from team.estimation.scans import SENSOR
+from team.estimation.scans import Own, together
 from team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 
 
@@ -37,150 +40,177 @@ class Settled:
     became: Became | None = None
 
 
-def split(keyframe: Keyframe) -> tuple[Keyframe, Keyframe]:
-    """The keyframe with its measurements of landmarks with names, and with the others alone."""
-    named = keyframe.ids < UNNAMED
-    return keyframe.only(named), keyframe.only(~named)
+class Event(NamedTuple):
+    """An instant of a window: a scan without identities, or the end of a keyframe.
+
+    keyframe: its place in the window. motion: since the event before.
+    """
+
+    at_ns: int
+    keyframe: int
+    motion: Increment
+    look: Look | None
+    named: Keyframe | None
 
 
 def settled(
-    named: list[Keyframe],
-    unnamed: list[Keyframe],
-    settings: Association,
-    sensor: Sensor,
-    most: int,
+    keyframes: Sequence[Keyframe], settings: Association, sensor: Sensor, most: int
 ) -> Settled:
     """The window with its detections associated; raises LinAlgError where it has no solution.
 
-    named, unnamed: each keyframe with its measurements of either kind. most: landmarks of a submap;
-    those that were seen most often stay.
+    keyframes: with their measurements of landmarks with names, and the looks without. most:
+    landmarks of a submap; those that were seen most often stay.
     """
-    both = [_joined(a, b) for a, b in zip(named, unnamed, strict=True)]
-    scans = scans_of(both, sensor)
+    events = events_of(keyframes)
+    scans = scans_of(events, sensor)
     found = associated(scans, settings)
     is_detection = scans.names == NOBODY
     order = np.argsort(-found.counts, kind="stable")[:most]
     kept = np.isin(found.landmark_of, order) & (found.landmark_of != NOBODY)
-    kept |= ~is_detection
     local = np.nonzero((found.names == NOBODY) & np.isin(np.arange(len(found.names)), order))[0]
     number = np.zeros(len(found.names) + 1, np.int64)  # the last is that of NOBODY
     number[local] = UNNAMED + np.arange(len(local))
-    ids = np.where(is_detection, number[found.landmark_of], scans.names).astype(np.uint32)
-    with_detections = np.array([len(each.ids) > 0 for each in unnamed], np.bool_)
-    silent, clutter = _silent(scans, kept, found.clutter, is_detection)
+    numbers = np.where(kept, number[found.landmark_of], 0)[is_detection]
+    with_detections = np.array([each.look is not None for each in events], np.bool_)
+    became = _became(events, numbers, found.clutter[is_detection])
+    silent, clutter = _silent(became)
     return Settled(
-        keyframes=_keyframes(both, ids, kept, found.slips),
+        keyframes=_keyframes(keyframes, events, numbers, found.slips),
         unnamed=Unnamed(
             found.counts[local].astype(np.uint32), found.seen[local][:, with_detections]
         ),
         unconfirmed=silent - clutter,
         clutter=clutter,
-        gated=int(np.count_nonzero(~kept)),
-        slips=tuple(Slipped(both[slip.keyframe].stamp_ns, slip.by) for slip in found.slips),
-        became=_became(
-            unnamed,
-            np.where(kept, ids, 0)[is_detection].astype(np.int64),
-            found.clutter[is_detection],
-        ),
+        gated=int(np.count_nonzero(numbers == 0)),
+        slips=tuple(Slipped(events[slip.keyframe].at_ns, slip.by) for slip in found.slips),
+        became=became,
     )
 
 
-def _became(
-    unnamed: list[Keyframe], landmarks: Int64[np.ndarray, " n"], clutter: Bool[np.ndarray, " n"]
-) -> Became:
-    """By the stamps of the scans and the detections' places in them."""
-    seen = [each for each in unnamed if len(each.ids)]
-    return Became(
-        stamps=np.array([each.stamp_ns for each in seen], np.int64),
-        counts=np.array([len(each.ids) for each in seen], np.int64),
-        rows=np.concatenate([each.ids for each in seen]).astype(np.int64) - UNNAMED,
-        landmarks=landmarks,
-        clutter=clutter,
-    )
+def events_of(keyframes: Sequence[Keyframe]) -> list[Event]:
+    """The looks of a window and the ends of its keyframes, in order of time.
 
-
-def _joined(named: Keyframe, unnamed: Keyframe) -> Keyframe:
-    """Both kinds of measurements of one keyframe; a message has one kind, so one of them is empty
-    (or a scan told both, whose noises are alike).
+    A keyframe that is itself a look, and has nothing beside it, is one event.
     """
-    if not len(named.ids) or not len(unnamed.ids):
-        return unnamed if len(unnamed.ids) else named
-    return replace(
-        named,
-        ids=np.concatenate((named.ids, unnamed.ids)),
-        ranges=np.concatenate((named.ranges, unnamed.ranges)),
-        bearings=np.concatenate((named.bearings, unnamed.bearings)),
-        own=np.concatenate((named.own, unnamed.own)),
-    )
+    events = []
+    for k, each in enumerate(keyframes):
+        events += [Event(x.at_ns, k, x.motion or Increment.identity(), x, None) for x in each.looks]
+        if each.rest is None or len(each.ids) or not _is_none(each.rest):
+            motion = each.increment if each.rest is None else each.rest
+            events.append(Event(each.stamp_ns, k, motion, None, each))
+    return sorted(events, key=lambda event: event.at_ns)
 
 
-def scans_of(keyframes: list[Keyframe], sensor: Sensor) -> Scans:
+def _is_none(motion: Increment) -> bool:
+    return not motion.mean.any() and not motion.covariance.any()
+
+
+def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
     """The window's measurements as the association takes them: points, with their noise."""
-    counts = [len(each.ids) for each in keyframes]
-    ids = np.concatenate([each.ids for each in keyframes]).astype(np.int64)
-    ranges = np.concatenate([each.ranges for each in keyframes])
-    bearings = np.concatenate([each.bearings for each in keyframes])
-    variances = np.concatenate([_variances(each, sensor) for each in keyframes])
-    points, covariances = points_of(ranges, bearings, variances)
+    seen = [_seen_at(event) for event in events]
+    counts = [len(ids) for ids, *_ in seen]
+    ids = np.concatenate([ids for ids, *_ in seen]).astype(np.int64)
+    ranges = np.concatenate([ranges for _, ranges, *_ in seen])
+    bearings = np.concatenate([bearings for *_, bearings, _ in seen])
+    noises = np.concatenate([variances(ranges, own, sensor) for _, ranges, _, own in seen])
+    points, covariances = points_of(ranges, bearings, noises)
     return Scans(
-        motions=np.array([each.increment.mean for each in keyframes]),
-        motion_covariances=np.array([each.increment.covariance for each in keyframes]),
-        keyframes=np.repeat(np.arange(len(keyframes)), counts),
+        motions=np.array([event.motion.mean for event in events]),
+        motion_covariances=np.array([event.motion.covariance for event in events]),
+        keyframes=np.repeat(np.arange(len(events)), counts),
         points=points,
         covariances=covariances,
         names=np.where(ids >= UNNAMED, NOBODY, ids),
     )
 
 
-def _variances(keyframe: Keyframe, sensor: Sensor) -> Float[np.ndarray, "n 3"]:
-    """(rr, rb, bb) of each measurement: what it claims itself, or the sensor's at its range."""
-    ranges = keyframe.ranges
-    of_sensor = np.column_stack(
-        (
-            sensor.range_sigma**2 + (sensor.range_sigma_per_m * ranges) ** 2,
-            np.zeros(len(ranges)),
-            np.full(len(ranges), sensor.bearing_sigma**2),
-        )
+def _seen_at(event: Event) -> Measured:
+    source = event.named if event.look is None else event.look
+    assert source is not None
+    return source.ids, source.ranges, source.bearings, source.own
+
+
+def _became(
+    events: Sequence[Event], landmarks: Int64[np.ndarray, " n"], clutter: Bool[np.ndarray, " n"]
+) -> Became:
+    """By the stamps of the scans and the detections' places in them."""
+    looks = [event.look for event in events if event.look is not None]
+    return Became(
+        stamps=np.array([each.stamp_ns for each in looks], np.int64),
+        counts=np.array([len(each.ids) for each in looks], np.int64),
+        rows=np.concatenate([each.ids for each in looks]).astype(np.int64) - UNNAMED,
+        landmarks=landmarks,
+        clutter=clutter,
     )
-    if not keyframe.own.size:
-        return of_sensor
-    claims = keyframe.own[:, 3] != SENSOR
-    return np.where(claims[:, None], keyframe.own[:, :3], of_sensor)
+
+
+def _silent(became: Became) -> tuple[int, int]:
+    """Scans none of whose detections is in the submap: how many, and of them those of clutter."""
+    scan = np.repeat(np.arange(len(became.counts)), became.counts)
+    k = len(became.counts)
+    used = np.bincount(scan[became.landmarks > 0], minlength=k)
+    false = np.bincount(scan[became.clutter], minlength=k)
+    silent = used == 0
+    return int(silent.sum()), int((silent & (false == became.counts)).sum())
 
 
 def _keyframes(
-    both: list[Keyframe],
-    ids: UInt32[np.ndarray, " N"],
-    kept: Bool[np.ndarray, " N"],
+    keyframes: Sequence[Keyframe],
+    events: Sequence[Event],
+    numbers: Int64[np.ndarray, " n"],
     slips: tuple[Slip, ...],
 ) -> tuple[Keyframe, ...]:
-    """The keyframes with these numbers; a motion that slipped is that much less sure."""
-    slipped = {slip.keyframe: slip_covariance(slip.by) for slip in slips}
-    bounds = np.cumsum([0, *(len(each.ids) for each in both)])
+    """The keyframes with their looks' landmarks under these numbers (0: it stays out), reduced to
+    one measurement of each; a motion that slipped is that much less sure.
+    """
+    looks: dict[int, list[Look]] = {}
+    first = 0
+    for event in events:
+        if event.look is not None:
+            own = numbers[first : first + len(event.look.ids)]
+            looks.setdefault(event.keyframe, []).append(_only(event.look, own))
+            first += len(event.look.ids)
+    slipped = {events[slip.keyframe].keyframe: slip_covariance(slip.by) for slip in slips}
     out = []
-    for k, (each, begin, end) in enumerate(zip(both, bounds, bounds[1:], strict=False)):
-        keyframe = replace(each, ids=ids[begin:end]).only(kept[begin:end])
+    for k, each in enumerate(keyframes):
+        keyframe = each
+        if k in looks:
+            keyframe = _with(keyframe, _measured(looks[k]))
         if k in slipped:
             motion = Increment(each.increment.mean, each.increment.covariance + slipped[k])
             keyframe = replace(keyframe, increment=motion)
-        out.append(keyframe)
+        out.append(replace(keyframe, looks=(), rest=None))
     return tuple(out)
 
 
-def _silent(
-    scans: Scans,
-    kept: Bool[np.ndarray, " N"],
-    clutter: Bool[np.ndarray, " N"],
-    is_detection: Bool[np.ndarray, " N"],
-) -> tuple[int, int]:
-    """Scans with detections none of which is kept: how many, and of them those of clutter alone."""
-    k = len(scans.motions)
-    count = _counted(scans.keyframes[is_detection], k)
-    used = _counted(scans.keyframes[is_detection & kept], k)
-    false = _counted(scans.keyframes[is_detection & clutter], k)
-    silent = (count > 0) & (used == 0)
-    return int(silent.sum()), int((silent & (false == count)).sum())
+def _only(look: Look, numbers: Int64[np.ndarray, " n"]) -> Look:
+    """The detections of a look that have a number, under it."""
+    kept = numbers > 0
+    return replace(
+        look,
+        ids=numbers[kept].astype(np.uint32),
+        ranges=look.ranges[kept],
+        bearings=look.bearings[kept],
+        own=look.own[kept],
+    )
 
 
-def _counted(keyframes: Int64[np.ndarray, " n"], k: int) -> Int64[np.ndarray, " K"]:
-    return np.bincount(keyframes, minlength=k)
+def _measured(looks: Sequence[Look]) -> Measured:
+    """What a keyframe's looks see from its end; of one that is the keyframe, what it sees."""
+    if len(looks) == 1 and looks[0].back is None:
+        (look,) = looks
+        return look.ids, look.ranges, look.bearings, look.own
+    return reduced(looks, np.zeros(3))
+
+
+def _with(keyframe: Keyframe, seen: Measured) -> Keyframe:
+    """The keyframe with more measurements."""
+    ids, ranges, bearings, own = seen
+    parts: list[tuple[int, Own]] = [(len(keyframe.ids), keyframe.own), (len(ids), own)]
+    return replace(
+        keyframe,
+        ids=np.concatenate((keyframe.ids, ids)),
+        ranges=np.concatenate((keyframe.ranges, ranges)),
+        bearings=np.concatenate((keyframe.bearings, bearings)),
+        own=together(parts),
+    )

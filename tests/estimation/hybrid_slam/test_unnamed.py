@@ -4,6 +4,7 @@ import numpy as np
 
 from team.config import UNNAMED, Association, Sensor
 from team.estimation.hybrid_slam.keyframes import Keyframe
+from team.estimation.hybrid_slam.reduction import Look
 from team.estimation.hybrid_slam.unnamed import settled
 from team.estimation.models import Increment
 from team.estimation.scans import unclaimed
@@ -13,16 +14,21 @@ FORWARD = Increment(np.array([1.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
 
 
 def keyframe(k: int, ranges: list[float]) -> Keyframe:
-    ids = UNNAMED + np.arange(len(ranges), dtype=np.uint32)
     bearings = np.linspace(-1.0, 1.0, len(ranges)) if ranges else np.empty(0)
-    seen = ids.astype(np.uint32), np.array(ranges), bearings
-    return Keyframe(k * SECOND, FORWARD, *seen, unclaimed(len(ranges)))
+    ids = (UNNAMED + np.arange(len(ranges))).astype(np.uint32)
+    own, still = unclaimed(len(ranges)), Increment.identity()
+    at = k * SECOND
+    look = Look(at, ids, np.array(ranges), bearings, own, np.zeros(3), at_ns=at, motion=FORWARD)
+    looks, rest = ((look,), still) if ranges else ((), None)
+    none = np.empty(0)
+    return Keyframe(
+        at, FORWARD, np.empty(0, np.uint32), none, none, unclaimed(0), looks=looks, rest=rest
+    )
 
 
 def test_a_window_that_confirms_no_detection_has_none() -> None:
-    named = [keyframe(k, []) for k in range(3)]
-    unnamed = [keyframe(0, [3.0]), keyframe(1, []), keyframe(2, [30.0])]
-    found = settled(named, unnamed, Association(least_seen=2), Sensor(), 100)
+    window = [keyframe(0, [3.0]), keyframe(1, []), keyframe(2, [30.0])]
+    found = settled(window, Association(least_seen=2), Sensor(), 100)
     assert [len(each.ids) for each in found.keyframes] == [0, 0, 0]
     assert (found.gated, found.unconfirmed + found.clutter) == (2, 2)
     assert len(found.unnamed.counts) == 0

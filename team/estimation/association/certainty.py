@@ -1,0 +1,123 @@
+"""How certain it is that a detection is of its landmark, as a probability.
+
+In one scan each landmark gives one detection at the most and each detection is of one landmark, of
+one that is not known, or clutter. Of a landmark that is in view with probability v and detected
+with P_D, the odds of "z is of landmark j" against "z is of something else and j was missed" are
+
+    ψ_j = P_D v_j N(z; ẑ_j, S_j) / ((1 − P_D v_j) ρ_j),    ρ_j = ρ_out + ρ (1 − exp(−ρ V_j)).
+
+ρ is how many detections of anything there are per square metre of a view, ρ_out how many of what
+is in no landmark, and V_j = π γ √|S_j| the volume of the gate γ: a landmark that lies in the gate
+of another may never have been told from it. The marginals over all joint associations of the scan
+follow by belief propagation (Williams and Lau 2014, IEEE TAES 50(4)).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.special import ndtr
+
+from team.config import Association
+from team.estimation.association.matching import squared_distances
+from team.estimation.association.scans import NOBODY, Scans
+from team.estimation.association.smoothing import Smoothed, predicted_by
+
+LEAST = 0.1
+"""What is seen at all is in view with this probability at least."""
+ROUNDS = 30
+SETTLED = 1e-6
+
+
+@dataclass(frozen=True)
+class View:
+    """What a window's scans look at, from its own detections.
+
+    density: detections of a scan per square metre of its view; area [m²]; looks: how many scans.
+    farthest [m]; least, most: bearings.
+    """
+
+    density: float
+    area: float
+    looks: int
+    farthest: float
+    least: float
+    most: float
+
+    def holds(
+        self, seen: Float[np.ndarray, "L 2"], spread: Float[np.ndarray, "L 2 2"]
+    ) -> Float[np.ndarray, " L"]:
+        """The probability of each place, in the sensor's frame, to be in view."""
+        ranges = np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-6)
+        bearings = np.arctan2(seen[:, 1], seen[:, 0])
+        along = seen / ranges[:, None]
+        across = np.column_stack((-along[:, 1], along[:, 0]))
+        far = np.sqrt(np.maximum(np.einsum("li,lij,lj->l", along, spread, along), 1e-12))
+        wide = np.sqrt(np.maximum(np.einsum("li,lij,lj->l", across, spread, across), 1e-12))
+        inside = ndtr((self.farthest - ranges) / far)
+        if self.most - self.least < 1.5 * np.pi:
+            inside *= ndtr((self.most - bearings) * ranges / wide)
+            inside *= ndtr((bearings - self.least) * ranges / wide)
+        return np.maximum(inside, LEAST)
+
+
+def view_of(scans: Scans) -> View:
+    """The sector that the window's detections fill, as far as it is not noise that widens it, and
+    how densely.
+    """
+    ranges = np.hypot(scans.points[:, 0], scans.points[:, 1])
+    bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
+    along = scans.points / np.maximum(ranges, 1e-6)[:, None]
+    noise = np.sqrt(np.einsum("ni,nij,nj->n", along, scans.covariances, along))
+    farthest = float((ranges - 2.0 * noise).max())
+    least, most = (float(value) for value in (bearings.min(), bearings.max()))
+    area = max(0.5 * max(most - least, 0.1) * farthest**2, 1e-9)
+    looks = len(np.unique(scans.keyframes))
+    return View(len(ranges) / (looks * area), area, looks, farthest, least, most)
+
+
+def certainties(
+    scans: Scans, landmark_of: Int64[np.ndarray, " N"], now: Smoothed, settings: Association
+) -> Float[np.ndarray, " N"]:
+    """Of each detection, the probability that it is of the landmark that it went to; of what went
+    to none, 0.
+    """
+    view = view_of(scans)
+    counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(now.landmarks))
+    alone = landmark_of == NOBODY
+    alone |= counts[landmark_of] < settings.least_seen
+    out = (1.0 + np.count_nonzero(alone)) / (view.looks * view.area)
+    bounds = scans.bounds
+    found = np.zeros(len(landmark_of))
+    for k in range(len(now.poses)):
+        of_scan = np.arange(bounds[k], bounds[k + 1])
+        of_scan = of_scan[landmark_of[of_scan] != NOBODY]
+        if not len(of_scan):
+            continue
+        seen, spread = predicted_by(now, k)
+        R = settings.variance_factor * scans.covariances[of_scan]
+        S = spread[None] + R[:, None]
+        squared, logs = squared_distances(scans.points[of_scan][:, None] - seen[None], S)
+        detected = settings.detection_probability * view.holds(seen, spread + R.mean(axis=0))
+        volume = np.pi * settings.gate * np.exp(0.5 * logs)
+        other = out - view.density * np.expm1(-view.density * volume)
+        with np.errstate(under="ignore"):
+            likely = np.exp(-0.5 * np.minimum(squared, 1e3) - 0.5 * logs) / (2.0 * np.pi)
+            weights = detected / (1.0 - detected) * likely / other
+        chosen = landmark_of[of_scan]
+        found[of_scan] = marginals(weights)[np.arange(len(chosen)), chosen]
+    return found
+
+
+def marginals(weights: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:
+    """P(detection i is of landmark j) by the odds ψ_ij of each pair alone, each of both once."""
+    messages = np.ones_like(weights)
+    for _ in range(ROUNDS):
+        of_landmark = (weights * messages).sum(axis=0) - weights * messages
+        forward = weights / (1.0 + np.maximum(of_landmark, 0.0))
+        of_detection = forward.sum(axis=1, keepdims=True) - forward
+        before, messages = messages, 1.0 / (1.0 + np.maximum(of_detection, 0.0))
+        if np.abs(messages - before).max(initial=0.0) < SETTLED:
+            break
+    total = 1.0 + forward.sum(axis=1, keepdims=True)
+    return np.asarray(forward / total)

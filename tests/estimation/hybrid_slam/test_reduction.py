@@ -1,0 +1,74 @@
+"""Scans of a moment reduced to one range and bearing of each landmark, with names and without."""
+
+import numpy as np
+import pytest
+
+from team.config import UNNAMED, Association, MotionModel, MotionNoise, Sensor
+from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from team.estimation.hybrid_slam.unnamed import events_of, settled
+from team.estimation.scans import unclaimed
+
+TICK = 10**8
+LANDMARKS = np.array([[3.0, 0.5], [3.0, -1.5], [5.0, 1.0]])
+NAMES = np.array([8, 3, 5], np.uint32)
+MOTION = MotionModel(forward=MotionNoise(per_m=0.05), turn=MotionNoise(per_rad=0.1))
+SENSOR = Sensor(range_sigma=0.02, bearing_sigma=0.01)
+
+
+def keyframes(keyframe_s: float, *, hidden: bool, tagged: int = 0) -> list[Keyframe]:
+    """A second of driving on an arc; each scan sees two of the three, in an order of its own.
+
+    tagged: of so many the names are told all the same, in a message of their own.
+    """
+    rng = np.random.default_rng(0)
+    segmenter = Segmenter(MOTION, SENSOR, keyframe_s)
+    segmenter.begin(0)
+    out, pose = [], np.zeros(3)
+    for tick in range(1, 11):
+        heading = pose[2] + 0.5 * 0.04
+        pose = pose + np.array([0.02 * np.cos(heading), 0.02 * np.sin(heading), 0.04])
+        seen = rng.permutation(3)[:2]
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        at = (LANDMARKS[seen] - pose[:2]) @ np.array([[c, -s], [s, c]])
+        ranges = np.hypot(*at.T) + 0.02 * rng.normal(size=2)
+        bearings = np.arctan2(at[:, 1], at[:, 0]) + 0.01 * rng.normal(size=2)
+        ids = (UNNAMED + np.arange(2)).astype(np.uint32) if hidden else NAMES[seen]
+        named = seen < tagged if hidden else np.ones(2, np.bool_)
+        for chosen, called in ((named, NAMES[seen]), (~named, ids)):
+            if chosen.any():
+                some = called[chosen], ranges[chosen], bearings[chosen]
+                segmenter.observe(tick * TICK - 1, *some, unclaimed(int(chosen.sum())))
+        out += segmenter.drive(tick * TICK, TICK, 0.2, 0.4)
+    return out + segmenter.cut(10 * TICK)[0]
+
+
+@pytest.mark.parametrize("keyframe_s", [0.0, 0.5])
+@pytest.mark.parametrize("tagged", [0, 1])
+def test_detections_that_are_associated_rightly_give_the_numbers_that_names_give(
+    keyframe_s: float, tagged: int
+) -> None:
+    named = keyframes(keyframe_s, hidden=False)
+    raw = keyframes(keyframe_s, hidden=True, tagged=tagged)
+    found = settled(raw, Association(certain=0.0), SENSOR, 100)
+    assert len(found.unnamed.counts) == 3 - tagged
+    merged: dict[int, list[Keyframe]] = {}
+    for each in found.keyframes:
+        merged.setdefault(each.stamp_ns, []).append(each)
+    for one in {each.stamp_ns for each in named}:
+        told = np.sort(np.concatenate([e.ranges for e in named if e.stamp_ns == one]))
+        assert (np.sort(np.concatenate([e.ranges for e in merged[one]])) == told).all()
+    motions = [sum(e.increment.mean for e in each) for each in (named, raw)]
+    assert np.allclose(*motions)
+
+
+def test_the_events_of_a_window_are_its_whole_motion_and_every_detection_once() -> None:
+    raw = keyframes(0.5, hidden=True, tagged=1)
+    events = events_of(raw)
+    assert [e.at_ns for e in events] == sorted(e.at_ns for e in events)
+    turned = sum(event.motion.mean[2] for event in events)
+    assert turned == pytest.approx(sum(each.increment.mean[2] for each in raw))
+    spread = sum(event.motion.covariance[2, 2] for event in events)
+    assert spread == pytest.approx(sum(each.increment.covariance[2, 2] for each in raw))
+    assert sum(len(e.look.ids) for e in events if e.look is not None) == sum(
+        len(look.ids) for each in raw for look in each.looks
+    )
