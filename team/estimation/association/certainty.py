@@ -58,7 +58,7 @@ class View:
         if self.most - self.least < 1.5 * np.pi:
             inside *= ndtr((self.most - bearings) * ranges / wide)
             inside *= ndtr((bearings - self.least) * ranges / wide)
-        return np.maximum(inside, LEAST)
+        return np.asarray(np.maximum(inside, LEAST))
 
 
 def view_of(scans: Scans) -> View:
