@@ -95,9 +95,11 @@ class Team:
         self._way: list[tuple[int, int, str, str, m.Message | Member]] = []
         self._count = 0
 
-    def send(self, sender: str, to: str, what: m.Message | Member, now_ns: int) -> None:
+    def send(
+        self, sender: str, to: str, what: m.Message | Member, now_ns: int, size: int = 0
+    ) -> None:
         """By the air, with 50 ms on the way."""
-        size = what.size if isinstance(what, Member) else len(encoded(what))
+        size = size or (what.size if isinstance(what, Member) else len(encoded(what)))
         for at_ns in self.air.arrivals(sender, to, size, now_ns):
             self._count += 1
             self.heard[to] += size
@@ -106,11 +108,12 @@ class Team:
     def spread(self, name: str, out: list[Outgoing], now_ns: int) -> None:
         """What a node says: a question to one, all else to everyone in reach."""
         for each in out:
-            self.said[name] += len(encoded(each.message))
+            size = len(encoded(each.message))
+            self.said[name] += size
             asked = ch.robot_of(each.name) if each.channel is ch.MEMBERS else None
             for other in self.names:
                 if other != name and asked in (None, other):
-                    self.send(name, other, each.message, now_ns)
+                    self.send(name, other, each.message, now_ns, size)
 
     def second(self, now_s: int) -> None:
         """One second of team time."""

@@ -11,13 +11,13 @@ from central.peers.fold import FoldWhen, PeerFold
 from team.containment import Boundary, reply_sample
 from team.peers.members import CHANNELS, Member, about
 from team.peers.node import PeerNode
-from team.peers.proofs import Proofs
+from team.peers.proofs import OPERATOR, Proofs
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
 
-TALK = (*CHANNELS, ch.SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
+TALK = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
 """What the set costs a radio; questions for it, too."""
 CENTRE = "central"
 """The node name of a centre."""
@@ -51,7 +51,7 @@ class Peer:
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
         """The channels to subscribe to whoever they name: members, summaries, progress."""
-        signed = () if self.peer.proofs is None else (ch.SIGNATURE,)
+        signed = () if self.peer.proofs is None else (ch.SIGNATURE, ch.ORDER_SIGNATURE)
         others = (ch.ROBOT_PROGRESS, ch.HEAD, ch.END, ch.END_ORDER, *signed)
         return tuple(dict.fromkeys((*PeerNode.listens, *others)))
 
@@ -97,8 +97,11 @@ class Peer:
                 self.carried += self.peer.take_carried(message)
                 return self._grown() + self._said(self.peer.more_of(message.node))
             case m.Signature():
-                if self.peer.proofs is not None:
-                    self.peer.proofs.hear(message)
+                found = ch.channel_of(sample.key)
+                if self.peer.proofs is not None and found is not None:
+                    channel, name = found
+                    speaker = OPERATOR if channel is ch.ORDER_SIGNATURE else name
+                    self.peer.proofs.hear(message, speaker)
                 return []
             case m.SetSummary():
                 return self._said(self.peer.hear(message))

@@ -416,7 +416,7 @@ def withdraw(
         fail(f"{team!r} is no team's name", WRONG_USE)
     with connected(team, connect, keys, "operator") as bus:
         try:
-            fused = order(bus, robot, reason, patience)
+            fused = order(bus, robot, reason, patience, _signer(keys, "operator", team))
         except WithdrawError as error:
             fail(str(error), FAILED)
     landmarks = len(ids(fused.ids, "ids"))
@@ -495,7 +495,7 @@ def end(
             if without is None:
                 end_team(bus, reason, patience)
             else:
-                give_up(bus, without, reason, patience)
+                give_up(bus, without, reason, patience, _signer(keys, "operator", team))
         except WithdrawError as error:
             fail(str(error), FAILED)
     said = f"nobody waits for {without} any more" if without else "the team ends"

@@ -13,7 +13,8 @@ from sim.launch.supervision import failure, supervise
 from sim.launch.supervisor import Ended, Supervised, end_all
 from sim.launch.watch import Watch
 from sim.scenarios.scenario import dumps
-from team.keys.credentials import credentials_of
+from team.keys.credentials import Credentials, credentials_of
+from team.peers.proofs import Signs
 from team.wire import channels as ch
 from team.wire.bus import BusError
 from team.wire.zenoh.bus import ZenohBus
@@ -76,6 +77,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
                 for channel in (ch.CONCLUDED, ch.TEAM_MAP, ch.TEAM_FINAL):
                     bus.subscribe(channel)
                 bus.watch_alive("central")
+                watch.signer = None if own is None else _signer(own)
             for channel in watch.errors.listens:
                 bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):
@@ -129,6 +131,13 @@ def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> S
     service = Supervised("router", command, plan.folder, starter)
     services.append(service)
     return service
+
+
+def _signer(own: Credentials) -> Signs:
+    """Imported here: without keys nothing is signed."""
+    from team.keys.signing import Signer
+
+    return Signer(own)
 
 
 def _endpoint(service: Supervised) -> str:

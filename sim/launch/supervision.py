@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 from sim.launch.supervisor import Ended, Supervised
 from sim.launch.watch import Watch
+from sim.launch.withdraw import ordered
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Outgoing
@@ -98,7 +99,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     node = node_of(service.name)
     order = m.GivenUp(stamp_ns=0, node=node, by="launch", reason=f"{ended.how}; {deaths}")
     if not _is_needed(service.name, watch):
-        bus.publish(Outgoing(ch.GIVEN_UP, node, order))
+        ordered(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
 
 
 def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:

@@ -13,6 +13,7 @@ from team.wire.newer import is_newer_map
 
 if TYPE_CHECKING:
     from sim.launch.truth import LiveErrors
+    from team.peers.proofs import Signs
 
 TURN_S = 0.1
 _PROGRESS = ("measurements", "submaps", "messages")
@@ -34,7 +35,8 @@ class Watch:
     against the truth, where there is one. place: by what other commands reach the team. notes: what
     became of processes, in words. restarts: how often each was started again. given_up: those that
     were. heard: when each node's last status came. peers: the robots that are to have a
-    final map of their own; concluded: whose is there, concluded_s: since when.
+    final map of their own; concluded: whose is there, concluded_s: since when. signer: signs
+    orders, where there are keys.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -52,6 +54,7 @@ class Watch:
     peers: frozenset[str] = frozenset()
     concluded: dict[str, m.Concluded] = field(default_factory=dict)
     concluded_s: dict[str, float] = field(default_factory=dict)
+    signer: "Signs | None" = None
     _voices: Voices = field(default_factory=Voices)
 
     @property

@@ -2,33 +2,52 @@
 
 import time
 
+from team.peers.members import Member, about
+from team.peers.proofs import Signs, signed_order
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, Outgoing, opened
+from team.wire.codec import encoded
 
 CENTRE_S = 10.0
 """A living centre and robot are heard of within this time."""
 LOOK_S = 0.05
-NO_CENTRE = "no centre answers; is the team running there? see --team, --connect"
+NO_CENTRE = "no centre and no peer answers; is the team running there? see --team, --connect"
+PEERS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL)
+"""What peers say of their own folds."""
+_PEER = "*"
+"""Stands among the robots that were heard of once one has said that it folds by itself."""
 
 
 class WithdrawError(RuntimeError):
     """The order could not be given, or was not followed: why, and what to do."""
 
 
-def withdraw(bus: Bus, robot: str, reason: str, patience_s: float) -> m.FusedMap:
-    """Order a robot's withdrawal and wait for the first map without it.
+def ordered(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
+    """Say an order; with keys its signature behind it, for peers that hear of it over others."""
+    bus.publish(order)
+    if signer is not None:
+        member = Member(order.key, encoded(order.message), order.message)
+        robot = about(order.message)
+        if robot:
+            bus.publish(Outgoing(ch.ORDER_SIGNATURE, robot, signed_order(signer, member)))
 
-    Raises WithdrawError where there is no centre, no such robot, no rule that can withdraw, or no
-    such map within the time.
+
+def withdraw(
+    bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
+) -> m.FusedMap:
+    """Order a robot's withdrawal and wait for the first map without it, a centre's or a peer's.
+
+    signer: the operator's, where there are keys. Raises WithdrawError where there is no centre and
+    no peer, no such robot, no rule that can withdraw, or no such map within the time.
     """
-    for channel in (ch.ROBOT_CONFIG, ch.FUSED_MAP, ch.FINAL_MAP):
+    for channel in (ch.ROBOT_CONFIG, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)
     bus.watch_alive()
     robots: set[str] = set()
     _await_team(bus, robot, robots)
     order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=reason)
-    bus.publish(Outgoing(ch.ORDER, robot, order))
+    ordered(bus, Outgoing(ch.ORDER, robot, order), signer)
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         for fused in _maps(bus, robots):
@@ -41,29 +60,33 @@ def withdraw(bus: Bus, robot: str, reason: str, patience_s: float) -> m.FusedMap
     raise WithdrawError(f"no map without {robot} within {patience_s:g} s; the order stands")
 
 
-def give_up(bus: Bus, robot: str, reason: str, patience_s: float) -> None:
-    """Order that nobody waits for a robot any more, and wait until the centre says that it follows.
+def give_up(
+    bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
+) -> None:
+    """Order that nobody waits for a robot any more, and wait until a centre or a peer says that it
+    follows.
 
-    Raises WithdrawError where there is no centre, no such robot, or no such word within the time.
+    signer: the operator's, where there are keys. Raises WithdrawError where there is no centre and
+    no peer, no such robot, or no such word within the time.
     """
-    for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP):
+    for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)
     bus.watch_alive()
     _await_team(bus, robot, set())
     node = ch.robot_node(robot)
-    bus.publish(
-        Outgoing(ch.GIVEN_UP, node, m.GivenUp(stamp_ns=0, node=node, by="operator", reason=reason))
-    )
+    order = m.GivenUp(stamp_ns=0, node=node, by="operator", reason=reason)
+    ordered(bus, Outgoing(ch.GIVEN_UP, node, order), signer)
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         for sample in bus.receive(LOOK_S):
             _, name, message = opened(sample)
             if isinstance(message, m.FusedMap) and message.final:
                 return
-            said = message.warnings if isinstance(message, m.Status) and name == "central" else ()
+            folds = name == "central" or name.startswith("robot/")
+            said = message.warnings if isinstance(message, m.Status) and folds else ()
             if any(warning.startswith(f"{robot} is given up") for warning in said):
                 return
-    raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
+    raise WithdrawError(f"nobody has followed within {patience_s:g} s; the order stands")
 
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
@@ -101,13 +124,16 @@ def await_centre(bus: Bus) -> None:
 
 
 def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
+    """Wait until a centre, or a peer, is there, and the robot has been heard of."""
     until = time.monotonic() + CENTRE_S
+    folds = False
     while time.monotonic() < until:
-        _maps(bus, robots)
-        if bus.is_alive("central") and robot in robots:
+        folds = bool(_maps(bus, robots)) or bus.is_alive("central") or _PEER in robots
+        if folds and robot in robots - {_PEER}:
             return
-    if not bus.is_alive("central"):
+    if not folds:
         raise WithdrawError(NO_CENTRE)
+    robots.discard(_PEER)
     known = ", ".join(sorted(robots)) or "none"
     raise WithdrawError(f"the team has no robot {robot}; heard of: {known}")
 
@@ -119,6 +145,8 @@ def _maps(bus: Bus, robots: set[str]) -> list[m.FusedMap]:
         channel, name, message = opened(sample)
         if channel is ch.ROBOT_CONFIG:
             robots.add(name)
+        elif channel is ch.TEAM_CONFIG:
+            robots.add(_PEER)
         elif isinstance(message, m.FusedMap):
             robots |= {member.robot for member in message.members} | set(message.withdrawn)
             found.append(message)

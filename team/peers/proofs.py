@@ -1,8 +1,9 @@
 """Whether a member that a third node carries was said by whom it is about.
 
 Every robot states its certificate, itself a member, and signs each of its members on a key of its
-own (`robot/r1/signature`), for whoever carries them. What an operator orders is not carried where
-there are keys: who was out of reach hears it when it is ordered again.
+own (`robot/r1/signature`), for whoever carries them. An operator does not stay: it signs its orders
+(`operator/signature/r1`) with its certificate in front, so that whoever was out of reach believes
+who carries them.
 """
 
 from typing import Protocol, runtime_checkable
@@ -11,8 +12,11 @@ from team.peers.members import Member, about
 from team.peers.replica import Replica
 from team.wire import messages as m
 
-MOST_SIGNATURES = 500_000
-"""Kept at the most; a robot has one for each of its members."""
+MOST_SIGNATURES = 250_000
+"""Kept of one node at the most; a robot has one for each of its members."""
+OPERATOR = "operator"
+ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
+"""What an operator says."""
 
 
 @runtime_checkable
@@ -37,7 +41,7 @@ class Proofs:
     def __init__(self, robot: str, signer: Signs) -> None:
         self._robot = robot
         self._signer = signer
-        self._signatures: dict[bytes, bytes] = {}
+        self._signatures: dict[str, dict[bytes, bytes]] = {}
 
     def certificate(self) -> m.Certificate:
         """The robot's own certificate, as a member."""
@@ -53,10 +57,11 @@ class Proofs:
             signature=signature,
         )
 
-    def hear(self, said: m.Signature) -> None:
-        """Keep a signature that a robot says on its own key."""
-        if len(self._signatures) < MOST_SIGNATURES:
-            self._signatures[said.member] = said.signature
+    def hear(self, said: m.Signature, speaker: str) -> None:
+        """Keep a signature that a robot, or an operator, says on its own key: of its own only."""
+        kept = self._signatures.setdefault(speaker, {})
+        if len(kept) < MOST_SIGNATURES and (speaker == OPERATOR or speaker == said.robot):
+            kept[said.member] = said.signature
 
     def of(self, member: Member) -> bytes:
         """A member's signature; empty where there is none yet, and of a certificate: the authority
@@ -64,9 +69,11 @@ class Proofs:
         """
         if isinstance(member.message, m.Certificate):
             return b""
-        found = member.signature or self._signatures.get(member.hash, b"")
-        if not found and about(member.message) == self._robot:
-            found = self._signatures[member.hash] = self._signer.sign(member.hash)
+        speaker = signed_by(member)
+        kept = self._signatures.setdefault(speaker, {})
+        found = member.signature or kept.get(member.hash, b"")
+        if not found and speaker == self._robot:
+            found = kept[member.hash] = self._signer.sign(member.hash)
         return found
 
     def refusal(self, member: Member, replica: Replica) -> str | None:
@@ -74,12 +81,48 @@ class Proofs:
         robot, message = about(member.message), member.message
         if isinstance(message, m.Certificate):
             return self._signer.refusal(f"robot-{robot}", message.certificate)
-        if isinstance(message, m.Withdrawal | m.GivenUp | m.Verdict):
-            return "an order is not carried where there are keys"
+        why = (
+            self._refused_order(member)
+            if isinstance(message, ORDERS)
+            else self._refused_of_robot(member, robot, replica)
+        )
+        if why is None:
+            self._signatures.setdefault(signed_by(member), {})[member.hash] = member.signature
+        return why
+
+    def _refused_of_robot(self, member: Member, robot: str, replica: Replica) -> str | None:
         known = replica.statements.get(robot, {}).get(("certificate", 0))
         if known is None or not isinstance(known.message, m.Certificate):
             return f"no certificate of {robot} is here yet"
         if not self._signer.is_signed(known.message.certificate, member.hash, member.signature):
             return f"not signed by {robot}"
-        self._signatures[member.hash] = member.signature
         return None
+
+    def _refused_order(self, member: Member) -> str | None:
+        certificate, signature = _parted(member.signature)
+        why = self._signer.refusal(OPERATOR, certificate)
+        if why is not None:
+            return f"an order with {why}"
+        if not self._signer.is_signed(certificate, member.hash, signature):
+            return "an order that no operator has signed"
+        return None
+
+
+def signed_by(member: Member) -> str:
+    """Whose signature proves a member: the robot that it is about, or `operator`."""
+    return OPERATOR if isinstance(member.message, ORDERS) else about(member.message)
+
+
+def signed_order(signer: Signs, member: Member) -> m.Signature:
+    """An operator's signature of its order, its certificate in front."""
+    certificate = signer.certificate
+    proof = len(certificate).to_bytes(2, "little") + certificate + signer.sign(member.hash)
+    message = member.message
+    return m.Signature(
+        stamp_ns=message.stamp_ns, robot=about(message), member=member.hash, signature=proof
+    )
+
+
+def _parted(proof: bytes) -> tuple[bytes, bytes]:
+    length = int.from_bytes(proof[:2], "little")
+    return proof[2 : 2 + length], proof[2 + length :]

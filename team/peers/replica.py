@@ -44,8 +44,9 @@ class RefusedError(ValueError):
 class StreamShare:
     """What is here of one incarnation.
 
-    complete: sequences whose submap is here with all inter-robot measurements from it. sum: of the
-    complete ones' hashes, modulo 2²⁵⁶.
+    complete: sequences whose submap is here with all inter-robot measurements from it; count: how
+    many of them from 0 on without a gap; beyond: the others. sum: of the complete ones' hashes,
+    modulo 2²⁵⁶.
     """
 
     start: Member | None = None
@@ -53,6 +54,7 @@ class StreamShare:
     factors: dict[int, dict[Look, Member]] = field(default_factory=dict)
     complete: set[int] = field(default_factory=set)
     count: int = 0
+    beyond: set[int] = field(default_factory=set)
     sum: int = 0
     newest_ns: int = 0
 
@@ -74,9 +76,11 @@ class StreamShare:
         assert isinstance(submap.message, m.Submap)
         if len(self.factors.get(sequence, ())) >= submap.message.sightings:
             self.complete.add(sequence)
+            self.beyond.add(sequence)
             self.sum = (self.sum + _sum(self.parcel(sequence))) % _WORD
             self.newest_ns = max(self.newest_ns, submap.message.stamp_ns)
-            while self.count in self.complete:
+            while self.count in self.beyond:
+                self.beyond.discard(self.count)
                 self.count += 1
 
     def forget(self, sequence: int) -> None:
@@ -84,7 +88,10 @@ class StreamShare:
         if sequence in self.complete:
             self.complete.discard(sequence)
             self.sum = (self.sum - _sum(self.parcel(sequence))) % _WORD
-            self.count = min(self.count, sequence)
+            self.beyond.discard(sequence)
+            if sequence < self.count:
+                self.beyond |= set(range(sequence + 1, self.count))
+                self.count = sequence
 
 
 class Have(NamedTuple):
@@ -107,6 +114,8 @@ class Replica:
         self.streams: dict[Stream, StreamShare] = {}
         self.statements: dict[str, dict[tuple[str, int], Member]] = {r: {} for r in self.robots}
         self.replacements = 0
+        self._holdings: dict[Stream, m.Holding] = {}
+        self._statements: dict[str, m.Statements] = {}
         self._told: _Told | None = None
 
     def add(self, member: Member) -> Outcome:
@@ -118,10 +127,13 @@ class Replica:
         if self._bytes[robot] + member.size > self._share:
             raise RefusedError(f"the share of {robot} is full: {self._share} bytes")
         if isinstance(message, m.Submap | m.SightingFactor | m.InitialPose):
-            outcome = self._add_streamed(member, (robot, message.incarnation))
+            stream = robot, message.incarnation
+            outcome = self._add_streamed(member, stream)
+            self._holdings.pop(stream, None)
             self.replacements += outcome == "replaced"
         else:
             outcome = self._add_stated(member, robot)
+            self._statements.pop(robot, None)
         if outcome != "known":
             self._bytes[robot] += member.size
             self._told = None
@@ -234,10 +246,25 @@ class Replica:
             robot=stream[0],
             incarnation=stream[1],
             start=share.start is not None,
-            sequences=intervals(share.complete, share.count),
+            sequences=intervals(share.beyond, share.count),
             digest=_digest(share.sum, () if share.start is None else (share.start,)),
             newest_ns=share.newest_ns,
         )
+
+    def _held(self, stream: Stream) -> m.Holding | None:
+        """As `holding`, kept until something of the stream comes."""
+        held = self._holdings.get(stream) or self.holding(stream)
+        if held is not None:
+            self._holdings[stream] = held
+        return held
+
+    def _said_of(self, robot: str) -> m.Statements:
+        found = self.statements[robot]
+        if robot not in self._statements:
+            self._statements[robot] = m.Statements(
+                robot=robot, count=len(found), digest=_digest(0, found.values())
+            )
+        return self._statements[robot]
 
     @property
     def digest(self) -> bytes:
@@ -267,12 +294,10 @@ class Replica:
     @property
     def _telling(self) -> "_Told":
         if self._told is None:
-            held = ((stream, self.holding(stream)) for stream in sorted(self.streams))
+            held = ((stream, self._held(stream)) for stream in sorted(self.streams))
             holdings = {stream: each for stream, each in held if each is not None}
             statements = {
-                robot: m.Statements(
-                    robot=robot, count=len(found), digest=_digest(0, found.values())
-                )
+                robot: self._said_of(robot)
                 for robot, found in sorted(self.statements.items())
                 if found
             }

@@ -214,6 +214,8 @@ CERTIFICATE = Channel(name="certificate", template="robot/{robot}/certificate", 
                       recomputable=False, meaning="by what a robot's signatures are checked")  # fmt: skip
 SIGNATURE = Channel(name="signature", template="robot/{robot}/signature", message=m.Signature, rate="one per member, with keys", delivery="all", recorded=False,
                     recomputable=False, meaning="a robot's signature of what it has said, for whoever carries it")  # fmt: skip
+ORDER_SIGNATURE = Channel(name="order_signature", template="operator/signature/{robot}", message=m.Signature, rate="one per order, with keys", delivery="all", recorded=False,
+                          recomputable=False, meaning="an operator's signature of an order about a robot, for whoever carries it")  # fmt: skip
 MEMBERS = Channel(name="members", template="{node}/members", message=m.MembersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                   meaning="a query to a peer; the replies are members of the set, as `carried`")  # fmt: skip
 CARRIED = Channel(name="carried", template="{node}/carried", message=m.Members, rate="as asked for", delivery="stream", recorded=False, recomputable=False,

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from team.keys.authority import make_keys
@@ -10,7 +11,7 @@ from team.keys.roster import nodes_of
 from team.keys.signing import Signer
 from team.peers.members import Member
 from team.peers.node import PeerNode
-from team.peers.proofs import Proofs
+from team.peers.proofs import OPERATOR, Proofs, signed_order
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
@@ -20,10 +21,15 @@ ROBOTS = ("r1", "r2", "r3")
 
 
 @pytest.fixture(scope="module")
-def nodes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, PeerNode]:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made: Path = tmp_path_factory.mktemp("keys")
+    make_keys(made, "t", nodes_of(ROBOTS))
+    return made
+
+
+@pytest.fixture(scope="module")
+def nodes(folder: Path) -> dict[str, PeerNode]:
     """Peers with keys; r1 has said something, which r2 has heard."""
-    folder: Path = tmp_path_factory.mktemp("keys")
-    make_keys(folder, "t", nodes_of(ROBOTS))
     found = {}
     for robot in ROBOTS:
         signer = Signer(credentials_of(folder, f"robot-{robot}", "t"))
@@ -57,7 +63,10 @@ def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(
     for each in said:
         nodes["r1"].take(each, "robot/r1")
         nodes["r2"].take(each, "robot/r1")
-        proofs_of(nodes["r2"]).hear(proofs_of(nodes["r1"]).signed(each))
+        own = proofs_of(nodes["r1"]).signed(each)
+        proofs_of(nodes["r2"]).hear(own, "r1")
+        wrong = msgspec.structs.replace(own, robot="r3", signature=b"of somebody else")
+        proofs_of(nodes["r2"]).hear(wrong, "r3")
     invented = parcel("r1", 2)[0]
     nodes["r2"].take(invented, "robot/r1")
     assert set(carried_to(nodes["r3"], nodes["r2"])) >= {certificate}
@@ -79,6 +88,30 @@ def test_a_signature_of_somebody_else_proves_nothing(nodes: dict[str, PeerNode])
     )
     assert nodes["r3"].take_carried(batch) == []
     assert "not signed by r1" in nodes["r3"].last_refused
+
+
+def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(
+    nodes: dict[str, PeerNode], folder: Path
+) -> None:
+    order = m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="broken")
+    said = member(ch.ORDER, order)
+    carrier = Signer(credentials_of(folder, "robot-r2", "t"))
+    batch = m.Members(
+        stamp_ns=0,
+        node="robot/r2",
+        keys=(said.key,),
+        payloads=(said.payload,),
+        signatures=(signed_order(carrier, said).signature,),
+    )
+    assert nodes["r3"].take_carried(batch) == []
+    assert "an order with a certificate of robot-r2" in nodes["r3"].last_refused
+    assert nodes["r3"].take_carried(msgspec.structs.replace(batch, signatures=(b"",))) == []
+    operator = Signer(credentials_of(folder, "operator", "t"))
+    nodes["r2"].take(said, "operator")
+    proofs_of(nodes["r2"]).hear(signed_order(operator, said), OPERATOR)
+    nodes["r3"].tick(20.0)
+    news = carried_to(nodes["r3"], nodes["r2"])
+    assert said.payload in [each.payload for each in news]
 
 
 def test_a_certificate_of_another_robot_is_nobodys_proof(nodes: dict[str, PeerNode]) -> None:

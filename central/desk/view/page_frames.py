@@ -32,6 +32,7 @@ SPACING_NS = 100_000_000
 """Between two poses, of truth and of estimates, that the page gets."""
 MAP_SPACING_NS = 1_000_000_000
 """Between two maps that the page gets."""
+_OF_A_SET = ("set_submaps", "set_agrees")
 _BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
 
 
@@ -72,7 +73,7 @@ class PageFrames:
         self._teller = EventTeller()
         self._truth = TrueLandmarks()
         self._map_ns: int | None = None
-        self._figures_s: dict[str, int] = {}
+        self._figures_s: dict[str, tuple[int, float, float]] = {}
         self._newest_ns = 0
 
     def hello(self, team: str, metadata: Mapping[str, str], name: str, *, live: bool) -> None:
@@ -217,8 +218,10 @@ class PageFrames:
     def _take_status(self, message: m.Status) -> None:
         second = int(self._t(message.stamp_ns))
         told = message.node == "central" or message.node.startswith("robot/")
-        if told and self._figures_s.get(message.node) != second:
-            self._figures_s[message.node] = second
+        whole, agrees = (message.figures.get(name, 0.0) for name in _OF_A_SET)
+        news = second, whole, agrees  # behind the end of the streams peers still come to agree
+        if told and self._figures_s.get(message.node) != news:
+            self._figures_s[message.node] = news
             figures = {name: _short(value) for name, value in message.figures.items()}
             self._say("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)
 

@@ -99,14 +99,16 @@ class Certificate(Message, frozen=True, kw_only=True, tag="certificate/1"):
 
 
 class Signature(Message, frozen=True, kw_only=True, tag="signature/1"):
-    """A robot's signature of a member that it has said, for whoever carries it.
+    """A signature of a member, by who said it, for whoever carries it: a robot's, or an operator's.
 
-    member: 32 bytes, the BLAKE2b of the key's length (2 bytes, little-endian), key and payload.
+    robot: that the member is about. member: 32 bytes, the BLAKE2b of the key's length (2 bytes,
+    little-endian), key and payload. signature: an operator's stands behind its certificate (DER),
+    and this behind its length (2 bytes, little-endian).
     """
 
     robot: Name
     member: Annotated[bytes, Meta(min_length=32, max_length=32)]
-    signature: Annotated[bytes, Meta(min_length=1, max_length=256)]
+    signature: Annotated[bytes, Meta(min_length=1, max_length=8192)]
 
 
 class Concluded(Message, frozen=True, kw_only=True, tag="concluded/1"):

@@ -167,6 +167,7 @@ function look() {
   $('empty').textContent = store.complete ? 'This log has no poses and no map.' : 'waiting for the team …';
   lookAtMap();
   lookAtRobots();
+  lookAtPeers();
   lookAtEvents();
   lookAtTraffic();
   const metres = gridStep(map.scale) * 2;
@@ -262,6 +263,63 @@ function poseTexts(robot, i) {
   const [x, y, heading, xx, xy, yy] = [0, 1, 2, 3, 4, 5].map((k) => robot.pose.get(i, k));
   const worst = 3 * Math.sqrt((xx + yy) / 2 + Math.hypot((xx - yy) / 2, xy));
   return [x.toFixed(2), y.toFixed(2), `${((heading * 180) / Math.PI).toFixed(0)}°`, worst.toFixed(2), ''];
+}
+
+/** What each peer has of the team's set, how old it is, and what its talk costs against a star. */
+function lookAtPeers() {
+  const now = new Map();
+  for (const node of store.figures.keys()) {
+    const figures = store.figuresAt(node, state.time);
+    if (figures && figures.set_submaps !== undefined) now.set(node, figures);
+  }
+  $('peers-card').hidden = !now.size;
+  if (!now.size) return;
+  const names = [...now.keys()].sort();
+  const whole = Math.max(...names.map((node) => now.get(node).set_submaps));
+  const newest = new Map();
+  for (const figures of now.values()) {
+    for (const [name, v] of Object.entries(figures)) {
+      if (name.startsWith('set_newest_s.')) newest.set(name.slice(13), Math.max(v, newest.get(name.slice(13)) ?? -Infinity));
+    }
+  }
+  const body = $('peers').tBodies[0];
+  while (body.rows.length > names.length) body.deleteRow(-1);
+  while (body.rows.length < names.length) { const row = body.insertRow(); for (let i = 0; i < 6; i++) row.insertCell(); }
+  let agreed = 0;
+  names.forEach((node, i) => {
+    const figures = now.get(node), own = node.replace('robot/', ''), cells = body.rows[i].cells;
+    const star = ['submap', 'sighting_factor'].reduce((sum, kind) => sum + bytesOf(`${node}/${kind}`), 0);
+    const since = sameSince(node, names.length - 1);
+    agreed += since !== null;
+    cells[0].textContent = own;
+    cells[1].textContent = `${figures.set_submaps} / ${whole}`;
+    cells[1].className = figures.set_submaps < whole ? 'warn' : '';
+    cells[2].textContent = [...newest].filter(([name]) => name !== own).sort().map(([name, at]) => {
+      const have = figures[`set_newest_s.${name}`];
+      return figures[`set_submaps.${name}`] ? `${name} ${Math.max(0, at - have).toFixed(0)} s` : `${name} –`;
+    }).join(', ');
+    cells[3].textContent = since === null ? '–' : `${since.toFixed(0)} s`;
+    const times = (bytes) => (star ? `${(bytes / star).toFixed(1)} ×` : bytesText(bytes));
+    cells[4].textContent = `${times(figures.set_uplink_bytes)}, ${times(figures.set_downlink_bytes)}`;
+    cells[4].title = `${bytesText(figures.set_uplink_bytes)} said, ${bytesText(figures.set_downlink_bytes)} heard, ${bytesText(star)} of its own submaps`;
+    cells[5].textContent = Object.entries(figures).filter(([name]) => name.startsWith('set_over.')).map(([name, v]) => [name.slice(9).replace('robot/', ''), v])
+      .filter(([name]) => name !== own).sort((a, b) => b[1] - a[1]).slice(0, 4).map(([name, v]) => `${name} ${v}`).join(', ');
+  });
+  $('peers-say').textContent = agreed === names.length ? 'all have the same set' : `${agreed} of ${names.length} know that all have the same set`;
+}
+
+/** Since when a peer has heard of so many others that their sets are its own; null: it has not. */
+function sameSince(node, others) {
+  const { t, f } = store.figures.get(node);
+  let i = upTo(t, state.time) - 1, since = null;
+  for (; i >= 0 && f[i].set_agrees >= others; i--) since = t[i];
+  return since;
+}
+
+function bytesOf(key) {
+  const of = store.traffic.get(key);
+  const i = of ? upTo(of.t, state.time) - 1 : -1;
+  return i < 0 ? 0 : of.b[i];
 }
 
 let listed = null;
