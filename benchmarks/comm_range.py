@@ -32,7 +32,6 @@ from team.wire import messages as m
 from team.wire.arrays import floats, ids
 from team.wire.codec import decoded
 
-RANGES: tuple[float | None, ...] = (5.0, 10.0, 20.0, 40.0, None)
 EVERY_S = 5.0
 Rows = dict[str, list[float]]
 
@@ -131,11 +130,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--picture", type=Path)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="kept, and taken up where it is there")
+    parser.add_argument("--ranges", nargs="*", default=["5", "10", "20", "40", "everyone"])
     options = parser.parse_args()
-    found: dict[str, Rows] = {}
+    there = options.json is not None and options.json.exists()
+    found: dict[str, Rows] = json.loads(options.json.read_text()) if there else {}
     sys.stdout.write("| reach | position [m] | its map [m] | landmarks | all agree at [s] |\n")
-    for range_m in RANGES:
+    for text in options.ranges:
+        range_m = None if text == "everyone" else float(text)
         name = "everyone" if range_m is None else f"{range_m:g} m"
         found[name] = rows = measured(range_m, options.steps)
         means = [float(np.nanmean(rows[key])) for key in ("pose_m", "map_m", "landmarks")]

@@ -21,6 +21,8 @@ from team.wire.codec import WireError, decoded, encoded
 
 SUMMARY_S = 1.0
 """Between two summaries at the least."""
+LAST_S = 0.2
+"""… once all have concluded: they leave soon, and are to know that they agree."""
 REPEAT_S = 10.0
 """… and at the most: who has turned up unnoticed learns of what is here."""
 PATIENCE_S = 3.0
@@ -170,7 +172,8 @@ class PeerNode:
             if now_s - heard_s < FRESH_S and summary.digest != self.replica.digest:
                 out += self._ask(summary)
         since_s = now_s - self._said_s
-        if since_s < SUMMARY_S:
+        over = self.replica.concluded.keys() >= set(self.replica.robots)
+        if since_s < (LAST_S if over else SUMMARY_S):
             return out
         digest = self.replica.digest
         if digest != self._said or self._answer_s is not None or since_s >= REPEAT_S:

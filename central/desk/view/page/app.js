@@ -284,17 +284,18 @@ function lookAtPeers() {
   }
   const body = $('peers').tBodies[0];
   while (body.rows.length > names.length) body.deleteRow(-1);
-  while (body.rows.length < names.length) { const row = body.insertRow(); for (let i = 0; i < 6; i++) row.insertCell(); }
+  while (body.rows.length < names.length) { const row = body.insertRow(); for (let i = 0; i < 5; i++) row.insertCell(); row.cells[2].append(document.createElement('span'), document.createElement('small')); }
+  const robots = names.filter((node) => node.startsWith('robot/')).length;
   let agreed = 0;
   names.forEach((node, i) => {
     const figures = now.get(node), own = node.replace('robot/', ''), cells = body.rows[i].cells;
     const star = ['submap', 'sighting_factor'].reduce((sum, kind) => sum + bytesOf(`${node}/${kind}`), 0);
-    const since = sameSince(node, names.length - 1);
+    const since = sameSince(node, robots - Number(node.startsWith('robot/')));
     agreed += since !== null;
     cells[0].textContent = own;
     cells[1].textContent = `${figures.set_submaps} / ${whole}`;
     cells[1].className = figures.set_submaps < whole ? 'warn' : '';
-    cells[2].textContent = [...newest].filter(([name]) => name !== own).sort().map(([name, at]) => {
+    cells[2].firstChild.textContent = [...newest].filter(([name]) => name !== own).sort().map(([name, at]) => {
       const have = figures[`set_newest_s.${name}`];
       return figures[`set_submaps.${name}`] ? `${name} ${Math.max(0, at - have).toFixed(0)} s` : `${name} –`;
     }).join(', ');
@@ -302,10 +303,11 @@ function lookAtPeers() {
     const times = (bytes) => (star ? `${(bytes / star).toFixed(1)} ×` : bytesText(bytes));
     cells[4].textContent = `${times(figures.set_uplink_bytes)}, ${times(figures.set_downlink_bytes)}`;
     cells[4].title = `${bytesText(figures.set_uplink_bytes)} said, ${bytesText(figures.set_downlink_bytes)} heard, ${bytesText(star)} of its own submaps`;
-    cells[5].textContent = Object.entries(figures).filter(([name]) => name.startsWith('set_over.')).map(([name, v]) => [name.slice(9).replace('robot/', ''), v])
-      .filter(([name]) => name !== own).sort((a, b) => b[1] - a[1]).slice(0, 4).map(([name, v]) => `${name} ${v}`).join(', ');
+    const over = Object.entries(figures).filter(([name, v]) => name.startsWith('set_over.') && v)
+      .map(([name, v]) => [name.slice(9).replace('robot/', ''), v]).filter(([name]) => name !== own).sort((a, b) => b[1] - a[1]);
+    cells[2].lastChild.textContent = over.length ? `over ${over.slice(0, 5).map(([name, v]) => `${name} ${v}`).join(', ')}` : '';
   });
-  $('peers-say').textContent = agreed === names.length ? 'all have the same set' : `${agreed} of ${names.length} know that all have the same set`;
+  $('peers-say').textContent = agreed === names.length ? 'all have the same set' : `${agreed} of ${names.length} have heard that all robots have the same set`;
 }
 
 /** Since when a peer has heard of so many others that their sets are its own; null: it has not. */
