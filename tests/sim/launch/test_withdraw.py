@@ -88,7 +88,7 @@ def test_a_robot_that_nobody_knows_can_not_be_withdrawn(monkeypatch: pytest.Monk
 
 def test_without_a_centre_there_is_nobody_to_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(orders, "CENTRE_S", 0.2)
-    with pytest.raises(WithdrawError, match="no centre answers"):
+    with pytest.raises(WithdrawError, match="no centre and no peer answers"):
         withdraw(MemoryBus(MemoryNetwork()), "r3", "a flat wheel", 1.0)
 
 
