@@ -456,9 +456,8 @@ def verdict(
         fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
     with connected(team, connect, keys, "operator") as bus:
         try:
-            fused = judge(
-                bus, Judgement(first=one, second=two, same=word == "same"), reason, patience
-            )
+            said = Judgement(first=one, second=two, same=word == "same")
+            fused = judge(bus, said, reason, patience, _signer(keys, "operator", team))
         except WithdrawError as error:
             fail(str(error), FAILED)
     landmarks = len(ids(fused.ids, "ids"))

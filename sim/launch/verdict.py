@@ -3,7 +3,8 @@
 import re
 import time
 
-from sim.launch.withdraw import LOOK_S, WithdrawError, await_centre
+from sim.launch.withdraw import LOOK_S, PEERS, WithdrawError, await_fold, ordered
+from team.peers.proofs import Signs
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, Outgoing, opened
@@ -21,18 +22,25 @@ def local_landmark(text: str) -> m.LocalLandmark:
     return m.LocalLandmark(robot=robot, incarnation=incarnation, sequence=sequence, local=local)
 
 
-def judge(bus: Bus, judgement: m.Judgement, reason: str, patience_s: float) -> m.FusedMap:
-    """Say the verdict and wait for the first map that rests on it.
+def judge(
+    bus: Bus,
+    judgement: m.Judgement,
+    reason: str,
+    patience_s: float,
+    signer: Signs | None = None,
+) -> m.FusedMap:
+    """Say the verdict and wait for the first map that rests on it, a centre's or a peer's.
 
-    Raises WithdrawError where there is no centre, or no such map within the time.
+    signer: the operator's, where there are keys. Raises WithdrawError where there is neither, or no
+    such map within the time.
     """
-    for channel in (ch.FUSED_MAP, ch.FINAL_MAP):
+    for channel in (ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)
     bus.watch_alive()
-    await_centre(bus)
+    await_fold(bus)
     robot = judgement.first.robot
     verdict = m.Verdict(stamp_ns=0, robot=robot, judgement=judgement, by="operator", reason=reason)
-    bus.publish(Outgoing(ch.VERDICT, robot, verdict))
+    ordered(bus, Outgoing(ch.VERDICT, robot, verdict), signer)
     wanted = {judgement.first, judgement.second}
     until = time.monotonic() + patience_s
     while time.monotonic() < until:

@@ -90,15 +90,15 @@ def give_up(
 
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
-    """Order a live team to end, and wait until the centre repeats the order.
+    """Order a live team to end, and wait until the centre repeats the order, or a peer follows.
 
-    Raises WithdrawError where there is no centre, the team has a world, or no such word within the
+    Raises WithdrawError where there is neither, the team has a world, or no such word within the
     time.
     """
     for channel in (ch.TEAM_END, ch.FINAL_MAP):
         bus.subscribe(channel)
     bus.watch_alive()
-    await_centre(bus)
+    await_fold(bus)
     if bus.is_alive("world"):
         raise WithdrawError(
             "this team has a world, which ends by itself; `teamslam end --without ROBOT` lets it "
@@ -109,18 +109,23 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         for sample in bus.receive(LOOK_S):
-            if sample.key in (ch.TEAM_END.key(), ch.FINAL_MAP.key()):
+            found = ch.channel_of(sample.key)
+            if found is not None and found[0] in (ch.TEAM_END, ch.FINAL_MAP, ch.TEAM_FINAL):
                 return
     raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
 
 
-def await_centre(bus: Bus) -> None:
-    """Wait until a centre is alive; raises WithdrawError where none is within CENTRE_S."""
-    until = time.monotonic() + CENTRE_S
-    while not bus.is_alive("central"):
+def await_fold(bus: Bus) -> None:
+    """Wait until a centre is alive or a peer says that it folds; raises WithdrawError where none
+    does within CENTRE_S.
+    """
+    until, heard = time.monotonic() + CENTRE_S, set[str]()
+    for channel in PEERS:
+        bus.subscribe(channel)
+    while not (bus.is_alive("central") or _PEER in heard):
         if time.monotonic() > until:
             raise WithdrawError(NO_CENTRE)
-        bus.receive(LOOK_S)
+        _maps(bus, heard)
 
 
 def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
