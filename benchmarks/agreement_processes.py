@@ -27,8 +27,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from team.wire.zenoh_bus import ZenohBus
-
 from benchmarks.agreement import WAYS, central_map, order_of, scenario_of
 from benchmarks.kills import PROGRAM, await_text, children
 from sim.in_memory.team import run_team
@@ -38,6 +36,7 @@ from team.recording.reader import open_log
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded
+from team.wire.zenoh.bus import ZenohBus
 
 
 @dataclass

@@ -113,6 +113,20 @@ class JoinRule(SubmapRule):
         watermark_ns = roll.watermark_ns(self.dealt, self.count)
         return self.broadcasts(watermark_ns, roll.now_ns)
 
+    def refresh(self, roll: Roll) -> list[Outgoing]:
+        """A map with every submap that is here, if the last one lacks any.
+
+        It waits for no tick's end and no teammate: what lies ahead of the watermark is provisional.
+        """
+        if not self._lacks(self._published, float("inf")):
+            return []
+        watermark_ns = roll.watermark_ns(self.dealt, self.count)
+        self._ticks.take_until(watermark_ns)
+        fold = self._ticks.provisional()
+        ahead = any(each.end_ns > watermark_ns for each in fold.contributions[-1:])
+        tail: Tail = "provisional" if ahead else "closed"
+        return [*self._withdrawals(roll.now_ns), *self._broadcast(fold, tail, roll.now_ns)]
+
     def broadcasts(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
         """Fold what the watermark allows; a broadcast when one is due."""
         self._ticks.take_until(watermark_ns)

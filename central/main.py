@@ -22,6 +22,8 @@ LOST_S = 3.0
 GAP_PATIENCE_S = 0.5
 """A measurement that is missing for so long is asked for at its source."""
 ASK_TIMEOUT_S = 10.0
+FRESH_SHARE = 1.0 / 3.0
+"""Of the time, for maps that are not due: so one waits for two solutions at the most."""
 FAREWELL_S = 10.0
 """The centre leaves after the others, at most this long after its final map."""
 _LOG = logging.getLogger("teamslam")
@@ -52,6 +54,7 @@ class CentralShell:
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
         self._shell.notes = self._awaited
+        self._shell.refresh_by(self.node.refresh, FRESH_SHARE)
         self._lost: dict[str, Sample] = {}
         self._since: dict[str, float] = {}
         self._alive: set[str] = set()
@@ -72,7 +75,7 @@ class CentralShell:
         self._shell.begin()
         while self._shell.going:
             self._shell.look_for_the_end()
-            samples = self._bus.receive(WAIT_S)
+            samples = self._shell.receive()
             if self._kept is not None:
                 self._kept.note(samples)
             self._shell.take(self._patient(samples))

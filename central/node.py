@@ -131,11 +131,18 @@ class CentralNode:
         if self.finished:
             return []
         self._roll.withdrawn = frozenset(self._rule.withdrawn)
-        out = self._rule.advance(self._roll)
+        out = self._counted(self._rule.advance(self._roll))
+        return out + self._conclude() if self._is_over else out
+
+    def _counted(self, out: list[Outgoing]) -> list[Outgoing]:
         maps = [o.message for o in out if isinstance(o.message, m.FusedMap)]
         self._broadcasts += bool(maps)
         self._newest = maps[-1] if maps else self._newest
-        return out + self._conclude() if self._is_over else out
+        return out
+
+    def refresh(self) -> list[Outgoing]:
+        """A map of all that is here, if the last one lacks something; for when there is time."""
+        return [] if self.finished else self._counted(self._rule.refresh(self._roll))
 
     @property
     def _is_over(self) -> bool:

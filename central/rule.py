@@ -83,6 +83,10 @@ class FusionRule(ABC):
     def advance(self, roll: Roll) -> list[Outgoing]:
         """The maps that are due."""
 
+    def refresh(self, roll: Roll) -> list[Outgoing]:
+        """The newest map at once, whether or not one is due, if it has more than the last one."""
+        return []
+
     @abstractmethod
     def conclude(self, now_ns: int) -> list[Outgoing]:
         """The last messages, the final map behind all others."""

@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import msgspec
 
 from team.containment import Boundary
+from team.spare import Spare
 from team.the_end import TheEnd
 from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
 from team.wire.channels import ALIVE, FAULT, QUERIES, STATUS, Channel
@@ -95,6 +96,34 @@ class Shell:
         self._messages = 0
         self._bytes = 0
         self._since = time.monotonic()
+        self._refresh: Callable[[], list[Outgoing]] | None = None
+        self._spare = Spare(1.0)
+        self._stale = False
+
+    def refresh_by(self, refresh: Callable[[], list[Outgoing]], share: float) -> None:
+        """What to say when something has come and nothing more waits: `share` of the time at most.
+
+        So what is worth most while it is new does not wait for when it would be due.
+        """
+        self._refresh, self._spare = refresh, Spare(share)
+
+    def receive(self) -> list[Sample]:
+        """What has come within WAIT_S; when nothing more has, what there is to refresh is said."""
+        refreshes = self._stale and self._refresh is not None
+        wait_s = min(WAIT_S, self._spare.wait_s) if refreshes else WAIT_S
+        samples = self.bus.receive(wait_s)
+        if samples:
+            self._stale = True
+        elif refreshes and not self._spare.wait_s and self._refresh is not None:
+            self._stale = False
+            began = time.monotonic()
+            out = self.contained("refresh", self._refresh)
+            if out is None:
+                self._spare.failed()
+            else:
+                self._spare.note(began, useful=bool(out))
+                self.publish(out)
+        return samples
 
     def begin(self) -> None:
         """Say what the node says first and declare it alive; its subscriptions are made before."""
@@ -243,6 +272,8 @@ class Shell:
             self._remind_due = now + REMIND_S
             _LOG.info("%s", "; ".join(warnings) or "waiting")
         warnings = (*warnings, *self.boundary.warnings)
+        if self._spare.took_s is not None:
+            rates["fresh_s"] = self._spare.took_s
         if self.boundary.faults:
             rates["faults"] = float(self.boundary.faults)
         status = msgspec.structs.replace(status, figures=status.figures | rates, warnings=warnings)
@@ -252,7 +283,7 @@ class Shell:
         """Turn after turn until the end: input, the node's answers, `duty`, status."""
         self.begin()
         while self.going:
-            self.take(self.bus.receive(WAIT_S))
+            self.take(self.receive())
             self.look_for_the_end()
             self.contained("duty", duty)
             self.report()

@@ -118,6 +118,10 @@ class PeerFold:
             out += self._give(message)
         return out
 
+    def refresh(self) -> list[Outgoing]:
+        """A map of all that is here, if the last one lacks something."""
+        return [] if self._waits else self.centre.refresh()
+
     def _give(self, message: m.Message) -> list[Outgoing]:
         before = self.centre.finished
         out = self.boundary.give(self.centre, message)

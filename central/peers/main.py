@@ -25,6 +25,8 @@ from team.wire.bus import NO_COUNTER, Bus, Sample
 
 LINGER_S = 5.0
 """A robot that knows that all others have concluded stays so long, so that they know of it, too."""
+FRESH_SHARE = 0.2
+"""Of the time, for maps that are not due: a robot has more to do than a centre."""
 WORLD_GONE_S = 1.0
 """The world leaves when everyone has concluded; one that died is there again sooner."""
 _LOG = logging.getLogger("teamslam")
@@ -89,6 +91,7 @@ class PeerShell(RobotShell):
         self._peer = PeerRobot(config, central, robots, exchange, when, signer)
         self.node = self._peer.node
         self._shell = Shell(bus, self._peer, self._peer.name, stop)
+        self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
         self._over_since: float | None = None
 
@@ -178,6 +181,7 @@ class CentreShell:
         self._bus = bus
         self._peer = PeerCentre(config, robots, signer)
         self._shell = Shell(bus, self._peer, CENTRE, stop)
+        self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
 
     def run(self) -> None:

@@ -143,6 +143,10 @@ class Peer:
         """What the fold says, as this node says it."""
         return list(said)
 
+    def refresh(self) -> list[Outgoing]:
+        """What there is to say of what has come since the last map; for when there is time."""
+        return self._of_fold(self.fold.refresh())
+
     def answer(self, request: bytes) -> list[bytes]:
         """The answer to a peer's `MembersRequest`."""
         answer = self.peer.answer(request)

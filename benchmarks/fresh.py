@@ -1,0 +1,102 @@
+"""How fresh the team's map is: from a submap's arrival to the map and the priors that hold it.
+
+`python benchmarks/fresh.py LOG… [--json FILE]`, of logs of `launch` at any pace. By wall time, of
+each submap but those of the last second: until the first map (a centre's, or any peer's) that has
+it, and until the first prior of another robot that rests on it. The measure is the round trip (the
+median from a submap to the centre's credit for it) and the time of a solution (the centre's own
+word): fresh is within three times their sum.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from team.recording.reader import open_log
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import opened
+
+CHANNELS = (ch.SUBMAP, ch.FUSED_MAP, ch.PRIOR, ch.CENTRAL_PROGRESS, ch.STATUS)
+Submap = tuple[str, int, int]
+
+
+def measured(log: Path) -> dict[str, Any]:
+    """Seconds until the map, until a teammate's prior; the round trip and a solution's time."""
+    arrived: dict[Submap, float] = {}
+    mapped: dict[Submap, float] = {}
+    told: dict[Submap, float] = {}
+    credit: dict[Submap, float] = {}
+    solve_s: list[float] = []
+    for sample in open_log(log).samples(CHANNELS):
+        channel, name, message = opened(sample)
+        at = sample.wall_ns * 1e-9
+        match message:
+            case m.Submap():
+                arrived[message.robot, message.incarnation, message.sequence] = at
+            case m.FusedMap():
+                _first(mapped, arrived, message.members, at)
+            case m.Prior():
+                others = [each for each in message.members if each.robot != name]
+                _first(told, arrived, others, at)
+            case m.Progress() if channel is ch.CENTRAL_PROGRESS:
+                key = message.robot, message.incarnation, message.submaps - 1
+                credit.setdefault(key, at)
+            case m.Status() if message.node == "central":
+                solve_s += [v for k, v in message.figures.items() if k == "fresh_s"]
+            case _:
+                pass
+    last = max(arrived.values(), default=0.0) - 1.0
+    judged = [key for key, at in arrived.items() if at <= last and key in mapped]
+    trips = [credit[key] - arrived[key] for key in judged if key in credit]
+    trip_s = float(np.median(trips)) if trips else 0.0
+    solving_s = float(np.median(solve_s)) if solve_s else 0.0
+    waits = np.array([mapped[key] - arrived[key] for key in judged])
+    priors = np.array([told[key] - arrived[key] for key in judged if key in told])
+    bound_s = 3.0 * (trip_s + solving_s)
+    return {
+        "submaps": len(judged),
+        "map_s": np.quantile(waits, (0.5, 0.95)).tolist(),
+        "prior_s": np.quantile(priors, (0.5, 0.95)).tolist() if len(priors) else [],
+        "round_trip_s": trip_s,
+        "solve_s": solving_s,
+        "within": float((waits <= bound_s).mean()) if bound_s else None,
+        "ratio": float(np.median(waits) / (trip_s + solving_s)) if trip_s + solving_s else None,
+    }
+
+
+def _first(
+    found: dict[Submap, float],
+    arrived: dict[Submap, float],
+    members: Any,
+    at: float,
+) -> None:
+    for each in members:
+        sequence = each.sequence
+        while sequence >= 0:
+            key = each.robot, each.incarnation, sequence
+            if key in found or key not in arrived:
+                break
+            found[key] = at
+            sequence -= 1
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("logs", nargs="+", type=Path)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    found = {str(log): measured(log) for log in options.logs}
+    for log, row in found.items():
+        sys.stdout.write(f"{log}: {json.dumps(row)}\n")
+    if options.json is not None:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
