@@ -269,7 +269,7 @@ PROCESSES: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "any command": (("sim.cli.main",), set()),
     "router": ((), {"zenoh"}),
     "record": ((), {"mcap", "zenoh"}),
-    "robot": (("team.robot.main",), COMPUTES),
+    "robot": (("team.robot.main", "team.robot.hybrid"), COMPUTES),
     "central": (("central.main",), COMPUTES),
     "world": (("sim.publisher.main",), COMPUTES),
 }  # fmt: skip

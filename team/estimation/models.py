@@ -40,12 +40,12 @@ class Increment:
     def then(self, other: "Increment") -> "Increment":
         """mean₁ ∘ mean₂ with covariance Ad C₁ Adᵀ + C₂, Ad = Ad(mean₂⁻¹)."""
         return Increment(
-            *_composed(self.mean, self.covariance, other.mean, other.covariance),
+            *composed(self.mean, self.covariance, other.mean, other.covariance),
         )
 
 
 @compiled
-def _composed(
+def composed(
     mean: Pose, covariance: Float[np.ndarray, "3 3"], then: Pose, added: Float[np.ndarray, "3 3"]
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
     """T₁Exp(ξ₁)T₂Exp(ξ₂) = T₁T₂Exp(Ad(T₂⁻¹)ξ₁)Exp(ξ₂), to first order in the noise."""
@@ -73,6 +73,17 @@ def increment_of(
 ) -> Increment:
     """One odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
 
+    The motion of `course_of`, and its noise in the tangent space of its end.
+    """
+    kernel = turn_then_drive if motion.kind == "turn-then-drive" else arc
+    return Increment(*kernel(*course_of(motion, duration_s, forward, yaw_rate)))
+
+
+def course_of(
+    motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """The way [m] and the turn [rad] of an interval, and the `motion_variances` over them.
+
     With v = forward_scale·forward (slow_scale·forward where |forward| < slow_below),
     ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
     d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the noises
@@ -91,9 +102,7 @@ def increment_of(
     logged = (motion.slow_scale if slow else motion.forward_scale) * forward * duration_s
     distance = math.copysign(max(abs(logged) - lost, 0.0), logged)
     turn = rate * duration_s + motion.veer * distance
-    variances = motion_variances(motion, duration_s, distance, turn)
-    kernel = _turn_then_drive if motion.kind == "turn-then-drive" else _arc
-    return Increment(*kernel(distance, turn, *variances))
+    return (distance, turn, *motion_variances(motion, duration_s, distance, turn))
 
 
 def motion_variances(
@@ -163,7 +172,7 @@ def _of_wheels(
 
 
 @compiled
-def _arc(
+def arc(
     distance: float,
     turn: float,
     forward_var: float,
@@ -203,7 +212,7 @@ def _arc(
 
 
 @compiled
-def _turn_then_drive(
+def turn_then_drive(
     distance: float,
     turn: float,
     forward_var: float,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from team.config import Association
 from team.estimation.association.matching import best_pairs_first, squared_distances
@@ -175,7 +175,7 @@ class Tracker:
         S = H @ self._P[:n, :n] @ H.T
         S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
         error = (points - seen).ravel()
-        return float(error @ np.linalg.solve(S, error) / chi2.isf(RARE, 2 * m))
+        return float(error @ np.linalg.solve(S, error) / chdtri(2 * m, RARE))
 
     def jump(
         self,

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt32
 from team.config import MotionModel, Sensor
 from team.estimation import geometry
 from team.estimation.geometry import adjoint, inverse
+from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.hybrid_slam.reduction import Look, reduced
 from team.estimation.hybrid_slam.sensitivity import carried_on
@@ -96,7 +97,8 @@ class Segmenter:
         self._mount = np.array(sensor.mount)
         self._unmount = adjoint(inverse(self._mount))
         self._last = STANDING
-        self._unmeasured = np.zeros((3, 3))
+        self._unmeasured: Float[np.ndarray, "3 3"] | None = None
+        self._run = OdometryRun(motion)
         self.now_ns: int | None = None
 
     def begin(self, stamp_ns: int) -> None:
@@ -144,7 +146,7 @@ class Segmenter:
         """
         over = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
         if measured:
-            self._last, self._unmeasured = over, np.zeros((3, 3))
+            self._last, self._unmeasured = over, None
         else:
             over = self._last.gone_on(stamp_ns, duration_ns)
             self._unmeasured = _unmeasured(duration_ns * 1e-9, over.speed, over.yaw_rate)
@@ -166,9 +168,10 @@ class Segmenter:
                 seen = scan.ids, scan.ranges, scan.bearings
                 keyframes.append(self._keyframe_at(at_ns, *seen, scan.own))
         keyframes += self._nodes(stamp_ns, over)
-        self._go_to(stamp_ns, over)
+        self._integrate(stamp_ns - self._here_ns, 0, over)
         self.now_ns = stamp_ns
         if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
+            self._settle()
             keyframes.append(self._close_keyframe(stamp_ns))
         return keyframes
 
@@ -177,6 +180,7 @@ class Segmenter:
 
         That motion's shift by an error of the scale of speed is `rest_forward`.
         """
+        self._settle()
         keyframes = [self._close_keyframe(stamp_ns)] if self._keyframe else []
         rest, self.rest_forward = self._increment, self._forward
         self._increment, self._forward = Increment.identity(), np.zeros(3)
@@ -212,14 +216,19 @@ class Segmenter:
         """Integrate up to a stamp; what lies before the interval's start is at its start."""
         at_ns = max(stamp_ns, self._here_ns)
         self._integrate(at_ns - self._here_ns, over.end_ns - at_ns, over)
+        self._settle()
         self._here_ns = at_ns
         return at_ns
 
     def _integrate(self, duration_ns: int, rest_ns: int, over: Interval) -> None:
         if duration_ns <= 0:
             return
+        if self._is_plain(over):
+            self._run.add(over, duration_ns)
+            return
+        self._settle()
         step = over.part(self._motion, duration_ns, rest_ns)
-        if self._unmeasured.any():
+        if self._unmeasured is not None:
             added = step.covariance + duration_ns * 1e-9 * self._unmeasured
             step = Increment(step.mean, added)
         if self._grid is not None:
@@ -236,6 +245,29 @@ class Segmenter:
             self._scan_motion = geometry.compose(self._scan_motion, step.mean)
         if self._since_look is not None:
             self._since_look = self._since_look.then(step)
+
+    def _is_plain(self, over: Interval) -> bool:
+        """Whether an interval's motion follows from its speeds, and nobody waits for it."""
+        return (
+            over.moved is None
+            and self._unmeasured is None
+            and not self._sensor.is_mounted
+            and (self._grid is None or not self._grid.carries)
+        )
+
+    def _settle(self) -> None:
+        """What has been driven since somebody asked is in the motions."""
+        if not self._run:
+            return
+        node = Increment.identity() if self._grid is None else self._grid.since_node
+        after = self._run.driven(self._increment, node, self._forward, self._scan_motion)
+        self._increment = Increment(after.motion, after.covariance)
+        if self._motion.calibrated_speed is not None:
+            self._forward = after.shift
+        if self._keyframe_ns:
+            self._scan_motion = after.of_scan
+        if self._grid is not None:
+            self._grid.since_node = Increment(after.node_motion, after.node_covariance)
 
     def _keyframe_at(
         self,

@@ -54,7 +54,10 @@ class _Look:
 
 
 class PoseGrid:
-    """The grid times and the sightings of the open window; the segmenter tells it of the motion."""
+    """The grid times and the sightings of the open window; the segmenter tells it of the motion.
+
+    since_node: the motion since the last pose node.
+    """
 
     def __init__(self, sensor: Sensor, front_end: FrontEnd) -> None:
         self._sensor = sensor
@@ -66,7 +69,7 @@ class PoseGrid:
         self._uncovered: list[_Look] = []
         self._ahead: list[_Look] = []
         self._at_node: dict[tuple[int, str], list[tuple[int, Carried]]] = {}
-        self._since_node = Increment.identity()
+        self.since_node = Increment.identity()
 
     def begin(self, stamp_ns: int) -> None:
         """A window begins; its nodes are the grid times within window_s from here."""
@@ -116,18 +119,23 @@ class PoseGrid:
             if look.stamp_ns < look.node_ns:
                 self._ahead.append(look)
             else:
-                self._keep(look, carried_back(look.seen, self._since_node))
+                self._keep(look, carried_back(look.seen, self.since_node))
             return False
         for look in self._ahead:
             self._keep(look, carried_on(look.seen, look.motion))
         self._ahead = []
-        self._since_node = Increment.identity()
+        self.since_node = Increment.identity()
         self._node_ns += self._grid_ns
         return True
 
+    @property
+    def carries(self) -> bool:
+        """Whether what was seen waits for the motion up to its node."""
+        return bool(self._ahead)
+
     def moved(self, step: Increment) -> None:
         """The observer has moved."""
-        self._since_node = self._since_node.then(step)
+        self.since_node = self.since_node.then(step)
         self._ahead = [replace(each, motion=each.motion.then(step)) for each in self._ahead]
 
     def sightings(self) -> tuple[NodeSighting, ...]:

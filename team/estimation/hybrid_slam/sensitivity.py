@@ -49,6 +49,7 @@ class Motion(NamedTuple):
     forward: Float[np.ndarray, "3"]
 
 
+@compiled
 def carried_on(
     column: Float[np.ndarray, "3"], motion: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:

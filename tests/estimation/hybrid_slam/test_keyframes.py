@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +10,9 @@ from hypothesis import strategies as st
 
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.models import Increment
+from team.estimation.hybrid_slam.sensitivity import carried_on
+from team.estimation.models import Increment, increment_of
+from team.estimation.odometry import forward_column
 
 SECOND = 1_000_000_000
 WHITE = MotionModel(
@@ -238,3 +241,20 @@ def test_a_cut_closes_the_keyframe_and_the_next_window_starts_clean():
     keyframes, rest = segmenter.cut(2 * SECOND)
     assert keyframes == []
     np.testing.assert_allclose(rest.mean, [1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
+def test_a_run_of_intervals_is_one_after_the_other_to_the_bit(kind):
+    motion = msgspec.structs.replace(WHITE, kind=kind, calibrated_speed=(0.2, 0.3))
+    segmenter, expected, shift = Segmenter(motion, Sensor(), 0.0), Increment.identity(), np.zeros(3)
+    segmenter.begin(0)
+    for k in range(1, 30):
+        speeds = 0.7 * np.sin(0.3 * k), np.cos(0.7 * k) * (k % 5 > 0)
+        segmenter.drive(k * SECOND, SECOND, *map(float, speeds))
+        step = increment_of(motion, 1.0, *map(float, speeds))
+        shift = carried_on(shift, step.mean) + forward_column(motion, 1.0, *map(float, speeds))
+        expected = expected.then(step)
+    found = segmenter.cut(29 * SECOND)[1]
+    np.testing.assert_array_equal(found.mean, expected.mean)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    np.testing.assert_array_equal(segmenter.rest_forward, shift)

@@ -1,0 +1,85 @@
+"""Odometry intervals one behind the other, composed in one compiled call.
+
+Odometry comes tens of times between two looks at where it has led. Each interval is one row here;
+the motion since the last keyframe, since the last pose node and since the first scan of a keyframe
+are brought up to date when somebody asks.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.config import MotionModel
+from team.estimation.compiled import compiled
+from team.estimation.geometry import Pose, compose
+from team.estimation.hybrid_slam.sensitivity import carried_on
+from team.estimation.models import Increment, arc, composed, course_of, turn_then_drive
+from team.estimation.odometry import Interval
+
+Spread = Float[np.ndarray, "3 3"]
+
+
+class Since(NamedTuple):
+    """Motions up to now: `motion` and its `covariance` since the last keyframe, `shift` of it by an
+    error of the scale of speed; the same since the last pose node, without the shift; `of_scan`
+    since a keyframe of several scans began, without noise.
+    """
+
+    motion: Pose
+    covariance: Spread
+    shift: Float[np.ndarray, "3"]
+    node_motion: Pose
+    node_covariance: Spread
+    of_scan: Pose
+
+
+@compiled
+def gone_on(since: Since, rows: Float[np.ndarray, "n 10"], turns_first: bool) -> Since:
+    """All of them after further intervals, in order: what `Increment.then` and `compose` give.
+
+    rows: `models.course_of` of each interval, then its `odometry.forward_column`.
+    """
+    motion, covariance, shift, node_motion, node_covariance, of_scan = since
+    for row in rows:
+        if turns_first:
+            step, spread = turn_then_drive(row[0], row[1], row[2], row[3], row[4], row[5], row[6])
+        else:
+            step, spread = arc(row[0], row[1], row[2], row[3], row[4], row[5], row[6])
+        node_motion, node_covariance = composed(node_motion, node_covariance, step, spread)
+        motion, covariance = composed(motion, covariance, step, spread)
+        shift = carried_on(shift, step)
+        for i in range(3):
+            shift[i] += row[7 + i]
+        of_scan = compose(of_scan, step)
+    return Since(motion, covariance, shift, node_motion, node_covariance, of_scan)
+
+
+class OdometryRun:
+    """Parts of intervals whose motion follows from their speeds, until somebody asks."""
+
+    def __init__(self, motion: MotionModel) -> None:
+        self._motion = motion
+        self._rows: list[tuple[float, ...]] = []
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._rows)
+
+    def add(self, over: Interval, duration_ns: int) -> None:
+        """The part of an interval that comes next."""
+        course = course_of(self._motion, duration_ns * 1e-9, over.forward, over.yaw_rate)
+        self._rows.append((*course, *over.forward_column(self._motion, duration_ns).tolist()))
+
+    def driven(
+        self,
+        increment: Increment,
+        since_node: Increment,
+        shift: Float[np.ndarray, "3"],
+        of_scan: Pose,
+    ) -> Since:
+        """The motions up to now with all of them; there are none any more."""
+        rows, self._rows = np.array(self._rows), []
+        node = since_node.mean, since_node.covariance
+        since = Since(increment.mean, increment.covariance, shift, *node, of_scan)
+        return gone_on(since, rows, self._motion.kind == "turn-then-drive")
