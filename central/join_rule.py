@@ -35,9 +35,10 @@ class JoinRule(SubmapRule):
 
     unnamed = ("missing", "heard")
 
-    def _begin(self) -> None:
-        super()._begin()
-        self._ticks = TickFold(self._config)
+    def reset(self) -> None:
+        """Nothing is here."""
+        super().reset()
+        self._ticks = TickFold(self.config)
         self._quiet_ns: int | None = None
         self._news: News | None = News(PRIOR_LANDMARKS)
         self._published: Mapping[Stream, int] = {}
@@ -51,14 +52,14 @@ class JoinRule(SubmapRule):
 
         Who was withdrawn is an input: nobody is judged again by a part of the set.
         """
-        shrunk = any(len(inputs.submaps.get(s, ())) < n for s, n in self._entered.items())
+        shrunk = any(len(inputs.submaps.get(s, ())) < n for s, n in self.entered.items())
         verdicts = {translate.verdict_of(each) for each in inputs.verdicts}
         if (
             shrunk
-            or not self._orders <= inputs.withdrawals.keys()
+            or not self.orders <= inputs.withdrawals.keys()
             or not self._ticks.verdicts <= verdicts
         ):
-            self._begin()
+            self.reset()
         self._ticks.convicts = False
         self._news = None  # every prior that a map may have brought
         for order in inputs.withdrawals.values():
@@ -68,7 +69,7 @@ class JoinRule(SubmapRule):
         for stream, submaps in sorted(inputs.submaps.items()):
             if stream in inputs.starts:
                 self.take_start(inputs.starts[stream])
-            for submap in submaps[self._entered.get(stream, 0) :]:
+            for submap in submaps[self.entered.get(stream, 0) :]:
                 for sighting in inputs.sightings.get((*stream, submap.sequence), ()):
                     self.take_sighting(sighting)
                 self.take_submap(submap)
@@ -105,7 +106,7 @@ class JoinRule(SubmapRule):
     @property
     def findings(self) -> tuple[str, ...]:
         """The monitor's, and why robots are not joined or the map is to be doubted, in words."""
-        unconfirmed = self._hearsay.unconfirmed(self.withdrawn)
+        unconfirmed = self.hearsay.unconfirmed(self.withdrawn)
         return (*self.finding.warnings, *self.reasons, *unconfirmed)
 
     def advance(self, roll: Roll) -> list[Outgoing]:
@@ -131,13 +132,13 @@ class JoinRule(SubmapRule):
         """Fold what the watermark allows; a broadcast when one is due."""
         self._ticks.take_until(watermark_ns)
         said = self._withdrawals(newest_ns)
-        if said or (self._is_due(newest_ns) and self._lacks(self._published, watermark_ns)):
+        if said or (self.is_due(newest_ns) and self._lacks(self._published, watermark_ns)):
             return [*said, *self._broadcast(*self._newest(watermark_ns), newest_ns)]
-        if not any(self._entered.values()):
+        if not any(self.entered.values()):
             return []
         if self._quiet_ns is None:
             self._quiet_ns = newest_ns
-        patience_s = 3.0 * max(self._config.broadcast_s, self._config.tick_s)
+        patience_s = 3.0 * max(self.config.broadcast_s, self.config.tick_s)
         if newest_ns - self._quiet_ns >= patience_s * 1e9:
             return self._broadcast(self._ticks.provisional(), "provisional", newest_ns)
         return []
@@ -145,14 +146,14 @@ class JoinRule(SubmapRule):
     @property
     def _heard(self) -> int:
         """Submaps in the fold's reach, robots that were withdrawn by an order, and verdicts."""
-        return sum(self._entered.values()) + len(self._orders) + self._ticks.judged
+        return sum(self.entered.values()) + len(self.orders) + self._ticks.judged
 
     def _lacks(self, members: Mapping[Stream, int], watermark_ns: float) -> bool:
         """Whether the watermark has passed a submap that is in reach and not among these."""
         gone = self._ticks.withdrawn
-        following = ((s, members.get(s, -1) + 1) for s in self._entered if s[0] not in gone)
+        following = ((s, members.get(s, -1) + 1) for s in self.entered if s[0] not in gone)
         return any(
-            k < self._entered[s] and self._set.streams[s][k].stamp_ns <= watermark_ns
+            k < self.entered[s] and self.members.streams[s][k].stamp_ns <= watermark_ns
             for s, k in following
         )
 
@@ -207,8 +208,8 @@ class JoinRule(SubmapRule):
         ]
 
     def _broadcast(self, fold: Fold, tail: Tail, now_ns: int) -> list[Outgoing]:
-        self._broadcast_ns = self._quiet_ns = now_ns
-        digest = self._ticks.digest(fold, self._config_digest, tail.encode())
+        self.broadcast_ns = self._quiet_ns = now_ns
+        digest = self._ticks.digest(fold, self.config_digest, tail.encode())
         fused = self._fused(fold, tail, digest)
         self._published = self._ticks.members(fold)
         if tail == "final":
@@ -234,7 +235,7 @@ class JoinRule(SubmapRule):
         if fold.contributions:
             agreement = self._ticks.agreement(fold)
             chi2, dof = agreement.chi2, agreement.dof
-            self.finding = finding(agreement, self._config.normal_scale)
+            self.finding = finding(agreement, self.config.normal_scale)
         joint = False
         shown = self._shown(fold)
         if not fold.contributions:
@@ -269,7 +270,7 @@ class JoinRule(SubmapRule):
             provisional=tail == "provisional",
             exchange=0,
             members=tuple(version_entry(*each) for each in self._ticks.members(fold).items()),
-            missing=self._set.missing(),
+            missing=self.members.missing(),
             joint=joint,
             ids=from_ids(ids),
             means=from_floats(means),
@@ -300,7 +301,7 @@ class JoinRule(SubmapRule):
         """The landmarks that the map has, by ascending id."""
         if not fold.contributions:
             return []
-        return marginals.confirmed(fold, self._config.landmark_submaps)
+        return marginals.confirmed(fold, self.config.landmark_submaps)
 
     def _unconfirmed(self, fold: Fold, shown: Sequence[int]) -> tuple[str, ...]:
         """What is left out of the map, in words."""
@@ -310,7 +311,7 @@ class JoinRule(SubmapRule):
             return ()
         named = ", ".join(str(id_) for id_ in out[:NAMED]) + (", …" if len(out) > NAMED else "")
         return (
-            f"left out, {self._config.landmark_submaps} submaps that agree needed: "
+            f"left out, {self.config.landmark_submaps} submaps that agree needed: "
             f"{len(out)} of {len(known)} landmarks ({named})",
         )
 
@@ -347,7 +348,7 @@ class JoinRule(SubmapRule):
                 continue
             found = marginals.trajectory(fold, robot, incarnation)
             poses, covariances = found.poses, found.covariances
-            ends = [s.stamp_ns for s in self._set.chain((robot, incarnation))][: len(poses)]
+            ends = [s.stamp_ns for s in self.members.chain((robot, incarnation))][: len(poses)]
             message = translate.trajectory_message(
                 ends[-1], robot, incarnation, digest, ends, poses, covariances
             )

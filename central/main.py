@@ -9,19 +9,17 @@ from pathlib import Path
 from central.config import CentralConfig
 from central.kept import KeptSet
 from central.node import CentralNode
+from team.missing import MissingMeasurements
 from team.shell import WAIT_S, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids
-from team.wire.bus import Bus, BusError, Outgoing, Sample, opened
+from team.wire.bus import Bus, Outgoing, Sample, opened
 from team.wire.codec import WireError
 from team.wire.patience import Patience
 
 LOST_S = 3.0
 """A robot whose token went for so long holds up no broadcast; the final map still waits for it."""
-GAP_PATIENCE_S = 0.5
-"""A measurement that is missing for so long is asked for at its source."""
-ASK_TIMEOUT_S = 10.0
 FRESH_SHARE = 1.0 / 3.0
 """Of the time, for maps that are not due: so one waits for two solutions at the most."""
 FAREWELL_S = 10.0
@@ -59,7 +57,7 @@ class CentralShell:
         self._since: dict[str, float] = {}
         self._alive: set[str] = set()
         self._stop = stop
-        self._gap_since: float | None = None
+        self._missing = MissingMeasurements(self._shell)
         self._patience: Patience[tuple[str, int]] = Patience()
         self._greeted: set[str] = set()
 
@@ -81,7 +79,7 @@ class CentralShell:
             self._shell.take(self._patient(samples))
             self._shell.take(self._long_lost())
             self._give_up()
-            self._shell.contained("wanted", self._mend)
+            self._shell.contained("wanted", lambda: self._missing.look(self.node.wanted()))
             self._shell.contained("wanted", self._gather)
             self._shell.report()
         self._shell.report(last=True)
@@ -163,20 +161,6 @@ class CentralShell:
             )
         return tuple(said)
 
-    def _mend(self) -> None:
-        """Ask for measurements that have been missing for GAP_PATIENCE_S (rules on raw
-        measurements).
-        """
-        wanted, now = self.node.wanted(), time.monotonic()
-        if not wanted:
-            self._gap_since = None
-        elif self._gap_since is None:
-            self._gap_since = now
-        elif now - self._gap_since > GAP_PATIENCE_S:
-            self._gap_since = now
-            for each in wanted:
-                self._ask(each)
-
     def _gather(self) -> None:
         """Ask robots for what they have sent and the centre lacks; those that appear, for all.
 
@@ -193,16 +177,6 @@ class CentralShell:
                 "submaps of %s from %d on are missing: asked for", stream[0], wanted[stream].first
             )
             self._bus.request(ch.SENT, stream[0], wanted[stream])
-
-    def _ask(self, wanted: m.MeasurementsRequest) -> None:
-        named = f"measurements {wanted.first} to {wanted.last} of {wanted.robot}"
-        _LOG.warning("%s are missing: asked for", named)
-        try:
-            replies = self._bus.ask(ch.MEASUREMENTS, wanted.robot, wanted, ASK_TIMEOUT_S)
-        except BusError as error:
-            _LOG.warning("%s", error)
-            return
-        self._shell.take_replies(ch.MEASUREMENTS, wanted.robot, replies, m.Measurement)
 
     def _leave_last(self) -> None:
         """Robots and world leave at the final map; whoever missed it may still ask for it."""

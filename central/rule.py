@@ -60,16 +60,16 @@ class FusionRule(ABC):
     unnamed: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
-        self._config = config
-        self._config_digest = digest
-        self._team = tuple(sorted(robots))
-        self._broadcast_ns: int | None = None
+        self.config = config
+        self.config_digest = digest
+        self.team = tuple(sorted(robots))
+        self.broadcast_ns: int | None = None
         self.landmarks = 0
         self.warnings: list[str] = []
 
     def admit(self, robot: str) -> None:
         """From now on the robot is in the team."""
-        self._team = tuple(sorted({*self._team, robot}))
+        self.team = tuple(sorted({*self.team, robot}))
 
     @abstractmethod
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
@@ -139,10 +139,10 @@ class FusionRule(ABC):
         """Measurements that are missing and must be asked for at their source."""
         return []
 
-    def _is_due(self, now_ns: int) -> bool:
+    def is_due(self, now_ns: int) -> bool:
         """Whether broadcast_s of team time have gone by since the last broadcast."""
-        last_ns = self._broadcast_ns
-        return last_ns is None or now_ns - last_ns >= self._config.broadcast_s * 1e9
+        last_ns = self.broadcast_ns
+        return last_ns is None or now_ns - last_ns >= self.config.broadcast_s * 1e9
 
 
 def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> FusionRule:

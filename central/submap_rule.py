@@ -19,21 +19,21 @@ class SubmapRule(FusionRule):
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
         super().__init__(config, digest, robots)
-        self._hearsay = Hearsay(robots)
-        self._begin()
+        self.hearsay = Hearsay(robots)
+        self.reset()
 
     def admit(self, robot: str) -> None:
         """From now on the robot is in the team, and may be heard of others."""
         super().admit(robot)
-        self._hearsay.admit(robot)
+        self.hearsay.admit(robot)
 
-    def _begin(self) -> None:
+    def reset(self) -> None:
         """Nothing is here."""
-        self._set = SubmapSet()
-        self._starts: dict[Stream, m.InitialPose] = {}
-        self._entered: dict[Stream, int] = {}
+        self.members = SubmapSet()
+        self.starts: dict[Stream, m.InitialPose] = {}
+        self.entered: dict[Stream, int] = {}
         self._refusals: dict[Stream, set[int]] = {}
-        self._orders: set[str] = set()
+        self.orders: set[str] = set()
         self.refused = 0
 
     def _enters(self, submap: m.Submap, sightings: Sequence[m.SightingFactor]) -> None:
@@ -66,7 +66,7 @@ class SubmapRule(FusionRule):
             case m.Verdict():
                 self._judges(message)
             case m.WithdrawalHeard():
-                order = self._hearsay.take(message)
+                order = self.hearsay.take(message)
                 return [] if order is None else self._follow(order)
             case _:
                 pass
@@ -75,39 +75,39 @@ class SubmapRule(FusionRule):
     def take_start(self, start: m.InitialPose) -> None:
         """A stream begins; its submaps wait for this."""
         stream = (start.robot, start.incarnation)
-        if stream not in self._starts:
-            self._starts[stream] = start
+        if stream not in self.starts:
+            self.starts[stream] = start
             self._began(start)
             self._enter(stream)
 
     def take_submap(self, submap: m.Submap) -> int:
         """Admit a submap; how many of its stream have been dealt with."""
         stream = (submap.robot, submap.incarnation)
-        self._judge(submap, self._set.admit(submap))
+        self._judge(submap, self.members.admit(submap))
         self._enter(stream)
-        return self._dealt_with(stream, self._set.count(stream))
+        return self._dealt_with(stream, self.members.count(stream))
 
     def take_sighting(self, sighting: m.SightingFactor) -> int:
         """Admit a sighting; how many submaps of its stream have been dealt with."""
         stream = (sighting.robot, sighting.incarnation)
-        self._judge(sighting, self._set.admit_sighting(sighting))
+        self._judge(sighting, self.members.admit_sighting(sighting))
         self._enter(stream)
-        return self._dealt_with(stream, self._set.count(stream))
+        return self._dealt_with(stream, self.members.count(stream))
 
     def _enter(self, stream: Stream) -> None:
         """Hand on what now is there without a gap."""
-        if stream not in self._starts:
+        if stream not in self.starts:
             return
-        chain = self._set.chain(stream)
-        for submap in chain[self._entered.get(stream, 0) :]:
-            self._enters(submap, self._set.sightings(submap))
-        self._entered[stream] = len(chain)
+        chain = self.members.chain(stream)
+        for submap in chain[self.entered.get(stream, 0) :]:
+            self._enters(submap, self.members.sightings(submap))
+        self.entered[stream] = len(chain)
 
     def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
         """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
         robot, known = withdrawal.robot, self.withdrawn
         self._goes(robot)
-        self._orders.add(robot)
+        self.orders.add(robot)
         if robot not in known:
             said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
             self.warnings.append(said)
@@ -126,7 +126,7 @@ class SubmapRule(FusionRule):
     @property
     def withdrawn(self) -> tuple[str, ...]:
         """The robots that the team goes on without, ascending."""
-        return tuple(sorted(self._orders))
+        return tuple(sorted(self.orders))
 
     # What is refused.
 
@@ -152,18 +152,18 @@ class SubmapRule(FusionRule):
         refused = self._refusals.get(stream, set())
         if count not in refused:
             return count
-        return max(*refused, *self._set.streams.get(stream, {}), count) + 1
+        return max(*refused, *self.members.streams.get(stream, {}), count) + 1
 
     # What is here.
 
     @property
     def streams(self) -> list[Stream]:
         """The streams that the set has submaps of."""
-        return sorted(self._set.streams)
+        return sorted(self.members.streams)
 
     def count(self, stream: Stream) -> int:
         """How many submaps of a stream are in the map's reach, or will never be."""
-        return self._dealt_with(stream, self._entered.get(stream, 0))
+        return self._dealt_with(stream, self.entered.get(stream, 0))
 
     @property
     def submaps(self) -> int:
@@ -179,11 +179,11 @@ class SubmapRule(FusionRule):
         sightings.
         """
         found: list[m.Message] = []
-        for stream in sorted((s for s in self._set.streams if s[0] == robot), reverse=True):
-            chain, start = self._set.chain(stream), self._starts.get(stream)
+        for stream in sorted((s for s in self.members.streams if s[0] == robot), reverse=True):
+            chain, start = self.members.chain(stream), self.starts.get(stream)
             if chain and start is not None:
                 found += [start, *chain]
-                found += [each for submap in chain for each in self._set.sightings(submap)]
+                found += [each for submap in chain for each in self.members.sightings(submap)]
         return found
 
     def lacking(self, roll: Roll) -> list[m.SubmapsRequest]:

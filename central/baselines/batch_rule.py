@@ -47,7 +47,7 @@ class BatchRule(MeasurementRule):
     @property
     def figures(self) -> Mapping[str, float]:
         """The poses, and the joint cost of the last map."""
-        if not self._robots:
+        if not self.models:
             return {}
         figures = {"poses": float(len(self._batch.poses))}
         if self._batch.dof > 0:
@@ -60,8 +60,8 @@ class BatchRule(MeasurementRule):
         return tuple(self._findings)
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        self._batch = batch.begun(starts, self._config.robust_c)
-        self._findings += taken_as_white(self._robots)
+        self._batch = batch.begun(starts, self.config.robust_c)
+        self._findings += taken_as_white(self.models)
 
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
         self._waiting += turns
@@ -97,7 +97,7 @@ class BatchRule(MeasurementRule):
                     self._batch = grown
                     return
             self._findings.append(
-                f"measurements of {len(turns)} steps up to {self._now_ns * 1e-9:.1f} s refused: "
+                f"measurements of {len(turns)} steps up to {self.now_ns * 1e-9:.1f} s refused: "
                 "with them the map has no solution"
             )
 
@@ -113,9 +113,9 @@ class BatchRule(MeasurementRule):
     def _poses(self) -> list[Outgoing]:
         """The newest pose of each robot that has moved since the last map."""
         said = [
-            self._pose(each, batch.pose_gaussian(self._batch, robot))
+            self.pose(each, batch.pose_gaussian(self._batch, robot))
             for robot, each in sorted(self._newest.items())
-            if self._pose_is_due(each)
+            if self.pose_is_due(each)
         ]
         self._newest = {}
         return said
@@ -127,8 +127,8 @@ class BatchRule(MeasurementRule):
             stamps = stamps[: len(poses) - 1]
             if not stamps:
                 continue
-            incarnation = self._members[robot].incarnation
-            sensor = self._robots[robot].sensor
+            incarnation = self.members[robot].incarnation
+            sensor = self.models[robot].sensor
             if sensor.is_mounted:
                 away = inverse(np.array(sensor.mount))
                 moved = [
@@ -138,7 +138,7 @@ class BatchRule(MeasurementRule):
                 poses = np.array([each.mean for each in moved])
                 covariances = np.array([each.covariance for each in moved])
             message = translate.trajectory_message(
-                stamps[-1], robot, incarnation, self._digest, stamps, poses[1:], covariances[1:]
+                stamps[-1], robot, incarnation, self.digest, stamps, poses[1:], covariances[1:]
             )
             said.append(Outgoing(ch.TRAJECTORY, robot, message))
         return said

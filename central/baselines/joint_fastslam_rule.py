@@ -39,16 +39,16 @@ class JointFastSlamRule(MeasurementRule):
     @property
     def figures(self) -> Mapping[str, float]:
         """The particles."""
-        return {"particles": float(self._config.particles)}
+        return {"particles": float(self.config.particles)}
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        first = self._robots[min(self._robots)]
+        first = self.models[min(self.models)]
         self._generator = generator(first.seed, "team", 0, 0)
         poses = {name: pose for name, (pose, _) in starts.items()}
-        particles = self._config.particles
+        particles = self.config.particles
         self._state = joint_fastslam.begun(poses, particles, "fastslam1", RESAMPLE_BELOW)
         turns = [
-            _uncertain(name, pose, covariance, self._robots[name])
+            _uncertain(name, pose, covariance, self.models[name])
             for name, (pose, covariance) in starts.items()
             if covariance is not None
         ]
@@ -65,9 +65,9 @@ class JointFastSlamRule(MeasurementRule):
                     break
             self.warnings.append("a step is refused: with it the particles have no weights")
         return [
-            self._pose(each, self._pose_gaussian(each.robot))
+            self.pose(each, self._pose_gaussian(each.robot))
             for each in step
-            if self._pose_is_due(each)
+            if self.pose_is_due(each)
         ]
 
     def _pose_gaussian(self, robot: str) -> PoseGaussian:

@@ -110,8 +110,8 @@ class _OwnMaps(FusionRule):
     ) -> m.FusedMap:
         self.landmarks = len(value.ids)
         return fused_message(
-            self._config,
-            translate.digest_of(self._config_digest, *(_payload(x) for x in maps)),
+            self.config,
+            translate.digest_of(self.config_digest, *(_payload(x) for x in maps)),
             value,
             tuple(_member(x) for x in maps),
             stamp_ns=max((x.stamp_ns for x in maps), default=stamp_ns),
@@ -153,16 +153,16 @@ class LatestRule(_OwnMaps):
         """A broadcast, when one is due and there is something new in it."""
         maps = self._known()
         members = tuple(_member(x) for x in maps)
-        if not self._is_due(roll.now_ns) or not members or members == self._said:
+        if not self.is_due(roll.now_ns) or not members or members == self._said:
             return []
-        self._broadcast_ns, self._said = roll.now_ns, members
+        self.broadcast_ns, self._said = roll.now_ns, members
         return self.fuse(Inputs(maps=maps), "closed")
 
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
         """These maps as one."""
         maps, final = inputs.maps, tail == "final"
         values = {x.robot: _value(x) for x in maps}
-        value, refused = fused_totally(kalman, values, self._config.bounds.coordinate_m)
+        value, refused = fused_totally(kalman, values, self.config.bounds.coordinate_m)
         own = self._maps.values()
         away = sorted(x.robot for x in own if not self._placed.get((x.robot, x.incarnation)))
         reasons = (*(f"{robot}: its start pose is not known" for robot in away), *refused)
@@ -188,7 +188,7 @@ class AloneRule(_OwnMaps):
         maps, reason = inputs.maps, ""
         if not maps:
             reason = "no fusion, and this estimator makes no map"
-        elif len(self._team) != 1:
+        elif len(self.team) != 1:
             reason = "no fusion: each robot has its own map"
         fused = self._message(
             maps,

@@ -50,12 +50,12 @@ class MeasurementRule(FusionRule):
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
         super().__init__(config, digest, robots)
         self._keyframes = TeamKeyframes(robots)
-        self._robots: dict[str, RobotConfig] = {}
-        self._members: dict[str, m.VersionEntry] = {}
+        self.models: dict[str, RobotConfig] = {}
+        self.members: dict[str, m.VersionEntry] = {}
         self._pose_ns: dict[str, int] = {}
         self._reasons: list[str] = []
         self._frame = START_POSES
-        self._now_ns = 0
+        self.now_ns = 0
         self._fused = False
 
     @abstractmethod
@@ -77,7 +77,7 @@ class MeasurementRule(FusionRule):
         self._fused = True
         for message in inputs.heard:
             self.take(message, 0)
-        out = self.advance(Roll.of(self._team))
+        out = self.advance(Roll.of(self.team))
         ended = any(isinstance(message, m.End) for message in inputs.heard)
         return out + self.conclude(0) if ended else out
 
@@ -108,12 +108,12 @@ class MeasurementRule(FusionRule):
 
     def advance(self, roll: Roll) -> list[Outgoing]:
         """Every step whose turn has come: the poses, and the map at broadcasts."""
-        if not self._robots and not self._begin():
+        if not self.models and not self._begin():
             return []
         out: list[Outgoing] = []
         for step in self._keyframes.steps():
             out += self._broadcast(step[0].stamp_ns)
-            out += self._take_step([each for each in step if each.robot in self._robots])
+            out += self._take_step([each for each in step if each.robot in self.models])
         return out
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
@@ -134,16 +134,16 @@ class MeasurementRule(FusionRule):
             name = min(starts)
             placed = {name: starts[name][1]}
             self._frame = f"{name}/{placed[name].incarnation}"
-        self._robots = {name: starts[name][0] for name in sorted(placed)}
+        self.models = {name: starts[name][0] for name in sorted(placed)}
         away = sorted(starts.keys() - placed.keys())
         self._reasons += [f"{name}: its start pose is not known" for name in away]
         known = {
             name: translate.pose_of(placed[name]) if self._is_placed(placed[name]) else (None, None)
-            for name in self._robots
+            for name in self.models
         }
-        self._members = {
+        self.members = {
             n: m.VersionEntry(robot=n, incarnation=placed[n].incarnation, sequence=0)
-            for n in self._robots
+            for n in self.models
         }
         self._start(
             {
@@ -157,7 +157,7 @@ class MeasurementRule(FusionRule):
         self, robot: str, pose: Pose, covariance: Matrix | None
     ) -> tuple[Pose, Matrix | None]:
         """Where the robot's sensor begins: keyframes are of it."""
-        sensor = self._robots[robot].sensor
+        sensor = self.models[robot].sensor
         if not sensor.is_mounted:
             return pose, covariance
         uncertain = np.zeros((3, 3)) if covariance is None else covariance
@@ -167,7 +167,7 @@ class MeasurementRule(FusionRule):
     def _is_placed(self, start: m.InitialPose) -> bool:
         """Whether the initial pose is known, and within the bounds."""
         value = translate.start_of(start)
-        return value is not None and start_beyond(value, self._config.bounds) is None
+        return value is not None and start_beyond(value, self.config.bounds) is None
 
     def _take_step(self, step: Sequence[RobotKeyframe]) -> list[Outgoing]:
         if not step:
@@ -176,7 +176,7 @@ class MeasurementRule(FusionRule):
             RobotStep(
                 each.robot,
                 each.keyframe.increment,
-                self._robots[each.robot].sensor,
+                self.models[each.robot].sensor,
                 each.keyframe.ids,
                 each.keyframe.ranges,
                 each.keyframe.bearings,
@@ -184,26 +184,27 @@ class MeasurementRule(FusionRule):
             )
             for each in step
         ]
-        self._now_ns = step[-1].stamp_ns
+        self.now_ns = step[-1].stamp_ns
         for each in step:
-            incarnation = self._members[each.robot].incarnation
-            self._members[each.robot] = m.VersionEntry(
+            incarnation = self.members[each.robot].incarnation
+            self.members[each.robot] = m.VersionEntry(
                 robot=each.robot, incarnation=incarnation, sequence=each.number
             )
         return self._take(step, turns)
 
-    def _pose_is_due(self, each: RobotKeyframe) -> bool:
+    def pose_is_due(self, each: RobotKeyframe) -> bool:
+        """Whether the robot's `pose_s` have gone by since its last pose."""
         last_ns = self._pose_ns.get(each.robot)
-        pose_ns = self._robots[each.robot].pose_s * 1e9
+        pose_ns = self.models[each.robot].pose_s * 1e9
         return last_ns is None or each.stamp_ns - last_ns >= pose_ns
 
-    def _pose(self, each: RobotKeyframe, pose: PoseGaussian) -> Outgoing:
+    def pose(self, each: RobotKeyframe, pose: PoseGaussian) -> Outgoing:
         """The pose at the end of a keyframe."""
         self._pose_ns[each.robot] = each.stamp_ns
-        sensor = self._robots[each.robot].sensor
+        sensor = self.models[each.robot].sensor
         if sensor.is_mounted:
             pose = moved_by(pose, inverse(np.array(sensor.mount)))
-        incarnation = self._members[each.robot].incarnation
+        incarnation = self.members[each.robot].incarnation
         message = translate.pose_message(
             each.stamp_ns, each.robot, incarnation, each.number, translate.NO_MAP, *pose
         )
@@ -211,30 +212,30 @@ class MeasurementRule(FusionRule):
 
     def _broadcast(self, stamp_ns: int) -> list[Outgoing]:
         """The map before the first step of each broadcast_s of team time."""
-        if self._broadcast_ns is None:
-            self._broadcast_ns = stamp_ns
-        if stamp_ns - self._broadcast_ns < self._config.broadcast_s * 1e9:
+        if self.broadcast_ns is None:
+            self.broadcast_ns = stamp_ns
+        if stamp_ns - self.broadcast_ns < self.config.broadcast_s * 1e9:
             return []
-        self._broadcast_ns = stamp_ns
+        self.broadcast_ns = stamp_ns
         return self._said(final=False)
 
     @property
-    def _digest(self) -> bytes:
+    def digest(self) -> bytes:
         """The name of the measurements so far."""
-        members = (self._members[robot] for robot in sorted(self._members))
+        members = (self.members[robot] for robot in sorted(self.members))
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
-        return translate.digest_of(self._config_digest, named)
+        return translate.digest_of(self.config_digest, named)
 
     def _said(self, *, final: bool) -> list[Outgoing]:
-        told = self._told(final=final) if self._robots else Told()
+        told = self._told(final=final) if self.models else Told()
         self.landmarks = len(told.landmarks.ids)
         lost = [f"{robot}: its stream began anew" for robot in self._keyframes.broken]
         fused = fused_message(
-            self._config,
-            self._digest,
+            self.config,
+            self.digest,
             told.landmarks,
-            tuple(self._members[robot] for robot in sorted(self._members)),
-            stamp_ns=self._now_ns,
+            tuple(self.members[robot] for robot in sorted(self.members)),
+            stamp_ns=self.now_ns,
             final=final,
             frame=self._frame,
             cost=(told.chi2, told.dof),

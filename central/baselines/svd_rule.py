@@ -72,16 +72,16 @@ class SvdJoinRule(SubmapRule):
     @property
     def findings(self) -> tuple[str, ...]:
         """Orders that are not believed."""
-        return self._hearsay.unconfirmed(self.withdrawn)
+        return self.hearsay.unconfirmed(self.withdrawn)
 
     def advance(self, roll: Roll) -> list[Outgoing]:
         """A broadcast of what is here, when one is due; a later one may put any of it elsewhere."""
-        if not self._is_due(roll.now_ns):
+        if not self.is_due(roll.now_ns):
             return []
         inputs = self._inputs()
         if not inputs.submaps:
             return []
-        self._broadcast_ns = roll.now_ns
+        self.broadcast_ns = roll.now_ns
         return self.fuse(inputs, "closed")
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
@@ -89,9 +89,9 @@ class SvdJoinRule(SubmapRule):
         return self.fuse(self._inputs(), "final")
 
     def _inputs(self) -> Inputs:
-        found = {s: self._set.chain(s) for s in self.streams if s in self._starts}
+        found = {s: self.members.chain(s) for s in self.streams if s in self.starts}
         chains = {stream: chain for stream, chain in found.items() if chain}
-        return Inputs(starts=self._starts, submaps=chains)
+        return Inputs(starts=self.starts, submaps=chains)
 
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
         """The map of these submaps: a function of them and of the starts alone."""
@@ -102,8 +102,8 @@ class SvdJoinRule(SubmapRule):
         chains = inputs.submaps
         if not chains:
             return fused_message(
-                self._config,
-                self._config_digest,
+                self.config,
+                self.config_digest,
                 NO_LANDMARKS,
                 (),
                 stamp_ns=0,
@@ -120,8 +120,8 @@ class SvdJoinRule(SubmapRule):
         refused = tuple(x.refused for _, x in sorted(joined.items()) if x.refused)
         self.landmarks = len(fused.ids)
         return fused_message(
-            self._config,
-            translate.digest_of(self._config_digest, *(joined[s].digest for s in sorted(joined))),
+            self.config,
+            translate.digest_of(self.config_digest, *(joined[s].digest for s in sorted(joined))),
             fused,
             tuple(version_entry(stream, joined[stream].count - 1) for stream in sorted(joined)),
             stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
@@ -133,7 +133,7 @@ class SvdJoinRule(SubmapRule):
     def _believed(self, told: m.InitialPose) -> Pose | None:
         """The initial pose of a stream, if it is known and within the bounds."""
         start = translate.start_of(told)
-        if start is None or start_beyond(start, self._config.bounds) is not None:
+        if start is None or start_beyond(start, self.config.bounds) is not None:
             return None
         return start.pose
 
@@ -150,13 +150,13 @@ class SvdJoinRule(SubmapRule):
         )
         before = self._joined.get(stream)
         if before is None or before.count > len(chain):
-            before = _Joined(0, begin, self._config_digest)
+            before = _Joined(0, begin, self.config_digest)
         state, digest, refused = before.state, before.digest, before.refused
         for submap in chain[before.count :]:
             digest = translate.digest_of(digest, encoded(submap))
             if not refused:
                 local = translate.local_map_of(submap).without_nodes.without_biases
-                why = submap_beyond(local, self._config.bounds)
+                why = submap_beyond(local, self.config.bounds)
                 after = _stepped(state, stream[0], local) if why is None else None
                 if after is None:
                     words = why or "with it the map has no solution"

@@ -36,6 +36,6 @@ class PeerCentre(Peer):
     def status(self) -> m.Status:
         """A centre's status with how much of the set is here."""
         own = self.fold.centre.status()
-        faults = (*self._boundary.warnings, *self.fold.boundary.warnings)
+        faults = (*self.boundary.warnings, *self.fold.boundary.warnings)
         figures = {**own.figures, **self.set_figures()}
         return msgspec.structs.replace(own, figures=figures, warnings=(*own.warnings, *faults))

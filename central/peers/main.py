@@ -90,8 +90,8 @@ class PeerShell(RobotShell):
         super().__init__(bus, config, stop, patience_s, exchange)
         self._peer = PeerRobot(config, central, robots, exchange, when, signer)
         self.node = self._peer.node
-        self._shell = Shell(bus, self._peer, self._peer.name, stop)
-        self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
+        self.run_in(Shell(bus, self._peer, self._peer.name, stop))
+        self.shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
         self._over_since: float | None = None
 
@@ -106,11 +106,11 @@ class PeerShell(RobotShell):
         everyones = self._peer.overhears
         for channel in self._peer.listens:
             if channel not in everyones:
-                self._bus.subscribe(channel, self.node.robot)
+                self.bus.subscribe(channel, self.node.robot)
         for channel in everyones:
-            self._bus.subscribe(channel)
-        self._bus.watch_alive()
-        self._shell.answer(ch.MEMBERS, self._peer.name, self._peer.answer)
+            self.bus.subscribe(channel)
+        self.bus.watch_alive()
+        self.shell.answer(ch.MEMBERS, self._peer.name, self._peer.answer)
 
     def _resume(self) -> bool:
         """Take over what is on disk; whether the stream goes on behind it."""
@@ -132,9 +132,9 @@ class PeerShell(RobotShell):
         return self._peer.final
 
     def _duty(self) -> None:
-        self._mend()
+        self.look_for_gaps()
         now = time.monotonic()
-        self._shell.publish(self._peer.tick(now))
+        self.shell.publish(self._peer.tick(now))
         self._log_carried()
         self._keeper.save(self._peer)
         self._peer.finished = self._may_leave(now)
@@ -144,7 +144,7 @@ class PeerShell(RobotShell):
         so the log proves the robot's maps, and logs of a team can be merged.
         """
         members, self._peer.carried = self._peer.carried, []
-        tap = getattr(self._bus, "tap", None)
+        tap = getattr(self.bus, "tap", None)
         if tap is not None and members:
             tap([_as_heard(member) for member in members])
 

@@ -42,7 +42,7 @@ class Peer:
         self.name = name
         self.peer = PeerNode(name, robots, proofs)
         self.fold = PeerFold(central, tuple(sorted(robots)), self.peer, when)
-        self._boundary = Boundary(name)
+        self.boundary = Boundary(name)
         self.finished = False
         self.uplink = self.downlink = 0
         self.carried: list[Member] = []
@@ -95,7 +95,7 @@ class Peer:
         match message:
             case m.Members():
                 self.carried += self.peer.take_carried(message)
-                return self._grown() + self._said(self.peer.more_of(message.node))
+                return self.grown() + self.counted(self.peer.more_of(message.node))
             case m.Signature():
                 found = ch.channel_of(sample.key)
                 if self.peer.proofs is not None and found is not None:
@@ -104,7 +104,7 @@ class Peer:
                     self.peer.proofs.hear(message, speaker)
                 return []
             case m.SetSummary():
-                return self._said(self.peer.hear(message))
+                return self.counted(self.peer.hear(message))
             case m.Progress() | m.StreamHead() | m.TeamEnd() | m.End():
                 return self._of_fold(self.fold.note(message))
             case m.Liveliness(node="world"):
@@ -124,19 +124,20 @@ class Peer:
         if channel is None or channel not in CHANNELS:
             return []
         self.peer.take_sample(sample, channel.speaker(name))
-        return self._grown()
+        return self.grown()
 
     def tick(self, now_s: float) -> list[Outgoing]:
         """What there is to say by now, by any clock that goes on."""
-        return self._said(self.peer.tick(now_s))
+        return self.counted(self.peer.tick(now_s))
 
-    def _said(self, out: Sequence[Outgoing]) -> list[Outgoing]:
+    def counted(self, out: Sequence[Outgoing]) -> list[Outgoing]:
         """Count what goes out of the set's talk."""
         talk = (each.message for each in out if each.channel in TALK or each.channel is ch.MEMBERS)
         self.uplink += sum(len(encoded(message)) for message in talk)
         return list(out)
 
-    def _grown(self) -> list[Outgoing]:
+    def grown(self) -> list[Outgoing]:
+        """Fold what the set has more; what the fold says."""
         return self._of_fold(self.fold.grow())
 
     def _of_fold(self, said: Sequence[Outgoing]) -> list[Outgoing]:

@@ -136,17 +136,17 @@ class PeerRobot(Peer):
             self.peer.take_sample(sample, channel.speaker(name))
             if isinstance(message, m.InitialPose) and name == self.robot:
                 out += self._vouched(Outgoing(ch.START, name, message))
-            out += self._grown()
+            out += self.grown()
         elif isinstance(message, m.InitialPose) and message.robot == self.robot:
             # a reply of the source: it has no key
-            out = self._vouched(Outgoing(ch.START, self.robot, message)) + self._grown()
+            out = self._vouched(Outgoing(ch.START, self.robot, message)) + self.grown()
         own = isinstance(message, m.Measurement) and message.robot == self.robot
         if own or isinstance(message, m.KnownMap | m.Rendezvous | m.Withdrawal):
             out = self._tell_robot(message, sample) + out
         return out
 
     def _tell_robot(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        return self._of_robot(self._said(self._boundary.hand(self.node, message, sample)))
+        return self._of_robot(self.counted(self.boundary.hand(self.node, message, sample)))
 
     def _of_robot(self, said: Sequence[Outgoing]) -> list[Outgoing]:
         """What the estimator says goes out; what of it is for fusion goes into the set, too."""
@@ -156,7 +156,7 @@ class PeerRobot(Peer):
                 out += self._vouched(each)
             elif isinstance(each.message, m.Progress):
                 out += self._of_fold(self.fold.note(each.message))
-        return out + self._grown()
+        return out + self.grown()
 
     def _of_fold(self, said: Sequence[Outgoing]) -> list[Outgoing]:
         """What the fold says, under this robot's name; the prior goes to the estimator first."""
@@ -173,7 +173,7 @@ class PeerRobot(Peer):
             else:
                 if channel is ch.TEAM_PRIOR:
                     sample = Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, -1)
-                    out += self._of_robot(self._boundary.hand(self.node, each.message, sample))
+                    out += self._of_robot(self.boundary.hand(self.node, each.message, sample))
                 out.append(Outgoing(channel, self.robot, each.message))
         if self.fold.finals > self._finals:
             self._finals = self.fold.finals
@@ -187,7 +187,7 @@ class PeerRobot(Peer):
         """The estimator's status with how much of the set is here, and what the fold finds."""
         own, fold = self.node.status(), self.fold.centre.status()
         figures = {f"fold.{name}": value for name, value in fold.figures.items()}
-        faults = [*self._boundary.warnings, *self.fold.boundary.warnings]
+        faults = [*self.boundary.warnings, *self.fold.boundary.warnings]
         warnings = (*own.warnings, *fold.warnings, *faults)
         state = "done" if self.final is not None else own.state
         figures = {**own.figures, **self.set_figures(), **figures}

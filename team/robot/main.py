@@ -8,6 +8,7 @@ from contextlib import suppress
 
 from team.config import Exchange, RobotConfig
 from team.containment import reply_of
+from team.missing import ASK_TIMEOUT_S, MissingMeasurements
 from team.robot.node import RobotNode
 from team.shell import RECORDER, Shell
 from team.wire import channels as ch
@@ -15,9 +16,6 @@ from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Sample
 from team.wire.codec import WireError, decoded
 
-GAP_PATIENCE_S = 0.5
-"""A measurement that is missing for so long is asked for at its source."""
-ASK_TIMEOUT_S = 10.0
 SECOND_PATIENCE_S = 6.0
 """The token of a process that was cut off is there for the lease of its link: 5 s of silence."""
 SECOND_PERIOD_S = 0.5
@@ -39,50 +37,59 @@ class RobotShell:
         patience_s: float = SECOND_PATIENCE_S,
         exchange: Exchange = "continuous",
     ) -> None:
-        self._bus = bus
+        self.bus = bus
         self._stop = stop
         self._patience_s = patience_s
         self._config, self._exchange = config, exchange
         self.node = RobotNode(config, exchange)
-        self._shell = Shell(bus, self.node, ch.robot_node(config.id), stop)
-        self._gap_since: float | None = None
+        self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
+
+    def run_in(self, shell: Shell) -> None:
+        """The shell of this process' node."""
+        self.shell = shell
+        self._missing = MissingMeasurements(shell)
 
     def run(self) -> None:
         """Until the final map."""
         name = self.node.robot
         self._be_the_only_one()
         self._subscribe()
-        self._shell.answer(ch.SENT, name, lambda request: self.node.answer_submaps(request))
-        self._shell.look_for_the_end()
+        self.shell.answer(ch.SENT, name, lambda request: self.node.answer_submaps(request))
+        self.shell.look_for_the_end()
         if not self.node.finished and self._resume():
             self._catch_up()
         self._look_for_driver()
-        self._shell.run(self._duty)
+        self.shell.run(self._duty)
         _LOG.info("%d submaps from %d measurements", self.node.submaps, self.node.next_measurement)
         self._await_recorder()
-        self._shell.end(self._final)
+        self.shell.end(self._final)
 
     def _subscribe(self) -> None:
         for channel in self.node.listens:
-            self._bus.subscribe(channel, self.node.robot)
+            self.bus.subscribe(channel, self.node.robot)
         for channel in self.node.overhears:
-            self._bus.subscribe(channel)
-        self._bus.watch_alive("central")
-        self._bus.watch_alive(RECORDER)
+            self.bus.subscribe(channel)
+        self.bus.watch_alive("central")
+        self.bus.watch_alive(RECORDER)
 
     @property
     def _final(self) -> m.FusedMap | None:
         return self.node.final
 
     def _duty(self) -> None:
-        self._mend()
+        self.look_for_gaps()
+
+    def look_for_gaps(self) -> None:
+        """Ask the source for what is missing of the stream."""
+        wanted = self.node.wanted()
+        self._missing.look(() if wanted is None else (wanted,))
 
     def _look_for_driver(self) -> None:
         """Whether the robot's driver is there is known before anything else is heard."""
         driver = ch.source_node(self.node.robot)
-        there = m.Liveliness(stamp_ns=0, node=driver, alive=self._bus.is_alive(driver))
+        there = m.Liveliness(stamp_ns=0, node=driver, alive=self.bus.is_alive(driver))
         self.node.handle(there, 0)
-        self._bus.watch_alive(driver)
+        self.bus.watch_alive(driver)
 
     def _await_recorder(self) -> None:
         """Stay until who records has every submap: it can ask nobody else for them."""
@@ -97,15 +104,15 @@ class RobotShell:
                             recorded.get(said.incarnation, 0), said.submaps
                         )
 
-        self._bus.subscribe(ch.RECORDER_PROGRESS, self.node.robot)
+        self.bus.subscribe(ch.RECORDER_PROGRESS, self.node.robot)
         own = self.node.incarnation, self.node.submaps
-        self._shell.wait_for_recorder(lambda: recorded.get(own[0], 0) < own[1], take)
+        self.shell.wait_for_recorder(lambda: recorded.get(own[0], 0) < own[1], take)
 
     def _be_the_only_one(self) -> None:
         """Return when no other process is this robot."""
         node = ch.robot_node(self.node.robot)
         deadline = time.monotonic() + self._patience_s
-        while self._bus.is_alive(node):
+        while self.bus.is_alive(node):
             if time.monotonic() >= deadline or self._stop.wait(SECOND_PERIOD_S):
                 raise BusError(
                     f"another process is {node} in this team already: "
@@ -116,7 +123,7 @@ class RobotShell:
         """Take over the submaps of an earlier life that the centre has; False if there are none."""
         wanted = m.SubmapsRequest(stamp_ns=0, robot=self.node.robot)
         try:
-            replies = self._bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
+            replies = self.bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
         except BusError as error:  # a centre that does not answer: the same submaps once more
             _LOG.warning("%s", error)
             return False
@@ -127,8 +134,8 @@ class RobotShell:
             self.node.take_over([start, *(reply_of(reply, m.Message) for reply in replies[1:])])
         except Exception as error:
             sample = Sample(ch.SUBMAPS.key(), replies[0], 0, 0, -1)
-            self._shell.publish([self._shell.boundary.note(error, sample, "")])
-            self.node = self._shell.node = RobotNode(self._config, self._exchange)
+            self.shell.publish([self.shell.boundary.note(error, sample, "")])
+            self.node = self.shell.node = RobotNode(self._config, self._exchange)
             return False
         _LOG.info(
             "resumed after submap %d of incarnation %d",
@@ -141,7 +148,7 @@ class RobotShell:
         """Ask the source for everything since the last submap that it has published already."""
         while True:
             first = self.node.next_measurement
-            replies = self._ask(
+            replies = self._missing.ask(
                 m.MeasurementsRequest(
                     stamp_ns=0,
                     robot=self.node.robot,
@@ -152,25 +159,3 @@ class RobotShell:
             )
             if not replies or self.node.next_measurement == first:
                 return
-
-    def _mend(self) -> None:
-        """Ask for measurements that have been missing for GAP_PATIENCE_S."""
-        wanted = self.node.wanted()
-        now = time.monotonic()
-        if wanted is None:
-            self._gap_since = None
-        elif self._gap_since is None:
-            self._gap_since = now
-        elif now - self._gap_since > GAP_PATIENCE_S:
-            self._gap_since = now
-            _LOG.warning("measurements %d to %d are missing: asked for", wanted.first, wanted.last)
-            self._ask(wanted)
-
-    def _ask(self, wanted: m.MeasurementsRequest) -> int:
-        try:
-            replies = self._bus.ask(ch.MEASUREMENTS, wanted.robot, wanted, ASK_TIMEOUT_S)
-        except BusError as error:
-            _LOG.warning("%s", error)
-            return 0
-        self._shell.take_replies(ch.MEASUREMENTS, wanted.robot, replies, m.Measurement)
-        return len(replies)

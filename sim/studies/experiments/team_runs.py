@@ -120,8 +120,8 @@ class TimedRun:
     """A team in memory, and the CPU time [s] that its robots and its centre spend on messages."""
 
     def __init__(self) -> None:
-        self._robots = 0.0
-        self._centre = 0.0
+        self._robots = _Watch()
+        self._centre = _Watch()
         self._steps = 0
         self._fusions = 0
 
@@ -137,31 +137,40 @@ class TimedRun:
     def figures(self) -> Figures:
         """The times in all, per odometry interval and per fused map."""
         return {
-            "robot_seconds": self._robots,
-            "centre_seconds": self._centre,
-            "seconds_per_step": self._robots / self._steps if self._steps else None,
-            "seconds_per_fusion": self._centre / self._fusions if self._fusions else None,
+            "robot_seconds": self._robots.seconds,
+            "centre_seconds": self._centre.seconds,
+            "seconds_per_step": self._robots.seconds / self._steps if self._steps else None,
+            "seconds_per_fusion": self._centre.seconds / self._fusions if self._fusions else None,
         }
 
     def _nodes(self) -> tuple[type[RobotNode], type[CentralNode]]:
         """The nodes with a watch on what they do with a message."""
-        run = self
+        robots, centre = self._robots, self._centre
 
         class TimedRobot(RobotNode):
             def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-                begin = time.process_time()
-                out = super().handle(message, now_ns)
-                run._robots += time.process_time() - begin
-                return out
+                with robots:
+                    return super().handle(message, now_ns)
 
         class TimedCentre(CentralNode):
             def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-                begin = time.process_time()
-                out = super().handle(message, now_ns)
-                run._centre += time.process_time() - begin
-                return out
+                with centre:
+                    return super().handle(message, now_ns)
 
         return TimedRobot, TimedCentre
+
+
+class _Watch:
+    """The CPU time [s] that this process has spent inside it."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __enter__(self) -> None:
+        self.seconds -= time.process_time()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds += time.process_time()
 
 
 def team_figures(evaluation: Evaluation) -> Figures:

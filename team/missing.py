@@ -1,0 +1,52 @@
+"""Measurements that a node lacks are asked for at their source."""
+
+import logging
+import time
+from collections.abc import Sequence
+
+from team.shell import Shell
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import BusError
+
+PATIENCE_S = 0.5
+"""What is on its way needs no question: a gap has this long to close."""
+ASK_TIMEOUT_S = 10.0
+"""A source that does not answer within this time is asked again later."""
+_LOG = logging.getLogger("teamslam")
+
+
+class MissingMeasurements:
+    """Of one node, whose shell takes the answers: `look` often."""
+
+    def __init__(self, shell: Shell) -> None:
+        self._shell = shell
+        self._since_s: float | None = None
+
+    def look(self, wanted: Sequence[m.MeasurementsRequest]) -> None:
+        """Ask for what is wanted, once something has been for PATIENCE_S."""
+        now_s = time.monotonic()
+        if not wanted:
+            self._since_s = None
+        elif self._since_s is None:
+            self._since_s = now_s
+        elif now_s - self._since_s > PATIENCE_S:
+            self._since_s = now_s
+            for each in wanted:
+                _LOG.warning(
+                    "measurements %d to %d of %s are missing: asked for",
+                    each.first,
+                    each.last,
+                    each.robot,
+                )
+                self.ask(each)
+
+    def ask(self, wanted: m.MeasurementsRequest) -> int:
+        """Ask now; how many measurements came, which the node has taken."""
+        try:
+            replies = self._shell.bus.ask(ch.MEASUREMENTS, wanted.robot, wanted, ASK_TIMEOUT_S)
+        except BusError as error:
+            _LOG.warning("%s", error)
+            return 0
+        self._shell.take_replies(ch.MEASUREMENTS, wanted.robot, replies, m.Measurement)
+        return len(replies)
