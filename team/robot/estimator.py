@@ -16,7 +16,7 @@ from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import Looks
 from team.estimation.odometry import Moved
 from team.estimation.scans import Scan
-from team.estimation.submap import LocalMap
+from team.estimation.submap import Became, LocalMap
 from team.pairs import ESTIMATORS
 from team.registry import loaded
 from team.rejection import Rejection
@@ -64,7 +64,8 @@ class Estimates:
     """What an odometry interval gave: a submap; the stamps of a new running pose and map.
 
     cloud: the particles, where there are any. judged: how well an estimator without windows
-    predicted what it measured since it last said so, and when.
+    predicted what it measured since it last said so, and when. became: what became of all its
+    detections without identities, from one without windows at the end of its stream.
     """
 
     closed: ClosedWindow | None = None
@@ -72,6 +73,7 @@ class Estimates:
     map_ns: int | None = None
     cloud: Cloud | None = None
     judged: tuple[Innovation, int] | None = None
+    became: Became | None = None
 
 
 NOTHING_NEW = Estimates()

@@ -230,5 +230,5 @@ class FrontEnd:
 
     @property
     def _associates(self) -> bool:
-        """Whether detections without identities are of use: only `join` knows what to do then."""
-        return isinstance(self.estimator, Associates) and self._config.fusion == "join"
+        """Whether detections without identities are of use."""
+        return isinstance(self.estimator, Associates) and self.estimator.associates

@@ -37,7 +37,6 @@ class HybridEstimator:
 
     used = "in a submap"
     joint = True
-    associates = True
 
     def __init__(
         self,
@@ -47,6 +46,7 @@ class HybridEstimator:
         known: KnownMap = NOTHING_KNOWN,
     ) -> None:
         self._slam = HybridSlam(config, incarnation)
+        self.associates = config.fusion == "join"
         origin = np.zeros(3) if initial.pose is None else initial.pose
         self.whole: WholeMap = begun(origin, initial.covariance)
         self._open: tuple[LocalMap | None] | None = None

@@ -410,7 +410,8 @@ class RobotNode:
         if estimates.map_ns is not None:
             out += speaker.cloud(estimates.map_ns, estimates.cloud)
             out += self._maps.at(estimates.map_ns, self._front, speaker)
-        return out
+        sequence = self._front.estimator.sequence
+        return out + speaker.association(sequence, self._now_ns, estimates.became)
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
         """Send a submap; it is among what is to be said before anything else of it can raise."""
@@ -428,7 +429,7 @@ class RobotNode:
         self._pending += self._outbox.put(messages)
         return [
             speaker.innovation(closed.end_ns, closed.sequence, closed.innovation),
-            *speaker.association(closed),
+            *speaker.association(closed.sequence, closed.end_ns, closed.became),
             *self._poses.at(closed.end_ns, self._front, speaker),
             *self._maps.at(closed.end_ns, self._front, speaker),
             self._progress(),

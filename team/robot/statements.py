@@ -12,6 +12,7 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
 from team.estimation.inter_robot import Sighting
+from team.estimation.submap import Became
 from team.robot.estimator import Cloud
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -42,12 +43,12 @@ class Speaker:
         )
         return Outgoing(ch.SUBMAP, self.robot, message)
 
-    def association(self, closed: ClosedWindow) -> list[Outgoing]:
+    def association(self, sequence: int, stamp_ns: int, became: Became | None) -> list[Outgoing]:
         """What became of the window's detections without identities, if it had any."""
-        if closed.became is None:
+        if became is None:
             return []
         message = translate.association_message(
-            self.robot, self.incarnation, closed.sequence, closed.end_ns, closed.became
+            self.robot, self.incarnation, sequence, stamp_ns, became
         )
         return [Outgoing(ch.ASSOCIATION, self.robot, message)]
 

@@ -62,8 +62,9 @@ class AssociationResult:
 
     label_of: of each of the map's unnamed landmarks, its label; UNKNOWN where nobody knows.
     duplicates: landmarks beyond the first of a label; confirmed: among those of two submaps or
-    more. merges_right, merges_wrong: pairs of robots that share landmarks in the map, by whether at
-    least half of those that both have labels for are one; merges_refused: attempts that wait.
+    more, and all of an estimator without submaps. merges_right, merges_wrong: pairs of robots that
+    share landmarks in the map, by whether at least half of those that both have labels for are one;
+    merges_refused: attempts that wait.
     left_out: labelled detections that are in no submap. clutter_in_map: others that are in one.
     """
 
@@ -86,7 +87,7 @@ def association_result(log: Collected) -> AssociationResult | None:
     if not labels:
         return None
     detections = list(_detections(log, labels))
-    identity = _identities(log)
+    identity = _identities(log) or _own_numbers(place for _, place, _ in detections)
     label = np.array([each[0] for each in detections], np.int64)
     places = [each[1] for each in detections]
     windows = [each[2] for each in detections]
@@ -94,11 +95,12 @@ def association_result(log: Collected) -> AssociationResult | None:
     joined = _numbered([None if p is None else identity.get(p, p) for p in places])
     known = label != UNKNOWN
     label_of, submaps = _majorities(label, places, identity)
+    several = len({place[:3] for place in identity}) > 1
     named = [label_of[number] for number in label_of if label_of[number] != UNKNOWN]
     confirmed = [
         label_of[number]
         for number in label_of
-        if label_of[number] != UNKNOWN and len(submaps[number]) > 1
+        if label_of[number] != UNKNOWN and (len(submaps[number]) > 1 or not several)
     ]
     final = log.sound(log.last(ch.FINAL_MAP))
     decisions = final.decisions if isinstance(final, m.FusedMap) else ()
@@ -198,6 +200,11 @@ def _identities(log: Collected) -> dict[Place, int]:
         for sequence, local, identity in rows:
             found[each.robot, each.incarnation, sequence, UNNAMED + local] = identity
     return found
+
+
+def _own_numbers(places: Iterable[Place | None]) -> dict[Place, int]:
+    """Of an estimator without submaps the numbers are those of its map."""
+    return {place: place[3] for place in places if place is not None}
 
 
 def _numbered(values: Sequence[object]) -> Int64[np.ndarray, " n"]:

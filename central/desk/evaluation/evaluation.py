@@ -6,7 +6,7 @@ radians; NEES is per degree of freedom, 1 where the covariance is right.
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from central.desk.evaluation.errors import (
     pose_errors,
     rigid_alignment,
 )
+from central.desk.evaluation.gospa import Gospa, gospa, half_spacing
 from central.desk.evaluation.gps import gps_median
 from central.desk.evaluation.log import Collected, Traffic, collected
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
@@ -58,6 +59,7 @@ class MapResult:
     payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
     covariance_scale: how many times the submaps' covariances ought to be taken; None: not known.
     withdrawn: the robots that the map goes without. lost: those that are not wholly in it.
+    gospa: of all landmarks against all true ones, after truth_from_map; None without it.
     """
 
     rule: str
@@ -77,6 +79,7 @@ class MapResult:
     withdrawn: tuple[str, ...] = ()
     covariance_scale: float | None = None
     lost: tuple[str, ...] = ()
+    gospa: Gospa | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,6 +268,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         if errors is None or evaluation.association is None
         else errors.aligned_rmse_m,
         "gps_median_m": evaluation.gps_median_m,
+        "gospa": None if fused is None or fused.gospa is None else asdict(fused.gospa),
         "unsound_messages": evaluation.unsound,
         "notes": list(evaluation.notes),
         "faults": evaluation.faults,
@@ -342,6 +346,7 @@ def _map_result(
     covariance = translate.landmark_covariance_of(message)
     labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
     truth, known = _truth_of(labels, true_ids, positions)
+    errors = _errors(means, covariance, truth, known)
     return MapResult(
         rule=message.rule,
         digest=message.digest.hex(),
@@ -353,14 +358,24 @@ def _map_result(
         joint=message.joint,
         truth=truth,
         known=known,
-        errors=_errors(means, covariance, truth, known),
+        errors=errors,
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
         reasons=message.reasons,
         joined=message.joined,
         withdrawn=message.withdrawn,
         covariance_scale=message.covariance_scale or None,
         lost=message.lost,
+        gospa=_gospa(means, errors, positions),
     )
+
+
+def _gospa(
+    means: Float[np.ndarray, "L 2"], errors: MapErrors | None, positions: Float[np.ndarray, "T 2"]
+) -> Gospa | None:
+    cut_off_m = half_spacing(positions)
+    if errors is None or errors.truth_from_map is None or not cut_off_m:
+        return None
+    return gospa(moved(errors.truth_from_map, means), positions, cut_off_m)
 
 
 def _own_map(

@@ -26,6 +26,14 @@ ENTRIES = (
         seeds=50,
         seeds_in_all=4,
     ),
+    Entry(
+        "association",
+        "association",
+        "Landmarks without names over spacing, clutter and misses; EKF and FastSLAM beside.",
+        seeds=8,
+        quick_seeds=1,
+        seeds_in_all=2,
+    ),
     Entry("ma-3", "ma_maps:FIGURE_3", "Ma & Ma: dead reckoning and FastSLAM on UTIAS.", 1, 1),
     Entry(
         "ma-4a", "ma_errors:FIGURE_4A", "Ma & Ma: path, dead reckoning against FastSLAM.", 10, 1, 5

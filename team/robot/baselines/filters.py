@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from team.estimation.baselines import (
     hybrid_thesis,
     hybrid_thesis_coded,
     localisation,
+    nearest_neighbour,
     plain_fastslam,
 )
 from team.estimation.baselines.hybrid_thesis_coded import CodedState
@@ -24,44 +25,9 @@ from team.estimation.geometry import tangent
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import Increment
+from team.robot.baselines.filter import IN_POSE, Begun, Filter, Judged, Step, Stepped
+from team.robot.baselines.likelihood import with_association
 from team.robot.estimator import InitialPose, KnownMap
-
-IN_MAP = "in the running map"
-IN_POSE = "in the running pose"
-"""The dispositions of a measurement that such an estimator takes."""
-
-
-Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""The motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the noises
-that they claim (`team.estimation.scans`) at its end."""
-Begun = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
-Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
-Judged = Callable[
-    [Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Innovation
-]
-
-
-class Filter(NamedTuple):
-    """A recursive estimator over a state of its own.
-
-    looks: it takes landmarks, and claims: those with covariances of their own; maps: it has a map
-    of its own. joint: with the covariance between landmarks. absorbed: the state with these
-    landmarks in place of its own. particles: those of a state, for viewers. innovation: of a step's
-    measurements, as the state before it predicts them.
-    """
-
-    begun: Begun
-    stepped: Stepped
-    pose: Callable[[Any], PoseGaussian]
-    landmarks: Callable[[Any], LandmarkGaussian]
-    innovation: Judged
-    absorbed: Callable[[Any, np.ndarray, np.ndarray, Matrix], Any] | None = None
-    used: str = IN_MAP
-    looks: bool = True
-    claims: bool = False
-    maps: bool = True
-    joint: bool = True
-    particles: Callable[[Any], Particles] | None = None
 
 
 def _random(stepped: Callable[..., Any]) -> Stepped:
@@ -261,12 +227,13 @@ FILTERS: Mapping[Estimator, Filter] = {
         maps=False,
     ),
     "ekf-slam": Filter(
-        *_exact(ekf_slam.begun, ekf_slam.stepped),
-        ekf_slam.pose_gaussian,
-        ekf_slam.landmark_gaussian,
-        _without_claims(ekf_slam.innovation),
+        *_exact(nearest_neighbour.begun, nearest_neighbour.stepped),
+        lambda state: ekf_slam.pose_gaussian(state.slam),
+        lambda state: ekf_slam.landmark_gaussian(state.slam),
+        lambda state, *step: ekf_slam.innovation(state.slam, *step[:-1]),
+        took=lambda state: np.concatenate(state.took),
     ),
-    "fastslam1": _plain("fastslam1"),
+    "fastslam1": with_association(_plain("fastslam1")),
     "fastslam2": _plain("fastslam2"),
     "hybrid-thesis": Filter(
         _thesis_begun,

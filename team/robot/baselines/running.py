@@ -1,11 +1,12 @@
 """An estimator that keeps one state from the start of a stream to its end."""
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from team.config import RobotConfig
+from team.config import UNNAMED, RobotConfig
 from team.estimation.gaussian import (
     LandmarkGaussian,
     NotACovarianceError,
@@ -13,15 +14,18 @@ from team.estimation.gaussian import (
 )
 from team.estimation.geometry import Pose, inverse
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
-from team.estimation.hybrid_slam.keyframes import Segmenter
+from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from team.estimation.hybrid_slam.reduction import Look
 from team.estimation.models import Increment
 from team.estimation.mount import moved_by
 from team.estimation.odometry import Moved
 from team.estimation.randomness import generator
 from team.estimation.scans import Scan, unclaimed
+from team.estimation.submap import Became
 from team.pairs import FEEDBACK
 from team.rejection import Rejection
-from team.robot.baselines.filters import FILTERS, Step
+from team.robot.baselines.filter import Step
+from team.robot.baselines.filters import FILTERS
 from team.robot.estimator import Cloud, Estimates, InitialPose, KnownMap, thinned
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
@@ -33,7 +37,8 @@ class RunningEstimator:
     """The state after every keyframe so far; its map is said once per window, or at every keyframe.
 
     It makes no submaps, so it can not be resumed: a robot that was started again takes its stream
-    from the beginning, and says the same again. sequence: keyframes so far.
+    from the beginning, and says the same again. sequence: keyframes so far. associates: it takes
+    scans without identities; what became of them it says at the end.
     """
 
     def __init__(
@@ -41,6 +46,8 @@ class RunningEstimator:
     ) -> None:
         self._config = config
         self._filter = FILTERS[config.estimator]
+        self.associates = self._filter.took is not None and config.fusion == "alone"
+        self._looks: list[Look] = []
         maps_at_keyframes = config.fusion in FEEDBACK
         self._map_every_ns = 0 if maps_at_keyframes else round(config.front_end.window_s * 1e9)
         self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
@@ -74,7 +81,8 @@ class RunningEstimator:
         """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
         if not self._filter.looks:
             return Rejection.NO_LANDMARKS
-        if scan.own.size and not self._filter.claims:
+        unnamed = bool((scan.ids >= UNNAMED).any())
+        if scan.own.size and not self._filter.claims and not unnamed:
             return Rejection.CLAIMS
         return self._segmenter.observe(stamp_ns, *scan)
 
@@ -95,14 +103,7 @@ class RunningEstimator:
         before = self.sequence
         motion = stamp_ns, duration_ns, forward, yaw_rate, moved
         for keyframe in self._segmenter.drive(*motion, measured=measured):
-            self._advance(
-                keyframe.stamp_ns,
-                keyframe.increment,
-                keyframe.ids,
-                keyframe.ranges,
-                keyframe.bearings,
-                keyframe.own,
-            )
+            self._take(keyframe)
         if not self._filter.looks:
             _, rest = self._segmenter.cut(stamp_ns)
             nothing = np.empty(0)
@@ -132,6 +133,30 @@ class RunningEstimator:
         if map_ns is None or self._filter.particles is None:
             return None
         return thinned(self._filter.particles(self._state), np.zeros(3))
+
+    def _take(self, keyframe: Keyframe) -> None:
+        """A keyframe: its scans without identities one by one, then what it has with names."""
+        for look in keyframe.looks:
+            self._looks.append(look)
+            seen = look.ids, look.ranges, look.bearings, look.own
+            self._advance(look.at_ns, look.motion or Increment.identity(), *seen)
+        seen = keyframe.ids, keyframe.ranges, keyframe.bearings, keyframe.own
+        motion = keyframe.increment if keyframe.rest is None else keyframe.rest
+        if not keyframe.looks or len(keyframe.ids) or motion.mean.any():
+            self._advance(keyframe.stamp_ns, motion, *seen)
+
+    def _became(self) -> Became | None:
+        """The landmark of each detection without an identity so far."""
+        if not self._looks or self._filter.took is None:
+            return None
+        numbers = self._filter.took(self._state)
+        return Became(
+            stamps=np.array([look.stamp_ns for look in self._looks], np.int64),
+            counts=np.array([len(look.ids) for look in self._looks], np.int64),
+            rows=np.concatenate([look.ids for look in self._looks]).astype(np.int64) - UNNAMED,
+            landmarks=numbers,
+            clutter=np.zeros(len(numbers), np.bool_),
+        )
 
     def _advance(
         self,
@@ -178,15 +203,8 @@ class RunningEstimator:
         before = self.sequence
         if self._segmenter.now_ns is not None:
             for keyframe in self._segmenter.cut(self._segmenter.now_ns)[0]:
-                self._advance(
-                    keyframe.stamp_ns,
-                    keyframe.increment,
-                    keyframe.ids,
-                    keyframe.ranges,
-                    keyframe.bearings,
-                    keyframe.own,
-                )
-        return self._driven(before, last=True), uncovered
+                self._take(keyframe)
+        return replace(self._driven(before, last=True), became=self._became()), uncovered
 
     def own_pose(self) -> PoseGaussian:
         """The pose at the last keyframe."""

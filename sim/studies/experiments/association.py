@@ -1,0 +1,223 @@
+"""Landmarks without names: how far association holds, over spacing, clutter and missed detections.
+
+One simulated place, four ways: ours without names, the same measurements with names, an EKF over
+the whole drive with nearest neighbour, and FastSLAM whose particles each associate by maximum
+likelihood. Sensors differ in nothing but their noise; each axis is turned alone.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple
+
+import msgspec
+
+from central.desk.evaluation.evaluation import evaluate, to_json
+from sim.in_memory.team import run_team
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from sim.studies.experiments.curves import figure, ruled
+from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
+from sim.studies.experiments.task import Task
+from team.config import Estimator, FusionRule
+
+SIZE_M, LANDMARKS, VIEW_M, STEPS = 60.0, 40, 12.0, 150
+SPACING_M = 0.5 * SIZE_M / LANDMARKS**0.5
+"""The mean distance of a landmark from its nearest neighbour, where they are uniform."""
+RATIOS = (4.0, 6.0, 10.0, 20.0, 40.0)
+CLUTTER = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+MISSED = (0.0, 0.1, 0.2, 0.3, 0.5)
+RATIO, FEW = 20.0, 2
+
+
+class System(NamedTuple):
+    """One way to do it: estimator, rule, and whether it hears the names."""
+
+    name: str
+    estimator: Estimator
+    fusion: FusionRule
+    named: bool = False
+
+
+OURS = System("ours", "hybrid", "join")
+NAMED = System("with names", "hybrid", "join", named=True)
+SYSTEMS = (
+    OURS,
+    NAMED,
+    System("EKF, nearest neighbour", "ekf-slam", "alone"),
+    System("FastSLAM, likelihood", "fastslam1", "alone"),
+)
+AXES: dict[str, tuple[float, ...]] = {
+    "spacing / noise": RATIOS,
+    "clutter": CLUTTER,
+    "missed": MISSED,
+}
+FIGURES = (
+    ("f1", "F1", "{:.3f}"),
+    ("wrong_percent", "wrong %", "{:.2f}"),
+    ("duplicates", "duplicates", "{:.1f}"),
+    ("merges_wrong", "wrong merges", "{:.2f}"),
+    ("rmse", "RMSE [m]", "{:.3f}"),
+    ("ratio", "÷ with names", "{:.2f}"),
+    ("nees", "shape NEES / 2", "{:.2f}"),
+    ("gospa", "GOSPA [m]", "{:.2f}"),
+)
+
+
+def tasks(options: Options) -> list[Task]:
+    """Each axis, value, system and seed."""
+    return [
+        task
+        for axis in AXES
+        for value in _values(axis, options)
+        for system in SYSTEMS
+        for task in _tasks(axis, value, system, options)
+    ]
+
+
+def _values(axis: str, options: Options) -> Sequence[float]:
+    values = AXES[axis]
+    return values[:: max(len(values) // FEW, 1)] if options.quick else values
+
+
+def _tasks(axis: str, value: float, system: System, options: Options) -> list[Task]:
+    ratio = value if axis == "spacing / noise" else RATIO
+    clutter = value if axis == "clutter" else 0.0
+    missed = value if axis == "missed" else 0.0
+    return [
+        Task(
+            "sim.studies.experiments.association:association_run",
+            {
+                "estimator": system.estimator,
+                "fusion": system.fusion,
+                "named": system.named,
+                "ratio": ratio,
+                "clutter": 0.0 if system.named else clutter,
+                "missed": missed,
+                "seed": seed,
+            },
+            f"{system.name}, {axis} {value:g}, seed {seed}",
+            4.0,
+        )
+        for seed in options.seeds
+    ]
+
+
+def association_run(
+    estimator: str,
+    fusion: str,
+    named: bool,
+    ratio: float,
+    clutter: float,
+    missed: float,
+    seed: int,
+) -> dict[str, Any]:
+    """One run; the baselines have one robot, since each of theirs has a map of its own."""
+    alone = fusion == "alone"
+    scenario = load("waypoints")
+    error_m = SPACING_M / ratio
+    sensor = {"range_sigma": 0.6 * error_m, "bearing_sigma": 0.8 * error_m / VIEW_M}
+    world = msgspec.structs.replace(
+        scenario.world,
+        size_m=SIZE_M,
+        landmark_count=LANDMARKS,
+        visible_to_m=VIEW_M,
+        steps=STEPS,
+        clutter=clutter,
+        missed=missed,
+    )
+    robots = tuple(
+        msgspec.structs.replace(each, sensor=msgspec.structs.replace(each.sensor, **sensor))
+        for each in scenario.robots[:1]
+    )
+    scenario = msgspec.structs.replace(scenario, world=world, robots=robots)
+    scenario = with_options(
+        scenario,
+        seed=seed,
+        robots=1 if alone else 2,
+        estimator=estimator,
+        fusion=fusion,
+        identities=None if named else "hidden",
+    )
+    found = to_json(evaluate(run_team(scenario, streams_of(scenario))))
+    scores = found["association"] or {}
+    shape = found["shape_nees_per_landmark"]
+    return {
+        "seed": seed,
+        "rmse": found["landmark_rmse_aligned_m"],
+        "nees": None if shape is None else 0.5 * shape,
+        "gospa": None if found["gospa"] is None else found["gospa"]["distance_m"],
+    } | {name: scores.get(name) for name in ("f1", "wrong_percent", "duplicates", "merges_wrong")}
+
+
+def outcome(options: Options, results: Results) -> Outcome:
+    """A table and a picture for each axis."""
+    figures: dict[str, dict[str, dict[str, dict[str, float | None]]]] = {}
+    tables = []
+    for axis in AXES:
+        of_axis = figures.setdefault(axis, {})
+        rows = []
+        for value in _values(axis, options):
+            named = _means(results.of_all(_tasks(axis, value, NAMED, options)))
+            for system in SYSTEMS:
+                means = _means(results.of_all(_tasks(axis, value, system, options)))
+                rmse, beside = means.get("rmse"), named.get("rmse")
+                means["ratio"] = rmse / beside if rmse and beside and system == OURS else None
+                of_axis.setdefault(system.name, {})[f"{value:g}"] = means
+                cells = [
+                    "–" if means.get(name) is None else form.format(means[name])
+                    for name, _, form in FIGURES
+                ]
+                rows.append((f"{value:g}: {system.name}", *cells))
+        tables.append(
+            Table(
+                f"over {axis}, {len(options.seeds)} seeds",
+                (axis, *(heading for _, heading, _ in FIGURES)),
+                tuple(rows),
+                "ours and with names: two robots, one map; the others one robot. Wrong: detections "
+                "in a landmark of another label; duplicates: landmarks beyond the first of a label",
+            )
+        )
+    return Outcome(
+        "landmarks without names",
+        {"association": figures},
+        tuple(tables),
+        tuple(_picture(axis, figures[axis]) for axis in AXES),
+        remarks=(
+            f"{LANDMARKS} landmarks uniform in {SIZE_M:g} m × {SIZE_M:g} m, nearest neighbours "
+            f"{SPACING_M:.1f} m apart in the mean; noise is the error at {VIEW_M:g} m, the end of "
+            f"the view. Clutter and missed detections at spacing / noise {RATIO:g}.",
+        ),
+    )
+
+
+def _means(runs: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    means: dict[str, float | None] = {}
+    for name, _, _ in FIGURES:
+        known = [run[name] for run in runs if run.get(name) is not None]
+        means[name] = fmean(known) if known else None
+    return means
+
+
+def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> Picture:
+    def draw(path: Path) -> None:
+        shown = [each for each in FIGURES if each[0] in ("f1", "duplicates", "rmse", "nees")]
+        made = figure(9.0, 6.0)
+        for axes, (name, heading, _) in zip(made.subplots(2, 2).flat, shown, strict=True):
+            for system, points in of_axis.items():
+                at = [(float(x), means[name]) for x, means in points.items()]
+                known = [(x, y) for x, y in at if y is not None]
+                if known:
+                    axes.plot(*zip(*known, strict=True), marker="o", markersize=3, label=system)
+            axes.set_xlabel(axis)
+            axes.set_title(heading, fontsize=10)
+            if axis == "spacing / noise":
+                axes.set_xscale("log")
+            if name in ("rmse", "nees"):
+                axes.set_yscale("log")
+            ruled(axes)
+        made.axes[0].legend(fontsize=8)
+        made.savefig(path, dpi=120)
+
+    file = "association-" + axis.replace(" / ", "-")
+    return Picture(file, f"Association over {axis}.", draw)

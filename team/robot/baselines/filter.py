@@ -1,0 +1,49 @@
+"""What a recursive estimator over a state of its own is: functions of one shape each."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from team.config import RobotConfig, Sensor
+from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.models import Increment
+from team.robot.estimator import InitialPose, KnownMap
+
+IN_MAP = "in the running map"
+IN_POSE = "in the running pose"
+"""The dispositions of a measurement that such an estimator takes."""
+Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""The motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the noises
+that they claim (`team.estimation.scans`) at its end."""
+Begun = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
+Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
+Judged = Callable[
+    [Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Innovation
+]
+
+
+class Filter(NamedTuple):
+    """A recursive estimator over a state of its own.
+
+    looks: it takes landmarks, and claims: those with covariances of their own; maps: it has a map
+    of its own. joint: with the covariance between landmarks. absorbed: the state with these
+    landmarks in place of its own. particles: those of a state, for viewers. innovation: of a step's
+    measurements, as the state before it predicts them.
+    """
+
+    begun: Begun
+    stepped: Stepped
+    pose: Callable[[Any], PoseGaussian]
+    landmarks: Callable[[Any], LandmarkGaussian]
+    innovation: Judged
+    absorbed: Callable[[Any, np.ndarray, np.ndarray, Matrix], Any] | None = None
+    used: str = IN_MAP
+    looks: bool = True
+    claims: bool = False
+    maps: bool = True
+    joint: bool = True
+    particles: Callable[[Any], Particles] | None = None
+    took: Callable[[Any], np.ndarray] | None = None
