@@ -16,7 +16,7 @@ from central.desk.evaluation.evaluation import evaluate, to_json
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
-from sim.studies.experiments.curves import figure, ruled
+from sim.studies.experiments.drawing import figure, ruled
 from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
 from sim.studies.experiments.task import Task
 from team.config import Estimator, FusionRule
