@@ -1,5 +1,8 @@
 """Teams whose robots tell in every form, in memory: every rule maps them, the log says it again."""
 
+from dataclasses import replace
+from functools import cache
+
 import msgspec
 import numpy as np
 import pytest
@@ -8,12 +11,14 @@ from central.desk.verification.verification import verify
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import streams_of
-from sim.studies.batch_reference.measurements import LimitError, Scan, chains_of
+from sim.studies.batch_reference.measurements import Scan, chains_of
+from sim.studies.batch_reference.reference import NoiseKind, batch_map
 from team import translate
 from team.config import MotionModel, MotionNoise, Sensor
 from team.rejection import Rejection
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
+from team.wire.codec import encoded
 from tests.sim.reruns import written
 
 MOUNT = (0.8, -0.3, 0.2)
@@ -41,6 +46,7 @@ def scenario(estimator: str = "hybrid", fusion: str = "join", **world: object) -
     )
 
 
+@cache
 def run(of: Scenario) -> list[Sample]:
     return list(run_team(of, streams_of(of)))
 
@@ -78,14 +84,42 @@ def test_what_they_said_is_computed_again_to_the_last_bit(tmp_path) -> None:
     assert verify(written(tmp_path / "log.mcap", run(of))).first is None
 
 
-def test_the_batch_reference_takes_claims_and_refuses_a_mount_by_name() -> None:
+def test_the_batch_reference_takes_claims() -> None:
     seen = np.array([7], np.uint32), np.ones(1), np.zeros(1)
     claimed = Scan(*seen, np.array([[0.1, 0.02, 0.3, 0.0]]))
     np.testing.assert_array_equal(claimed.noise(0, Sensor(), 1.0), [[0.1, 0.02], [0.02, 0.3]])
     plain = Scan(*seen)
     np.testing.assert_allclose(plain.noise(0, Sensor(), 1.0), np.diag([0.01, 4e-4]))
-    with pytest.raises(LimitError, match=r"r1, r2: sensor.mount .* --fusion batch"):
-        chains_of([], scenario())
+
+
+def told(of: Scenario, samples: list[Sample]) -> list[Sample]:
+    """The same run with another scenario in its log."""
+    payload = encoded(translate.configured("world", 0, 0, of))
+    return [
+        replace(sample, payload=payload)
+        if isinstance(opened(sample)[2], m.Configuration)
+        else sample
+        for sample in samples
+    ]
+
+
+@pytest.mark.parametrize("noise", ["white", "profile"])
+def test_the_batch_reference_links_the_poses_of_mounted_sensors(noise: NoiseKind) -> None:
+    of = scenario()
+    found = batch_map(run(of), noise)
+    chains = chains_of(run(of), of)
+    measured = sum(len(scan.ids) for chain in chains for scan in chain.scans)
+    assert found.cost / (2 * measured - 2 * len(found.ids)) == pytest.approx(1.0, abs=0.15)
+    assert max(found.position_rmse_m.values()) < 0.2, "the base's poses"
+    assert max(found.final_pose_nees_per_dof.values()) < 5.0
+    elsewhere = tuple(
+        msgspec.structs.replace(
+            each, sensor=msgspec.structs.replace(each.sensor, mount=(0.8, 0.3, 0.0))
+        )
+        for each in of.robots
+    )
+    mutant = batch_map(told(msgspec.structs.replace(of, robots=elsewhere), run(of)), noise)
+    assert mutant.cost > 1.5 * found.cost
 
 
 def test_an_estimator_that_takes_no_claims_says_so() -> None:

@@ -9,7 +9,8 @@ with the shares w that the sensor calls white. e is a first-order Gauss-Markov p
 variance for each robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ) with the
 sensor's correlation times; so it is in the simulator, and the robots' windows take it as constant.
 The biases are three numbers per robot with the centre's priors. A teammate's sighting is a factor
-between two poses of the same time, as the robots reduce them. GTSAM has no factor for such a
+between two poses of the same time, as the robots reduce them. A covariance that comes with a
+measurement is white, and all of its noise. GTSAM has no factor for such a
 measurement: it is a Python function of (pose, landmark, e, biases) with its own derivatives.
 """
 
@@ -25,7 +26,7 @@ from sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under
 from sim.studies.batch_reference.measurements import Chain
 from team.config import Sensor
 from team.estimation.geometry import Point, wrapped
-from team.estimation.models import NEAREST_M, noise, predicted
+from team.estimation.models import NEAREST_M, predicted
 
 BIASES = ("bearing", "range_offset", "range_scale")
 """The errors of a robot's sensor that the centre would estimate, in their order here."""
@@ -33,12 +34,16 @@ FORGOTTEN = 1e-3
 """A correlation below this is none: the process begins anew."""
 _ERRORS = 2**56
 _BIASES = 2**57
+_BASES = 2**58
+HELD_SIGMA = 1e-6
+"""Of a base's pose where its sensor's is mounted [m, rad]: none, as far as GTSAM can take it."""
 
 
 class Look(NamedTuple):
     """A landmark seen from a pose of a chain, and the error state of this measurement.
 
-    before: the error state of the measurement of the same landmark that is gap_s older.
+    before: the error state of the measurement of the same landmark that is gap_s older. number: of
+    the measurement in its scan.
     """
 
     key: int
@@ -49,6 +54,7 @@ class Look(NamedTuple):
     bearing: float
     before: int | None
     gap_s: float
+    number: int
 
 
 def bias_key(chain: int) -> int:
@@ -63,7 +69,8 @@ def looks_of(chains: Sequence[Chain]) -> list[Look]:
         last: dict[int, tuple[int, int]] = {}
         for i, scan in enumerate(chain.scans, 1):
             stamp_ns = int(chain.stamps_ns[i])
-            for landmark, r, b in zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True):
+            seen = zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True)
+            for number, (landmark, r, b) in enumerate(seen):
                 key = _ERRORS + len(looks)
                 before, then_ns = last.get(landmark, (None, stamp_ns))
                 gap_s = 1e-9 * (stamp_ns - then_ns)
@@ -77,6 +84,7 @@ def looks_of(chains: Sequence[Chain]) -> list[Look]:
                         bearing=float(b),
                         before=before,
                         gap_s=gap_s,
+                        number=number,
                     )
                 )
                 last[landmark] = key, stamp_ns
@@ -108,10 +116,17 @@ def profile_graph(
         sensor = chains[look.chain].config.sensor
         graph.push_back(_process_factor(gtsam, look, sensor))
         distance, _ = predicted(poses[look.chain][look.pose], landmarks[look.landmark])
-        range_var, bearing_var = noise(sensor, distance)
-        variances = np.array([bearing_var, range_var])
+        scan = chains[look.chain].scans[look.pose - 1]
+        R = scan.noise(look.number, sensor, distance)[::-1, ::-1]
         white = np.array([sensor.bearing_white, sensor.range_white])
-        model = gtsam.noiseModel.Diagonal.Variances(variances * white)
+        if scan.own.size:  # what a detector claims of a measurement is that one's own
+            white = np.ones(2)
+        variances = np.diag(R)
+        model = (
+            gtsam.noiseModel.Gaussian.Covariance(R)
+            if scan.own.size
+            else gtsam.noiseModel.Diagonal.Variances(variances * white)
+        )
         keys = [pose_key(look.chain, look.pose), look.landmark, look.key]
         if has_biases(chains[look.chain]):
             keys.append(bias_key(look.chain))
@@ -127,8 +142,11 @@ def has_biases(chain: Chain) -> bool:
     return bool(set(BIASES) & set(chain.config.front_end.biases))
 
 
-def add_errors(values: Any, chains: Sequence[Chain]) -> Any:
-    """The values with all error states and biases at zero."""
+def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
+    """The values with all error states and biases at zero, and the bases where the sensors say."""
+    for c, i in _bases(chains):
+        pose = values.atPose2(pose_key(c, i)).compose(gtsam.Pose2(*chains[c].mount).inverse())
+        values.insert(_base_key(chains[c], c, i), pose)
     for look in looks_of(chains):
         values.insert(look.key, np.zeros(2))
     for c, chain in enumerate(chains):
@@ -187,14 +205,37 @@ def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
     return gtsam.LinearContainerFactor(linear, at)
 
 
+def _base_key(chain: Chain, number: int, pose: int) -> int:
+    """Of the base's pose: the sensor's, unless that is mounted elsewhere."""
+    own = pose_key(number, pose)
+    return _BASES + own if chain.config.sensor.is_mounted else own
+
+
+def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
+    """(chain, pose) of the bases' poses that are states of their own: at times of sightings."""
+    times = {sighting.stamp_ns for chain in chains for sighting in chain.sightings}
+    return [
+        (c, i)
+        for c, chain in enumerate(chains)
+        if chain.config.sensor.is_mounted
+        for i, stamp_ns in enumerate(chain.stamps_ns.tolist())
+        if stamp_ns in times
+    ]
+
+
 def _sighting_factors(gtsam: Any, chains: Sequence[Chain], loss: float | None) -> list[Any]:
-    """Between the poses of two robots at one time; none where the teammate has no pose then."""
+    """Between the bases' poses of two robots at one time; none where the teammate has none then."""
     keys = {
-        (chain.config.id, int(stamp)): pose_key(c, i)
+        (chain.config.id, int(stamp)): _base_key(chain, c, i)
         for c, chain in enumerate(chains)
         for i, stamp in enumerate(chain.stamps_ns)
     }
     factors = []
+    for c, i in _bases(chains):
+        model = gtsam.noiseModel.Isotropic.Sigma(3, HELD_SIGMA)
+        mount = gtsam.Pose2(*chains[c].mount)
+        base, sensor = _base_key(chains[c], c, i), pose_key(c, i)
+        factors.append(gtsam.BetweenFactorPose2(base, sensor, mount, model))
     for chain in chains:
         for sighting in chain.sightings:
             here = keys.get((chain.config.id, sighting.stamp_ns))

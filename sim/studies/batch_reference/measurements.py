@@ -12,11 +12,12 @@ from central.desk.evaluation.errors import Path, on_circle
 from central.team_config import TeamConfig
 from team import translate
 from team.config import RobotConfig, Sensor
-from team.estimation.gaussian import Matrix
-from team.estimation.geometry import Pose, between, compose
+from team.estimation.gaussian import Matrix, PoseGaussian
+from team.estimation.geometry import Pose, between, compose, inverse
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
 from team.estimation.models import Increment, noise
+from team.estimation.mount import moved_by
 from team.estimation.scans import Own, unclaimed
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -58,11 +59,13 @@ class Scan(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """One incarnation of a robot's stream: N + 1 poses, the first at the start.
+    """One incarnation of a robot's stream: N + 1 poses of its sensor, the first at the start.
 
-    increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1.
-    start: the pose that measurement 0 gives (None: unknown), with its covariance (None: exact).
-    sightings: of teammates, from the poses at the team's grid times, if they were asked for.
+    The base is at pose ∘ mount⁻¹ (`of_base`, `of_sensor`).
+
+    increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1. start:
+    the pose that measurement 0 gives (None: unknown), with its covariance (None: exact).
+    sightings: of teammates, from the base's poses at the team's grid times, if they were asked for.
     """
 
     config: RobotConfig
@@ -73,6 +76,20 @@ class Chain:
     increments: tuple[Increment, ...]
     scans: tuple[Scan, ...]
     sightings: tuple[NodeSighting, ...] = ()
+
+    @property
+    def mount(self) -> Pose:
+        """The sensor's pose on the base."""
+        return np.array(self.config.sensor.mount)
+
+    def of_sensor(self, base: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
+        """The sensor's poses where the base is there."""
+        return np.array([compose(pose, self.mount) for pose in base]).reshape(-1, 3)
+
+    def of_base(self, poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
+        """The base's poses where the sensor is there."""
+        away = inverse(self.mount)
+        return np.array([compose(pose, away) for pose in poses]).reshape(-1, 3)
 
     @property
     def dead_reckoned(self) -> Float[np.ndarray, "K 3"]:
@@ -90,7 +107,7 @@ def chains_of(
     once.
 
     With sightings there is a pose at each time of the team's grid (`front_end.node_s`) too.
-    Raises WireError for a measurement that is not sound, LimitError for a mounted sensor.
+    Raises WireError for a measurement that is not sound.
     """
     streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:
@@ -101,12 +118,6 @@ def chains_of(
                 stream = streams.setdefault((message.robot, message.incarnation), {})
                 stream[message.number] = message
     configs = {robot.id: robot for robot in scenario.robots}
-    mounted = sorted(robot.id for robot in scenario.robots if robot.sensor.is_mounted)
-    if mounted:
-        raise LimitError(
-            f"{', '.join(mounted)}: sensor.mount is not that of the base, whose poses the batch "
-            "reference links; the rule `batch` takes it: teamslam rerun LOG --fusion batch"
-        )
     chains = [
         _chain(
             configs[robot], incarnation, [measurements[i] for i in sorted(measurements)], sightings
@@ -137,7 +148,7 @@ def _chain(
     for measurement in measurements:
         match measurement:
             case m.InitialPose():
-                start = translate.pose_of(measurement)
+                start = _of_sensor(*translate.pose_of(measurement), np.array(config.sensor.mount))
             case m.Observations() | m.Points():
                 segmenter.observe(measurement.stamp_ns, *translate.scan_of(measurement))
             case m.Sightings() if grid is not None:
@@ -162,6 +173,18 @@ def _chain(
         scans=tuple(Scan(e.ids, e.ranges, e.bearings, e.own) for e in keyframes),
         sightings=() if grid is None else grid.sightings(),
     )
+
+
+def _of_sensor(
+    pose: Pose | None, covariance: Matrix | None, mount: Pose
+) -> tuple[Pose | None, Matrix | None]:
+    """The initial pose of a sensor that is mounted there on a base with this one."""
+    if pose is None or not mount.any():
+        return pose, covariance
+    found = moved_by(
+        PoseGaussian(pose, np.zeros((3, 3)) if covariance is None else covariance), mount
+    )
+    return found.mean, None if covariance is None else found.covariance
 
 
 def _grid(config: RobotConfig) -> PoseGrid | None:

@@ -1,9 +1,10 @@
 """The limit: the batch MAP over all raw measurements of a log, by GTSAM (the extra `limit`).
 
-One pose per keyframe of each robot. Factors: the start poses; between consecutive poses
-the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of `increment_of`, which is GTSAM's
-`BetweenFactorPose2` with its logarithm; each accepted range and bearing, independent, with the
-sensor's noise (under a Cauchy loss where the centre's `robust_c` asks for a robust join).
+One pose per keyframe of each robot: its sensor's, wherever that is mounted. Factors: the start
+poses; between consecutive poses the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of
+`increment_of`, which is GTSAM's `BetweenFactorPose2` with its logarithm; each accepted range and
+bearing, independent, with the sensor's noise or its own (under a Cauchy loss where the centre's
+`robust_c` asks for a robust join).
 Levenberg-Marquardt starts from the joined solution, so what it finds is never worse than that: from
 three ways to fill the paths between its poses (under the noise `profile` from the best of them).
 Under the noise `white` every measurement's error is its own and sightings of teammates are not
@@ -31,8 +32,9 @@ from central.desk.evaluation.evaluation import Evaluation, evaluate
 from sim.studies.batch_reference.errors import add_errors, bias_key, has_biases, profile_graph
 from sim.studies.batch_reference.graph import factor_graph, landmark_starts, pose_key, values_of
 from sim.studies.batch_reference.measurements import Chain, LimitError, anchored, chains_of
-from team.estimation.gaussian import Matrix
-from team.estimation.geometry import tangent
+from team.estimation.gaussian import Matrix, PoseGaussian
+from team.estimation.geometry import inverse, tangent
+from team.estimation.mount import moved_by
 from team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3
@@ -147,7 +149,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
         for poses, landmarks in zip(fillings, starts, strict=True)
     ]
     if noise == "profile":
-        initials = [add_errors(values, chains) for values in initials]
+        initials = [add_errors(gtsam, values, chains) for values in initials]
         initials = [min(initials, key=graph.error)]
     try:
         optimum, figures = _solved(gtsam, graph, initials, descend)
@@ -216,7 +218,7 @@ def placed(
         if not own.any():
             left_out.append(f"{robot}: it is not in the joined map")
             continue
-        stamps, poses = path.stamps_ns[own], path.poses[own]
+        stamps, poses = path.stamps_ns[own], chain.of_sensor(path.poses[own])
         if chain.start is not None:
             stamps = np.concatenate((chain.stamps_ns[:1], stamps))
             poses = np.concatenate((chain.start[np.newaxis], poses))
@@ -288,7 +290,8 @@ def _limit(
         robot, last = chain.config.id, pose_key(c, len(chain.increments))
         keys = range(pose_key(c, 0), last + 1)
         poses = [optimum.atPose2(key) for key in keys]
-        path = Path(chain.stamps_ns, np.array([[p.x(), p.y(), p.theta()] for p in poses]))
+        sensor = np.array([[p.x(), p.y(), p.theta()] for p in poses])
+        path = Path(chain.stamps_ns, chain.of_base(sensor))
         true_path = run.robots[robot].truth
         true_poses, seen = interpolated(true_path, path.stamps_ns)
         paths[robot] = path
@@ -297,8 +300,9 @@ def _limit(
             biases[robot] = (turned, offset, scaled)
         if seen.any():
             errors[robot] = distance_rmse(path.poses[seen, :2], true_poses[seen, :2])
-        turn = tangent(path.poses[-1, 2])
+        turn = tangent(sensor[-1, 2])
         P = turn @ marginals.marginalCovariance(last) @ turn.T
+        P = moved_by(PoseGaussian(sensor[-1], P), inverse(chain.mount)).covariance
         end = pose_errors(Path(path.stamps_ns[-1:], path.poses[-1:]), P[np.newaxis], true_path)
         if end is not None:
             nees[robot] = end.nees_per_dof

@@ -20,7 +20,7 @@ from team.estimation.hybrid_slam import consensus
 from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.hybrid_slam.consensus import agreeing, confirmed
 from team.estimation.models import Increment, increment_of, predicted
-from team.estimation.scans import unclaimed
+from team.estimation.scans import point_scan, polar_scan, unclaimed
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(0.03), turn=MotionNoise(0.02), lateral=MotionNoise(0.01))
@@ -36,8 +36,8 @@ class Drive:
     ids: np.ndarray
     measurements: np.ndarray
 
-    def judged(self, by=confirmed, garbage: float = 0.3) -> np.ndarray:
-        seen = self.ids, self.measurements, unclaimed(len(self.ids))
+    def judged(self, by=confirmed, garbage: float = 0.3, own=None) -> np.ndarray:
+        seen = self.ids, self.measurements, unclaimed(len(self.ids)) if own is None else own
         return by(self.motions, self.keyframes, *seen, SENSOR, garbage)
 
 
@@ -81,6 +81,33 @@ def test_a_measurement_that_is_alone_is_not_taken_nor_are_two_that_disagree():
     taken = window.judged()
     assert not taken[[3, 8, 21]].any()
     assert np.delete(taken, [3, 8, 21]).all()
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_measurements_are_judged_by_the_covariances_that_they_claim(points: bool) -> None:
+    window = drive(3)
+    few = np.arange(1, 40, 5)
+    r, b = window.measurements.T
+    r[few] += 1.5  # fifteen times the sensor's deviation
+    sigmas = np.tile([0.1, 0.02], (40, 1))
+    claims = {"those": sigmas.copy(), "narrow": sigmas}
+    claims["those"][few] = [2.0, 0.2]
+    taken = {}
+    for name, each in claims.items():
+        rr, bb = (each**2).T
+        if points:
+            c, s = np.cos(b), np.sin(b)
+            across = bb * r * r
+            C = np.column_stack(
+                [rr * c * c + across * s * s, (rr - across) * c * s, rr * s * s + across * c * c]
+            )
+            own = point_scan(window.ids, np.column_stack([r * c, r * s]), C).own
+        else:
+            own = polar_scan(window.ids, r, b, np.column_stack([rr, 0 * rr, bb])).own
+        taken[name] = window.judged(own=own)
+    assert taken["those"].all()
+    assert not taken["narrow"][few].any()
+    assert np.count_nonzero(~np.delete(taken["narrow"], few)) <= 2
 
 
 def test_a_landmark_under_another_ones_name_is_not_taken():

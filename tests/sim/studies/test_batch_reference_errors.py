@@ -96,7 +96,7 @@ def held_cost(chain: Chain) -> float:
         graph.push_back(gtsam.PriorFactorPose2(pose_key(0, i), gtsam.Pose2(), exact.Sigma(3, 1e-7)))
     for key, at in LANDMARKS.items():
         graph.push_back(gtsam.PriorFactorPoint2(key, at, exact.Sigma(2, 1e-7)))
-    values = add_errors(values_of(gtsam, poses, LANDMARKS), [chain])
+    values = add_errors(gtsam, values_of(gtsam, poses, LANDMARKS), [chain])
     optimum = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return 2.0 * float(graph.error(optimum))
 
@@ -110,11 +110,16 @@ def test_the_error_states_eliminated_are_the_processes_covariance(mutant: bool) 
     assert same == (not mutant)
 
 
+def mounted(chain: Chain, mount: tuple[float, float, float]) -> Chain:
+    sensor = msgspec.structs.replace(chain.config.sensor, mount=mount)
+    return replace(chain, config=msgspec.structs.replace(chain.config, sensor=sensor))
+
+
 def test_the_derivatives_are_those_of_the_residuals() -> None:
     chain = standing(LASTING)
     poses = [np.array([[0.1 * i, 0.2, 0.3 * i] for i in range(4)])]
     graph = profile_graph(gtsam, [chain], poses, LANDMARKS, None, BiasSigmas())
-    values = add_errors(values_of(gtsam, poses, LANDMARKS), [chain])
+    values = add_errors(gtsam, values_of(gtsam, poses, LANDMARKS), [chain])
     values.update(bias_key(0), np.array([0.02, 0.01, 0.03]))
     for look in looks_of([chain]):
         values.update(look.key, np.array([0.7, -0.4]))
@@ -127,7 +132,8 @@ def test_the_derivatives_are_those_of_the_residuals() -> None:
     assert (ahead - behind) / h == pytest.approx(slope, rel=1e-5)
 
 
-def test_a_sighting_ties_the_poses_of_one_time() -> None:
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.5, -0.2, 0.3)])
+def test_a_sighting_ties_the_bases_poses_of_one_time(mount: tuple[float, float, float]) -> None:
     there = np.array([3.0, 4.0, 1.0])
     seen = NodeSighting(
         2 * 10**9, "r2", np.array([5.5, 0.9]), np.array([[0.04, 0.001], [0.001, 0.01]]), (1,)
@@ -136,10 +142,12 @@ def test_a_sighting_ties_the_poses_of_one_time() -> None:
         replace(standing(LASTING), sightings=(seen,)),
         standing(LASTING, "r2", there),
     ]
-    poses = [np.zeros((4, 3)), np.tile(there, (4, 1))]
-    values = add_errors(values_of(gtsam, poses, LANDMARKS), chains)
+    chains = [mounted(chain, mount) for chain in chains]
+    poses = [chain.of_sensor(np.tile(base, (4, 1))) for chain, base in
+             zip(chains, (np.zeros(3), there), strict=True)]  # fmt: skip
+    values = add_errors(gtsam, values_of(gtsam, poses, LANDMARKS), chains)
     costs = []
-    for team in (chains, [standing(LASTING), chains[1]]):
+    for team in (chains, [replace(chains[0], sightings=()), chains[1]]):
         graph = profile_graph(gtsam, team, poses, LANDMARKS, None, BiasSigmas())
         costs.append(2.0 * graph.error(values))
     r = np.array([5.0 - 5.5, np.arctan2(4.0, 3.0) - 0.9])
