@@ -33,7 +33,7 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 .PHONY: run test check docs setup constraints clean
 
 run: $(VENV)/.runtime
-	$(BIN)/teamslam launch waypoints --speed max
+	$(BIN)/teamslam launch waypoints --speed 20
 
 # tests/conftest.py says which worker gets what.
 test: $(VENV)/.dev

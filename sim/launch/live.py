@@ -252,8 +252,8 @@ def _consistency(watch: Watch) -> str:
         if name in figures
     ]
     if landmarks.count:
-        parts.append(f"map NEES per dof {landmarks.mean:.2f}")
-        parts.append(f"{landmarks.coverage:.0%} of landmarks within 95 %")
+        parts.append(f"landmark NEES per dof {landmarks.mean:.2f}")
+        parts.append(f"{landmarks.coverage:.0%} within 95 %")
     return ", ".join(parts)
 
 

@@ -136,6 +136,7 @@ class Link:
             for channel in self._node.listens:
                 bus.subscribe(channel, self._node.journal.robot)
             bus.subscribe(ch.HEAD)
+            bus.subscribe(ch.SET_SUMMARY, ch.robot_node(self._node.journal.robot))
             bus.watch_alive()
             shell.answer(ch.MEASUREMENTS, self._node.journal.robot, self._node.measurements)
             self._hear(shell, bus)

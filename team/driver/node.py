@@ -26,7 +26,8 @@ class SourceNode:
     An incarnation begins on the wire when the robot has had all of the one before: it would drop
     the rest of that. delivered, recorded: how far the robot and a recorder are by their own word.
     done: incarnation, measurements and submaps of the robot's last word; joined: incarnation and
-    submaps that the centre has dealt with.
+    submaps that the centre has dealt with. concluded: without a centre, the robot has its own final
+    map; is_peer: it has a set of its own.
     """
 
     journal: Journal
@@ -36,6 +37,8 @@ class SourceNode:
     recorded: Stream = field(default=(0, 0), init=False)
     done: tuple[int, int, int] = field(default=(0, 0, 0), init=False)
     joined: Stream = field(default=(0, 0), init=False)
+    is_peer: bool = field(default=False, init=False)
+    concluded: bool = field(default=False, init=False)
     pose: m.PoseEstimate | None = field(default=None, init=False)
     warnings: list[str] = field(default_factory=list, init=False)
 
@@ -54,11 +57,12 @@ class SourceNode:
         ch.ROBOT_DONE,
         ch.CENTRAL_PROGRESS,
         ch.RECORDER_PROGRESS,
+        ch.CONCLUDED,
         ch.TEAM_POSE,
         ch.TEAM_END,
         ch.FINAL_MAP,
     )
-    """Of this robot or of the team; beside them the heads of all drivers."""
+    """Of this robot or of the team; beside them the heads of all drivers and the robot's set."""
 
     def begin(self) -> list[Outgoing]:
         """The beginning of the stream for whoever missed it, and how far it is."""
@@ -147,6 +151,9 @@ class SourceNode:
                 self.told_to_end = True
             case m.FusedMap() if message.final:
                 self.finished = True
+            case m.SetSummary() | m.Concluded():
+                self.is_peer = True
+                self.concluded |= isinstance(message, m.Concluded) and message.robot == self._robot
             case m.PoseEstimate():
                 self.pose = message
             case m.StreamHead() if message.robot != self._robot:
@@ -180,12 +187,13 @@ class SourceNode:
 
     @property
     def is_delivered(self) -> bool:
-        """The robot is done with all that there is, the centre with all of its submaps, and a
-        recorder that is there has it: whoever dies now needs nothing of this driver any more.
+        """The robot is done with all that there is, the centre with all of its submaps (a peer has
+        the final map), and a recorder that is there has it: whoever dies now needs nothing of this
+        driver any more.
         """
         newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
         incarnation, measurements, submaps = self.done
-        is_joined = self.joined >= (incarnation, submaps) or not submaps
+        is_joined = self.joined >= (incarnation, submaps) or not submaps or self.concluded
         return (incarnation, measurements) >= newest and is_joined and not self.recorder_lacks
 
     @property
@@ -197,7 +205,8 @@ class SourceNode:
     @property
     def waits_for(self) -> str:
         """Who is not there that is needed, in words; empty: nobody."""
-        missing = [n for n in (ch.robot_node(self._robot), "central") if n not in self.alive]
+        needed = [ch.robot_node(self._robot), *([] if self.is_peer else ["central"])]
+        missing = [node for node in needed if node not in self.alive]
         return " and ".join(missing)
 
     def status(self) -> m.Status:

@@ -21,15 +21,15 @@ MAP_FRAME = "map"
 class TeamFigures(msgspec.Struct, frozen=True):
     """Figures of the team for plots; what is not known is left out.
 
-    Errors are of the map as it lies; map_nees_per_dof takes each landmark by itself (2 degrees of
-    freedom, 1 is right). status: the centre's own figures, the consistency monitor's among them.
+    Errors are of the map as it lies; landmark_nees_per_dof takes each landmark by itself (2 degrees
+    of freedom, 1 is right). status: the centre's own figures, the consistency monitor's among them.
     """
 
     team_time_s: float
     landmarks: int
     robots: int
     map_rmse_m: float | UnsetType = UNSET
-    map_nees_per_dof: float | UnsetType = UNSET
+    landmark_nees_per_dof: float | UnsetType = UNSET
     status: dict[str, float] = msgspec.field(default_factory=dict)
 
 

@@ -276,6 +276,26 @@ def test_a_robot_gets_all_from_a_driver_that_was_killed_and_the_driver_waits_for
         robot.bus.close()
 
 
+def test_without_a_centre_the_robots_own_final_map_is_the_end(tmp_path):
+    driver = Driver("r1", team="lab", file=tmp_path / "r1.stream", patience_s=0.0)
+    drive(driver, range(5))
+    node = driver._node
+    assert node.waits_for == "robot/r1 and central"
+    count = driver._journal.count(1)
+    node.handle(m.Done(stamp_ns=0, robot="r1", incarnation=1, measurements=count, steps=0,
+                       submaps=2, ledger=()), 0)  # fmt: skip
+    assert not node.is_delivered, "its submaps are in no map yet"
+    over = {"stamp_ns": 0, "serial": 1, "digest": bytes(8)}
+    final = over | {"sha256": bytes(32), "submaps": 2}
+    node.handle(m.Concluded(robot="r2", **final), 0)
+    assert not node.is_delivered
+    node.handle(m.Concluded(robot="r1", **final), 0)
+    assert node.is_delivered
+    node.handle(m.SetSummary(node="robot/r1", holdings=(), statements=(), **over), 0)
+    assert node.waits_for == "robot/r1"
+    driver.close()
+
+
 def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path):
     with router() as endpoint:
         driver = Driver("r1", team="lab", connect=endpoint, file=tmp_path / "r1.stream")

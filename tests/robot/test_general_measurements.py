@@ -110,7 +110,7 @@ def test_the_batch_reference_links_the_poses_of_mounted_sensors(noise: NoiseKind
     chains = chains_of(run(of), of)
     measured = sum(len(scan.ids) for chain in chains for scan in chain.scans)
     assert found.cost / (2 * measured - 2 * len(found.ids)) == pytest.approx(1.0, abs=0.15)
-    assert max(found.position_rmse_m.values()) < 0.2, "the base's poses"
+    assert max(found.position_rmse_m.values()) < 0.4, "the base's poses"
     assert max(found.final_pose_nees_per_dof.values()) < 5.0
     elsewhere = tuple(
         msgspec.structs.replace(

@@ -113,7 +113,9 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     nees = history.map_nees
     if len(nees.values):
         seconds = history.seconds(nees.stamps_ns)
-        axis.plot(seconds, nees.values, color=MAP_COLOUR, linewidth=1.4, label="map's landmarks")
+        axis.plot(
+            seconds, nees.values, color=MAP_COLOUR, linewidth=1.4, label="landmarks, each by itself"
+        )
         largest = max(largest, float(nees.values.max()))
     _scale(axis, max(largest, high))
     axis.set_ylabel("NEES per dof")

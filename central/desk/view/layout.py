@@ -25,7 +25,7 @@ def layout(team: str, robots: Sequence[str]) -> str:
                 _line(
                     f"{prefix}/{views.TEAM.key()}.status.covariance_scale", "covariance scale", None
                 ),
-                _line(f"{prefix}/{views.TEAM.key()}.map_nees_per_dof", "map NEES", None),
+                _line(f"{prefix}/{views.TEAM.key()}.landmark_nees_per_dof", "landmark NEES", None),
             ],
         ),
     }

@@ -138,7 +138,7 @@ def test_figures_hold_errors_within_their_bounds_and_the_monitors_cost(read):
     _, team = read["view/team"][-1]
     assert team["landmarks"] > 10
     assert 0.0 < team["map_rmse_m"] < 5.0
-    assert 0.1 < team["map_nees_per_dof"] < 10.0
+    assert 0.1 < team["landmark_nees_per_dof"] < 10.0
 
 
 def test_the_log_view_tells_the_end(read):

@@ -75,7 +75,7 @@ def test_the_table_fits_eighty_columns_with_the_largest_figures() -> None:
         "r3", "12,345", "1,234", "1,000", "12.34", "1.05", "1,500", "150,000", "2.00", "50%",
         "mapping",
     ]  # fmt: skip
-    expected = "joint cost per dof 1.07, map NEES per dof 0.75, 100% of landmarks within 95 %"
+    expected = "joint cost per dof 1.07, landmark NEES per dof 0.75, 100% within 95 %"
     assert expected in lines
 
 

@@ -462,7 +462,7 @@ function drawConsistency() {
   const fits = store.maps.filter((m) => m.nees !== null);
   if (fits.length) {
     line(fits.map((m) => m.t), fits.map((m) => m.nees), { colour: colour('landmark'), width: 1.5 });
-    legend.push(['landmark', 'map NEES']);
+    legend.push(['landmark', 'landmarks, NEES per dof']);
     for (const m of fits) high = Math.max(high, Math.min(1.15 * m.nees, 5));
   }
   drawInnovations();
