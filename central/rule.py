@@ -147,5 +147,7 @@ class FusionRule(ABC):
 
 def rule_of(config: CentralConfig, digest: bytes, robots: Sequence[str]) -> FusionRule:
     """The rule that the configuration names; raises NotInstalledError."""
-    made: type[FusionRule] = loaded(RULES[config.fusion], f"the fusion rule {config.fusion}")
+    made: type[FusionRule] = loaded(
+        RULES[config.fusion].made_by, f"the fusion rule {config.fusion}"
+    )
     return made(config, digest, robots)

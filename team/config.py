@@ -5,10 +5,12 @@ it does not depend on the rate of the odometry: a standard deviation per square 
 a metre driven and of a radian turned; the three add in variance.
 """
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
+
+from team.pairs import ESTIMATORS, RULES
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
@@ -20,30 +22,14 @@ UNNAMED = 2**31
 associates: in a submap 2³¹ + a local index, in the team's map 2³¹ | a name of its first member.
 """
 Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
-Estimator = Literal[
-    "hybrid",
-    "hybrid-thesis",
-    "hybrid-thesis-coded",
-    "ekf-slam",
-    "fastslam1",
-    "fastslam2",
-    "localisation",
-    "dead-reckoning",
-]
 Exchange = Literal["continuous", "rendezvous"]
 """When robots send: each submap as it is closed, or what they hold when one sees another."""
-FusionRule = Literal[
-    "join",
-    "kalman",
-    "kalman-per-axis",
-    "covariance-intersection",
-    "latest",
-    "alone",
-    "svd-join",
-    "svd-join-spherical",
-    "joint-fastslam",
-    "batch",
-]
+if TYPE_CHECKING:
+    Estimator = str
+    FusionRule = str
+else:  # the names of the tables: a row there is a value here
+    Estimator = Literal[tuple(ESTIMATORS)]
+    FusionRule = Literal[tuple(RULES)]
 
 
 class MotionNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

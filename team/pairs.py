@@ -1,91 +1,99 @@
-"""Which estimator may feed which fusion rule, and the channel that the rule consumes."""
+"""The estimators and the fusion rules that there are: one row for each, and which may feed which.
+
+A row names its class as `package.module:name`, found by `team.registry` when it is chosen: so what
+is there for comparison can be left out of an installation.
+"""
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Literal
-
-from team.config import Estimator, FusionRule
+from typing import Literal, NamedTuple
 
 Channel = Literal["submap", "own/map", "measurements"]
+"""What a rule's map rests on. submap: independent, each measurement once. own/map: whole maps.
+measurements: the sensor channels; what the robots run is then for their own poses."""
 
-MAPPERS: tuple[Estimator, ...] = ("hybrid", "hybrid-thesis", "ekf-slam", "fastslam1", "fastslam2")
-AS_CODED: Estimator = "hybrid-thesis-coded"
-LOCALISERS: tuple[Estimator, ...] = ("localisation", "dead-reckoning")
-_CONSUMES: Mapping[FusionRule, tuple[Channel, tuple[Estimator, ...]]] = {
-    "join": ("submap", ("hybrid",)),
-    "kalman": ("own/map", ("hybrid",)),
-    "covariance-intersection": ("own/map", ("hybrid",)),
-    "kalman-per-axis": ("own/map", ("hybrid", "hybrid-thesis", AS_CODED)),
-    "latest": ("own/map", MAPPERS),
-    "alone": ("own/map", (*MAPPERS, AS_CODED, *LOCALISERS)),
-    "svd-join": ("submap", ("hybrid",)),
-    "svd-join-spherical": ("submap", ("hybrid",)),
-    "joint-fastslam": ("measurements", ("hybrid", "dead-reckoning")),
-    "batch": ("measurements", ("hybrid", "dead-reckoning")),
-}
 
-PAIRS: Mapping[tuple[Estimator, FusionRule], Channel] = MappingProxyType(
+class EstimatorRow(NamedTuple):
+    """made_by: a `team.robot.estimator.Factory`. feeds: rules, beside those that name it.
+
+    needs_map: it is told the landmarks.
+    """
+
+    made_by: str
+    feeds: tuple[str, ...] = ()
+    needs_map: bool = False
+
+
+class RuleRow(NamedTuple):
+    """made_by: a `central.rule.FusionRule`. takes: its estimators, beside those that name it.
+
+    feedback: the robots absorb its map again, in lockstep.
+    """
+
+    made_by: str
+    consumes: Channel
+    takes: tuple[str, ...] = ("hybrid",)
+    feedback: bool = False
+
+
+_RUNNING = "team.robot.baselines.running:running_estimator"
+_WHOLE = ("latest", "alone")
+_ROUNDS = "central.baselines.map_rules:ExchangeRule"
+_SVD = "central.baselines.svd_rule:SvdJoinRule"
+_CHEAP = ("hybrid", "dead-reckoning")
+_PER_AXIS = ("hybrid", "hybrid-thesis", "hybrid-thesis-coded")
+
+ESTIMATORS: Mapping[str, EstimatorRow] = MappingProxyType(
     {
-        (estimator, fusion): channel
-        for fusion, (channel, estimators) in _CONSUMES.items()
-        for estimator in estimators
+        "hybrid": EstimatorRow("team.robot.hybrid:HybridEstimator"),
+        "hybrid-thesis": EstimatorRow(_RUNNING, _WHOLE),
+        "hybrid-thesis-coded": EstimatorRow(_RUNNING, ("alone",)),
+        "ekf-slam": EstimatorRow(_RUNNING, _WHOLE),
+        "fastslam1": EstimatorRow(_RUNNING, _WHOLE),
+        "fastslam2": EstimatorRow(_RUNNING, _WHOLE),
+        "localisation": EstimatorRow(_RUNNING, ("alone",), needs_map=True),
+        "dead-reckoning": EstimatorRow(_RUNNING, ("alone",)),
     }
 )
-"""(estimator, rule) → what the centre subscribes to. `submap`: independent, each measurement once.
-`own/map`: whole maps. `measurements`: the sensor channels; what the robots run is then for their
-own poses, so only the default and the cheapest are there. Any other pair has no meaning: only
-`hybrid` makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis,
-and who only localises himself has no map to fuse.
-"""
-CONSUMES: Mapping[FusionRule, Channel] = MappingProxyType(
-    {fusion: channel for fusion, (channel, _) in _CONSUMES.items()}
+RULES: Mapping[str, RuleRow] = MappingProxyType(
+    {
+        "join": RuleRow("central.join_rule:JoinRule", "submap"),
+        "kalman": RuleRow(_ROUNDS, "own/map", feedback=True),
+        "kalman-per-axis": RuleRow(_ROUNDS, "own/map", _PER_AXIS, feedback=True),
+        "covariance-intersection": RuleRow(_ROUNDS, "own/map", feedback=True),
+        "latest": RuleRow("central.baselines.map_rules:LatestRule", "own/map"),
+        "alone": RuleRow("central.baselines.map_rules:AloneRule", "own/map"),
+        "svd-join": RuleRow(_SVD, "submap"),
+        "svd-join-spherical": RuleRow(_SVD, "submap"),
+        "joint-fastslam": RuleRow(
+            "central.baselines.joint_fastslam_rule:JointFastSlamRule", "measurements", _CHEAP
+        ),
+        "batch": RuleRow("central.baselines.batch_rule:BatchRule", "measurements", _CHEAP),
+    }
 )
-"""What each rule's map rests on."""
-FEEDBACK: frozenset[FusionRule] = frozenset(
-    {"kalman", "kalman-per-axis", "covariance-intersection"}
+
+PAIRS: Mapping[tuple[str, str], Channel] = MappingProxyType(
+    {
+        (estimator, rule): RULES[rule].consumes
+        for rule in RULES
+        for estimator, row in ESTIMATORS.items()
+        if estimator in RULES[rule].takes or rule in row.feeds
+    }
 )
+"""(estimator, rule) → what the centre subscribes to. Any other pair has no meaning: only `hybrid`
+makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis, and who
+only localises himself has no map to fuse."""
+FEEDBACK = frozenset(rule for rule, row in RULES.items() if row.feedback)
 """The rules whose map the robots absorb again, in lockstep."""
-NEEDS_MAP: frozenset[Estimator] = frozenset({"localisation"})
+NEEDS_MAP = frozenset(name for name, row in ESTIMATORS.items() if row.needs_map)
 """The estimators that are told the landmarks."""
 
 
-def rules_for(estimator: Estimator) -> list[FusionRule]:
+def rules_for(estimator: str) -> list[str]:
     """The rules that an estimator can feed."""
-    return [fusion for each, fusion in PAIRS if each == estimator]
+    return [rule for each, rule in PAIRS if each == estimator]
 
 
 def named_pairs() -> str:
     """The valid pairs as a user writes them: `hybrid + join, …`."""
-    return ", ".join(f"{estimator} + {fusion}" for estimator, fusion in PAIRS)
-
-
-_RUNNING = "team.robot.baselines.running:running_estimator"
-ESTIMATORS: Mapping[Estimator, str] = MappingProxyType(
-    {
-        "hybrid": "team.robot.hybrid:HybridEstimator",
-        "hybrid-thesis": _RUNNING,
-        "hybrid-thesis-coded": _RUNNING,
-        "ekf-slam": _RUNNING,
-        "fastslam1": _RUNNING,
-        "fastslam2": _RUNNING,
-        "localisation": _RUNNING,
-        "dead-reckoning": _RUNNING,
-    }
-)
-"""Estimator → what makes one (`team.robot.estimator.Factory`), found by `team.registry`."""
-
-RULES: Mapping[FusionRule, str] = MappingProxyType(
-    {
-        "join": "central.join_rule:JoinRule",
-        "kalman": "central.baselines.map_rules:ExchangeRule",
-        "kalman-per-axis": "central.baselines.map_rules:ExchangeRule",
-        "covariance-intersection": "central.baselines.map_rules:ExchangeRule",
-        "latest": "central.baselines.map_rules:LatestRule",
-        "alone": "central.baselines.map_rules:AloneRule",
-        "svd-join": "central.baselines.svd_rule:SvdJoinRule",
-        "svd-join-spherical": "central.baselines.svd_rule:SvdJoinRule",
-        "joint-fastslam": "central.baselines.joint_fastslam_rule:JointFastSlamRule",
-        "batch": "central.baselines.batch_rule:BatchRule",
-    }
-)
-"""Rule → its `central.rule.FusionRule`, found by `team.registry`."""
+    return ", ".join(f"{estimator} + {rule}" for estimator, rule in PAIRS)

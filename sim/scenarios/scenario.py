@@ -242,8 +242,8 @@ def _filled(scenario: Scenario) -> Scenario:
             f"but {' or '.join(rules_for(scenario.estimator))}; valid: {named_pairs()}"
         )
     for what, place in (
-        (f"the estimator {scenario.estimator}", ESTIMATORS[scenario.estimator]),
-        (f"the fusion rule {scenario.fusion}", RULES[scenario.fusion]),
+        (f"the estimator {scenario.estimator}", ESTIMATORS[scenario.estimator].made_by),
+        (f"the fusion rule {scenario.fusion}", RULES[scenario.fusion].made_by),
     ):
         absent = absence(place, what)
         if absent is not None:

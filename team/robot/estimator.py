@@ -164,5 +164,7 @@ def estimator_of(
     known: KnownMap = NOTHING_KNOWN,
 ) -> RobotEstimator:
     """The estimator that the configuration names, at the beginning of an incarnation."""
-    made: Factory = loaded(ESTIMATORS[config.estimator], f"the estimator {config.estimator}")
+    made: Factory = loaded(
+        ESTIMATORS[config.estimator].made_by, f"the estimator {config.estimator}"
+    )
     return made(config, incarnation, initial, known)

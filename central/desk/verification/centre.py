@@ -10,7 +10,7 @@ import msgspec
 
 from central.desk.verification.recorded import Identity, Recorded, Stream, identity
 from central.rule import FusionRule, Inputs, Tail, rule_of
-from team.pairs import CONSUMES, Channel
+from team.pairs import RULES, Channel
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -59,7 +59,7 @@ def _retold(
     config, digest = log.central_config()
     announced = {n.removeprefix("robot/") for n in log.configured if n.startswith("robot/")}
     rule = rule_of(config, digest, sorted(announced.union(log.robots)))
-    inputs = _LogInputs(log, CONSUMES[config.fusion])
+    inputs = _LogInputs(log, RULES[config.fusion].consumes)
     lost = finals[-1].lost if finals else ()
     for fused in (*sorted(maps, key=lambda f: f.exchange), *finals):
         named = inputs.of(fused)

@@ -9,7 +9,7 @@ from team.estimation.baselines import dead_reckoning, ekf_slam, localisation, pl
 from team.estimation.gaussian import NO_LANDMARKS
 from team.estimation.models import Increment, corrected, increment_of
 from team.estimation.randomness import generator
-from team.pairs import LOCALISERS, MAPPERS, PAIRS, rules_for
+from team.pairs import PAIRS, rules_for
 from team.robot.baselines.running import POSE_FLOOR
 from team.robot.estimator import (
     NOTHING_KNOWN,
@@ -23,14 +23,14 @@ from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
-from tests.teams import LANDMARKS, config, driven, of, published, stream
+from tests.teams import LANDMARKS, LOCALISERS, config, driven, of, published, stream
 
 STREAM = stream("r1", 12)
 MEASUREMENTS = published(STREAM)
 KNOWN = KnownMap(np.arange(1, len(LANDMARKS) + 1, dtype=np.uint32), LANDMARKS)
 TOLD = m.KnownMap(stamp_ns=0, ids=from_ids(KNOWN.ids), positions=from_floats(KNOWN.landmarks))
 ALL = sorted({estimator for estimator, _ in PAIRS})
-WHOLE = sorted({*MAPPERS, *LOCALISERS} - {"hybrid", "hybrid-thesis"})
+WHOLE = sorted({"ekf-slam", "fastslam1", "fastslam2", *LOCALISERS})
 UNKNOWN = InitialPose(None, None)
 SPREAD = np.diag([0.2, 0.1, 0.02])
 

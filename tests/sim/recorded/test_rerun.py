@@ -21,7 +21,7 @@ from sim.recorded.noise import with_noise
 from sim.scenarios.checks import ScenarioError
 from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.models import increment_of
-from team.pairs import LOCALISERS, PAIRS
+from team.pairs import PAIRS
 from team.recording.reader import Log
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -29,7 +29,7 @@ from team.wire.arrays import floats, from_floats
 from team.wire.bus import Sample
 from team.wire.codec import encoded
 from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
-from tests.teams import Team, config, stream, world_of
+from tests.teams import LOCALISERS, Team, config, stream, world_of
 
 STEPS = 60
 ODOMETRY_OF_SUBMAP_3 = 35
