@@ -11,11 +11,11 @@ _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
 """How a table names what is found by name (`team.registry`)."""
 
 
-def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
+def sources_of(module: str, packages: tuple[str, ...], *, places: bool = True) -> dict[str, bytes]:
     """The text of a module and of every module of these packages that it imports, near or far.
 
     They are found by their import statements, those inside functions too, and by the places that
-    tables name.
+    tables name; not by these for what calls nothing by name.
     """
     found: dict[str, bytes] = {}
     waiting = [module]
@@ -28,12 +28,12 @@ def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
             continue
         found[name] = path.read_bytes()
         waiting.append(name.rpartition(".")[0])
-        waiting += _imported(found[name])
+        waiting += _imported(found[name], places)
     return found
 
 
 @lru_cache
-def _imported(source: bytes) -> tuple[str, ...]:
+def _imported(source: bytes, places: bool) -> tuple[str, ...]:
     """Modules that a source may use: `from a import b` may mean a.b, a text `a.b:c` means a.b."""
     names: list[str] = []
     for node in ast.walk(ast.parse(source)):
@@ -41,7 +41,7 @@ def _imported(source: bytes) -> tuple[str, ...]:
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
             names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+        elif places and isinstance(node, ast.Constant) and isinstance(node.value, str):
             names += _PLACE.findall(node.value)
     return tuple(names)
 

@@ -45,7 +45,8 @@ def compiled(function: F) -> F:
 def program_of(module: str) -> str:
     """Digest of a module and of every module of ours that it imports, near or far."""
     digest = hashlib.blake2b(digest_size=8)
-    for name, source in sorted(sources_of(module, (module.partition(".")[0],)).items()):
+    package = (module.partition(".")[0],)
+    for name, source in sorted(sources_of(module, package, places=False).items()):
         digest.update(f"{name}\n".encode() + source)
     return digest.hexdigest()
 
