@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
@@ -122,7 +123,8 @@ class Evaluation:
     true_landmarks: all of them, seen or not. notes: what the world had to say of its data, and what
     each node set aside. faults: how many messages were.
     unsound: samples that are no sound message. arbitrary_frame: no robot knew its initial pose, so
-    the map's frame is not the truth's, and only aligned errors mean something.
+    the map's frame is not the truth's, and only aligned errors mean something. decisions: closures
+    and merges by landmarks without names, as the final map says.
     """
 
     scenario: TeamConfig | None
@@ -138,6 +140,7 @@ class Evaluation:
     arbitrary_frame: bool = False
     peers: Mapping[str, PeerResult] = field(default_factory=dict)
     association: AssociationResult | None = None
+    decisions: tuple[m.AssociationDecision, ...] = ()
     gps_median_m: float | None = None
 
 
@@ -181,8 +184,15 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         arbitrary_frame=_is_arbitrary(log),
         peers=peer_results(log),
         association=association,
+        decisions=_decisions(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
     )
+
+
+def _decisions(log: Collected) -> tuple[m.AssociationDecision, ...]:
+    """Closures and merges of landmarks without names, taken, undone and waiting."""
+    final = log.sound(log.last(ch.FINAL_MAP))
+    return final.decisions if isinstance(final, m.FusedMap) else ()
 
 
 def _is_arbitrary(log: Collected) -> bool:
@@ -264,6 +274,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "association": None
         if evaluation.association is None
         else association_json(evaluation.association),
+        "association_decisions": [msgspec.structs.asdict(each) for each in evaluation.decisions],
         "reference_rmse_m": None
         if errors is None or evaluation.association is None
         else errors.aligned_rmse_m,

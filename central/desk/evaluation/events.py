@@ -189,7 +189,7 @@ def decision_words(decision: m.AssociationDecision) -> str:
     """A closure or a merge with its figures, and why it was undone."""
     figures = (
         f"{decision.pairs} landmarks, log-likelihood ratio {decision.llr:.0f} against "
-        f"{decision.rival_llr:.0f}, share {decision.share:.2f}"
+        f"{decision.rival_llr:.0f}, share {decision.share:.2f}, {decision.absent} absent"
     )
     if decision.kind == "undone":
         return f"a closure of {decision.about} is undone: {decision.why} ({figures})"

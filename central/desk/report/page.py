@@ -21,6 +21,14 @@ from central.desk.pictures.time import (
     timeline_picture,
     traffic_picture,
 )
+from central.desk.report.identities import (
+    DECISION_HEADINGS,
+    DECISION_NOTE,
+    SCORE_HEADINGS,
+    decision_rows,
+    score_note,
+    score_rows,
+)
 from central.desk.report.run import Run
 from central.desk.report.tables import (
     OWN_HEADINGS,
@@ -142,6 +150,7 @@ def _page(
     sections = [
         ("Map", [_image(pictures, "map", wide=False), *_own_maps(run)]),
         ("Robots", _robots(run, pictures)),
+        ("Landmarks", _identities(run)),
         ("Peers", _peers(run)),
         ("Consistency", _consistency(run, pictures)),
         ("Paths", _paths(run)),
@@ -162,6 +171,16 @@ def _page(
         f"<style>{_STYLE}</style>\n<h1>{title}</h1>\n<nav>{links}</nav>\n"
         f"{_table((), team_rows(run.evaluation), words=True)}\n{_notes(run)}\n{body}\n</html>\n"
     )
+
+
+def _identities(run: Run) -> list[str]:
+    """How landmarks without names were told apart, and which closures and merges were decided."""
+    parts = []
+    if (found := run.evaluation.association) is not None:
+        parts += [_table(SCORE_HEADINGS, score_rows(found)), _note(score_note(found))]
+    if decisions := run.evaluation.decisions:
+        parts += [_table(DECISION_HEADINGS, decision_rows(decisions)), _note(DECISION_NOTE)]
+    return parts
 
 
 def _peers(run: Run) -> list[str]:

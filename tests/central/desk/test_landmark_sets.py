@@ -1,4 +1,8 @@
+import msgspec
+
+from central.desk.evaluation.association import AssociationResult, Pairs
 from central.desk.evaluation.events import EventTeller
+from central.desk.report.identities import decision_rows, score_note, score_rows
 from central.desk.view.landmark_sets import sets_of
 from team.wire import messages as m
 from tests.support import examples
@@ -20,7 +24,7 @@ def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone() -> None:
     first = [each for each in teller.take(FUSED, 0) if each.kind == "closure"]
     assert [each.text for each in first] == [
         "alpha (incarnation 1) and bravo (incarnation 0) merged by their maps: 12 landmarks, "
-        "log-likelihood ratio 40 against 6, share 0.75"
+        "log-likelihood ratio 40 against 6, share 0.75, 0 absent"
     ]
     (decision,) = FUSED.decisions
     undone = m.AssociationDecision(
@@ -38,3 +42,37 @@ def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone() -> None:
         "undone"
     ]
     assert not [each for each in teller.take(again, 0) if each.kind in ("closure", "undone")]
+
+
+def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why() -> None:
+    (made,) = FUSED.decisions
+    waits = msgspec.structs.replace(made, kind="waits", why="evidence 3 < 12", absent=9)
+    undone = msgspec.structs.replace(made, kind="undone", why="share 0.41 < 0.5")
+    rows = decision_rows([made, undone, waits])
+    assert [row[0].partition(":")[0] for row in rows] == ["undone", "merge", "waits"]
+    assert [row[-1] for row in rows] == ["share 0.41 < 0.5", "", "evidence 3 < 12"]
+    assert rows[2][1:6] == ("0.0", "12", "40", "9", "5")
+
+
+def test_the_report_has_the_scores_inside_windows_and_over_all() -> None:
+    def pairs(missed: int) -> Pairs:
+        return Pairs(right=30, wrong=10, missed=missed, wrong_detections=1, detections=50)
+
+    found = AssociationResult(
+        pairs=pairs(30),
+        inside=pairs(0),
+        label_of={},
+        landmarks=9,
+        duplicates=2,
+        duplicates_confirmed=1,
+        merges_right=4,
+        merges_wrong=0,
+        merges_refused=3,
+        left_out=0,
+        clutter_in_map=0,
+    )
+    assert score_rows(found) == [
+        ("inside windows", "0.75000", "1.0000", "0.8571", "2.000 %"),
+        ("over all", "0.75000", "0.5000", "0.6000", "2.000 %"),
+    ]
+    assert "4 rightly, 0 wrongly; 3 attempts wait" in score_note(found)

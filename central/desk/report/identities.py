@@ -1,0 +1,66 @@
+"""The tables on landmarks without names: their scores, and what was decided of them."""
+
+from collections.abc import Sequence
+
+from central.desk.evaluation.association import AssociationResult, Pairs
+from central.desk.report.tables import shown
+from team.wire import messages as m
+
+SCORE_HEADINGS = ("pairs of detections", "precision", "recall", "F1", "wrong\ndetections")
+DECISION_HEADINGS = (
+    "decision", "at [s]", "pairs", "LLR", "absent", "rival's\npairs", "rival's\nevidence", "share",
+    "sd [m]", "why",
+)  # fmt: skip
+DECISION_NOTE = (
+    "LLR: log-likelihood ratio of the pairs; absent: landmarks that one side has where the other "
+    "looked and has none, which speak against; share: of the landmarks there, matched ones. What "
+    "waits failed the test that is named; what is undone was taken back by a later one."
+)
+LISTED = 200
+"""Decisions in the table; report.json has them all."""
+
+
+def score_rows(found: AssociationResult) -> list[tuple[str, ...]]:
+    """The scores inside windows and over all."""
+    return [_row("inside windows", found.inside), _row("over all", found.pairs)]
+
+
+def _row(name: str, pairs: Pairs) -> tuple[str, ...]:
+    return (
+        name,
+        shown(pairs.precision, ".5f", ""),
+        shown(pairs.recall, ".4f", ""),
+        shown(pairs.f1, ".4f", ""),
+        shown(pairs.wrong_percent, ".3f", " %"),
+    )
+
+
+def score_note(found: AssociationResult) -> str:
+    """What else the labels say, in words."""
+    return (
+        f"{found.landmarks} landmarks without names, {found.duplicates} of them duplicates, "
+        f"{found.duplicates_confirmed} among those of two submaps or more; pairs of robots that "
+        f"share landmarks: {found.merges_right} rightly, {found.merges_wrong} wrongly; "
+        f"{found.merges_refused} attempts wait. Scored by labels that no node hears."
+    )
+
+
+def decision_rows(decisions: Sequence[m.AssociationDecision]) -> list[tuple[str, ...]]:
+    """A row for each closure and merge, the newest of what happened first, then what waits."""
+    made = [each for each in decisions if each.kind != "waits"]
+    waits = [each for each in decisions if each.kind == "waits"]
+    return [
+        (
+            f"{each.kind}: {each.about}",
+            f"{each.stamp_ns * 1e-9:.1f}",
+            str(each.pairs),
+            f"{each.llr:.0f}",
+            str(each.absent),
+            str(each.rival_pairs),
+            f"{each.rival_llr:.0f}",
+            f"{each.share:.2f}",
+            f"{each.sd:.2f}",
+            each.why,
+        )
+        for each in [*reversed(made), *waits][:LISTED]
+    ]
