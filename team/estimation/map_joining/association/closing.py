@@ -23,7 +23,7 @@ BEND = 8.0
 """So many radii of one object may two maps be bent against each other within a patch."""
 WEAK = 2
 """An alignment with so many times fewer votes than the best one has pairs is no rival of it."""
-LOOKED_AT = 24
+LOOKED_AT = 80
 """So many alignments are looked at, those with the most matched points."""
 TRIED = 8
 """So many of them are grown: those of which the least is absent for what is matched."""

@@ -8,15 +8,15 @@ that is not looked for is a rival that is not seen.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 
-from team.estimation.map_joining.alignment import procrustes
-
-MOST_BINS = 40
+MOST_BINS = 80
 """So many of the motions with the most votes are refined."""
 ANGLE_BIN = np.radians(6.0)
 REFINEMENTS = 4
 MOST_HYPOTHESES = 100_000
+MOST_DISTANCES = 2_000_000
+"""So many distances between points are held at once."""
 
 
 class Points(NamedTuple):
@@ -43,18 +43,21 @@ def voted(a: Points, b: Points, tolerance: float, longest: float) -> list[Vote]:
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
     centre = a.mean.mean(axis=0)
+    proposed = _proposed(a.mean - centre, b.mean, tolerance, longest)
+    most = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
     found = [
-        _refined(a, b, centre, motion, tolerance)
-        for motion in _proposed(a.mean - centre, b.mean, tolerance, longest)
+        vote
+        for k in range(0, len(proposed), most)
+        for vote in _refined(a, b, centre, np.array(proposed[k : k + most]), tolerance)
     ]
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
-    paired: list[Int64[np.ndarray, " n"]] = []
+    paired = np.full((len(found), len(a.mean)), -1)
     for vote in found:
-        if len(vote.first) >= 2 and not any(_is_variant(vote, other) for other in paired):
+        same = (paired[: len(distinct), vote.first] == vote.second).sum(axis=1)
+        if (2 * same < len(vote.first)).all():  # else a variant of another one
+            paired[len(distinct), vote.first] = vote.second
             distinct.append(vote)
-            paired.append(np.full(len(a.mean), -1))
-            paired[-1][vote.first] = vote.second
     return distinct
 
 
@@ -131,22 +134,61 @@ def _refined(
     a: Points,
     b: Points,
     centre: Float[np.ndarray, "2"],
-    motion: Float[np.ndarray, "3"],
+    motions: Float[np.ndarray, "B 3"],
     tolerance: float,
-) -> Vote:
-    """The motion that the nearest neighbours agree on, with a tolerance that narrows to its own."""
+) -> list[Vote]:
+    """The motions that the nearest neighbours agree on, with a tolerance that narrows to its own.
+
+    Those that no two points agree on are left out.
+    """
     local = a.mean - centre
-    first = second = np.zeros(0, np.int64)
     for step in range(REFINEMENTS):
-        first, second = _neighbours(
-            moved(motion, local), b.mean, tolerance * (1.5 if step < 2 else 1.0)
-        )
-        if len(first) < 2:
-            break
-        if step < REFINEMENTS - 1:
-            weights = 1.0 / (a.sd[first] ** 2 + b.sd[second] ** 2 + tolerance**2)
-            motion = procrustes(b.mean[second], local[first], weights)
-    return Vote(motion, first, second)
+        reach = tolerance * (1.5 if step < 2 else 1.0)
+        to, agree = _neighbours(motions, local, b.mean, reach)
+        lasting = agree.sum(axis=1) >= 2
+        motions, to, agree = motions[lasting], to[lasting], agree[lasting]
+        if step < REFINEMENTS - 1 and len(motions):
+            weights = agree / (a.sd**2 + b.sd[to] ** 2 + tolerance**2)
+            motions = _aligned(local, b.mean[to], weights)
+    return [
+        Vote(motion, np.flatnonzero(own), of[own])
+        for motion, of, own in zip(motions, to, agree, strict=True)
+    ]
+
+
+def _neighbours(
+    motions: Float[np.ndarray, "B 3"],
+    a: Float[np.ndarray, "n 2"],
+    b: Float[np.ndarray, "m 2"],
+    reach: float,
+) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
+    """Of each point the nearest one of b, and whether they are each other's and within reach."""
+    c, s = np.cos(motions[:, 2:]), np.sin(motions[:, 2:])
+    x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
+    y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]
+    away = (x[:, :, None] - b[:, 0]) ** 2 + (y[:, :, None] - b[:, 1]) ** 2
+    to_b, to_a = away.argmin(axis=2), away.argmin(axis=1)
+    nearest = np.take_along_axis(away, to_b[:, :, None], axis=2)[:, :, 0]
+    mutual = np.take_along_axis(to_a, to_b, axis=1) == np.arange(len(a))
+    return to_b, mutual & (nearest < reach**2)
+
+
+def _aligned(
+    a: Float[np.ndarray, "n 2"],
+    to: Float[np.ndarray, "B n 2"],
+    weights: Float[np.ndarray, "B n"],
+) -> Float[np.ndarray, "B 3"]:
+    """The argmin over (x, y, θ) of Σ w ‖to − R(θ) a − (x, y)‖² for each of B."""
+    share = weights / weights.sum(axis=1, keepdims=True)
+    from_, onto = share @ a, (share[:, :, None] * to).sum(axis=1)
+    p, q = a - from_[:, None], to - onto[:, None]
+    along = (share[:, :, None] * p * q).sum(axis=(1, 2))
+    across = (share * (p[:, :, 0] * q[:, :, 1] - p[:, :, 1] * q[:, :, 0])).sum(axis=1)
+    angle = np.arctan2(across, along)
+    c, s = np.cos(angle), np.sin(angle)
+    x = onto[:, 0] - c * from_[:, 0] + s * from_[:, 1]
+    y = onto[:, 1] - s * from_[:, 0] - c * from_[:, 1]
+    return np.column_stack([x, y, angle])
 
 
 def moved(
@@ -156,22 +198,3 @@ def moved(
     c, s = np.cos(motion[2]), np.sin(motion[2])
     placed: Float[np.ndarray, "n 2"] = points @ np.array([[c, s], [-s, c]]) + motion[:2]
     return placed
-
-
-def _neighbours(
-    a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"], tolerance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points that are each other's nearest neighbours, within the tolerance."""
-    away = np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
-    to_b, to_a = away.argmin(axis=1), away.argmin(axis=0)
-    index = np.arange(len(a))
-    mutual = (to_a[to_b] == index) & (away[index, to_b] < tolerance)
-    return index[mutual], to_b[mutual]
-
-
-def _is_variant(vote: Vote, other: Int64[np.ndarray, " n"]) -> bool:
-    """Whether most of its pairs are those of another alignment: then it is no rival of it.
-
-    other: of each point the one that the other alignment pairs it with, or −1.
-    """
-    return bool(2 * np.count_nonzero(other[vote.first] == vote.second) >= len(vote.first))
