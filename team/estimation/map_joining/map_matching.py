@@ -48,6 +48,9 @@ from team.estimation.map_joining.merging import Merge, placed
 from team.estimation.map_joining.minima import minimum
 from team.estimation.map_joining.submap_graph import tied
 
+PART = 15
+"""So many neighbouring landmarks vote by themselves for where they lie."""
+
 
 def recognised(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
     """The fold after the association of a tick's submaps; itself where none has unnamed ones."""
@@ -108,7 +111,7 @@ def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
     if min(len(patch), len(target)) < profile.closure_pairs:
         return fold
     others = sorted({*range(len(view.seen_by))}.difference(submaps))
-    sides = _side(view, patch, submaps), _side(view, target, others)
+    sides = _patch_side(view, patch, submaps), _side(view, target, others)
     found = closure(
         *sides,
         lambda _: (view.joint, sides[1]),
@@ -208,6 +211,19 @@ def _side(view: View, at: Indices, submaps: Sequence[int]) -> Side:
     return Side(at, points, at, np.arange(len(at)), renumbered(seen, place))
 
 
+def _patch_side(view: View, patch: Indices, submaps: Sequence[int]) -> Side:
+    """A patch, with the landmarks from each of its submaps on, until they are PART or more."""
+    parts = []
+    for first in range(len(submaps)):
+        part = union([])
+        for k in submaps[first:]:
+            part = np.union1d(part, view.seen_by[k])
+            if len(part) >= PART:
+                parts.append(np.searchsorted(patch, part))
+                break
+    return _side(view, patch, submaps)._replace(parts=tuple(parts))
+
+
 def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
     return Decision(
         stamp_ns=view.stamp_ns,
@@ -241,7 +257,7 @@ def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Vie
         ),
         mine.joint.apart[np.ix_(patch, patch)],
     )
-    of_patch = _side(mine, patch, submaps)._replace(at=np.arange(n))
+    of_patch = _patch_side(mine, patch, submaps)._replace(at=np.arange(n))
 
     def laid_on(view: View) -> tuple[Side, Callable[[Vote], tuple[Joint, Side]]]:
         side = _side(view, np.arange(len(view.ids)), range(len(view.seen_by)))

@@ -23,13 +23,13 @@ BEND = 8.0
 """So many radii of one object may two maps be bent against each other within a patch."""
 WEAK = 2
 """An alignment with so many times fewer votes than the best one has pairs is no rival of it."""
-LOOKED_AT = 80
+LOOKED_AT = 120
 """So many alignments are looked at, those with the most matched points."""
 TRIED = 8
 """So many of them are grown: those of which the least is absent for what is matched."""
 WORTH = 3.0
 """About what a matched point adds to the log-likelihood ratio, for which are grown."""
-SEEDS = 1
+SEEDS = 3
 """So many pairs of seeds are tried for each."""
 
 
@@ -37,7 +37,7 @@ class Side(NamedTuple):
     """Landmarks of one side: where they are in the joint Gaussian, their places and spreads.
 
     names: what they are called, for who asks. within: which of the whole side's they are.
-    views: which of the whole side's were seen together.
+    views: which of the whole side's were seen together. parts: of the whole side's, neighbours.
     """
 
     at: Indices
@@ -45,6 +45,7 @@ class Side(NamedTuple):
     names: Indices
     within: Indices
     views: Views
+    parts: tuple[Indices, ...] = ()
 
 
 class Alignment(NamedTuple):
@@ -100,7 +101,9 @@ def aligned(
     joint_of: the joint Gaussian of both given a proposed alignment, and what of the target is in
     it.
     """
-    votes = voted(patch.points, target.points, tolerance(profile), reach(profile))[:LOOKED_AT]
+    votes = voted(patch.points, target.points, tolerance(profile), reach(profile), patch.parts)[
+        :LOOKED_AT
+    ]
     votes.sort(key=lambda vote: -_promise(vote, patch, target, profile))
     found: list[Alignment] = []
     most = 0

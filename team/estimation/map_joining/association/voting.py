@@ -5,16 +5,19 @@ that many pairs propose are refined by the nearest neighbours. No place is left 
 that is not looked for is a rival that is not seen.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-MOST_BINS = 80
+MOST_BINS = 60
 """So many of the motions with the most votes are refined."""
 ANGLE_BIN = np.radians(6.0)
 REFINEMENTS = 4
 MOST_HYPOTHESES = 100_000
+OF_A_PART = 16
+"""So many of a part's motions are refined on all points."""
 MOST_DISTANCES = 2_000_000
 """So many distances between points are held at once."""
 
@@ -34,28 +37,48 @@ class Vote(NamedTuple):
     second: Int64[np.ndarray, " k"]
 
 
-def voted(a: Points, b: Points, tolerance: float, longest: float) -> list[Vote]:
+def voted(
+    a: Points,
+    b: Points,
+    tolerance: float,
+    longest: float,
+    parts: Sequence[Int64[np.ndarray, " _"]] = (),
+) -> list[Vote]:
     """Distinct rigid motions of a onto b by falling number of matched points.
 
     tolerance: how far matched points may lie apart [m]. longest: pairs of points that are farther
-    apart do not vote [m], since maps are not rigid over any distance.
+    apart do not vote [m], since maps are not rigid over any distance. parts: of a, each of which
+    votes by itself too: where two maps share a small place that lies far from the middle of a, the
+    votes of all its points scatter.
     """
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
     centre = a.mean.mean(axis=0)
-    proposed = _proposed(a.mean - centre, b.mean, tolerance, longest)
-    most = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
-    found = [
-        vote
-        for k in range(0, len(proposed), most)
-        for vote in _refined(a, b, centre, np.array(proposed[k : k + most]), tolerance)
-    ]
+    motions = [_proposed(a.mean - centre, b.mean, tolerance, longest)]
+    for part in parts:
+        if not 2 <= len(part) < len(a.mean):
+            continue
+        own = Points(a.mean[part], a.sd[part])
+        middle = own.mean.mean(axis=0)
+        proposed = _proposed(own.mean - middle, b.mean, tolerance, longest)
+        found = _distinct(_refined(own, b, middle, proposed, tolerance), len(part))[:OF_A_PART]
+        if found:
+            moving = np.array([vote.motion for vote in found])
+            c, s = np.cos(moving[:, 2]), np.sin(moving[:, 2])
+            x, y = centre - middle
+            moving[:, :2] += np.column_stack([c * x - s * y, s * x + c * y])
+            motions.append(moving)
+    return _distinct(_refined(a, b, centre, np.concatenate(motions), tolerance), len(a.mean))
+
+
+def _distinct(found: list[Vote], points: int) -> list[Vote]:
+    """Those that are no variant of one with more matched points, by falling number of them."""
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
-    paired = np.full((len(found), len(a.mean)), -1)
+    paired = np.full((len(found), points), -1)
     for vote in found:
         same = (paired[: len(distinct), vote.first] == vote.second).sum(axis=1)
-        if (2 * same < len(vote.first)).all():  # else a variant of another one
+        if (2 * same < len(vote.first)).all():
             paired[len(distinct), vote.first] = vote.second
             distinct.append(vote)
     return distinct
@@ -63,7 +86,7 @@ def voted(a: Points, b: Points, tolerance: float, longest: float) -> list[Vote]:
 
 def _proposed(
     a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"], tolerance: float, longest: float
-) -> list[Float[np.ndarray, "3"]]:
+) -> Float[np.ndarray, "_ 3"]:
     """The motions (of a's origin, its centroid) in the bins with the most votes."""
     shortest = 4.0 * tolerance
     i, j, length_a = _baselines(a, shortest, longest)
@@ -92,7 +115,7 @@ def _proposed(
             [c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]]
         )
         motions.append(np.column_stack([0.5 * (b[p] + b[q]) - moved, turn]))
-    return _peaks(np.concatenate(motions), 3.0 * tolerance)
+    return np.array(_peaks(np.concatenate(motions), 3.0 * tolerance)).reshape(-1, 3)
 
 
 def _baselines(
@@ -141,6 +164,22 @@ def _refined(
 
     Those that no two points agree on are left out.
     """
+    most = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
+    return [
+        vote
+        for k in range(0, len(motions), most)
+        for vote in _refined_together(a, b, centre, motions[k : k + most], tolerance)
+    ]
+
+
+def _refined_together(
+    a: Points,
+    b: Points,
+    centre: Float[np.ndarray, "2"],
+    motions: Float[np.ndarray, "B 3"],
+    tolerance: float,
+) -> list[Vote]:
+    """As `_refined`, with all distances held at once."""
     local = a.mean - centre
     for step in range(REFINEMENTS):
         reach = tolerance * (1.5 if step < 2 else 1.0)
