@@ -3,6 +3,7 @@
 #   make run        a team maps a random place; what `make test` needs is not installed for it
 #   make test       all tests
 #   make check      format, lint, strict types, the direction of imports
+#   make bench      the benchmarks against their committed baselines; half an hour on a free machine
 #   make docs       the documentation site, docs/_build/site/index.html, and the pictures of its gallery
 #   make setup      what all of these need
 #   make constraints    writes constraints.txt and the hashes anew from what .venv holds
@@ -30,7 +31,7 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 .DEFAULT_GOAL := run
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: run test check docs setup constraints clean
+.PHONY: run test check bench docs setup constraints clean
 
 run: $(VENV)/.runtime
 	$(BIN)/teamslam launch waypoints --speed 20
@@ -46,15 +47,22 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+bench: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.every
+
 # The pictures are made once; `make clean` lets them be made anew.
 PICTURES := docs/generated
-docs: $(VENV)/.dev $(PICTURES)/run/report.html $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png
+docs: $(VENV)/.dev $(PICTURES)/run/report.html $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
+  $(PICTURES)/benchmarks.png
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs docs/_build/site
 	@echo "docs/_build/site/index.html"
 
 $(PICTURES)/run/report.html: | $(VENV)/.dev
 	rm -rf $(@D)
 	$(BIN)/teamslam launch waypoints --speed max --output $(@D)
+
+$(PICTURES)/benchmarks.png: benchmarks/chart.py $(wildcard benchmarks/*.json) | $(VENV)/.dev
+	$(BIN)/python -m benchmarks.chart $(@D)
 
 $(PICTURES)/%.png: examples/%.py | $(VENV)/.dev
 	mkdir -p $(@D)

@@ -1,6 +1,6 @@
 """How the centre's cost grows with the length of a run: time, memory and bytes per broadcast.
 
-    python benchmarks/growth.py [--robots 5] [--landmarks 50] [--at 250,500,1000,2500] [--json FILE]
+    python -m benchmarks.growth [--robots 5] [--landmarks 50] [--at 250,500,1000,2500] [--json FILE]
 
 Synthetic submaps, drawn about a known truth, go through the rule `join` without a network: all
 robots end a window in each tick, then comes a broadcast. At each size: CPU per tick with its
@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.baseline import worse
 from central.config import CentralConfig
 from central.join_rule import JoinRule
 from team import translate
@@ -30,7 +31,6 @@ from team.wire.arrays import floats, from_floats, ids
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
 
-BASELINE = Path(__file__).with_suffix(".json")
 TICK_S = 10.0
 WINDOW = 25
 """Ticks of which the median is told."""
@@ -170,18 +170,6 @@ def figures(rows: list[dict[str, float]]) -> dict[str, float]:
     }
 
 
-def worse(found: dict[str, float]) -> list[str]:
-    """What is worse than the baseline allows, in words."""
-    said = []
-    for name, of in json.loads(BASELINE.read_text())["figures"].items():
-        bound = of["value"] * (1.0 + of["tolerance"])
-        if found[name] > bound:
-            said.append(
-                f"{name} is {found[name]:.4g}, it was {of['value']:.4g}, at most {bound:.4g}"
-            )
-    return said
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--robots", type=int, default=5)
@@ -196,7 +184,7 @@ def main() -> int:
     if told.json:
         told.json.write_text(json.dumps(found, indent=1) + "\n")
     standard = (told.robots, told.landmarks, at[-1]) == (5, 50, 2500)
-    problems = worse(found["figures"]) if standard and BASELINE.exists() else []
+    problems = worse(found["figures"], "growth") if standard else []
     print("\n".join(problems), file=sys.stderr)
     return 1 if problems else 0
 

@@ -1,6 +1,6 @@
 """ROS 2 bags: how fast they are imported beside the library's plain reading; damage is survived.
 
-    python benchmarks/importing.py [--messages 40000] [--damaged 1000000] [--json FILE]
+    python -m benchmarks.importing [--messages 40000] [--damaged 1000000] [--json FILE]
 
 A bag of odometry and detections is written as .mcap and .db3, read plainly (every message
 deserialised by rosbags), and imported to a folder. Then so many damaged payloads are decoded: each
@@ -18,13 +18,13 @@ from pathlib import Path
 
 from rosbags.highlevel import AnyReader
 
+from benchmarks.baseline import worse
 from sim.importing.bag import imported_bag
 from team.ros2.decoding import READERS, DamagedError, decode
 from team.ros2.definitions import types
 from tests.ros2 import messages as ros
 from tests.ros2.test_decoding import SAMPLES
 
-BASELINE = Path(__file__).with_suffix(".json")
 ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 PERIOD_NS = 10_000_000
 ODOMETRY_PER_SCAN = 9
@@ -104,13 +104,9 @@ def main() -> int:
     print(json.dumps(figures, indent=1))
     if asked.json:
         asked.json.write_text(json.dumps(figures, indent=1) + "\n")
-    worse = wrong > 0
-    for name, told in json.loads(BASELINE.read_text())["figures"].items():
-        worst = told["value"] * (1.0 + told["tolerance"])
-        if figures[name] > worst:
-            print(f"{name}: {figures[name]}, was {told['value']}, at most {worst:.2f}")
-            worse = True
-    return int(worse)
+    problems = worse(figures, "importing")
+    print("\n".join(problems))
+    return int(bool(problems))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The recorder under load: is everything that was published in the log, and what does it cost?
 
-    python benchmarks/recorder.py [--robots 10] [--hz 100] [--seconds 60] [--json FILE]
+    python -m benchmarks.recorder [--robots 10] [--hz 100] [--seconds 60] [--json FILE]
 
 Real processes in real time: a router, `teamslam record`, and publishers that send each robot's
 odometry and observations at this rate. Then, per key, published = recorded, and the log is sound.
@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.baseline import worse
 from sim.scenarios.scenario import dumps, load, with_options
 from team.recording.check import checked
 from team.recording.reader import open_log
@@ -30,7 +31,6 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.zenoh.bus import ZenohBus
 
-BASELINE = Path(__file__).with_suffix(".json")
 PUBLISHERS = 2
 LANDMARKS = 5
 """Seen in one observation."""
@@ -122,8 +122,9 @@ def measured(robots: int, hz: float, seconds: float, folder: Path) -> dict[str, 
             began_cpu, began = cpu_s(recorder.pid), time.monotonic()
             publishers = [
                 subprocess.Popen(
-                    [sys.executable, __file__, "--publish", endpoint, scenario.team,
-                     *names[k::PUBLISHERS], "--hz", str(hz), "--seconds", str(seconds)],
+                    [sys.executable, "-m", "benchmarks.recorder",
+                     "--publish", endpoint, scenario.team, *names[k::PUBLISHERS],
+                     "--hz", str(hz), "--seconds", str(seconds)],
                     stdout=subprocess.PIPE, text=True,
                 )
                 for k in range(PUBLISHERS)
@@ -203,17 +204,6 @@ def _no_map() -> m.FusedMap:
     )
 
 
-def worse(figures: dict[str, Any]) -> list[str]:
-    """What is worse than the baseline allows, in words."""
-    found = []
-    for name, of in json.loads(BASELINE.read_text())["figures"].items():
-        value, was, share = figures[name], of["value"], of["tolerance"]
-        bound = was * (1.0 + share) if of["better"] == "less" else was * (1.0 - share)
-        if (value > bound) if of["better"] == "less" else (value < bound):
-            found.append(f"{name} is {value:.4g}, it was {was:.4g} and may be {bound:.4g}")
-    return found
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--robots", type=int, default=10)
@@ -232,7 +222,7 @@ def main() -> int:
     if told.json:
         told.json.write_text(json.dumps(figures, indent=1) + "\n")
     problems = [*figures["findings"], *(f"{k}: {v}" for k, v in figures["lost"].items())]
-    problems += worse(figures) if BASELINE.exists() else []
+    problems += worse(figures, "recorder")
     print("\n".join(problems) or "nothing lost, nothing worse", file=sys.stderr)
     return 1 if problems else 0
 

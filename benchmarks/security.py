@@ -1,6 +1,6 @@
 """What keys and the fault boundary cost: messages per second and latency, as ratios in one run.
 
-    python benchmarks/security.py [--messages 20000] [--rounds 5] [--json FILE]
+    python -m benchmarks.security [--messages 20000] [--rounds 5] [--json FILE]
 
 Links: a router, a publisher and a receiver, each a process with Zenoh on loopback; once open over
 TCP, once with certificates and access control over TLS, alternating. Throughput: observations of
@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.baseline import worse
 from team.containment import Boundary
 from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
@@ -36,10 +37,9 @@ from team.wire.codec import encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 
-BASELINE = Path(__file__).with_suffix(".json")
 TEAM = "bench"
 PINGS = 500
-_HERE = [sys.executable, str(Path(__file__).resolve())]
+_HERE = [sys.executable, "-m", "benchmarks.security"]
 
 
 def observations(i: int) -> m.Observations:
@@ -185,17 +185,6 @@ def measured(count: int, rounds: int) -> dict[str, Any]:
     }
 
 
-def worse(figures: dict[str, Any]) -> list[str]:
-    """What is worse than the baseline allows, in words."""
-    found = []
-    for name, of in json.loads(BASELINE.read_text())["figures"].items():
-        value, was, share = figures[name], of["value"], of["tolerance"]
-        bound = was * (1.0 + share) if of["better"] == "less" else was * (1.0 - share)
-        if (value > bound) if of["better"] == "less" else (value < bound):
-            found.append(f"{name} is {value:.4g}, it was {was:.4g} and may be {bound:.4g}")
-    return found
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--messages", type=int, default=20_000)
@@ -215,7 +204,7 @@ def main() -> int:
     print(json.dumps(figures, indent=1))
     if told.json:
         told.json.write_text(json.dumps(figures, indent=1))
-    found = worse(figures)
+    found = worse(figures, "security")
     print("\n".join(found) or f"within the baseline; load {os.getloadavg()[0]:.1f}")
     return 1 if found else 0
 

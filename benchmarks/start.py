@@ -1,6 +1,6 @@
 """What the processes of a launch cost: forked from the warm template, and each from scratch.
 
-    python benchmarks/start.py [--scenario waypoints] [--robots N] [--json FILE]
+    python -m benchmarks.start [--scenario waypoints] [--robots N] [--json FILE]
 
 The same team is launched twice, without views. first_s: from the start of the template to the first
 measurement on the bus. cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. Only
@@ -17,14 +17,13 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from benchmarks.baseline import worse
 from sim.launch.launch import launch
 from sim.launch.plan import Plan
 from sim.launch.processes import Starter
 from sim.scenarios.scenario import Scenario, load, with_options
 from team.recording.reader import open_log
 from team.wire.channels import SENSORS
-
-BASELINE = Path(__file__).with_suffix(".json")
 
 
 def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> dict[str, Any]:
@@ -81,16 +80,6 @@ def measured(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def worse(figures: dict[str, Any]) -> list[str]:
-    """What is worse than the baseline allows, in words."""
-    found = []
-    for name, of in json.loads(BASELINE.read_text())["figures"].items():
-        bound = of["value"] * (1.0 + of["tolerance"])
-        if figures[name] > bound:
-            found.append(f"{name} is {figures[name]:.4g}, it was {of['value']:.4g}")
-    return found
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--scenario", default="waypoints")
@@ -101,7 +90,7 @@ def main() -> int:
     print(json.dumps(figures, indent=1))
     if told.json:
         told.json.write_text(json.dumps(figures, indent=1) + "\n")
-    problems = worse(figures) if BASELINE.exists() else []
+    problems = worse(figures, "start")
     print("\n".join(problems) or "nothing worse", file=sys.stderr)
     return 1 if problems else 0
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.lapack import dpotri, dtrtrs
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
@@ -26,6 +26,9 @@ class LandmarkGaussian(NamedTuple):
 
 
 NO_LANDMARKS = LandmarkGaussian(np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 0)))
+
+
+EPSILON = float(np.finfo(np.float64).eps)
 
 
 class NotACovarianceError(ValueError):
@@ -56,9 +59,17 @@ def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
     except np.linalg.LinAlgError:
         raise NotACovarianceError(what, "not positive definite") from None
     pivots = np.diag(factor) / sigmas
-    if (pivots * pivots <= len(covariance) * np.finfo(np.float64).eps).any():
+    if (pivots * pivots <= len(covariance) * EPSILON).any():
         raise NotACovarianceError(what, "not positive definite")
     return factor
+
+
+def whitened(L: Matrix, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """L⁻¹ e of a lower triangular L, n > 0: `scipy.linalg.solve_triangular` and its bits, in a
+    tenth of its time for the few rows of a keyframe.
+    """
+    solved, _ = dtrtrs(L.T, error, lower=0, trans=1)
+    return np.asarray(solved)
 
 
 def information(covariance: Matrix, what: str) -> Matrix:

@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
-from scipy.linalg import solve_triangular
 
 from team.config import Sensor
 from team.estimation.compiled import compiled
-from team.estimation.gaussian import cholesky_factor
+from team.estimation.gaussian import cholesky_factor, whitened
 from team.estimation.geometry import compose, tangent, wrapped
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor, slots_of
@@ -141,8 +140,8 @@ def joint_innovation(
 
 def _squared(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> Innovation:
     L = cholesky_factor(S, "the prediction of measurements")
-    whitened = solve_triangular(L, error, lower=True)
-    return Innovation(float(whitened @ whitened), len(error))
+    white = whitened(L, error)
+    return Innovation(float(white @ white), len(error))
 
 
 @compiled

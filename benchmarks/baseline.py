@@ -1,0 +1,54 @@
+"""The committed figures of a benchmark, and whether a run is worse than they allow.
+
+`benchmarks/NAME.json` has the `command`, where it was `measured`, and of each of its `figures` the
+`value`, which direction is `better` ("less" or "more"), and the `tolerance`: the share by which a
+figure may be worse. Ratios of two halves of one run hold on any machine; others say on which.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).parent
+
+
+class Held(NamedTuple):
+    """A figure beside its baseline: at worst it may be `bound`."""
+
+    name: str
+    value: float
+    was: float
+    bound: float
+    better: str
+
+    @property
+    def is_worse(self) -> bool:
+        """Beyond its bound, or no number at all."""
+        within = self.value <= self.bound if self.better == "less" else self.value >= self.bound
+        return not within
+
+
+def baselines() -> dict[str, dict[str, Any]]:
+    """All that are committed, by the benchmark's name."""
+    read = {path.stem: json.loads(path.read_text()) for path in sorted(HERE.glob("*.json"))}
+    return {name: told for name, told in read.items() if "figures" in told}
+
+
+def held(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held]:
+    """Each figure of the baseline beside what a run has found."""
+    rows = []
+    for name, of in baseline["figures"].items():
+        sign = 1.0 if of["better"] == "less" else -1.0
+        bound = of["value"] * (1.0 + sign * of["tolerance"])
+        rows.append(Held(name, float(figures[name]), of["value"], bound, of["better"]))
+    return rows
+
+
+def worse(figures: Mapping[str, float], name: str) -> list[str]:
+    """What is worse than the baseline `name` allows, in words."""
+    return [
+        f"{row.name} is {row.value:.4g}, it was {row.was:.4g} and may be {row.bound:.4g}"
+        for row in held(figures, baselines()[name])
+        if row.is_worse
+    ]

@@ -1,0 +1,119 @@
+"""What takes seconds: parts of a robot's step against each other, in one run.
+
+    python -m benchmarks.ratios [--rounds 7] [--json FILE]
+
+in_a_run: an interval of odometry as the segmenter takes it, against composing it at once.
+improved: a step of FastSLAM 2.0 against one of 1.0, 100 particles and four known landmarks.
+innovation: the NIS of that step against the step. CPU time, the halves of a ratio alternate, each
+is the least of its rounds. Held against benchmarks/ratios.json; exit status 1 if one is worse.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.baseline import worse
+from team.config import MotionModel, MotionNoise, Sensor
+from team.estimation.hybrid_slam.fastslam import Particles, Proposal, stepped
+from team.estimation.hybrid_slam.innovation import innovation
+from team.estimation.hybrid_slam.keyframes import Segmenter
+from team.estimation.models import Increment, increment_of
+
+MOTION = MotionModel(forward=MotionNoise(per_m=0.03), turn=MotionNoise(per_rad=0.1))
+SENSOR = Sensor(range_sigma=0.2, bearing_sigma=0.03)
+PARTICLES, KNOWN, SEEN = 100, 12, 4
+INTERVALS = 300
+INTERVAL_NS = 15_000_000
+
+
+def least(parts: list[Callable[[], None]], rounds: int) -> list[float]:
+    """CPU seconds of each part, the least of all rounds; the parts take turns."""
+    took = [[_cpu_s(part) for part in parts] for _ in range(rounds + 1)]
+    return np.min(took[1:], axis=0).tolist()  # the first round compiles or loads
+
+
+def _cpu_s(part: Callable[[], None]) -> float:
+    began = time.process_time()
+    part()
+    return time.process_time() - began
+
+
+def composed_at_once() -> None:
+    """Each interval's motion is made and composed by itself."""
+    motion = Increment.identity()
+    for _ in range(INTERVALS):
+        motion = motion.then(increment_of(MOTION, INTERVAL_NS * 1e-9, 0.3, 0.1))
+
+
+def composed_in_a_run() -> None:
+    """The same intervals through the segmenter, which is asked at the end."""
+    segmenter = Segmenter(MOTION, Sensor(), 0.0)
+    segmenter.begin(0)
+    for k in range(1, INTERVALS + 1):
+        segmenter.drive(k * INTERVAL_NS, INTERVAL_NS, 0.3, 0.1)
+    segmenter.cut(INTERVALS * INTERVAL_NS)
+
+
+def steps() -> list[Callable[[], None]]:
+    """A step of FastSLAM 1.0 and of 2.0, and the innovation before it, thirty times each."""
+    rng = np.random.default_rng(1)
+    landmarks = rng.uniform(-20.0, 20.0, (KNOWN, 2))
+    spread = np.zeros((PARTICLES, KNOWN, 3))
+    spread[..., 0] = spread[..., 2] = 0.05
+    particles = Particles(
+        rng.normal(0.0, 0.05, (PARTICLES, 3)),
+        np.full(PARTICLES, -np.log(PARTICLES)),
+        np.arange(KNOWN, dtype=np.uint32),
+        landmarks + rng.normal(0.0, 0.1, (PARTICLES, KNOWN, 2)),
+        spread,
+    )
+    motion = increment_of(MOTION, 1.0, 0.5, 0.1)
+    x, y = landmarks[:SEEN].T
+    seen = particles.ids[:SEEN], np.hypot(x, y), np.arctan2(y, x)
+
+    def step(proposal: Proposal) -> Callable[[], None]:
+        def taken() -> None:
+            for _ in range(30):
+                stepped(particles, motion, SENSOR, *seen, proposal, np.random.default_rng(2))
+
+        return taken
+
+    def judged() -> None:
+        for _ in range(30):
+            innovation(particles, motion, SENSOR, *seen)
+
+    return [step("fastslam1"), step("fastslam2"), judged]
+
+
+def measured(rounds: int) -> dict[str, float]:
+    """The ratios."""
+    at_once, in_a_run = least([composed_at_once, composed_in_a_run], rounds)
+    plain, improved, judged = least(steps(), rounds)
+    return {
+        "in_a_run": in_a_run / at_once,
+        "improved": improved / plain,
+        "innovation": judged / improved,
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--json", type=Path)
+    told = parser.parse_args()
+    figures = measured(told.rounds)
+    print(json.dumps(figures, indent=1))
+    if told.json:
+        told.json.write_text(json.dumps(figures, indent=1) + "\n")
+    problems = worse(figures, "ratios")
+    print("\n".join(problems) or "nothing worse", file=sys.stderr)
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
