@@ -8,6 +8,7 @@ import typer
 
 from sim.cli.options import (
     WRONG_USE,
+    IdentitiesOption,
     Robots,
     ScenarioArgument,
     Seed,
@@ -46,16 +47,23 @@ def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")],
     robots: Robots = None,
     seed: Seed = None,
+    identities: IdentitiesOption = None,
 ) -> None:
-    """Write a scenario's world as a data set in the UTIAS format, with a scenario that runs it."""
+    """Write a scenario's world as a data set, with a scenario that runs it.
+
+    In the UTIAS format; with hidden identities as CSV tables, detections and their labels apart.
+    """
+    from sim.datasets.folder_writer import write_folder
     from sim.datasets.utias_writer import write_utias
     from sim.scenarios.source import streams_of
-    from sim.scenarios.toml import data_set_scenario
+    from sim.scenarios.toml import data_set_scenario, folder_scenario
 
     if output.exists() and any(output.iterdir()):
         fail(f"{output} is not empty: give a new folder", WRONG_USE)
-    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed)
-    write_utias(streams_of(resolved), output)
+    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, identities=identities)
+    hidden = getattr(resolved.world, "identities", "known") == "hidden"
+    (write_folder if hidden else write_utias)(streams_of(resolved), output)
     beside = output / "scenario.toml"
-    beside.write_text(data_set_scenario(resolved), encoding="utf-8")
+    text = folder_scenario(resolved) if hidden else data_set_scenario(resolved)
+    beside.write_text(text, encoding="utf-8")
     typer.echo(f"wrote {output}; `teamslam launch {beside}` runs the team on it")

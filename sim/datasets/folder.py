@@ -5,6 +5,8 @@ r1/odometry.csv       t_s with forward_m_s,yaw_rate_rad_s or x_m,y_m,theta_rad o
                       wheel_speed_m_s,steering_rad
 r1/observations.csv   t_s,landmark with range_m,bearing_rad (with c_rr,c_rb,c_bb) or
                       x_m,y_m (with c_xx,c_xy,c_yy)
+r1/detections.csv     t_s,range_m,bearing_rad without identities, and r1/labels.csv for scoring
+                      (`sim.datasets.detections_table`)                   (optional)
 r1/sightings.csv      t_s,teammate with range_m,bearing_rad or x_m,y_m    (optional)
 r1/start.csv          x_m,y_m,theta_rad, with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt  (optional)
 r1/truth.csv          t_s,x_m,y_m,theta_rad                               (optional)
@@ -21,6 +23,7 @@ from jaxtyping import Float, Int64
 
 from sim.datasets import folder_tables as rows
 from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.detections_table import detections_of, together
 from sim.datasets.folder_files import EXPECTED, left_out, opened_folder
 from sim.datasets.folder_odometry import intervals_of
 from sim.datasets.tables import DatasetError, File
@@ -99,7 +102,9 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
 
 @dataclass(frozen=True)
 class RobotRows:
-    """One robot's tables in order of time; looked: when it looked and saw nothing."""
+    """One robot's tables in order of time; looked: when it looked and saw nothing; unnamed: its
+    detections without identities.
+    """
 
     robot: str
     start: StartPose | None
@@ -110,6 +115,7 @@ class RobotRows:
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]
+    unnamed: Detections | None = None
 
     @property
     def start_ns(self) -> int:
@@ -120,6 +126,7 @@ class RobotRows:
             self.seen.stamps_ns[:1],
             self.looked[:1],
             self.met.stamps_ns[:1],
+            np.empty(0, np.int64) if self.unnamed is None else self.unnamed.stamps_ns[:1],
         )
         return int(np.concatenate(first).min())
 
@@ -134,6 +141,7 @@ class RobotRows:
             seen=self.seen.where(self.seen.stamps_ns <= last_ns),
             looked=self.looked[self.looked <= last_ns],
             met=self.met.where(self.met.stamps_ns <= last_ns),
+            unnamed=_within(self.unnamed, (0, last_ns)),
             truth_ns=self.truth_ns[:samples],
             truth=self.truth[:samples],
         )
@@ -152,11 +160,13 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
         notes.append("no odometry: only what it saw is given")
     seen, looked, said = rows.measurements_of(observed, "measurement", None, driven)
     notes += said
-    if not len(seen.stamps_ns):
+    unnamed = _within(detections_of(place, robot), driven)
+    if not len(seen.stamps_ns) and unnamed is None:
         notes.append("no observations: only its odometry is given")
     met, _, said = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
     notes += said
-    if driven is None and not len(seen.stamps_ns) and not len(met.stamps_ns):
+    saw = len(seen.stamps_ns) or len(met.stamps_ns) or unnamed is not None
+    if driven is None and not saw:
         raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
     truth_ns, poses, said = rows.truth_of(truth)
     notes += said if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
@@ -170,7 +180,16 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
         truth_ns=truth_ns,
         truth=poses,
         notes=tuple(notes),
+        unnamed=unnamed,
     )
+
+
+def _within(seen: Detections | None, driven: tuple[int, int] | None) -> Detections | None:
+    """The scans from the first of these times to the last."""
+    if seen is None or driven is None:
+        return seen
+    first, last = np.searchsorted(seen.stamps_ns, [driven[0], driven[1] + 1])
+    return seen.only(int(first), int(last))
 
 
 def _apart(read: Sequence[RobotRows]) -> list[str]:
@@ -203,7 +222,7 @@ def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> R
         start_ns=read.start_ns,
         start=None if starts_unknown(world, read.robot) else read.start,
         intervals=read.intervals,
-        observations=_with_empty(read.seen.grouped(), read.looked),
+        observations=together(_with_empty(read.seen.grouped(), read.looked), read.unnamed),
         sightings=read.met.grouped(),
         teammates=tuple(clocks),
         truth_ns=read.truth_ns if known else None,

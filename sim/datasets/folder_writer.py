@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sim.datasets.detections_table import rows_of, split
 from sim.datasets.folder_tables import (
     INCREMENTS,
     POINT_COVARIANCE,
@@ -39,8 +40,13 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
     place.mkdir(exist_ok=True)
     if len(stream.intervals.end_ns):
         write_table(place / "odometry.csv", *_odometry(stream))
-    seen, met = stream.landmark_detections, stream.teammate_detections
-    write_table(place / "observations.csv", *_measured(seen, "landmark", seen.ids.tolist()))
+    (seen, unnamed), met = split(stream.landmark_detections), stream.teammate_detections
+    if unnamed is None or len(seen.stamps_ns):
+        write_table(place / "observations.csv", *_measured(seen, "landmark", seen.ids.tolist()))
+    if unnamed is not None:
+        columns, told, labels = rows_of(unnamed)
+        write_table(place / "detections.csv", columns, ((seconds(t), *row) for t, row in told))
+        write_table(place / "labels.csv", ("landmark",), ((label,) for label in labels))
     if len(met.ids):
         names = [stream.teammates[i] for i in met.ids]
         write_table(place / "sightings.csv", *_measured(met, "teammate", names))

@@ -14,6 +14,7 @@ GarbageKind = Literal["reading", "identity", "drop"]
 Steering = Literal["together", "turn-first"]
 OdometryForm = Literal["speeds", "increments", "steering"]
 LandmarkForm = Literal["ranges", "points"]
+Layout = Literal["uniform", "twins", "rooms"]
 Point = tuple[float, float]
 
 
@@ -24,7 +25,9 @@ class SimulatedWorld(
 
     radius_m: the place is a disc about (0, 0) instead: random landmarks and way-points have a
     radius that is uniform up to it and a uniform direction, and robots start at its centre.
-    landmarks: their positions, or landmark_count of them at random.
+    landmarks: their positions, or landmark_count of them at random. layout: how those lie:
+    "uniform"; as "twins", each with another one twin_m beside it; or in "rooms": a grid of
+    rooms × rooms equal squares that all have the same pattern, which no map can tell apart.
     paths: path i is the way-points of robot i. A robot without one drives to random way-points at
     up to speed_m_s and turn_rate_rad_s, a way-point being reached within way_point_tolerance_m;
     way_point_count: to so many of them, and the world ends, before `steps`, when all robots have.
@@ -57,6 +60,9 @@ class SimulatedWorld(
     step_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 1.0
     landmarks: tuple[Point, ...] = ()
     landmark_count: Annotated[int, Meta(ge=0, le=100_000)] = 0
+    layout: Layout = "uniform"
+    twin_m: Positive = 1.0
+    rooms: Annotated[int, Meta(ge=1, le=100)] = 3
     paths: tuple[tuple[Point, ...], ...] = ()
     speed_m_s: Positive = 1.0
     turn_rate_rad_s: Positive = 1.0

@@ -52,7 +52,7 @@ def _hidden(
     untagged = _rows(seen, message, kept & ~named, hidden=True)
     if hiding.clutter:
         untagged = _with_clutter(untagged, hiding, rng)
-    both = _in_order([*parts, untagged])
+    both = in_order([*parts, untagged])
     # A scan that saw nothing stays a measurement, whichever kind it is.
     return with_observations(stream, both)
 
@@ -110,7 +110,7 @@ def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) ->
     )
 
 
-def _in_order(parts: list[Detections]) -> Detections:
+def in_order(parts: list[Detections]) -> Detections:
     """The messages of all by time; at one time those with names first."""
     if len(parts) == 1:
         return parts[0]

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int64, UInt32
 
 from sim.world.config import SimulatedWorld, starts_unknown
 from sim.world.forms import claimed, increments_told, seen_from, steering_told, with_errors
+from sim.world.layouts import laid_out
 from sim.world.odometry import slip, told
 from sim.world.outliers import spoilt
 from sim.world.paths import Drive, Limits, Pose, Step, driven, followed
@@ -77,6 +78,8 @@ def generator(seed: int, *names: str) -> np.random.Generator:
 
 
 def _landmarks(world: SimulatedWorld, seed: int) -> Float[np.ndarray, "L 2"]:
+    if world.landmark_count and world.layout != "uniform":
+        return laid_out(world, generator(seed, "world", "landmarks"))
     if world.landmark_count:
         uniform = generator(seed, "world", "landmarks").random((world.landmark_count, 2))
         return _places(world, uniform)

@@ -25,6 +25,9 @@ from team.estimation.association.smoothing import Smoothed, predicted_by
 
 LEAST = 0.1
 """What is seen at all is in view with this probability at least."""
+WIDER, FARTHER = 0.5, 1.25
+"""A view goes on by so much [rad] beside the outermost bearing, and to so many times the median
+range at least: a robot that stands sees one landmark at one place, and looks at more."""
 ROUNDS = 30
 SETTLED = 1e-6
 
@@ -69,9 +72,9 @@ def view_of(scans: Scans) -> View:
     bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
     along = scans.points / np.maximum(ranges, 1e-6)[:, None]
     noise = np.sqrt(np.einsum("ni,nij,nj->n", along, scans.covariances, along))
-    farthest = float((ranges - 2.0 * noise).max())
-    least, most = (float(value) for value in (bearings.min(), bearings.max()))
-    area = max(0.5 * max(most - least, 0.1) * farthest**2, 1e-9)
+    farthest = max(float((ranges - 2.0 * noise).max()), FARTHER * float(np.median(ranges)))
+    least, most = float(bearings.min()) - WIDER, float(bearings.max()) + WIDER
+    area = max(0.5 * min(most - least, 2.0 * np.pi) * farthest**2, 1e-9)
     looks = len(np.unique(scans.keyframes))
     return View(len(ranges) / (looks * area), area, looks, farthest, least, most)
 

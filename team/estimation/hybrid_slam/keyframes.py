@@ -259,6 +259,8 @@ class Segmenter:
         """What has been driven since somebody asked is in the motions."""
         if not self._run:
             return
+        if self._since_look is not None:
+            self._since_look = self._run.behind(self._since_look)
         node = Increment.identity() if self._grid is None else self._grid.since_node
         after = self._run.driven(self._increment, node, self._forward, self._scan_motion)
         self._increment = Increment(after.motion, after.covariance)

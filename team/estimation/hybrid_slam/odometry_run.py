@@ -71,6 +71,14 @@ class OdometryRun:
         course = course_of(self._motion, duration_ns * 1e-9, over.forward, over.yaw_rate)
         self._rows.append((*course, *over.forward_column(self._motion, duration_ns).tolist()))
 
+    def behind(self, motion: Increment) -> Increment:
+        """A motion with all of them behind it; they stay."""
+        none = np.zeros(3)
+        still = none, np.zeros((3, 3))
+        since = Since(motion.mean, motion.covariance, none, *still, none)
+        after = gone_on(since, np.array(self._rows), self._motion.kind == "turn-then-drive")
+        return Increment(after.motion, after.covariance)
+
     def driven(
         self,
         increment: Increment,

@@ -1,0 +1,117 @@
+"""Detections without identities in a robot's folder of a data set.
+
+r1/detections.csv   t_s,range_m,bearing_rad, with c_rr,c_rb,c_bb and diameter_m if there are any
+r1/labels.csv       landmark: row by row of detections.csv, -1 for clutter; for scoring (optional)
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import UInt32
+
+from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
+from sim.datasets.tables import File
+from sim.datasets.utias_rows import on_circle
+from sim.world.identities import in_order
+from sim.world.streams import NO_LABEL, Detections
+
+COLUMNS = ("t_s", *POLAR, *POLAR_COVARIANCE, "diameter_m")
+LABELS = ("landmark",)
+FILES = ("detections.csv", "labels.csv")
+
+
+def detections_of(place: File, robot: str) -> Detections | None:
+    """A robot's detections without identities; None where it has none. Raises DatasetError.
+
+    Rows of one time are one scan; the ids are the labels, NO_LABEL of what nobody has labelled.
+    """
+    table = _read(place, FILES[0], robot, COLUMNS)
+    if table is None or not len(table):
+        return None
+    if not table.has(*POLAR):
+        raise table.fault(f"no detection in its columns; give t_s,{','.join(POLAR)}")
+    stamps = table.stamps("t_s")
+    if (np.diff(stamps) < 0).any():
+        raise table.fault("its rows are not in order of time")
+    ranges, bearings = table.numbers(*POLAR).T
+    if (ranges < 0.0).any():
+        raise table.error(int(np.argmax(ranges < 0.0)), "range_m", "below 0")
+    claims = table.has(*POLAR_COVARIANCE)
+    first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
+    return Detections(
+        stamps_ns=stamps[first],
+        offsets=np.append(first, len(stamps)).astype(np.int64),
+        ids=_labels(_read(place, FILES[1], robot, LABELS), len(stamps)),
+        ranges=ranges.copy(),
+        bearings=on_circle(bearings),
+        covariances=table.numbers(*POLAR_COVARIANCE) if claims else None,
+        hidden=np.ones(len(first), np.bool_),
+        signatures=table.numbers("diameter_m")[:, 0] if table.has("diameter_m") else None,
+    )
+
+
+def together(named: Detections, unnamed: Detections | None) -> Detections:
+    """Both kinds of scans by time."""
+    if unnamed is None:
+        return named
+    told = replace(named, hidden=np.zeros(len(named.stamps_ns), np.bool_))
+    return in_order([told, unnamed]) if len(named.stamps_ns) else unnamed
+
+
+def rows_of(
+    seen: Detections,
+) -> tuple[Sequence[str], Iterable[tuple[int, Sequence[float]]], Sequence[int]]:
+    """Columns of detections.csv, its rows (stamp [ns], numbers), and the labels."""
+    numbers = np.column_stack((seen.ranges, seen.bearings))
+    columns = ["t_s", *POLAR]
+    if seen.covariances is not None:
+        numbers = np.hstack((numbers, seen.covariances))
+        columns += POLAR_COVARIANCE
+    if seen.signatures is not None:
+        numbers = np.column_stack((numbers, seen.signatures))
+        columns.append("diameter_m")
+    stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets)).tolist()
+    labels = [-1 if label == NO_LABEL else label for label in seen.ids.tolist()]
+    return columns, zip(stamps, numbers.tolist(), strict=True), labels
+
+
+def split(seen: Detections) -> tuple[Detections, Detections | None]:
+    """The scans with names, and those without (None: there are none)."""
+    if seen.hidden is None or not seen.hidden.any():
+        return seen, None
+    return _where(seen, ~seen.hidden), _where(seen, seen.hidden)
+
+
+def _where(seen: Detections, chosen: np.ndarray) -> Detections:
+    """The chosen messages."""
+    rows = np.repeat(chosen, np.diff(seen.offsets))
+    counts = np.diff(seen.offsets)[chosen]
+    return Detections(
+        stamps_ns=seen.stamps_ns[chosen],
+        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        ids=seen.ids[rows],
+        ranges=seen.ranges[rows],
+        bearings=seen.bearings[rows],
+        points=None if seen.points is None else seen.points[rows],
+        covariances=None if seen.covariances is None else seen.covariances[rows],
+        hidden=None if seen.hidden is None else seen.hidden[chosen],
+        signatures=None if seen.signatures is None else seen.signatures[rows],
+    )
+
+
+def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTable | None:
+    file = place / name
+    if not file.is_file():
+        return None
+    return read_table(file, f"{robot}/{name}" if robot else name, columns)
+
+
+def _labels(table: CsvTable | None, rows: int) -> UInt32[np.ndarray, " R"]:
+    if table is None:
+        return np.full(rows, NO_LABEL, np.uint32)
+    labels = table.numbers(*LABELS)[:, 0].astype(np.int64)
+    if len(labels) != rows:
+        raise table.fault(f"{len(labels)} rows, {rows} in detections.csv: row by row, one for each")
+    return np.where(labels < 0, NO_LABEL, labels).astype(np.uint32)

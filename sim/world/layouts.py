@@ -1,0 +1,28 @@
+"""Landmarks that are hard to tell apart: twins, and rooms that are all alike."""
+
+import numpy as np
+from jaxtyping import Float
+
+from sim.world.config import SimulatedWorld
+
+INNER = 0.1
+"""No landmark is nearer to a wall than this part of a room's side."""
+
+
+def laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
+    """landmark_count points of the square; in rooms, as many as are alike in all of them."""
+    if world.layout == "twins":
+        return _twins(world, rng)
+    side = world.size_m / world.rooms
+    each = max(world.landmark_count // world.rooms**2, 1)
+    pattern = side * rng.uniform(INNER, 1.0 - INNER, (each, 2))
+    corners = side * np.stack(np.divmod(np.arange(world.rooms**2), world.rooms), axis=1)
+    return np.asarray((corners[:, None] + pattern[None]).reshape(-1, 2))
+
+
+def _twins(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
+    count = world.landmark_count
+    first = rng.uniform(0.0, world.size_m, ((count + 1) // 2, 2))
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(first))
+    second = first + world.twin_m * np.column_stack((np.cos(angle), np.sin(angle)))
+    return np.asarray(np.concatenate((first, second))[:count])
