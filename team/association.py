@@ -48,7 +48,7 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     margin: NonNegative = 10.0
     ratio: Annotated[float, Meta(ge=1.0)] = 1.5
     island_pairs: Few = 8
-    island_llr: float = 12.0
+    island_llr: float = 15.0
     context: NonNegative = 1.0
     share: Share = 0.7
     undone_below: Share = 0.5

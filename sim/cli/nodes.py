@@ -432,13 +432,17 @@ def verdict(
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     reason: Annotated[str, typer.Option(help="Why, for the log.")] = "seen by an operator",
+    withdraw: Annotated[
+        bool, typer.Option("--withdraw", help="This verdict holds no more, and for good.")
+    ] = False,
     patience: Annotated[
         float, typer.Option(help="Seconds to wait for a map that rests on it.", min=0.0)
     ] = 60.0,
 ) -> None:
     """Tell a running team that two landmarks without names are one, or that they are two.
 
-    The page names them where one clicks on a landmark. The verdict is recorded and stays.
+    The page names them where one clicks on a landmark. The verdict is recorded and stays, until it
+    is withdrawn.
     """
     from sim.launch.verdict import judge, local_landmark
     from sim.launch.withdraw import WithdrawError
@@ -457,11 +461,13 @@ def verdict(
     with connected(team, connect, keys, "operator") as bus:
         try:
             said = Judgement(first=one, second=two, same=word == "same")
-            fused = judge(bus, said, reason, patience, _signer(keys, "operator", team))
+            signer = _signer(keys, "operator", team)
+            fused = judge(bus, said, reason, patience, signer, withdrawn=withdraw)
         except WithdrawError as error:
             fail(str(error), FAILED)
     landmarks = len(ids(fused.ids, "ids"))
-    typer.echo(f"{first} and {second} are {word}; the map of {landmarks} landmarks rests on it")
+    are = "are no more said to be" if withdraw else "are"
+    typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
 
 
 @app.command()

@@ -28,18 +28,28 @@ def judge(
     reason: str,
     patience_s: float,
     signer: Signs | None = None,
+    *,
+    withdrawn: bool = False,
 ) -> m.FusedMap:
     """Say the verdict and wait for the first map that rests on it, a centre's or a peer's.
 
-    signer: the operator's, where there are keys. Raises WithdrawError where there is neither, or no
-    such map within the time.
+    withdrawn: say that it holds no more, and wait for a map without it. signer: the operator's,
+    where there are keys. Raises WithdrawError where there is neither, or no such map within the
+    time.
     """
     for channel in (ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)
     bus.watch_alive()
     await_fold(bus)
     robot = judgement.first.robot
-    verdict = m.Verdict(stamp_ns=0, robot=robot, judgement=judgement, by="operator", reason=reason)
+    verdict = m.Verdict(
+        stamp_ns=0,
+        robot=robot,
+        judgement=judgement,
+        by="operator",
+        reason=reason,
+        withdrawn=withdrawn,
+    )
     ordered(bus, Outgoing(ch.VERDICT, robot, verdict), signer)
     wanted = {judgement.first, judgement.second}
     until = time.monotonic() + patience_s
@@ -48,11 +58,13 @@ def judge(
             _, _, message = opened(sample)
             if not isinstance(message, m.FusedMap):
                 continue
-            if any(
+            holds = any(
                 {each.first, each.second} == wanted and each.same == judgement.same
                 for each in message.verdicts
-            ):
+            )
+            if holds is not withdrawn:
                 return message
             if message.final:
                 raise WithdrawError("the final map was out before the verdict; run the log again")
-    raise WithdrawError(f"no map that rests on it within {patience_s:g} s; the verdict stands")
+    what = "its withdrawal" if withdrawn else "the verdict"
+    raise WithdrawError(f"no map that rests on it within {patience_s:g} s; {what} stands")

@@ -139,3 +139,24 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedM
     assert isinstance(without, m.FusedMap)
     assert with_verdict.digest != without.digest
     assert without.means == final.means
+
+
+def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been() -> None:
+    """Whenever the order comes: before its submaps, among them, behind a broadcast."""
+    order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
+    alone = _rule()
+    for submap in TEAM["r1"]:
+        alone.take(submap, 0)
+    wanted = _final(alone)
+    maps = []
+    for at in (0, 5, 16):
+        rule = _rule()
+        both = [each for pair in zip(TEAM["r1"], TEAM["r2"], strict=True) for each in pair]
+        for k, message in enumerate([*both[:at], order, *both[at:]]):
+            rule.take(message, 0)
+            if k % 6 == 5:
+                rule.broadcasts(message.stamp_ns, message.stamp_ns)
+        maps.append(_final(rule))
+    assert len({encoded(each) for each in maps}) == 1
+    assert (maps[0].means, maps[0].memberships) == (wanted.means, wanted.memberships)
+    assert maps[0].withdrawn == ("r2",)
