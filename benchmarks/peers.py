@@ -1,8 +1,9 @@
 """What a set that spreads costs: bytes of each robot, and the time until all agree, by topology.
 
-`python -m benchmarks.peers [--json FILE]`: peers without estimators, each of which closes a submap
-of 1.2 kB every 10 s for 300 s of team time; every second they talk. The star is what a centre would
-receive of each robot. `benchmarks/peers.json` is what was measured; a run compares itself with it.
+`python -m benchmarks.peers [--json FILE] [--picture FILE]`: peers without estimators, each of which
+closes a submap of 1.2 kB every 10 s for 300 s of team time; every second they talk. The star is
+what a centre would receive of each robot. `benchmarks/peers.json` is what was measured; a run
+compares itself with it.
 """
 
 import argparse
@@ -30,6 +31,7 @@ WINDOW_S = 10
 LANDMARKS = 6
 CUT_S = (100, 200)
 TEAMS = (2, 5, 10, 50)
+TOPOLOGIES = ("all", "line", "ring", "meetings", "partition")
 SECOND_NS = 10**9
 TOLERANCE = 0.05
 
@@ -180,17 +182,49 @@ def measured(topology: str, robots: int) -> dict[str, float]:
     }
 
 
+def drawn(found: dict[str, dict[str, float]], path: Path) -> None:
+    """Bytes per robot and second over the number of robots, a line for each topology."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.8), sharex=True, sharey=True)
+    names = {"said_b_s": "said, a broadcast once", "heard_b_s": "heard"}
+    for axis, (figure_name, title) in zip(axes, names.items(), strict=True):
+        star: list[tuple[int, float]] = []
+        for topology in TOPOLOGIES:
+            rows = sorted(
+                (int(name.partition("/")[2]), row)
+                for name, row in found.items()
+                if name.startswith(f"{topology}/")
+            )
+            robots, values = [n for n, _ in rows], [row[figure_name] for _, row in rows]
+            axis.plot(robots, values, "o-", label=topology, markersize=4)
+            star += [(n, row["star_b_s"]) for n, row in rows]
+        star = sorted(set(star))
+        axis.plot([n for n, _ in star], [b for _, b in star], "k--", label="star, of one robot")
+        axis.set(title=title, xlabel="robots", xscale="log", yscale="log")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("bytes per robot and second")
+    axes[0].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
 def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
     """Measure, print, compare with the baseline; 1 where something has become dearer."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--json", type=Path)
     options.add_argument("--teams", type=int, nargs="*", default=list(TEAMS))
+    options.add_argument("--topologies", nargs="*", default=list(TOPOLOGIES))
+    options.add_argument("--picture", type=Path, help="how it grows with the number of robots")
     chosen = options.parse_args()
     before = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
     found, worse = {}, []
     show("| topology | robots | agree after [s] | said [B/s] | heard [B/s] | star [B/s] |\n")
     show("|---|---|---|---|---|---|\n")
-    for topology in ("all", "line", "ring", "meetings", "partition"):
+    for topology in chosen.topologies:
         for robots in chosen.teams:
             name = f"{topology}/{robots}"
             found[name] = figures = measured(topology, robots)
@@ -201,7 +235,10 @@ def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
                 if old is not None and value > old * (1.0 + TOLERANCE) + 1.0:
                     worse.append(f"{name}: {figure} is {value:.1f}, was {old:.1f}")
     if chosen.json is not None:
-        chosen.json.write_text(json.dumps(found, indent=1) + "\n")
+        there = json.loads(chosen.json.read_text()) if chosen.json.exists() else {}
+        chosen.json.write_text(json.dumps(there | found, indent=1) + "\n")
+    if chosen.picture is not None:
+        drawn(before | found, chosen.picture)
     show("".join(f"worse: {each}\n" for each in worse))
     return 1 if worse else 0
 

@@ -27,23 +27,26 @@ _AS = {
 LISTENS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY)
 """The channels that are heard so."""
 _FOLD = "fold."
+_LAST = (ch.TEAM_FINAL, ch.TEAM_TRAJECTORY)
+"""What counts for the team unless a centre has said it: one that comes back late may lack some."""
 
 
 class Voices:
     """Gives samples a centre's key, one after the other."""
 
     def __init__(self) -> None:
-        self._centre = False
+        self._centre = self._concluded = False
         self._voice: str | None = None
 
     def of(self, sample: Sample) -> Sample | None:
         """The sample as a centre would have said it; None: nothing of the kind."""
         if sample.key in _CENTRE:
             self._centre = True
+            self._concluded = self._concluded or sample.key == ch.FINAL_MAP.key()
         elif sample.key == _TOKEN:
             self._centre = self._centre and _is_alive(sample)
         found = ch.channel_of(sample.key)
-        if self._centre or found is None:
+        if found is None or (self._centre and (self._concluded or found[0] not in _LAST)):
             return None
         channel, name = found
         if channel is ch.STATUS:

@@ -66,6 +66,21 @@ class Keeper:
             self._store = None
 
 
+class Alone:
+    """How long a peer has been left alone: who comes back when all have gone leaves, too."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def since(self, now: float, *, alone: bool) -> bool:
+        """Whether it has been so for LINGER_S."""
+        self._since = (self._since or now) if alone else None
+        left = self._since is not None and now - self._since >= LINGER_S
+        if left:
+            _LOG.warning("the team has ended, and nobody is there who has the rest of the set")
+        return left
+
+
 class PeerShell(RobotShell):
     """A robot's process without a centre: subscribe, go on with what is on disk, run, stay for
     others.
@@ -94,6 +109,7 @@ class PeerShell(RobotShell):
         self.shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
         self._over_since: float | None = None
+        self._alone = Alone()
 
     def run(self) -> None:
         """Until nobody needs this peer any more."""
@@ -150,6 +166,8 @@ class PeerShell(RobotShell):
 
     def _may_leave(self, now: float) -> bool:
         """Nobody needs this peer any more: all have concluded, or the world has left."""
+        if self._alone.since(now, alone=self._peer.is_left_alone):
+            return True
         if self._peer.final is None:
             self._over_since = None
             return False
@@ -183,6 +201,7 @@ class CentreShell:
         self._shell = Shell(bus, self._peer, CENTRE, stop)
         self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
+        self._alone = Alone()
 
     def run(self) -> None:
         """Until every peer has the final map that is here."""
@@ -205,4 +224,5 @@ class CentreShell:
         now = time.monotonic()
         self._shell.publish(self._peer.tick(now))
         self._keeper.save(self._peer)
-        self._peer.finished = self._peer.all_concluded
+        alone = self._alone.since(time.monotonic(), alone=self._peer.is_left_alone)
+        self._peer.finished = self._peer.all_concluded or alone

@@ -28,7 +28,8 @@ class Peer:
 
     finished: whether it may leave: by its shell's word. carried: members that others have brought,
     since somebody has last cleared it. uplink, downlink: bytes of the set's talk that were said,
-    each once, and heard. world_alive: None while no world was heard of.
+    each once, and heard. world_alive: None while no world was heard of. ended: whether somebody has
+    had a final map. others: the robots and the centre that are there, but for this node.
     """
 
     def __init__(
@@ -47,6 +48,8 @@ class Peer:
         self.uplink = self.downlink = 0
         self.carried: list[Member] = []
         self.world_alive: bool | None = None
+        self.ended = False
+        self.others: set[str] = set()
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
@@ -110,12 +113,27 @@ class Peer:
             case m.Liveliness(node="world"):
                 self.world_alive = message.alive
                 return []
+            case m.FusedMap():
+                self.ended = self.ended or message.final
+                return []
             case m.Liveliness():
-                if message.alive and (message.node.startswith("robot/") or message.node == CENTRE):
-                    self.peer.greet()
+                self._meet(message)
                 return self._of_fold(self.fold.note(message))
             case _:
                 return None
+
+    def _meet(self, token: m.Liveliness) -> None:
+        """Somebody comes, who may lack something, or goes."""
+        if token.node == self.name or not (token.node.startswith("robot/") or token.node == CENTRE):
+            return
+        (self.others.add if token.alive else self.others.discard)(token.node)
+        if token.alive:
+            self.peer.greet()
+
+    @property
+    def is_left_alone(self) -> bool:
+        """The team has ended, and nobody is there who has what is missing here."""
+        return self.ended and self.final is None and not self.others
 
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str

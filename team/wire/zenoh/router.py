@@ -13,7 +13,15 @@ from zenoh.handlers import Callback
 
 from team.keys.roster import Roster
 from team.wire.bus import BusError
-from team.wire.channels import ALIVE, FINAL_KEPT, FINAL_MAP, GIVEN_UP, ORDERS_KEPT, TALLY
+from team.wire.channels import (
+    ALIVE,
+    FINAL_KEPT,
+    FINAL_MAP,
+    GIVEN_UP,
+    ORDERS_KEPT,
+    TALLY,
+    TEAM_FINAL,
+)
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FinalMapRequest
 from team.wire.zenoh.access import access_control
@@ -70,7 +78,7 @@ class _Keeper:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._teams: defaultdict[str, Kept] = defaultdict(Kept)
-        for channel in (FINAL_MAP, GIVEN_UP, TALLY):
+        for channel in (FINAL_MAP, TEAM_FINAL, GIVEN_UP, TALLY):
             key = f"team/*/{channel.key('**')}"
             session.declare_subscriber(key, Callback(self._take, indirect=False))
         session.liveliness().declare_subscriber(
@@ -87,7 +95,7 @@ class _Keeper:
 
     def _take(self, sample: zenoh.Sample) -> None:
         kept, key = self._of(sample.key_expr)
-        if key == FINAL_MAP.key():
+        if key == FINAL_MAP.key() or TEAM_FINAL.owner(key) is not None:
             kept.end(sample.payload.to_bytes(), time.monotonic())
         elif (node := GIVEN_UP.owner(key)) is not None:
             kept.order(node, sample.payload.to_bytes())
