@@ -481,6 +481,7 @@ def examples() -> Iterator[m.Message]:
     yield m.FinalMapRequest(stamp_ns=0, node="robot/alpha")
     yield m.FinalMapReply(stamp_ns=0, age_ns=5_000_000_000, final=b"\x91\xc0", missed=True)
     yield m.OrdersRequest(stamp_ns=0)
+    yield m.FoldRequest(stamp_ns=0)
     yield from peers_examples(digest)
     yield m.Fault(
         stamp_ns=9_000,

@@ -18,8 +18,8 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
 
-FoldWhen = Literal["always", "end"]
-"""When a peer folds: as the set grows, or only when the whole set is there."""
+FoldWhen = Literal["always", "request", "end"]
+"""When a peer folds: as the set grows; when asked to, and when all is there; or only then."""
 
 
 class PeerFold:
@@ -46,7 +46,8 @@ class PeerFold:
         self._ordered: m.TeamEnd | None = None
         self.final: m.FusedMap | None = None
         self.finals = 0
-        self._waits = when == "end"
+        self._when = when
+        self._waits = when != "always"
         self._begin()
 
     def _begin(self) -> None:
@@ -116,6 +117,15 @@ class PeerFold:
             self._begin()
         for message in news:
             out += self._give(message)
+        return out
+
+    def ask(self) -> list[Outgoing]:
+        """Fold what is here now, whatever was waited for; what there is to say of it."""
+        if self._when == "end" and self._waits:
+            return []
+        waits, self._waits = self._waits, False
+        out = [*self.grow(), *self.centre.refresh()]
+        self._waits = waits and self.final is None
         return out
 
     def refresh(self) -> list[Outgoing]:

@@ -127,6 +127,7 @@ class PeerShell(RobotShell):
             self.bus.subscribe(channel)
         self.bus.watch_alive()
         self.shell.answer(ch.MEMBERS, self._peer.name, self._peer.answer)
+        self.shell.answer(ch.FOLD, self._peer.robot, self._peer.answer_fold)
 
     def _resume(self) -> bool:
         """Take over what is on disk; whether the stream goes on behind it."""

@@ -15,7 +15,7 @@ from team.peers.proofs import OPERATOR, Proofs
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
+from team.wire.codec import decoded, encoded
 
 TALK = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
 """What the set costs a radio; questions for it, too."""
@@ -29,7 +29,8 @@ class Peer:
     finished: whether it may leave: by its shell's word. carried: members that others have brought,
     since somebody has last cleared it. uplink, downlink: bytes of the set's talk that were said,
     each once, and heard. world_alive: None while no world was heard of. ended: whether somebody has
-    had a final map. others: the robots and the centre that are there, but for this node.
+    had a final map. others: the robots and the centre that are there, but for this node. unsaid: of
+    a fold that was asked for; newest: the last map that was.
     """
 
     def __init__(
@@ -50,6 +51,8 @@ class Peer:
         self.world_alive: bool | None = None
         self.ended = False
         self.others: set[str] = set()
+        self.unsaid: list[Outgoing] = []
+        self.newest: m.FusedMap | None = None
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
@@ -146,7 +149,8 @@ class Peer:
 
     def tick(self, now_s: float) -> list[Outgoing]:
         """What there is to say by now, by any clock that goes on."""
-        return self.counted(self.peer.tick(now_s))
+        unsaid, self.unsaid = self.unsaid, []
+        return [*unsaid, *self.counted(self.peer.tick(now_s))]
 
     def counted(self, out: Sequence[Outgoing]) -> list[Outgoing]:
         """Count what goes out of the set's talk."""
@@ -172,6 +176,14 @@ class Peer:
         self.uplink += sum(len(batch) for batch in answer)
         self.downlink += len(request)
         return answer
+
+    def answer_fold(self, request: bytes) -> list[bytes]:
+        """The answer to a `FoldRequest`: the newest map, once all that is here has been folded."""
+        decoded(request, m.FoldRequest)
+        self.unsaid += self._of_fold(self.fold.ask())
+        maps = [each.message for each in self.unsaid if isinstance(each.message, m.FusedMap)]
+        self.newest = maps[-1] if maps else self.newest
+        return [] if self.newest is None else [encoded(self.newest)]
 
     def set_figures(self) -> dict[str, float]:
         """How much of the set is here, how new, over whom it came, and who has the same."""

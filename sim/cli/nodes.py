@@ -5,7 +5,7 @@ import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
@@ -145,7 +145,11 @@ def robot(
     ] = None,
     fold: Annotated[
         str,
-        typer.Option(help="With --peers: fold the set always, or at the end only.", metavar="WHEN"),
+        typer.Option(
+            help="With --peers: fold the set always, on request (`teamslam map`) and at the end, "
+            "or at the end only.",
+            metavar="always|request|end",
+        ),
     ] = "always",
 ) -> None:
     """A robot: runs its estimator on its sensor stream and publishes submaps, maps and poses.
@@ -195,12 +199,13 @@ def _peer_shell(
     fold: str,
     keys: Path | None,
 ) -> "PeerShell":
+    from central.peers.fold import FoldWhen
     from central.peers.main import PeerShell
     from sim.radio.bus import behind_radio
     from team.peers.store import StoreError
 
-    if fold not in ("always", "end"):
-        fail(f"--fold is always or end, not {fold!r}", WRONG_USE)
+    if fold not in get_args(FoldWhen):
+        fail(f"--fold is always, request or end, not {fold!r}", WRONG_USE)
     signer = _signer(keys, f"robot-{config.id}", scenario.team)
     try:
         door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
@@ -212,7 +217,7 @@ def _peer_shell(
             robots=[each.id for each in scenario.robots],
             store=kept,
             exchange=scenario.exchange,
-            when="end" if fold == "end" else "always",
+            when=cast(FoldWhen, fold),
             signer=signer,
         )
     except StoreError as error:
@@ -390,6 +395,37 @@ def _lost_in(parts: Sequence[Path]) -> tuple[str, ...]:
         except (LogError, WireError, OSError) as error:
             _LOG.debug("%s", error)
     return ()
+
+
+@app.command(name="map")
+def map_(
+    robot: Annotated[str, typer.Argument(help="The peer that is to fold, as r3.")],
+    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for the answer.", min=0.1)
+    ] = 60.0,
+) -> None:
+    """Ask a peer to fold the set that it has now (`--fold request`), and print the map as CSV."""
+    from team.wire.arrays import floats
+    from team.wire.bus import BusError
+    from team.wire.channels import FOLD
+    from team.wire.codec import decoded
+    from team.wire.messages import FoldRequest, FusedMap
+
+    with connected(team, connect, keys, "operator") as bus:
+        try:
+            replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
+        except BusError as error:
+            fail(str(error), FAILED)
+    if not replies:
+        fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
+    fused = decoded(replies[-1], FusedMap)
+    typer.echo("landmark,x,y")
+    means = floats(fused.means, "means").reshape(-1, 2)
+    for landmark, (x, y) in zip(ids(fused.ids, "ids").tolist(), means, strict=True):
+        typer.echo(f"{landmark},{x:.4f},{y:.4f}")
 
 
 @app.command()

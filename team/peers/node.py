@@ -31,6 +31,31 @@ FRESH_S = 25.0
 """A summary that is older says nothing of who is in reach."""
 
 
+GIVEN_BYTES = 8 * 2**20
+"""Of members that one node is given within a second, at the most; all together GIVEN_TO_ALL."""
+GIVEN_TO_ALL = 32 * 2**20
+
+
+class Given:
+    """What was given within the current second, to each node and to all: questions without end
+    cost no more than that.
+    """
+
+    def __init__(self) -> None:
+        self._second = 0
+        self._bytes: dict[str, int] = {}
+
+    def allows(self, node: str, now_s: float) -> bool:
+        """Whether a node may be given more now."""
+        if int(now_s) != self._second:
+            self._second, self._bytes = int(now_s), {}
+        return self._bytes.get(node, 0) < GIVEN_BYTES and sum(self._bytes.values()) < GIVEN_TO_ALL
+
+    def note(self, node: str, size: int) -> None:
+        """It was given so many bytes."""
+        self._bytes[node] = self._bytes.get(node, 0) + size
+
+
 @dataclass
 class Carried:
     """What has come over one node: members that were news, and bytes, news or not."""
@@ -61,7 +86,10 @@ class PeerNode:
         self._said_s = -REPEAT_S
         self._answer_s: float | None = None
         self._heard: dict[str, tuple[float, m.SetSummary]] = {}
-        self._asked: dict[tuple[Stream, int], float] = {}
+        self._asked: dict[tuple[Stream, int], tuple[float, str]] = {}
+        self._failures: dict[str, int] = {}
+        self._given = Given()
+        self._known = frozenset({*map(ch.robot_node, robots), "central"})
         self._fed: dict[Stream, int] = {}
         self._news: list[m.Message] = []
         self.rebuild = False
@@ -154,6 +182,9 @@ class PeerNode:
         """Take another's summary: ask for what it has more, and let it know of what is here."""
         if summary.node == self.node:
             return []
+        if summary.node not in self._known:
+            self._refuse(f"a summary of {summary.node[:80]}, not in this team")
+            return []
         self._heard[summary.node] = self._now_s, summary
         if self._said is not None and summary.digest != self._said:
             self.greet()
@@ -166,9 +197,10 @@ class PeerNode:
     def tick(self, now_s: float) -> list[Outgoing]:
         """What there is to say by now: a summary that is due, questions that were not answered."""
         self._now_s = now_s
-        self._asked = {name: until for name, until in self._asked.items() if until > now_s}
+        self._forget_questions()
         out: list[Outgoing] = []
-        for heard_s, summary in list(self._heard.values()):
+        by_trust = sorted(self._heard, key=lambda node: self._failures.get(node, 0))
+        for heard_s, summary in [self._heard[node] for node in by_trust]:
             if now_s - heard_s < FRESH_S and summary.digest != self.replica.digest:
                 out += self._ask(summary)
         since_s = now_s - self._said_s
@@ -183,6 +215,16 @@ class PeerNode:
             out.append(Outgoing(ch.SET_SUMMARY, self.node, summary))
         return out
 
+    def _forget_questions(self) -> None:
+        """Who has not given what it says to have is asked after the others the next time."""
+        over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
+        for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:
+            self._failures[node] = self._failures.get(node, 0) + 1
+        self._asked = {name: of for name, of in self._asked.items() if name not in over}
+
+    def _lacks(self, stream: Stream, sequence: int) -> bool:
+        return sequence >= 0 and sequence not in self.replica.share_of(stream).complete
+
     def more_of(self, node: str) -> list[Outgoing]:
         """A node has answered: ask for the rest of what it has."""
         heard = self._heard.get(node)
@@ -192,8 +234,8 @@ class PeerNode:
         request = wanted(self.replica, summary, self._asked)
         if request is None:
             return []
-        until_s = self._now_s + PATIENCE_S
-        self._asked |= dict.fromkeys(named(request), until_s)
+        until = self._now_s + PATIENCE_S, summary.node
+        self._asked |= dict.fromkeys(named(request), until)
         asked = m.MembersRequest(
             stamp_ns=request.stamp_ns,
             node=self.node,
@@ -205,7 +247,13 @@ class PeerNode:
     def answer(self, request: bytes) -> list[bytes]:
         """The answer to a `MembersRequest`; raises WireError."""
         wanted_of_us = decoded(request, m.MembersRequest)
-        return [encoded(batch) for batch in self._answered(wanted_of_us)]
+        asker = wanted_of_us.node
+        if not self._given.allows(asker, self._now_s):
+            self._refuse(f"{asker[:80]} asks for more than {GIVEN_BYTES} bytes a second")
+            return []
+        batches = [encoded(batch) for batch in self._answered(wanted_of_us)]
+        self._given.note(asker, sum(map(len, batches)))
+        return batches
 
     def _answered(self, request: m.MembersRequest) -> list[m.Members]:
         sign = None if self.proofs is None else self.proofs.of

@@ -216,6 +216,8 @@ SIGNATURE = Channel(name="signature", template="robot/{robot}/signature", messag
                     recomputable=False, meaning="a robot's signature of what it has said, for whoever carries it")  # fmt: skip
 ORDER_SIGNATURE = Channel(name="order_signature", template="operator/signature/{robot}", message=m.Signature, rate="one per order, with keys", delivery="all", recorded=False,
                           recomputable=False, meaning="an operator's signature of an order about a robot, for whoever carries it")  # fmt: skip
+FOLD = Channel(name="fold", template="robot/{robot}/fold", message=m.FoldRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+               meaning="a query to a peer: it folds the set that it has; the reply is the map")  # fmt: skip
 MEMBERS = Channel(name="members", template="{node}/members", message=m.MembersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                   meaning="a query to a peer; the replies are members of the set, as `carried`")  # fmt: skip
 CARRIED = Channel(name="carried", template="{node}/carried", message=m.Members, rate="as asked for", delivery="stream", recorded=False, recomputable=False,
@@ -225,13 +227,14 @@ VIEW = Channel(name="view", template="view/{view}", message=m.Message, rate="abo
                meaning="what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
-QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT, MEMBERS)
+QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT, MEMBERS, FOLD)
 REPLIES = {
     MEASUREMENTS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
     SENT: (START, SUBMAP, SIGHTING_FACTOR),
     ORDERS_KEPT: (GIVEN_UP,),
     MEMBERS: (CARRIED,),
+    FOLD: (TEAM_MAP,),
 }
 """The channels whose messages answer a query."""
 UNOPENED = (*QUERIES, VIEW)

@@ -8,6 +8,7 @@ import pytest
 
 from central.config import CentralConfig
 from central.join_rule import JoinRule
+from central.roll import Roll
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -104,6 +105,22 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
         found.take_submap(submap)
     config = CentralConfig(tick_s=100.0, broadcast_s=3.0)
     assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
+
+
+def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
+    """What r1 has just closed is out though r2 is a window behind, and no broadcast is due."""
+    found, roll = rule(CentralConfig(tick_s=100.0, broadcast_s=100.0)), Roll.of(["r1", "r2"])
+    said = []
+    for name, k in (("r1", 0), ("r2", 0), ("r1", 1)):
+        found.take_submap(SUBMAPS[name][k])
+        said.append(found.refresh(roll))
+        assert not found.refresh(roll)
+    maps = [of(out, ch.FUSED_MAP)[0] for out in said]
+    assert [sum(each.sequence + 1 for each in fused.members) for fused in maps] == [1, 2, 3]
+    assert all(fused.provisional for fused in maps)
+    for submap in ALL:
+        found.take_submap(submap)
+    assert encoded(final(found)) == encoded(final(whole(found._config))), "it leaves no trace"
 
 
 def test_no_map_has_less_than_the_one_before_it():

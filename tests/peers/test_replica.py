@@ -7,10 +7,11 @@ import pytest
 
 from team.peers.exchange import MOST_ASKED, answered, wanted
 from team.peers.members import LARGEST_MEMBER, Member, member_of
+from team.peers.node import GIVEN_BYTES, PeerNode
 from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica, intervals
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.codec import encoded
+from team.wire.codec import decoded, encoded
 from tests.peers.teams import done, member, parcel, said, start
 
 ROBOTS = ("r1", "r2")
@@ -30,6 +31,57 @@ def everything() -> list[Member]:
 
 def digest_of(replica: Replica) -> bytes:
     return replica.summary("", 0, 0).digest
+
+
+def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> None:
+    """A liar says to have everything, of everyone, and gives nothing; r2 has four submaps."""
+    node, honest = (
+        PeerNode("robot/r1", ("r1", "r2", "r3")),
+        PeerNode("robot/r2", ("r1", "r2", "r3")),
+    )
+    for each in (start("r2"), *(m_ for k in range(4) for m_ in parcel("r2", k))):
+        honest.take(each, "robot/r2")
+    claim = m.Holding(
+        robot="r2",
+        incarnation=1,
+        start=True,
+        sequences=(0, 2_000_000),
+        digest=bytes(8),
+        newest_ns=0,
+    )
+    lie = m.SetSummary(
+        stamp_ns=0, node="robot/r3", serial=0, digest=bytes(8), holdings=(claim,) * 3, statements=()
+    )
+    asked: list[str] = []
+    for second in range(12):
+        out = [*node.hear(lie), *node.tick(float(second))]
+        out += node.hear(honest.replica.summary("robot/r2", second, 0))
+        for each in out:
+            if each.channel is ch.MEMBERS:
+                asked.append(each.name)
+                assert sum(1 + w.last - w.first for w in each.message.wanted) <= MOST_ASKED
+                if each.name == "robot/r2":
+                    for reply in honest.answer(encoded(each.message)):
+                        node.take_carried(decoded(reply, m.Members))
+    assert asked[0] == "robot/r3"
+    assert node.replica.submaps == 4
+    stranger = msgspec.structs.replace(lie, node="robot/x9")
+    assert node.hear(stranger) == []
+    assert "not in this team" in node.last_refused
+
+
+def test_questions_without_end_are_given_so_many_bytes_a_second() -> None:
+    node = PeerNode("robot/r1", ("r1", "r2"))
+    for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
+        node.take(each, "robot/r2")
+    want = m.Wanted(robot="r2", incarnation=1, start=True, first=0, last=39)
+    request = encoded(m.MembersRequest(stamp_ns=0, node="robot/r2", wanted=(want,)))
+    one = sum(map(len, node.answer(request)))
+    node._given.note("robot/r2", GIVEN_BYTES)
+    assert one > 0
+    assert node.answer(request) == []
+    node.tick(2.0)
+    assert sum(map(len, node.answer(request))) == one
 
 
 def test_the_order_of_arrival_and_duplicates_change_nothing() -> None:

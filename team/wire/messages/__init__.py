@@ -68,6 +68,7 @@ from team.wire.messages.orders import Withdrawal as Withdrawal
 from team.wire.messages.orders import WithdrawalHeard as WithdrawalHeard
 from team.wire.messages.peers import Certificate as Certificate
 from team.wire.messages.peers import Concluded as Concluded
+from team.wire.messages.peers import FoldRequest as FoldRequest
 from team.wire.messages.peers import Holding as Holding
 from team.wire.messages.peers import Members as Members
 from team.wire.messages.peers import MembersRequest as MembersRequest

@@ -91,6 +91,10 @@ class Members(Message, frozen=True, kw_only=True, tag="members/1"):
             raise ValueError("wrong length: keys, payloads and signatures")
 
 
+class FoldRequest(Message, frozen=True, kw_only=True, tag="fold_wanted/1"):
+    """A query to a peer that folds on request: the map of the set as it is there now."""
+
+
 class Certificate(Message, frozen=True, kw_only=True, tag="certificate/1"):
     """A robot's certificate (DER), by which its signatures can be checked: a member of the set."""
 

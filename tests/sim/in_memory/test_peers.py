@@ -3,6 +3,7 @@
 import msgspec
 import pytest
 
+from central.peers.robot import PeerRobot
 from sim.in_memory.air import Air, Meeting, meetings
 from sim.in_memory.peers import PeerTeam, peer_world
 from sim.in_memory.team import final_map, run_team
@@ -103,6 +104,12 @@ def test_the_fold_of_a_set_that_changed_or_grew_is_the_fold_of_what_it_is_now(ce
     team, _ = peers(Air())
     seat = team.seats["r1"]
     before = seat.node.final
+    small = PeerRobot(scenario().robots[0], scenario().central, ["r1", "r2", "r3"], when="request")
+    small.keep(seat.node.peer.replica.members())
+    assert not small.fold.refresh(), "it folds when it is asked to"
+    (reply,) = small.answer_fold(encoded(m.FoldRequest(stamp_ns=0)))
+    assert decoded(reply, m.FusedMap).members == before.members
+    assert ch.TEAM_MAP in {each.channel for each in small.tick(0.0)}
     first = next(s for s in central if s.key == ch.SUBMAP.key("r2"))
     submap = decoded(first.payload, m.Submap)
     changed = (
