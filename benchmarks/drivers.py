@@ -30,21 +30,16 @@ from team.recording.check import holes
 from team.recording.reader import open_log
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
-ROBOTS = ("anna", "bert")
+ROBOTS = ("r1", "r2")
 STEP_S = 0.1
 CUTS_S = (0.3, 1.0, 3.0, 12.0)
 TEAM = """
 base = "recorded"
 name = "lab"
+robot_count = 2
 
 [world]
 kind = "live"
-
-[[robots]]
-id = "anna"
-
-[[robots]]
-id = "bert"
 """
 
 

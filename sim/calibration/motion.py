@@ -147,7 +147,7 @@ def fit_motion(
     if np.count_nonzero(moving) < LEAST_SPANS:
         raise CalibrationError(
             f"{np.count_nonzero(moving)} stretches of {SPAN_S:.0f} s of motion with a known path, "
-            f"{LEAST_SPANS} needed"
+            f"{LEAST_SPANS} needed: record more, or give several data sets at once"
         )
     limit = np.inf if yaw_rate_limit is None else yaw_rate_limit
     way, rotation = spans.way, np.abs(spans.rates(1.0, limit)).sum(axis=1) * STEP_S

@@ -144,7 +144,7 @@ def _enough(rows: _Rows) -> _Rows:
     if len(rows.series) < LEAST_MEASUREMENTS:
         raise CalibrationError(
             f"{len(rows.series)} measurements of landmarks from known poses, "
-            f"{LEAST_MEASUREMENTS} needed"
+            f"{LEAST_MEASUREMENTS} needed: record more, or give several data sets at once"
         )
     return rows
 

@@ -90,6 +90,13 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
         (np.empty(0, np.uint32), None) if surveyed is None else rows.landmarks_of(surveyed)
     )
     notes = [] if len(ids) else ["no landmarks.csv: the map's error can not be computed"]
+    cars = {robot.id for robot in robots if robot.motion.kind == "ackermann"}
+    steered = [each.robot for each in read if each.intervals.steered and each.robot not in cars]
+    if steered:
+        notes.append(
+            f"{', '.join(steered)}: wheel speed and steering can not be used: give "
+            'kind = "ackermann" and wheel_base in [defaults.motion] of scenario.toml'
+        )
     notes += [*said, *_apart(read)]
     return WorldStreams(
         streams=tuple(_stream(each, world, clocks) for each in read),

@@ -19,14 +19,8 @@ from tests.system.observer import endpoint_of
 from tests.system.processes import Processes, until
 from tests.system.scenarios import final_map, short
 
-LIVE = """
-base = "thesis"
-robot_count = 2
-name = "lab"
-
-[world]
-kind = "live"
-"""
+PAGE = (ROOT / "docs" / "your_robot.md").read_text("utf-8")
+LIVE = PAGE.partition("```toml\n")[2].partition("```")[0]
 PAUSE = "0.05"
 """Of the example at each step: sixty of them take three seconds."""
 
@@ -56,6 +50,8 @@ async def test_robots_join_live_and_deaths_and_cuts_change_no_bit_of_the_map(
 
         async def driver(robot: str, life: int):
             example = ROOT / "examples" / "robot.py"
+            typed = f"python examples/robot.py {robot} data/{robot} lab tcp/127.0.0.1:7447"
+            assert typed in PAGE
             words = (example, robot, f"data/{robot}", "lab", link.endpoint, PAUSE)
             return await team.run(f"driver-{robot}-{life}", [sys.executable, *map(str, words)])
 

@@ -128,7 +128,9 @@ def test_increments_come_with_their_covariances(tmp_path: Path) -> None:
 
 def test_a_car_s_wheel_and_steering_hold_until_the_next_row(tmp_path: Path) -> None:
     text = "t_s,wheel_speed_m_s,steering_rad\n0,1,0.1\n1,0,0\n"
-    driven = only(data_set(tmp_path, odometry=text)).intervals
+    world = read(data_set(tmp_path, odometry=text))
+    assert 'r1: wheel speed and steering can not be used: give kind = "acker' in world.notes[1]
+    driven = world.streams[0].intervals
     assert (driven.steered, driven.forward.tolist(), driven.yaw_rate.tolist()) == (True, [1], [0.1])
 
 

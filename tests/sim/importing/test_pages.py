@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.core import TyperGroup
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from sim.cli.main import app
@@ -36,7 +38,7 @@ def test_the_data_set_of_the_page_is_read(tmp_path: Path, monkeypatch: pytest.Mo
     assert second == "teamslam launch --dataset my_set"
     scenario = with_options(load(scenario_beside("my_set")), dataset="my_set")
     world = streams_of(scenario)
-    assert [stream.robot for stream in world.streams] == ["anna", "bert"]
+    assert [stream.robot for stream in world.streams] == ["r1", "r2"]
     assert all(len(stream.landmark_detections.ids) == 2400 for stream in world.streams)
     assert world.landmarks is not None
 
@@ -51,7 +53,7 @@ def test_the_scenario_and_the_map_of_the_page_are_sound(
     made("python examples/own_data.py my_set", tmp_path)
     (tmp_path / "my_set" / "scenario.toml").write_text(own)
     scenario = load(scenario_beside("my_set"))
-    assert [robot.id for robot in scenario.robots] == ["anna", "bert"]
+    assert [robot.id for robot in scenario.robots] == ["r1", "r2"]
     assert scenario.robots[0].sensor.bearing_sigma == 0.02
 
 
@@ -84,3 +86,25 @@ def test_the_topics_of_the_page_are_sound(tmp_path: Path) -> None:
     (tmp_path / "topics.toml").write_text(blocks("your_ros2_robot.md", "toml")[0])
     topics = load_topics(tmp_path / "topics.toml")
     assert topics.robots["r1"].teammates == {"5": "r2"}
+
+
+def test_the_commands_of_a_team_over_wifi_are_sound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The certificates are made as the page says; the others find their files and options."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lab.toml").write_text(blocks("your_robot.md", "toml")[0])
+    page = (ROOT / "docs" / "machines.md").read_text("utf-8")
+    section = page.partition("## A team over Wi-Fi")[2].partition("\n## ")[0]
+    typed = [line.split()[1:] for line in section.splitlines() if line.startswith("    teamslam")]
+    assert [words[0] for words in typed] == ["keys", "router", "record", "central", "robot"]
+    made = CliRunner().invoke(app, typed[0])
+    assert made.exit_code == 0, made.output
+    names = {path.name for path in (tmp_path / "keys").rglob("*")}
+    for node in ("robot-r1", "source-r1", "robot-r2", "central", "recorder"):
+        assert any(name.startswith(node) for name in names), node
+    commands = get_command(app)
+    assert isinstance(commands, TyperGroup)
+    for name, *words in typed[1:]:
+        context = commands.commands[name].make_context(name, list(words))
+        assert context.params["keys"] == Path("keys")
