@@ -9,8 +9,8 @@ base or from a mounted sensor. Each world is written as a folder of tables; then
 and `import` makes another folder of it, whose tables are the same bytes. A cell is the
 figure that tells whether the command did its work: landmark RMSE, NEES per dof and
 joint cost per dof of the final map, the learnt factor or scale of the odometry, landmark RMSE
-of the batch. Exit status 1 where a command fails, tables differ, the batch's RMSE is above the
-team's and 2 cm, or a learnt figure is more than 25 % from 1.
+of the batch. Exit status 1 where a command fails, tables differ, NEES per dof of either
+map is not between 0.4 and 2, or a learnt figure is more than 25 % from 1.
 """
 
 import argparse
@@ -113,8 +113,8 @@ def row(name: str, seconds: int, place: Path) -> tuple[str, bool]:
         f"cost {run['joint_cost_per_dof']:.2f}; batch {batch['landmark_rmse_m']:.3f} m,",
         f"NEES/dof {batch['map_nees_per_dof']:.2f}; g2o {edges} edges; learnt {factor:.3f}",
     ]
-    near = batch["landmark_rmse_m"] <= run["landmark_rmse_m"] + 0.02
-    return " ".join(words), bits and near and abs(factor - 1.0) < 0.25
+    sound = all(0.4 < each["map_nees_per_dof"] < 2.0 for each in (run, batch))
+    return " ".join(words), bits and sound and abs(factor - 1.0) < 0.25
 
 
 def main() -> int:
