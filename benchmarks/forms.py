@@ -6,11 +6,11 @@ A simulated team tells its odometry as speeds, as increments (without and with c
 car's encoders; it sees landmarks as ranges or as points, without and with covariances, from the
 base or from a mounted sensor. Each world is written as a folder of tables; then `rerun`,
 `calibrate`, `batch-reference` and `batch-reference --g2o` are called on the folder as a user would,
-and `import` makes another folder of it, whose tables are the same bytes. A cell is the
-figure that tells whether the command did its work: landmark RMSE, NEES per dof and
-joint cost per dof of the final map, the learnt factor or scale of the odometry, landmark RMSE
-of the batch. Exit status 1 where a command fails, tables differ, NEES per dof of either
-map is not between 0.4 and 2, or a learnt figure is more than 25 % from 1.
+and `import` makes another folder of it, whose tables are the same bytes. A cell is the figure that
+tells whether the command did its work: landmark RMSE, NEES per dof and joint cost per dof of the
+final map, those of the batch, the learnt factor or scale of the odometry. Exit status 1 where a
+command fails, tables differ, NEES per dof of either map is not between 0.4 and 2, or a learnt
+figure is more than 25 % from 1.
 """
 
 import argparse
