@@ -1,6 +1,7 @@
 """How fresh the team's map is: from a submap's arrival to the map and the priors that hold it.
 
-`python benchmarks/fresh.py LOG… [--json FILE]`, of logs of `launch` at any pace. By wall time, of
+`python -m benchmarks.fresh [LOG…] [--json FILE]`, of logs of `launch` at any pace, or of a run of
+its own at ten times real time. By wall time, of
 each submap but those of the last second: until the first map (a centre's, or any peer's) that has
 it, and until the first prior of another robot that rests on it. The measure is the round trip (the
 median from a submap to the centre's credit for it) and the time of a solution (the centre's own
@@ -9,12 +10,15 @@ word): fresh is within three times their sum.
 
 import argparse
 import json
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.baseline import worse
 from team.recording.reader import open_log
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -84,18 +88,36 @@ def _first(
             sequence -= 1
 
 
+def launched(folder: Path) -> Path:
+    """The log of a run of `waypoints` at ten times real time."""
+    words = ["launch", "waypoints", "--speed", "10", "--no-report", "--no-views"]
+    subprocess.run(
+        [sys.executable, "-P", "-m", "sim", *words, "--output", str(folder)],
+        check=True,
+        stdout=sys.stderr,
+    )
+    return folder / "log.mcap"
+
+
 def main() -> int:
-    """Measure and print."""
+    """Measure and print; without a log, of a run of its own against the committed baseline."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("logs", nargs="+", type=Path)
+    parser.add_argument("logs", nargs="*", type=Path)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    found = {str(log): measured(log) for log in options.logs}
-    for log, row in found.items():
-        sys.stdout.write(f"{log}: {json.dumps(row)}\n")
+    problems: list[str] = []
+    if options.logs:
+        found: dict[str, Any] = {str(log): measured(log) for log in options.logs}
+    else:
+        with tempfile.TemporaryDirectory() as made:
+            figures = measured(launched(Path(made) / "run"))
+        found = {"ratio": figures["ratio"], "within": figures["within"]}
+        problems = worse(found, "fresh")
+    sys.stdout.write(json.dumps(found, indent=1) + "\n")
     if options.json is not None:
         options.json.write_text(json.dumps(found, indent=1) + "\n")
-    return 0
+    sys.stderr.write("".join(f"worse: {each}\n" for each in problems))
+    return 1 if problems else 0
 
 
 if __name__ == "__main__":

@@ -205,6 +205,8 @@ def drawn(found: dict[str, dict[str, float]], path: Path) -> None:
         star = sorted(set(star))
         axis.plot([n for n, _ in star], [b for _, b in star], "k--", label="star, of one robot")
         axis.set(title=title, xlabel="robots", xscale="log", yscale="log")
+        axis.minorticks_off()
+        axis.set_xticks(TEAMS, [str(each) for each in TEAMS])
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("bytes per robot and second")
     axes[0].legend(fontsize=8)
