@@ -17,6 +17,7 @@ from statistics import fmean, median
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import streams_of
@@ -24,16 +25,19 @@ from sim.world import streams as s
 from sim.world.streams import RobotStream, WorldStreams
 from team.config import RobotConfig
 
+FAR = float(chi2.isf(1e-9, 3))
+"""NEES of a pose that lies far outside its own covariance."""
 UNKNOWN_M2 = 1e6
 """The variance of a landmark that nobody has seen."""
 
 
 class Bounded(NamedTuple):
-    """A robot's poses: errors (x, y, θ) and covariances at stamps_ns."""
+    """A robot's poses: errors (x, y, θ), covariances and true headings at stamps_ns."""
 
     stamps_ns: np.ndarray
     errors: np.ndarray
     covariances: np.ndarray
+    headings: np.ndarray
 
     def rmse_m(self, stamps_ns: np.ndarray) -> float:
         """Of the positions at these stamps."""
@@ -46,6 +50,26 @@ class Bounded(NamedTuple):
         variances = self.covariances[at, 0, 0] + self.covariances[at, 1, 1]
         return float(np.sqrt(np.mean(variances)))
 
+    def nees_on_arcs(self) -> np.ndarray:
+        """NEES of (x, y, θ) where these errors are exact as an estimate: truth ∘ Exp(error).
+
+        Such an estimator knows its covariance, and a pose is still no Gaussian in (x, y, θ): behind
+        a heading that is off by three sigma it lies on an arc, outside its own ellipse.
+        """
+        found = np.empty(len(self.errors))
+        for k, (error, covariance) in enumerate(zip(self.errors, self.covariances, strict=True)):
+            c, s_ = np.cos(self.headings[k]), np.sin(self.headings[k])
+            R = np.array([[c, -s_, 0.0], [s_, c, 0.0], [0.0, 0.0, 1.0]])
+            forward, left, turn = R.T @ error
+            a = np.sinc(turn / np.pi)
+            b = np.sinc(0.5 * turn / np.pi) * np.sin(0.5 * turn)
+            there = R @ [a * forward - b * left, b * forward + a * left, turn]
+            c, s_ = np.cos(turn), np.sin(turn)
+            turned = np.array([[c, -s_, 0.0], [s_, c, 0.0], [0.0, 0.0, 1.0]])
+            P = turned @ covariance @ turned.T
+            found[k] = there @ np.linalg.lstsq(P, there)[0]  # of rank 2 after the first interval
+        return found
+
     def nees_per_dof(self, stamps_ns: np.ndarray) -> float:
         """Of these poses; 1 on average."""
         at = np.isin(self.stamps_ns, stamps_ns)
@@ -56,7 +80,7 @@ class Bounded(NamedTuple):
 def bounds(scenario: Scenario, world: WorldStreams) -> dict[str, Bounded]:
     """Of each robot, after each odometry interval."""
     filter_ = _AtTruth(world)
-    found: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {
+    found: dict[str, list[tuple[int, np.ndarray, np.ndarray, float]]] = {
         config.id: [] for config in scenario.robots
     }
     robots, counters = world.order()
@@ -70,7 +94,8 @@ def bounds(scenario: Scenario, world: WorldStreams) -> dict[str, Bounded]:
             filter_.drive(robot, stream, counter, config)
             if (robot, stamp_ns) in seen:
                 filter_.look(robot, stream, seen[robot, stamp_ns], config)
-            found[config.id].append((stamp_ns, *filter_.pose(robot)))
+            heading = float(_true(stream, stamp_ns)[2])
+            found[config.id].append((stamp_ns, *filter_.pose(robot), heading))
     return {
         name: Bounded(*(np.array(part) for part in zip(*rows, strict=True)))
         for name, rows in found.items()
@@ -160,13 +185,24 @@ def _around(angle: float) -> float:
     return float(np.angle(np.exp(1j * angle)))
 
 
+def longest_s(stamps_ns: np.ndarray, far: np.ndarray) -> float:
+    """The longest time in a row in which this holds [s]."""
+    longest, begun = 0.0, None
+    for stamp_ns, is_far in zip(stamps_ns.tolist(), far.tolist(), strict=True):
+        begun = None if not is_far else stamp_ns if begun is None else begun
+        if begun is not None:
+            longest = max(longest, (stamp_ns - begun) * 1e-9)
+    return longest
+
+
 def runs(name: str, seeds: range, silent_s: float) -> Iterator[dict[str, float]]:
     """The bound's figures of each robot and seed, without the first silent_s."""
     for seed in seeds:
         scenario = with_options(load(name), seed=seed)
         for robot in bounds(scenario, streams_of(scenario)).values():
             at = robot.stamps_ns[robot.stamps_ns >= silent_s * 1e9]
-            yield {"rmse_m": robot.rmse_m(at), "sigma_m": robot.sigma_m(at)}
+            silent = longest_s(robot.stamps_ns, robot.nees_on_arcs() > FAR)
+            yield {"rmse_m": robot.rmse_m(at), "sigma_m": robot.sigma_m(at), "silent_s": silent}
 
 
 def main() -> int:
@@ -174,6 +210,7 @@ def main() -> int:
     parser.add_argument("scenarios", nargs="*", default=("thesis", "thesis-b"))
     parser.add_argument("--seeds", default="1000-1019", help="FIRST-LAST, both in it")
     parser.add_argument("--from-s", type=float, default=24.0, help="when the first prior is there")
+    parser.add_argument("--window-s", type=float, default=12.0, help="how long is silent")
     told = parser.parse_args()
     first, _, last = told.seeds.partition("-")
     for name in told.scenarios:
@@ -183,6 +220,8 @@ def main() -> int:
         ratio = max(errors) / median(errors)
         print(f"{name}, seeds {told.seeds}: median {median(errors):.3f} m, worst {max(errors):.3f}")
         print(f"  worst over median {ratio:.2f}, expected RMSE {expected:.3f} m")
+        silent = [each["silent_s"] for each in found if each["silent_s"] > told.window_s]
+        print(f"  outside their ellipse for longer than a window: {len(silent)} of {len(found)}")
     return 0
 
 

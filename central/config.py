@@ -25,13 +25,16 @@ class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How large the errors are that all robots share, beside each robot's own; 0: there are none.
 
-    What was calibrated for robots of a kind is off by one amount for all of them.
+    What was calibrated for robots of a kind is off by one amount for all of them. marker: the share
+    of the range by which a landmark's marker, each by itself, reads too far for whoever sees it,
+    since it hangs higher or is larger than the others; for landmarks with names.
     """
 
     bearing: NonNegative = 0.0
     range_offset: NonNegative = 0.0
     range_scale: NonNegative = 0.0
     forward_scale: NonNegative = 0.0
+    marker: NonNegative = 0.0
 
 
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

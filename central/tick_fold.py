@@ -38,12 +38,14 @@ from team.estimation.map_joining.joining import (
 )
 from team.estimation.map_joining.marginals import Agreement
 from team.estimation.map_joining.relinearising import is_due, relinearised
-from team.estimation.map_joining.submap_graph import CondensedError
+from team.estimation.map_joining.submap_graph import CommonBias, CondensedError
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
 from team.wire.messages import SightingFactor, Submap
 
 Stream = tuple[str, int]
 
+COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
+"""The errors that the whole team has."""
 GROWTH = 1.25
 """Suspects whom nothing convicted are tried again when there are so many times the submaps."""
 FULL = 2000
@@ -61,9 +63,9 @@ def join_settings(config: CentralConfig) -> JoinSettings:
         covariance_factor=config.covariance_factor,
         bias_sigma={bias: getattr(config.bias_sigma, bias) for bias in BIASES},
         common_bias_sigma={
-            bias: sigma
-            for bias in BIASES
-            if (sigma := getattr(config.common_bias_sigma, bias)) > 0.0
+            name: sigma
+            for name in COMMON
+            if (sigma := getattr(config.common_bias_sigma, name)) > 0.0
         },
         joined_ranges=config.joined_ranges,
         association=config.association,

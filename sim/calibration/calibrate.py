@@ -29,7 +29,7 @@ from sim.calibration.consistency import covariance_factor, normal_scale
 from sim.calibration.data import Reference, references, true_paths
 from sim.calibration.figures import CalibrationError, Figure, jackknifed
 from sim.calibration.join import config_of, joined_team
-from sim.calibration.own import own_constants
+from sim.calibration.own import marker_spread, own_constants
 from sim.scenarios.scenario import Scenario
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
@@ -111,7 +111,9 @@ def _by_truth(
         progress(f"joined map of {label} with what was learnt")
         team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
         folds.append(team.fold)
-    of_central = _central_figures(folds, learnt, own.strays, progress)
+    marker = marker_spread(data, depth=depth)
+    strays = own.strays if marker is None else (*own.strays, marker)
+    of_central = _central_figures(folds, learnt, strays, progress)
     said = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
     return Calibration(of_motion, of_sensor, True, said, of_central, own.robots)
 
@@ -167,8 +169,9 @@ def _central_figures(
     """The errors of each robot's own, the factor that they leave, and the monitor's scale then."""
     progress("maps of single robots against the rest of their team")
     fields = nested(msgspec.to_builtins(scenario.central), strays, CentralConfig)
-    told = msgspec.to_builtins(scenario.central.bias_sigma)
-    fields["bias_sigma"] = told | (fields["bias_sigma"] if strays else {})
+    for table in ("bias_sigma", "common_bias_sigma"):
+        told = msgspec.to_builtins(getattr(scenario.central, table))
+        fields[table] = told | msgspec.to_builtins(fields[table])
     central = msgspec.convert(fields, CentralConfig)
     factor = covariance_factor(folds, central)
     if factor is None:

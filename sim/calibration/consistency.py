@@ -3,18 +3,21 @@
 A robot's own map a and the map b of the others share no measurement. Where the covariances are
 right,
 
-    D = min over rigid motions of (a − b)ᵀ (P_a + P_b)⁻¹ (a − b)
+    D = min over rigid motions of (a − b)ᵀ (P_a + P_b − P_ab − P_ba)⁻¹ (a − b)
 
 has the mean 2n − 3 for the n landmarks of both. `covariance_factor` is what makes Σ D that of all
 robots of all worlds: it stands for errors that last longer than a window, and for a robust loss,
-which weighs down what fits, too. What is wrong alike for all robots is not seen.
+which weighs down what fits, too. What is wrong alike for all robots is not seen. a and b have the
+states of what the team shares in common (`central.common_bias_sigma`), hence P_ab: a marker that
+reads too far does so for both, from where each sees it.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from central.config import CentralConfig
 from central.desk.evaluation.errors import map_errors, moved, rigid_alignment
@@ -22,12 +25,11 @@ from central.tick_fold import join_settings
 from sim.calibration.figures import Figure
 from team.estimation.consistency import covariance_scale
 from team.estimation.contribution import InitialPoseFactor, Stream
-from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import joint_cost
 from team.estimation.map_joining.merging import ages
-from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extended
 
 LEAST_LANDMARKS = 3
 """Two have one number between them: their distance."""
@@ -36,6 +38,8 @@ LEAST_ROBOTS = 3
 SETTLED = 0.02
 """A factor that moves by a smaller share than this is found."""
 MOST_ROUNDS = 8
+APART = 2**40
+"""No landmark has a number from here on."""
 
 
 class Disagreement(NamedTuple):
@@ -99,22 +103,28 @@ def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
     robots = sorted({robot for robot, _ in island.graph.streams})
     found = []
     for robot in robots if len(robots) > 1 else ():
-        own = _map_of(island, [robot], fold.starts, settings)
-        rest = _map_of(island, [r for r in robots if r != robot], fold.starts, settings)
-        common = np.intersect1d(own.ids, rest.ids)
+        graph, solved = _apart(island, robot, fold.starts, settings)
+        common = [id_ for id_ in sorted(graph.landmarks) if id_ + APART in graph.landmarks]
         if len(common) >= LEAST_LANDMARKS:
-            found.append(_between(_part(own, common), _part(rest, common)))
+            nodes = [graph.landmarks[id_ + of] for of in (APART, 0) for id_ in common]
+            found.append(_between(*joint_marginal(solved, nodes)))
     return found
 
 
-def _map_of(
-    island: Island,
-    robots: Collection[str],
-    starts: Mapping[Stream, InitialPoseFactor],
-    settings: JoinSettings,
-) -> LandmarkGaussian:
-    """The map of some robots' submaps alone, solved from where the whole team has it."""
-    submaps = [each for each in island.graph.submaps if each.contribution.robot in robots]
+def _apart(
+    island: Island, robot: str, starts: Mapping[Stream, InitialPoseFactor], settings: JoinSettings
+) -> tuple[Graph, Island]:
+    """One robot's map beside that of the others, each from its own submaps, solved from where the
+    whole team has it; the robot's landmarks have numbers from APART on.
+
+    What both have in common are the errors that the whole team shares.
+    """
+    submaps = island.graph.submaps
+    numbers = {
+        each.contribution.key: (each.contribution.local.ids.astype(np.int64) + APART).tolist()
+        for each in submaps
+        if each.contribution.robot == robot
+    }
     graph, state = extended(
         EMPTY_GRAPH,
         np.zeros(0),
@@ -122,31 +132,30 @@ def _map_of(
         starts,
         settings.bias_sigma,
         settings.common_bias_sigma,
+        numbers,
     )
     for own, of_team in zip(graph.submaps, submaps, strict=True):
-        for node, there in zip(own.nodes, of_team.nodes, strict=True):
+        known = len(of_team.nodes) - len(of_team.common)
+        for node, there in zip(own.nodes[:known], of_team.nodes[:known], strict=True):
             first, last = island.graph.offset[there : there + 2]
             state[graph.offset[node] : graph.offset[node + 1]] = island.state[first:last]
     solved, _, _ = settled(Island(graph, state, ages(len(submaps)), ages(0), settings))
-    ids = sorted(graph.landmarks)
-    mean, covariance = joint_marginal(solved, [graph.landmarks[id_] for id_ in ids])
-    return LandmarkGaussian(np.array(ids, np.uint32), mean.reshape(-1, 2), covariance)
+    return graph, solved
 
 
-def _part(of: LandmarkGaussian, ids: np.ndarray) -> LandmarkGaussian:
-    at = np.searchsorted(of.ids, ids)
-    numbers = np.column_stack([2 * at, 2 * at + 1]).ravel()
-    return LandmarkGaussian(ids, of.means[at], of.covariance[np.ix_(numbers, numbers)])
-
-
-def _between(a: LandmarkGaussian, b: LandmarkGaussian) -> Disagreement:
-    a_from_b = rigid_alignment(a.means, b.means)
+def _between(
+    mean: Float[np.ndarray, " 4n"], covariance: Float[np.ndarray, "4n 4n"]
+) -> Disagreement:
+    """D of two maps of n landmarks, the one behind the other, and their joint covariance."""
+    a, b = mean.reshape(2, -1, 2)
+    a_from_b = rigid_alignment(a, b)
     if a_from_b is None:
         return Disagreement(0.0, 0)
     c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
-    turn = np.kron(np.eye(len(a.ids)), np.array([[c, -s], [s, c]]))
-    covariance = a.covariance + turn @ b.covariance @ turn.T
-    shape = map_errors(a.means, covariance, moved(a_from_b, b.means)).shape
-    dof = 2 * len(a.ids) - 3
+    turn = np.kron(np.eye(len(a)), np.array([[c, -s], [s, c]]))
+    difference = np.hstack([np.eye(2 * len(a)), -turn])
+    of_difference = difference @ covariance @ difference.T
+    shape = map_errors(a, of_difference, moved(a_from_b, b)).shape
+    dof = 2 * len(a) - 3
     assert shape is not None
     return Disagreement(0.5 * dof * shape.nees_per_landmark, dof)

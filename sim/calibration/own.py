@@ -7,6 +7,9 @@ worlds, drawn towards the mean of all robots by what the spread s of e leaves un
 
 Where no constant's τ² is beyond doubt (F test) all robots are alike. s is a robust estimate: one
 camera that was touched between two worlds is not the rule.
+
+Landmarks have something of their own, too: a marker that hangs higher or is larger than the others
+reads too far by a share of the range, for whoever sees it (`marker_spread`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,10 +21,12 @@ from scipy.stats import f as f_distribution
 
 from sim.calibration.data import Reference
 from sim.calibration.figures import CalibrationError, Figure, groups_of
-from sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants
+from sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
 
 LEAST_ROBOTS = 3
 """Of fewer it is not known how far robots differ."""
+LEAST_LANDMARKS = 4
+"""Of fewer it is not known how far they differ."""
 BEYOND_DOUBT = 0.99
 BIAS_OF = {
     "bearing_offset": "bearing",
@@ -81,3 +86,37 @@ def _within(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
     """The spread of a robot's values about their mean, by the median of |v − v̄| √(n/(n − 1))."""
     off = [np.abs(part - part.mean()) * np.sqrt(len(part) / (len(part) - 1)) for part in parts]
     return MAD_TO_SIGMA * float(np.median(np.concatenate(off)))
+
+
+def marker_spread(data: Sequence[Reference], *, depth: bool) -> Figure | None:
+    """How far one landmark's ranges differ from another's, relative, for all robots of a world.
+
+    The share e_rl by which robot r sees landmark l too far, given r's own constants, is m_l + ε_rl:
+    var(m) = var(ē_l) − var(ε) mean(1/n_l) of the n_l robots that see it. None where that is not
+    beyond doubt (F test): where no two robots of a world see one landmark, or few landmarks.
+    """
+    by_world: dict[str, dict[int, list[float]]] = {}
+    for each in data:
+        world = by_world.setdefault(each.name.rpartition(" ")[0], {})
+        for landmark, share in shares_by_landmark(each, depth=depth).items():
+            world.setdefault(landmark, []).append(share)
+    between, within, of_means = [], [], []
+    for world in by_world.values():
+        seen = [np.array(shares) for shares in world.values() if len(shares) > 1]
+        if len(seen) < LEAST_LANDMARKS:
+            continue
+        means = np.array([shares.mean() for shares in seen])
+        between.append((float(np.var(means, ddof=1)), len(means) - 1))
+        squares = sum(float(((shares - shares.mean()) ** 2).sum()) for shares in seen)
+        within.append((squares, sum(len(shares) - 1 for shares in seen)))
+        of_means.append(float(np.mean([1.0 / len(shares) for shares in seen])))
+    if not between:
+        return None
+    dof = sum(n for _, n in between), sum(n for _, n in within)
+    alone = sum(squares for squares, _ in within) / dof[1] * float(np.mean(of_means))
+    found = sum(variance * n for variance, n in between) / dof[0]
+    if found <= alone * float(f_distribution.ppf(BEYOND_DOUBT, *dof)):
+        return None
+    sigma = float(np.sqrt(found - alone))
+    error = found / sigma * float(np.sqrt(0.5 / dof[0]))
+    return Figure("common_bias_sigma.marker", sigma, error, "")

@@ -225,6 +225,25 @@ def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str
     return figures | _marker(data, owns)
 
 
+def shares_by_landmark(data: Reference, *, depth: bool) -> dict[int, float]:
+    """By what share of its range each landmark is seen too far, given the robot's own constants.
+
+    Medians less their mean, of landmarks with LEAST_MEASUREMENTS and more; none of too few.
+    """
+    rows = _rows([data])
+    if len(rows.series) < LEAST_MEASUREMENTS:
+        return {}
+    own = _constants(rows, depth)
+    share = own.distances(rows.ranges, rows.bearings) / rows.distances - 1.0
+    found = {}
+    for landmark in np.unique(rows.series).tolist():
+        chosen = (rows.series == landmark) & np.isfinite(share)
+        if np.count_nonzero(chosen) >= LEAST_MEASUREMENTS:
+            found[landmark] = float(np.median(share[chosen]))
+    mean = float(np.mean(list(found.values()))) if found else 0.0
+    return {landmark: value - mean for landmark, value in found.items()}
+
+
 def _by_robot(data: Sequence[Reference]) -> dict[str, list[Reference]]:
     by_robot: dict[str, list[Reference]] = {}
     for each in data:

@@ -7,6 +7,7 @@ from team.estimation.map_joining.conditioning import (
     Followed,
     Posed,
     Shared,
+    curved,
     followed,
     is_majority,
     pose_now,
@@ -33,14 +34,17 @@ class TeamMap:
         self.doubt = ""
 
     def pose(self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None) -> Posed:
-        """The robot's pose in the team's frame; `window`: the one in progress, if it has begun."""
+        """The robot's pose in the team's frame; `window`: the one in progress, if it has begun.
+
+        Its covariance is that of the arc on which a robot lies whose heading is known badly.
+        """
         given = self.given(prior, submaps)
         open_window = None if window is None else self._shared.taken(window.named)
         posed = pose_now(given.whole, open_window)
         self.known = posed.known + sum(given.known[-1:])
         self.refused = posed.refused + sum(given.refused[-1:])
         self.doubt = self._doubt(given)
-        return posed
+        return posed._replace(pose=curved(posed.pose))
 
     def _doubt(self, given: Followed) -> str:
         if is_majority(self.refused, self.known):

@@ -5,7 +5,8 @@ import pytest
 
 from team import translate
 from team.config import Bounds
-from team.estimation.map_joining.conditioning import followed
+from team.estimation.gaussian import PoseGaussian
+from team.estimation.map_joining.conditioning import curved, followed
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.plausible import prior_beyond
 from team.robot.team_map import TeamMap
@@ -35,6 +36,15 @@ def test_the_map_that_is_kept_is_the_one_that_is_made_anew() -> None:
     for known in range(2, 7):
         again = TeamMap().given(told, LOCALS[:known])
         assert kept.given(told, LOCALS[:known]).whole.mean.tobytes() == again.whole.mean.tobytes()
+
+
+def test_a_pose_is_told_with_the_covariance_of_its_arc() -> None:
+    told = prior(5)
+    alone = translate.prior_of(told).whole
+    expected = curved(PoseGaussian(alone.mean[:3], alone.covariance[:3, :3])).covariance
+    posed = TeamMap().pose(told, LOCALS[:6], None).pose
+    assert posed.covariance.tobytes() == expected.tobytes()
+    assert (posed.covariance[0, 0], posed.covariance[1, 1]) > tuple(np.diag(alone.covariance)[:2])
 
 
 def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already() -> None:

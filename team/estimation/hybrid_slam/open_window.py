@@ -4,13 +4,16 @@ Where the particles of a window have once had no solution, none of its measureme
 left of it is the motion that the odometry says.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
+import msgspec
 import numpy as np
 
 from team.config import RobotConfig
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.fastslam import effective_sample_size
 from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
 from team.estimation.hybrid_slam.unnamed import Settled, settled
@@ -20,6 +23,12 @@ from team.estimation.mount import of_base
 from team.estimation.plausible import submap_beyond
 from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
+
+DEPLETED = 10.0
+"""Effective particles: where fewer were left after a keyframe, their scatter says nothing. One of a
+thousand windows of `thesis`, whose submap is then far off and sure of itself (decision 0081)."""
+AGAIN = 8
+"""So many times the particles take such a window again."""
 
 
 class OpenWindow:
@@ -39,9 +48,13 @@ class OpenWindow:
         self.settled = Settled(())
         self._begin()
 
-    def _begin(self) -> None:
+    def _begin(self, times: int = 1) -> None:
         config = self._config
-        self.particles = windows.opened(config.front_end, config.sensor)
+        front = config.front_end
+        if times > 1:
+            front = msgspec.structs.replace(front, particles=times * front.particles)
+        self.particles = windows.opened(front, config.sensor)
+        self._least = math.inf
         self._generator = generator(config.seed, config.id, *self._key)
         self.keyframes_ns: tuple[int, ...] = ()
 
@@ -58,10 +71,9 @@ class OpenWindow:
 
     def confirm(self) -> None:
         """Where there may be outliers, or there are detections without identities, the window once
-        more with what all of it confirms.
+        more with what all of it confirms; where that depleted the particles, again with more.
         """
-        if self._gate.judges or any(each.looks for each in self._keyframes):
-            self._try(self._settle)
+        self._try(self._settle)
 
     def move(self, rest: Increment, forward: np.ndarray) -> None:
         """The motion after the last keyframe; forward: its shift by an error of the speed."""
@@ -107,13 +119,15 @@ class OpenWindow:
             keyframe.forward,
             own=keyframe.own,
         )
+        self._least = min(self._least, effective_sample_size(self.particles.particles.log_weights))
         self.keyframes_ns = (*self.keyframes_ns, keyframe.stamp_ns)
         if keyframe.is_node:
             self.particles = windows.marked(self.particles, keyframe.stamp_ns)
 
     def _settle(self) -> None:
         keyframes = self._gate.settled() if self._gate.judges else tuple(self._keyframes)
-        if any(each.looks for each in self._keyframes):
+        has_unnamed = any(each.looks for each in self._keyframes)
+        if has_unnamed:
             config = self._config
             self.settled = settled(
                 keyframes,
@@ -122,7 +136,13 @@ class OpenWindow:
                 config.bounds.submap_landmarks,
             )
             keyframes = self.settled.keyframes
-        self._begin()
+        if has_unnamed or self._gate.judges:
+            self._take_all(keyframes)
+        if self._least < DEPLETED and not has_unnamed:
+            self._take_all(keyframes, AGAIN)
+
+    def _take_all(self, keyframes: Sequence[Keyframe], times: int = 1) -> None:
+        self._begin(times)
         for keyframe in keyframes:
             self._take(keyframe)
 

@@ -24,6 +24,7 @@ from team.config import Bias
 from team.estimation.consistency import chi2_quantile
 from team.estimation.contribution import Contribution
 from team.estimation.gaussian import PoseGaussian
+from team.estimation.geometry import tangent
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
 from team.estimation.map_joining.joining_kernel import landmark_chi2
 from team.estimation.map_joining.merging import ages
@@ -204,3 +205,22 @@ def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
         return Posed(PoseGaussian(whole.mean[:3], whole.covariance[:3, :3]))
     pose, refused = end_pose(whole, open_window, GATE)
     return Posed(pose, int(np.isin(open_window.ids, whole.ids).sum()), refused)
+
+
+def curved(pose: PoseGaussian) -> PoseGaussian:
+    """The covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ = (f, l, φ) ~ N(0, S), to second order.
+
+    A robot whose heading is known badly lies on an arc, not in an ellipse: the position is
+    (f, l) + φ/2 (−l, f) to second order, so what is known to σ_f along the way is spread across it
+    by E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4, and so on (moments of a Gaussian; Isserlis 1918). Far
+    from where the heading was known that is larger than σ_f². The mean stays the most likely pose.
+    """
+    T = tangent(float(pose.mean[2]))
+    S = T.T @ pose.covariance @ T
+    turn = S[:2, 2]
+    of_squares = S[2, 2] * S[:2, :2] + 2.0 * np.outer(turn, turn)
+    (ff, fl), (_, ll) = 0.25 * of_squares
+    spread = np.array([[ll, -fl], [-fl, ff]])
+    covariance = pose.covariance.copy()
+    covariance[:2, :2] += T[:2, :2] @ spread @ T[:2, :2].T
+    return PoseGaussian(pose.mean, covariance)

@@ -27,7 +27,7 @@ from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import least_squares
 from team.estimation.map_joining.least_squares import STUCK, Values, robust_scale
-from team.estimation.map_joining.submap_graph import Graph
+from team.estimation.map_joining.submap_graph import CommonBias, Graph
 from team.estimation.sparse_cholesky import sparse
 
 LEAST_WEIGHT = 1e-6
@@ -51,7 +51,8 @@ class JoinSettings:
     alignment_heading_sigma: the shape of the shared landmarks must give a heading this well [rad].
     bias_sigma: how large the errors are that a robot's submaps share, before they are estimated.
     common_bias_sigma: the same of errors that all robots share, as of a calibration of their kind;
-        they add to each robot's own.
+        they add to each robot's own. "marker": by what share of the range a landmark reads too far
+        for all of them, each landmark by itself.
     joined_ranges: errors of ranges are proportional to the range, and it is taken from the joined
         map (`joining_kernel.with_joined_ranges`).
     association: when landmarks without names count as one.
@@ -68,7 +69,7 @@ class JoinSettings:
     alignment_confidence: float = 0.999
     alignment_heading_sigma: float = 0.3
     bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
-    common_bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
+    common_bias_sigma: Mapping[CommonBias, float] = field(default_factory=dict)
     joined_ranges: bool = False
     association: AssociationProfile = DEFAULT_PROFILE
 
@@ -208,11 +209,12 @@ class Island:
         """Robust weight of each prior: that of a bias as of a submap, of all else 1.
 
         A sensor that was changed since its calibration is one robot's: its prior is an outlier, and
-        must not draw the others, by what they have in common, away from theirs.
+        must not draw the others, by what they have in common, away from theirs. Markers are not
+        changed, and one that is seen from one side only is told from its landmark by its prior.
         """
         if self.settings.robust_c is None:
             return np.ones(len(self.graph.priors))
-        of_bias = np.array([len(prior.mean) == 1 for prior in self.graph.priors], dtype=np.bool_)
+        of_bias = self.graph.of_bias
         weight: Values = 1.0 / (1.0 + self.prior_chi2 / self.settings.robust_c**2)
         return np.where(of_bias, weight, 1.0)
 

@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.config import Bias
+from team.config import UNNAMED, Bias
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import Sighting
@@ -21,19 +21,25 @@ from team.estimation.map_joining.condensed_factor import Condensed
 from team.estimation.map_joining.inter_robot_kernel import Sightings
 from team.estimation.map_joining.joining_kernel import Factors, block_pattern
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
+from team.estimation.submap import LocalMap
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 
 
-NONE_IN_COMMON: Mapping[Bias, float] = MappingProxyType({})
+CommonBias = Bias | Literal["marker"]
+"""What the team has in common: the errors of all sensors, and those of each landmark's marker."""
+CommonError = Bias | int
+"""One of them: a bias of all sensors, or the share of the range that a landmark, by its number,
+reads too far for everyone."""
+NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
 
 
 class Prior(NamedTuple):
     """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹).
 
-    A robust join weighs that of a bias, as a submap, by how far the state is from it.
+    A robust join weighs that of a sensor's bias, as a submap, by how far the state is from it.
     """
 
     node: int
@@ -44,12 +50,13 @@ class Prior(NamedTuple):
 class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
 
-    common: those of its biases that have a node of the whole team too, which stand last.
+    common: the errors that have a node of the whole team, which stand last: of its biases, and of
+        the markers of its landmarks.
     """
 
     contribution: Contribution
     nodes: Indices
-    common: tuple[Bias, ...] = ()
+    common: tuple[CommonError, ...] = ()
 
     @property
     def landmarks(self) -> Indices:
@@ -59,17 +66,30 @@ class Joined(NamedTuple):
         return self.nodes[first : first + len(local.ids)]
 
     @property
-    def biases(self) -> tuple[Bias, ...]:
-        """The bias of each row of `sensitivity`."""
+    def biases(self) -> tuple[CommonError, ...]:
+        """The error of each row of `sensitivity`."""
         return (*self.contribution.local.biases, *self.common)
 
     @property
     def sensitivity(self) -> Float[np.ndarray, "B _"]:
-        """∂mean/∂b, a row for each bias node: a robot's own error and the team's add."""
+        """∂mean/∂b, a row for each bias node: a robot's own error and the team's add.
+
+        A marker's is that of the scale of the ranges, as far as it moves this landmark.
+        """
         local = self.contribution.local
         if not self.common:
             return local.sensitivity
-        return local.sensitivity[[local.biases.index(bias) for bias in self.biases]]
+        rows = local.sensitivity[[local.biases.index(_scaling(error)) for error in self.biases]]
+        first = len(local.mean) - 2 * len(local.ids)
+        for row, error in zip(rows, self.biases, strict=True):
+            if isinstance(error, int):
+                at = first + 2 * int(np.searchsorted(local.ids, error))
+                row[:at] = row[at + 2 :] = 0.0
+        return rows
+
+
+def _scaling(error: CommonError) -> Bias:
+    return "range_scale" if isinstance(error, int) else error
 
 
 class Encounter(NamedTuple):
@@ -105,7 +125,7 @@ class Graph:
     submaps: tuple[Joined, ...]
     sightings: tuple[Encounter, ...]
     priors: tuple[Prior, ...]
-    common: Mapping[Bias, int] = field(default_factory=dict)
+    common: Mapping[CommonError, int] = field(default_factory=dict)
     condensed: Condensed | None = None
     gone: Mapping[Stream, int] = field(default_factory=dict)
 
@@ -129,7 +149,8 @@ class Graph:
             block=np.concatenate([np.zeros((0, 3)), *(each.blocks for each in submaps)]),
             block_start=_starts([len(each.local.ids) for each in submaps]),
             of_range=np.array(
-                [b == "range_scale" for each in self.submaps for b in each.biases], np.bool_
+                [_scaling(b) == "range_scale" for each in self.submaps for b in each.biases],
+                np.bool_,
             ),
             row_start=_starts([len(each.biases) for each in self.submaps]),
         )
@@ -179,6 +200,14 @@ class Graph:
         return dimensions
 
     @cached_property
+    def of_bias(self) -> Bool[np.ndarray, " priors"]:
+        """Which priors are of a bias of sensors, not of a pose or a landmark's marker."""
+        markers = {node for error, node in self.common.items() if isinstance(error, int)}
+        return np.array(
+            [len(each.mean) == 1 and each.node not in markers for each in self.priors], np.bool_
+        )
+
+    @cached_property
     def headings(self) -> Indices:
         """Where the headings lie in the state."""
         headings: Indices = self.offset[:-1][np.diff(self.offset) == 3] + 2
@@ -207,9 +236,9 @@ class Graph:
         for (stream, bias), at in self.biases.items():
             if node == at:
                 return f"the bias {bias} of {named(stream)}"
-        for bias, at in self.common.items():
+        for error, at in self.common.items():
             if node == at:
-                return f"the bias {bias} of the team"
+                return f"the {'marker' if isinstance(error, int) else 'bias'} {error} of the team"
         ids = [id_ for id_, at in self.landmarks.items() if at == node]
         return f"landmark {ids[0]}"
 
@@ -266,7 +295,7 @@ def extended(
     contributions: Sequence[Contribution],
     starts: Mapping[Stream, InitialPoseFactor],
     bias_sigma: Mapping[Bias, float],
-    common_bias_sigma: Mapping[Bias, float] = NONE_IN_COMMON,
+    common_bias_sigma: Mapping[CommonBias, float] = NONE_IN_COMMON,
     numbers: Mapping[Key, Sequence[int]] = NO_NUMBERS,
 ) -> tuple[Graph, Values]:
     """The graph with more submaps, in the given order; a stream without a start begins at 0.
@@ -305,16 +334,16 @@ def extended(
                 growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
                 certainty = np.array([[bias_sigma[bias] ** -2]])
                 priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
-        common = tuple(bias for bias in local.biases if bias in common_bias_sigma)
-        for bias in common:
-            if bias not in growth.common:
-                growth.common[bias] = growth.add(np.zeros(1), fixed=False)
-                certainty = np.array([[common_bias_sigma[bias] ** -2]])
-                priors.append(Prior(growth.common[bias], np.zeros(1), certainty))
+        common = _in_common(local, common_bias_sigma)
+        for error, sigma in common.items():
+            if error not in growth.common:
+                growth.common[error] = growth.add(np.zeros(1), fixed=False)
+                certainty = np.array([[sigma**-2]])
+                priors.append(Prior(growth.common[error], np.zeros(1), certainty))
         errors = [growth.biases[stream, bias] for bias in local.biases]
-        errors += [growth.common[bias] for bias in common]
+        errors += [growth.common[error] for error in common]
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
-        submaps.append(Joined(contribution, nodes, common))
+        submaps.append(Joined(contribution, nodes, tuple(common)))
     grown = Graph(
         streams=growth.streams,
         landmarks=growth.landmarks,
@@ -330,6 +359,22 @@ def extended(
         gone=graph.gone,
     )
     return grown, np.concatenate([state, *growth.values])
+
+
+def _in_common(
+    local: LocalMap, common_bias_sigma: Mapping[CommonBias, float]
+) -> dict[CommonError, float]:
+    """The errors of a submap that the whole team has, each with its sigma, in their order.
+
+    Landmarks without names have no marker that could be known again.
+    """
+    found: dict[CommonError, float] = {
+        bias: common_bias_sigma[bias] for bias in local.biases if bias in common_bias_sigma
+    }
+    of_marker = common_bias_sigma.get("marker")
+    if of_marker is not None and "range_scale" in local.biases:
+        found |= dict.fromkeys((id_ for id_ in local.ids.tolist() if id_ < UNNAMED), of_marker)
+    return found
 
 
 class CondensedError(ValueError):

@@ -15,21 +15,23 @@ from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, conver
 from team.estimation.submap import LocalMap
 from tests.estimation.submap_world import local_truth
 
-OWN, COMMON = 0.03, 0.1
+OWN, COMMON, MARKER = 0.03, 0.1, 0.04
 SIGMA = {"range_scale": OWN}
 SHARE = 0.1
 """Of a range: the standard deviation of its error in one submap."""
 LANDMARKS = np.array([[4.0, 3.0], [6.0, -3.0], [9.0, 2.0], [3.0, -4.0], [11.0, -2.0]])
 
 
-def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01):
+def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01, marker=0.0):
     """Robots on known ways whose ranges are wrong in proportion; each says what it measured.
 
-    own, common: standard deviations of the robots' errors; way: of each submap's end pose [m].
+    own, common, marker: standard deviations of errors of each robot, of all, and of each landmark's
+    marker, whoever sees it; way: of each submap's end pose [m].
     Contributions, starts, and the true error of each robot's scale.
     """
     random = np.random.default_rng(seed)
     shared = common * random.standard_normal()
+    of_marker = marker * np.random.default_rng([seed, 1]).standard_normal(len(LANDMARKS))
     made, starts, errors = [], [], {}
     for r in range(robots):
         robot, pose = f"r{r}", np.array([0.0, 2.0 * r - 1.0, 0.0])
@@ -47,6 +49,7 @@ def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01):
                 angle = np.arctan2(off[1], off[0]) + 0.01 * random.standard_normal()
                 # The scale multiplies what is there; the noise of the measurement adds to it.
                 share = 1.0 + errors[robot] + SHARE * random.standard_normal()
+                share += of_marker[at // 2 - 1]
                 ahead = np.array([np.cos(angle), np.sin(angle)])
                 distance = np.hypot(*off) * share
                 mean[at : at + 2] = middle + distance * ahead
@@ -147,16 +150,37 @@ def nees_of_maps(seeds, common_bias_sigma):
     )
     total = 0.0
     for seed in seeds:
-        submaps, starts, _ = carts(seed, submaps=4, own=0.1 * OWN, common=COMMON, way=0.05)
+        submaps, starts, _ = carts(
+            seed, submaps=3, own=0.1 * OWN, common=COMMON, way=0.05, marker=MARKER
+        )
         found = marginals.landmark_map(fold_of(submaps, starts, options))
         total += nees((found.means - LANDMARKS).ravel(), found.covariance)
     return total / len(seeds)
 
 
-def test_a_map_with_a_common_error_is_as_sure_as_it_says_only_where_the_team_has_a_state_of_it():
+def test_a_map_is_as_sure_as_it_says_only_with_a_state_of_each_error_that_all_robots_share():
+    """Of the scale of all ranges, and of each landmark's marker, which reads too far for all."""
     low, high = chi2_interval(10, 0.999, len(SEEDS))
-    assert low < nees_of_maps(SEEDS, {"range_scale": COMMON}) / 10.0 < high
-    assert nees_of_maps(SEEDS[:50], {}) / 10.0 > 1.3
+    states = {"range_scale": COMMON, "marker": MARKER}
+    assert low < nees_of_maps(SEEDS, states) / 10.0 < high
+    for missing in states:
+        less = {name: sigma for name, sigma in states.items() if name != missing}
+        assert nees_of_maps(SEEDS[:25], less) / 10.0 > 1.25
+
+
+def test_a_marker_is_the_teams_and_its_prior_is_no_sensors_bias():
+    submaps, starts, _ = carts(6, submaps=2, marker=MARKER)
+    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER}, robust_c=1.0)
+    graph = fold_of(submaps, starts, options).main.graph
+    assert sorted(graph.common) == [1, 2, 3, 4, 5]
+    assert graph.name(graph.common[3]) == "the marker 3 of the team"
+    markers = set(graph.common.values())
+    assert [each.node not in markers for each in graph.priors] == graph.of_bias.tolist()
+    rows = graph.submaps[0].sensitivity
+    local = graph.submaps[0].contribution.local
+    np.testing.assert_array_equal(rows[1:].sum(axis=0), np.where(np.arange(13) < 3, 0.0, rows[0]))
+    np.testing.assert_array_equal(rows[0], local.sensitivity[0])
+    assert (np.count_nonzero(rows[1:], axis=1) == 2).all()
 
 
 def test_what_a_robot_is_told_of_its_scale_is_its_own_error_and_the_teams():

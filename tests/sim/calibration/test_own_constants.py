@@ -8,7 +8,7 @@ import pytest
 from central.desk.evaluation.errors import Path, on_circle
 from sim.calibration.calibrate import _other_model
 from sim.calibration.data import Reference
-from sim.calibration.own import own_constants
+from sim.calibration.own import marker_spread, own_constants
 from sim.calibration.sensor import fit_sensor
 from sim.world.streams import Intervals, grouped
 
@@ -22,7 +22,12 @@ BENT = -0.05
 
 
 def looking(
-    robot: str, world: int, camera: tuple[float, float, float], *, depth: bool = True
+    robot: str,
+    world: int,
+    camera: tuple[float, float, float],
+    *,
+    depth: bool = True,
+    marker: float = 0.0,
 ) -> Reference:
     """A robot that stands at the origin and reads eight landmarks 300 times, 1 % of the range."""
     rng = np.random.default_rng([int(robot[1:]), world])
@@ -31,6 +36,7 @@ def looking(
     places = np.repeat(np.array(list(PLACES.values())), 300, axis=0)
     bearings = np.arctan2(places[:, 1], places[:, 0])
     distances = np.hypot(*places.T) * (1.0 + 0.01 * rng.standard_normal(len(ids)))
+    distances *= 1.0 + marker * np.random.default_rng(world).standard_normal(len(PLACES))[ids - 1]
     raw = bearings + 0.01
     for _ in range(20):
         raw = bearings + 0.01 + BENT * raw**3
@@ -96,3 +102,19 @@ def test_the_wrong_model_of_the_range_is_told(depth: bool) -> None:
     assert _other_model(data, depth) == ()
     (told,) = _other_model(data, not depth)
     assert f"set range_is_depth = {str(depth).lower()}" in told
+
+
+def test_how_far_markers_differ_comes_out_and_is_none_where_they_are_alike() -> None:
+    """Of six worlds of eight landmarks, whose constants take up a part of what they differ by."""
+    marked = [
+        looking(r, world, camera, marker=0.02)
+        for world in range(1, 7)
+        for r, camera in CAMERAS.items()
+    ]
+    found = marker_spread(marked, depth=True)
+    assert found is not None
+    assert found.name == "common_bias_sigma.marker"
+    assert found.value == pytest.approx(0.02, abs=3.0 * found.sigma)
+    assert 0.0005 < found.sigma < 0.004
+    assert marker_spread(team(CAMERAS), depth=True) is None
+    assert marker_spread(marked[:1], depth=True) is None
