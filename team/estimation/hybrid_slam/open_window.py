@@ -71,7 +71,8 @@ class OpenWindow:
 
     def confirm(self) -> None:
         """Where there may be outliers, or there are detections without identities, the window once
-        more with what all of it confirms; where that depleted the particles, again with more.
+        more with what all of it confirms; where that depleted the particles, again with more
+        (where landmarks have names and errors are white: decision 0081).
         """
         self._try(self._settle)
 
@@ -138,7 +139,9 @@ class OpenWindow:
             keyframes = self.settled.keyframes
         if has_unnamed or self._gate.judges:
             self._take_all(keyframes)
-        if self._least < DEPLETED and not has_unnamed:
+        sensor = self._config.sensor
+        white = sensor.range_white == sensor.bearing_white == 1.0
+        if self._least < DEPLETED and white and not has_unnamed:
             self._take_all(keyframes, AGAIN)
 
     def _take_all(self, keyframes: Sequence[Keyframe], times: int = 1) -> None:
