@@ -52,14 +52,17 @@ bench: $(VENV)/.dev
 
 # The pictures are made once; `make clean` lets them be made anew.
 PICTURES := docs/generated
-docs: $(VENV)/.dev $(PICTURES)/run/report.html $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
+RUNS := run hidden peers
+docs: $(VENV)/.dev $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
   $(PICTURES)/benchmarks.png
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs docs/_build/site
 	@echo "docs/_build/site/index.html"
 
-$(PICTURES)/run/report.html: | $(VENV)/.dev
+$(PICTURES)/hidden/report.html: OPTIONS := --identities hidden
+$(PICTURES)/peers/report.html: OPTIONS := --without-centre
+$(PICTURES)/%/report.html: | $(VENV)/.dev
 	rm -rf $(@D)
-	$(BIN)/teamslam launch waypoints --speed max --output $(@D)
+	$(BIN)/teamslam launch waypoints --speed max $(OPTIONS) --output $(@D)
 
 $(PICTURES)/benchmarks.png: benchmarks/chart.py $(wildcard benchmarks/*.json) | $(VENV)/.dev
 	$(BIN)/python -m benchmarks.chart $(@D)

@@ -155,6 +155,9 @@ def test_the_example_of_fastslam_is_short_and_maps_the_landmarks(
     found = re.fullmatch(r"8 landmarks, RMSE (0\.\d+) m\n", out)
     assert found is not None
     assert float(found[1]) < 0.2
+    lines = (EXAMPLES / "fastslam.py").read_text("utf-8").splitlines()
+    begin, end = (next(k for k, x in enumerate(lines) if x.startswith(y)) for y in ("rng", "print"))
+    assert sum(map(bool, lines[begin : end + 1])) <= 20
     assert (tmp_path / "f.png").stat().st_size > 10_000
 
 
