@@ -43,15 +43,6 @@ def opened_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
         raise NoTablesError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
 
 
-def is_folder(path: str | Path) -> bool:
-    """Whether there is a data set of CSV tables."""
-    try:
-        with opened_folder(str(path)):
-            return True
-    except (DatasetError, OSError):
-        return False
-
-
 def has_tables(path: str | Path) -> bool:
     """Whether tables of robots lie there, whatever the folders are called; raises DatasetError."""
     if not Path(path).exists():

@@ -11,7 +11,6 @@ from sim.world.radio import reach_of
 from sim.world.streams import WorldStreams
 from team.estimation.randomness import generator
 
-EVERYONE = "*"
 Reach = Callable[[str, str, int], bool]
 """Whether two nodes reach each other at a team time [ns]."""
 

@@ -141,19 +141,6 @@ def _unit_diagonal(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64
         return np.clip(matrix / sigmas / sigmas[:, None], -2.0, 2.0)
 
 
-def least_pivot(covariance: NDArray[np.float64]) -> float:
-    """The least share 1 − Rᵢ² of a variance that the numbers before it leave unexplained.
-
-    The squared diagonal of the Cholesky factor of the matrix scaled to a unit diagonal, whose lower
-    triangle is read; 0 where there is none. No change of units alters it.
-    """
-    try:
-        factor = np.linalg.cholesky(_unit_diagonal(covariance, ""))
-    except ValueError:  # numpy's LinAlgError is one
-        return 0.0
-    return float(np.min(np.diag(factor), initial=1.0) ** 2)
-
-
 def _check_positive(scaled: NDArray[np.float64], what: str) -> None:
     """Of a matrix with a unit diagonal: each pivot is more than rounding can leave, n ε."""
     try:

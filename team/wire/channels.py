@@ -239,7 +239,6 @@ REPLIES = {
 """The channels whose messages answer a query."""
 UNOPENED = (*QUERIES, VIEW)
 """Rows whose traffic is not opened: queries have no samples, a view is no message of ours."""
-EVERYTHING = "**"
 
 
 def robot_node(robot: str) -> str:
