@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -130,7 +131,11 @@ def nodes(options: argparse.Namespace) -> dict[str, object]:
                 launch.send_signal(signal.SIGINT)
                 status = launch.wait(60.0)
         said.close()
-        result = json.loads((folder / "result.json").read_text()) if not waits else {}
+        if options.keep:
+            subprocess.run(["cp", "-r", folder, options.keep], check=False)
+        result = {}
+        with suppress(OSError, ValueError):
+            result = json.loads((folder / "result.json").read_text())
         text = (folder / "said").read_text("utf-8", "replace")
         left = children(launch.pid, folder)
         for pid in left:
@@ -139,13 +144,12 @@ def nodes(options: argparse.Namespace) -> dict[str, object]:
         equal = None
         if options.keys:
             equal = final == expected_of(resolved)
-        if options.keep:
-            subprocess.run(["cp", "-r", folder, options.keep], check=False)
     return {
         "sent": dict(sent), "total": sent.total(), "storm_s": round(storm_s, 1), "exit": status,
         "waits": waits, "restarts": result.get("restarts", {}), "equal": equal,
         "faults": [line for line in text.splitlines() if "set aside" in line],
         "deaths": [line for line in text.splitlines() if "is started again" in line],
+        "tracebacks": text.count("Traceback (most recent call last)"),
         "final": final is not None, "left": len(left), "failures": result.get("failures", []),
     }  # fmt: skip
 
@@ -173,7 +177,7 @@ def main() -> int:
         after = nodes(options)
         found |= after
         print(json.dumps(after, indent=1), flush=True)
-        bad |= bool(after["deaths"] or after["faults"] or after["left"])
+        bad |= any(after[what] for what in ("deaths", "faults", "left", "waits", "tracebacks"))
         bad |= bool(options.keys) and (after["equal"] is not True or after["exit"] != 0)
     if options.json:
         options.json.write_text(json.dumps(found | {"load": os.getloadavg()[0]}, indent=1))

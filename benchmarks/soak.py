@@ -88,7 +88,7 @@ def watched(launch: subprocess.Popen[bytes], seconds: float) -> dict[int, Proces
     found: dict[int, Process] = {}
     began = time.monotonic()
     while (now := time.monotonic() - began) < seconds and launch.poll() is None:
-        for pid, name in children(launch.pid).items():
+        for pid, name in {launch.pid: "launch", **children(launch.pid)}.items():
             seen = look(pid)
             if seen is not None:
                 found.setdefault(pid, Process(name)).looks.append((now, *seen))
@@ -121,8 +121,13 @@ def main() -> int:
             launch = subprocess.Popen(command, stdout=output, stderr=output)  # our own program
             found = watched(launch, seconds)
             died = launch.poll() is not None
-            launch.send_signal(signal.SIGINT)
-            launch.wait(60.0)
+            launch.send_signal(signal.SIGTERM)  # SIGINT is ignored by what a shell's & has started
+            try:
+                launch.wait(60.0)
+            except subprocess.TimeoutExpired:
+                sys.stderr.write("launch had not ended 60 s after SIGTERM: killed\n")
+                launch.kill()
+                launch.wait()
         if died:
             sys.stderr.write((Path(place) / "output").read_text("utf-8", "replace")[-2000:])
         log = sum(each.stat().st_size for each in run.glob("*.mcap")) / 1e6

@@ -24,6 +24,8 @@ FRESH_SHARE = 1.0 / 3.0
 """Of the time, for maps that are not due: so one waits for two solutions at the most."""
 FAREWELL_S = 10.0
 """The centre leaves after the others, at most this long after its final map."""
+ORDERS_S = 30.0
+"""Between two questions to the router for an operator's orders."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -60,6 +62,7 @@ class CentralShell:
         self._missing = MissingMeasurements(self._shell)
         self._patience: Patience[tuple[str, int]] = Patience()
         self._greeted: set[str] = set()
+        self._orders_due = 0.0
 
     def run(self) -> None:
         """Until the final map is out and the others have gone."""
@@ -67,7 +70,7 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
-        self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
+        self._hear_orders()
         self._shell.look_for_the_end()
         self._restore()
         self._shell.begin()
@@ -81,6 +84,7 @@ class CentralShell:
             self._give_up()
             self._shell.contained("wanted", lambda: self._missing.look(self.node.wanted()))
             self._shell.contained("wanted", self._gather)
+            self._hear_orders()
             self._shell.report()
         self._shell.report(last=True)
         final = self.node.final
@@ -161,15 +165,24 @@ class CentralShell:
             )
         return tuple(said)
 
+    def _hear_orders(self) -> None:
+        """Ask the router for the operator's orders now and then: who gave them does not stay, and
+        this process may have been cut off, or another one, when they were given.
+        """
+        now = time.monotonic()
+        if now >= self._orders_due:
+            self._orders_due = now + ORDERS_S
+            self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
+
     def _gather(self) -> None:
         """Ask robots for what they have sent and the centre lacks; those that appear, for all.
 
         What a resumed robot took over from an earlier life is in no publisher's cache.
         """
         robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
-        for robot in sorted(robots - self._greeted):
+        for robot in sorted(robots.intersection(self.node.robots) - self._greeted):
             self._bus.request(ch.SENT, robot, m.SubmapsRequest(stamp_ns=0, robot=robot))
-        self._greeted |= robots
+        self._greeted |= robots.intersection(self.node.robots)
         wanted = {(each.robot, each.incarnation): each for each in self.node.lacking()}
         firsts = {stream: each.first for stream, each in wanted.items()}
         for stream in self._patience.due(firsts, time.monotonic()):

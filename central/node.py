@@ -4,7 +4,7 @@ It listens to what its rule consumes (submaps, own maps or raw measurements), to
 liveliness, and to nothing that holds the fused map.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import msgspec
 
@@ -13,7 +13,7 @@ from central.fused import fused_message
 from central.roll import Roll
 from central.rule import rule_of
 from team import translate
-from team.door import Door
+from team.door import Door, absurd
 from team.estimation.gaussian import NO_LANDMARKS
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -70,7 +70,9 @@ class CentralNode:
         self._admit(message)
         refused = self._door.refusal(message)
         if refused is None and isinstance(message, m.End):
-            return self._roll.contradicts(message)
+            refused = self._roll.contradicts(message)
+            if refused is not None:
+                self._roll.doubt(message)
         return refused
 
     def _admit(self, message: m.Message) -> None:
@@ -78,7 +80,7 @@ class CentralNode:
         robot = message.robot if isinstance(message, m.InitialPose) else None
         if isinstance(message, m.Configuration):
             robot = ch.robot_of(message.node)
-        if not self._admits or robot is None or robot in self._roll.robots:
+        if not self._admits or robot is None or robot in self._roll.robots or absurd(message):
             return
         if len(self._roll.robots) < MOST_ROBOTS:
             for admits in (self._door, self._roll, self._rule):
@@ -116,6 +118,11 @@ class CentralNode:
         if final.final and not self.finished:
             self.finished, self.final = True, final
         return []
+
+    @property
+    def robots(self) -> Collection[str]:
+        """Who is in the team."""
+        return self._roll.robots.keys()
 
     @property
     def awaited(self) -> list[str]:

@@ -56,11 +56,14 @@ class Roll:
     """The team's robots by name; `now_ns` is the newest team time that anyone has spoken of.
 
     withdrawn: the robots that the team goes on without; nobody waits for one that has left.
-    world_end: the end that a world has said. ordered: a live team was told to end.
+    world_end: the end that a world has said. doubted: one that contradicts what robots have said to
+    have consumed; their last words may yet say that it is right. ordered: a live team was told to
+    end.
     """
 
     robots: dict[str, Attendance]
     world_end: m.End | None = None
+    doubted: m.End | None = None
     now_ns: int = 0
     withdrawn: frozenset[str] = frozenset()
     ordered: bool = False
@@ -89,6 +92,7 @@ class Roll:
                 # A robot's last word is that of its last incarnation, in whichever order they come.
                 if robot.done is None or robot.done.incarnation <= message.incarnation:
                     robot.done = message
+                    self.doubt(self.doubted)
             case m.End():
                 self.world_end = later_end(message, self.world_end)
             case m.TeamEnd():
@@ -107,6 +111,20 @@ class Roll:
                 found.given_up = True
             case _:
                 pass
+
+    def doubt(self, end: m.End | None) -> None:
+        """Keep an end that contradicts robots' progress until all of them are done at its counts.
+
+        A word on how far a robot is may be anybody's where there are no keys; a robot that is done
+        there has had the same end from its source.
+        """
+        self.doubted = end
+        if end is None:
+            return
+        dones = {r: a.done for r, a in self.robots.items() if a.done is not None}
+        counts = {(d.robot, d.incarnation, d.measurements) for d in dones.values()}
+        if counts == {(s.robot, s.incarnation, s.measurements) for s in end.streams}:
+            self.world_end, self.doubted = later_end(end, self.world_end), None
 
     def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
         robot.began = max(robot.began, message.incarnation)

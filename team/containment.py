@@ -99,7 +99,7 @@ class Boundary:
         try:
             return open_()
         except WireError as error:
-            self._refuse(sample, str(error))
+            self.refuse(sample, str(error))
         except Exception as error:
             return [self.note(error, sample, "")]
         return []
@@ -112,7 +112,7 @@ class Boundary:
         try:
             refused = node.refusal(message) if _guarded(type(node)) else None  # type: ignore[attr-defined]
             if refused is not None:
-                self._refuse(sample, refused)
+                self.refuse(sample, refused)
                 return []
             if _takes_samples(type(node)):
                 return node.handle_sample(message, sample)  # type: ignore[attr-defined, no-any-return]
@@ -127,7 +127,8 @@ class Boundary:
                 out.append(self.note(error, sample, tag))
         return out
 
-    def _refuse(self, sample: Sample, why: str) -> None:
+    def refuse(self, sample: Sample, why: str) -> None:
+        """Count and log a message that is not taken."""
         self.refused += 1
         self.last_refused = f"{_cut(sample.key, 80)}: {_cut(why, 200)}"
         _LOG.warning("%s: dropped %s", self.name, self.last_refused)

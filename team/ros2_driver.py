@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from team.containment import place_of
 from team.driver.measured import MeasurementError
 from team.ros2.decoding import READERS, DamagedError, Record, TransformsRecord, decode
 from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token
@@ -25,6 +26,8 @@ STATIC = "/tf_static"
 ODOMETRY = "nav_msgs/msg/Odometry"
 HELD = 1000
 """Messages of a topic whose type no token has told yet."""
+MOST_REASONS = 100
+"""Reasons for which messages are dropped that are told apart: a key's type may be any text."""
 WARN_S = 10.0
 """Between two words about what is dropped."""
 NANO = Decimal(10) ** -9
@@ -90,7 +93,7 @@ class Ros2Driver:
             return
         named = of_rmw(sample.key, self._domain)
         if named is not None:
-            topic, kind = named
+            topic, kind = named[0], named[1][:80]
         else:
             topic = "/" + sample.key.strip("/")
             kind = self._kinds.get(topic, "")
@@ -123,10 +126,16 @@ class Ros2Driver:
                 for transform in record.transforms:
                     self._translator.frames.take(transform)
             return
-        for measured in self._translator.take(topic, _stamped(record)):
+        try:
+            found = self._translator.take(topic, _stamped(record))
+        except Exception as error:  # a sound message that the translation does not know how to take
+            place = place_of(error.__traceback__)
+            self._note(f"{topic}: set aside", f"{type(error).__name__} at {place}: {error}")
+            return
+        for measured in found:
             try:
                 self._hand_over(measured)
-            except MeasurementError as error:
+            except (MeasurementError, OverflowError) as error:
                 self._note(f"{topic}: refused", str(error))
 
     def _hand_over(self, measured: Measured) -> None:
@@ -152,6 +161,8 @@ class Ros2Driver:
                 pass
 
     def _note(self, reason: str, detail: str = "") -> None:
+        if reason not in self.dropped and len(self.dropped) >= MOST_REASONS:
+            reason = "for other reasons"
         self.dropped[reason] += 1
         if reason not in self._said and detail:
             _LOG.warning("%s (first: %s)", reason, detail)

@@ -90,6 +90,8 @@ class Shell:
         self._remind_due = time.monotonic() + REMIND_S
         self.boundary = Boundary(name)
         self.notes: Callable[[], tuple[str, ...]] = tuple
+        self.believed: Callable[[Sequence[Sample]], Sequence[Sample]] = lambda samples: samples
+        """What of the samples of a turn the process lets come to its node's door."""
         self.the_end = TheEnd(bus, name)
         self._recorder_is_there: bool | None = None
         self._recorder_since = 0.0
@@ -283,7 +285,7 @@ class Shell:
         """Turn after turn until the end: input, the node's answers, `duty`, status."""
         self.begin()
         while self.going:
-            self.take(self.receive())
+            self.take(self.believed(self.receive()))
             self.look_for_the_end()
             self.contained("duty", duty)
             self.report()

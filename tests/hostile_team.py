@@ -27,8 +27,11 @@ SIGMAS = (1e-150, 1e-30, 1e-9, 1e-6, 1e-3, 0.1, 0.1, 0.1, 1.0, 30.0, 1e3, 1e6, 1
 ROBOTS = ("r1", "r2", "r3")
 PAIR = ("r1", "r2")
 """The robots of the scenario that real processes run."""
-OF_THE_RUN = (m.FusedMap, m.End, m.Done, m.Withdrawal, m.WithdrawalHeard, m.GivenUp)
-"""What only keys can keep a stranger from: he ends the run, or makes it wait."""
+OF_THE_RUN = (
+    m.FusedMap, m.End, m.Done, m.Withdrawal, m.WithdrawalHeard, m.GivenUp, m.TeamEnd, m.StreamHead,
+    m.Fault,
+)  # fmt: skip
+"""What only keys can keep a stranger from: he ends the run or makes it wait, or lies of a fault."""
 SKIPPED = (*ch.QUERIES, ch.VIEW, ch.ALIVE)
 
 
@@ -76,10 +79,14 @@ def packed(P: np.ndarray) -> bytes:
 
 
 class Team:
-    """The robots of a hostile team: chains of submaps that continue, so that a set takes them."""
+    """The robots of a hostile team: chains of submaps that continue, so that a set takes them.
+
+    In every third team landmarks have no names, and an operator says which are one, or two.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
+        self._unnamed = int(rng.integers(3)) == 0
         self._next = dict.fromkeys(ROBOTS, 0)
         self.messages: list[m.Message] = []
         for robot in ROBOTS:
@@ -123,6 +130,8 @@ class Team:
     def submap(self, robot: str) -> m.Submap:
         rng, k = self._rng, self._next[robot]
         ids = np.unique(rng.integers(1, 8, int(rng.integers(0, 6)))).astype(np.uint32)
+        if self._unnamed:
+            ids = (2**31 + np.arange(len(ids))).astype(np.uint32)
         nodes = np.unique(rng.integers(1, 6, int(rng.integers(0, 3)))) * 2 * S + k * 10 * S
         n = 3 + 3 * len(nodes) + 2 * len(ids)
         mean = numbers(rng, n)
@@ -162,6 +171,25 @@ class Team:
             self._next[robot] += 1
             for each in seen:
                 self._add(each)
+        if self._unnamed and rng.random() < 0.3:
+            self._add(self._verdict())
+
+    def _verdict(self) -> m.Verdict:
+        """An operator's word on two landmarks, which need not be there."""
+        rng = self._rng
+        first, second = (
+            m.LocalLandmark(
+                robot=str(rng.choice(ROBOTS)),
+                incarnation=1,
+                sequence=int(rng.integers(4)),
+                local=int(rng.choice([0, 1, 2, 2**31 - 1], p=[0.4, 0.3, 0.2, 0.1])),
+            )
+            for _ in range(2)
+        )
+        judgement = m.Judgement(first=first, second=second, same=bool(rng.random() < 0.5))
+        return m.Verdict(
+            stamp_ns=0, robot=first.robot, judgement=judgement, by="operator", reason="it is so"
+        )
 
     def _sighting(self, submap: m.Submap, stamp_ns: int) -> m.SightingFactor:
         rng = self._rng
@@ -231,6 +259,47 @@ def centre_session(
     return centre, out
 
 
+def _interval(
+    rng: np.random.Generator, robot: str, number: int, start_ns: int, end_ns: int
+) -> m.Measurement:
+    """One odometry interval in any of its three forms."""
+    speed = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 1.0
+    turn = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 0.1
+    name = {"stamp_ns": end_ns, "robot": robot, "incarnation": 1, "number": number}
+    name["duration_ns"] = end_ns - start_ns
+    match rng.integers(6):
+        case 0:
+            spread = b"" if rng.random() < 0.5 else from_floats(covariance(rng, 3))
+            motion = from_floats([speed, float(numbers(rng, 1)[0]), np.clip(turn, -3.1, 3.1)])
+            return m.Increment(**name, increment=motion, covariance=spread)
+        case 1:
+            return m.Steering(**name, wheel_speed=speed, steering=float(np.clip(turn, -1.5, 1.5)))
+        case _:
+            return m.Odometry(**name, forward=speed, yaw_rate=turn)
+
+
+def _scan(rng: np.random.Generator, robot: str, number: int, stamp_ns: int) -> m.Measurement:
+    """Landmarks with identities, as ranges or points, or without; with own covariances or not."""
+    n = int(rng.choice([0, 1, 2, 3, 6, 300], p=[0.1, 0.2, 0.3, 0.2, 0.18, 0.02]))
+    ids = from_ids(rng.integers(1, 8 if n < 300 else 5000, n))
+    ranges, bearings = np.abs(numbers(rng, n)), rng.uniform(-np.pi, np.pi, n)
+    bearings *= rng.random() < 0.8
+    spread = b""
+    if rng.random() < 0.3:
+        spread = b"".join(packed(covariance(rng, 2)) for _ in range(n))
+    name = {"stamp_ns": stamp_ns, "robot": robot, "incarnation": 1, "number": number}
+    polar = {"ranges": from_floats(ranges), "bearings": from_floats(bearings)}
+    match rng.integers(6):
+        case 0:
+            places = from_floats(numbers(rng, 2 * n))
+            return m.Points(**name, ids=ids, positions=places, covariances=spread)
+        case 1:
+            alike = b"" if rng.random() < 0.5 else from_floats(numbers(rng, n))
+            return m.Detections(**name, **polar, covariances=spread, signatures=alike)
+        case _:
+            return m.Observations(**name, ids=ids, **polar, covariances=spread)
+
+
 def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator[m.Message]:
     """The measurements of one robot, as a broken driver may send them, and what comes back."""
     yield Team(rng).start(robot)
@@ -243,35 +312,12 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
         if kind == 0:  # a clock that stands, goes back or leaps
             stamp_ns = now_ns + int(rng.choice([-3600, -1, 0, 3600, 10**7, 10**9])) * S
         if kind <= 5:
-            duration_ns = int(rng.choice([0, 1, S // 10, S, S, S, S, 3600 * S]))
-            speed = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 1.0
-            yaw = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 0.1
-            end_ns = stamp_ns + duration_ns
-            yield m.Odometry(
-                stamp_ns=end_ns,
-                robot=robot,
-                incarnation=1,
-                number=counter,
-                duration_ns=duration_ns,
-                forward=speed,
-                yaw_rate=yaw,
-            )
+            end_ns = stamp_ns + int(rng.choice([0, 1, S // 10, S, S, S, S, 3600 * S]))
+            yield _interval(rng, robot, counter, stamp_ns, end_ns)
             if kind != 0:
                 now_ns = end_ns
         elif kind <= 10:
-            n = int(rng.choice([0, 1, 2, 3, 6, 300], p=[0.1, 0.2, 0.3, 0.2, 0.18, 0.02]))
-            ids = rng.integers(1, 8 if n < 300 else 5000, n)
-            ranges = np.abs(numbers(rng, n))
-            bearings = rng.uniform(-np.pi, np.pi, n) * (rng.random() < 0.8)
-            yield m.Observations(
-                stamp_ns=stamp_ns,
-                robot=robot,
-                incarnation=1,
-                number=counter,
-                ids=from_ids(ids),
-                ranges=from_floats(ranges),
-                bearings=from_floats(bearings),
-            )
+            yield _scan(rng, robot, counter, stamp_ns)
         else:
             names = tuple(str(x) for x in rng.choice(ROBOTS, int(rng.integers(0, 3))))
             yield m.Sightings(

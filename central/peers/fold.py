@@ -17,6 +17,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
+from team.wire.newer import further, later_end, later_head
 
 FoldWhen = Literal["always", "request", "end"]
 """When a peer folds: as the set grows; when asked to, and when all is there; or only then."""
@@ -40,6 +41,7 @@ class PeerFold:
         self._peer = peer
         self.boundary = Boundary(peer.node)
         self._end: m.End | None = None
+        self._doubted: m.End | None = None
         self._progress: dict[str, m.Progress] = {}
         self._alive: dict[str, bool] = {}
         self._heads: dict[str, m.StreamHead] = {}
@@ -56,30 +58,40 @@ class PeerFold:
             for alive in (True, self._alive.get(robot, False)):
                 node = ch.robot_node(robot)
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
-        ends = (self._end, self._ordered)
+        ends = (self._end, self._doubted, self._ordered)
         known = (*self._heads.values(), *(e for e in ends if e is not None))
         for said in (*known, *self._progress.values()):
             self._give(said)
 
     def note(self, message: m.Message) -> list[Outgoing]:
         """Take what is no member: progress, liveliness, the end of the streams."""
+        refused = self.centre.refusal(message)
+        if refused is None and not self._kept(message):
+            return []
+        if refused is not None and isinstance(message, m.End):
+            self._doubted = message  # robots' last words may yet say that it is right
+        return [*self._give(message), *self.grow()]
+
+    def _kept(self, message: m.Message) -> bool:
+        """Keep for a fold that begins anew what no later word takes back; whether it is of use."""
         match message:
             case m.End():
-                self._end = message
+                self._end = later_end(message, self._end)
             case m.StreamHead():
-                self._heads[message.robot] = message
+                self._heads[message.robot] = later_head(message, self._heads.get(message.robot))
             case m.TeamEnd():
                 self._ordered = message
             case m.Progress():
-                self._progress[message.robot] = message
+                held = self._progress.get(message.robot)
+                self._progress[message.robot] = further(message, held)
             case m.Liveliness():
                 robot = ch.robot_of(message.node)
-                if robot is None:
-                    return []
+                if robot not in self._robots:
+                    return False
                 self._alive[robot] = message.alive
             case _:
-                return []
-        return [*self._give(message), *self.grow()]
+                return False
+        return True
 
     def _end_by_others(self) -> list[Outgoing]:
         """Who missed the word that all streams have ended knows it from others' conclusions."""

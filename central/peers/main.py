@@ -126,6 +126,7 @@ class PeerShell(RobotShell):
         for channel in everyones:
             self.bus.subscribe(channel)
         self.bus.watch_alive()
+        self.bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
         self.shell.answer(ch.MEMBERS, self._peer.name, self._peer.answer)
         self.shell.answer(ch.FOLD, self._peer.robot, self._peer.answer_fold)
 

@@ -21,6 +21,8 @@ from team.wire.zenoh.bus import ZenohBus
 
 ROUTER_PATIENCE_S = 20.0
 """The router must say where it listens within this time; a busy machine starts Python slowly."""
+POSES = (ch.OWN_POSE, ch.TEAM_POSE)
+"""Who only looks on can do without some of them, when it does not keep up."""
 REFUSED = 2
 """The exit status of a command that can not do what it was asked for."""
 
@@ -65,9 +67,9 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         team = plan.scenario.team
         own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
         door = "".join(f" {word}" for word in plan.door)
-        endpoint = _endpoint(router)
+        endpoint, connected = entered(router, lambda at: ZenohBus(team, at, keys=own, sheds=POSES))
         watch.place = f"--team {team} --connect {endpoint}{door}"
-        with ZenohBus(team, endpoint, keys=own) as bus:
+        with connected as bus:
             bus.subscribe(ch.STATUS)
             bus.subscribe(ch.FUSED_MAP)
             bus.subscribe(ch.FINAL_MAP)
@@ -138,6 +140,26 @@ def _signer(own: Credentials) -> Signs:
     from team.keys.signing import Signer
 
     return Signer(own)
+
+
+def entered(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, ZenohBus]:
+    """Where the router listens, and this process's own bus there.
+
+    A router that is killed meanwhile is started again; what it refuses by itself is raised.
+    """
+    while True:
+        try:
+            endpoint = _endpoint(router)
+            return endpoint, enter(endpoint)
+        except (BusError, LaunchError):
+            if router.child.exit is None or router.child.exit >= 0:
+                raise
+            router.died(0.0)
+            if router.given_up:
+                raise
+        while router.due is not None:
+            time.sleep(0.02)
+            router.start_again()
 
 
 def _endpoint(service: Supervised) -> str:

@@ -7,7 +7,7 @@ from sim.launch.withdraw import LOOK_S, PEERS, WithdrawError, await_fold, ordere
 from team.peers.proofs import Signs
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, Outgoing, opened
+from team.wire.bus import Bus, Outgoing, sound
 
 _NAME = re.compile(r"([a-z][a-z0-9_]{0,31})/(\d+)/(\d+)/(\d+)")
 
@@ -54,8 +54,7 @@ def judge(
     wanted = {judgement.first, judgement.second}
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
-        for sample in bus.receive(LOOK_S):
-            _, _, message = opened(sample)
+        for _, _, message in sound(bus.receive(LOOK_S)):
             if not isinstance(message, m.FusedMap):
                 continue
             holds = any(

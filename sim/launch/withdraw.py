@@ -6,7 +6,7 @@ from team.peers.members import Member, about
 from team.peers.proofs import Signs, signed_order
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, Outgoing, opened
+from team.wire.bus import Bus, Outgoing, sound
 from team.wire.codec import encoded
 
 CENTRE_S = 10.0
@@ -78,8 +78,7 @@ def give_up(
     ordered(bus, Outgoing(ch.GIVEN_UP, node, order), signer)
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
-        for sample in bus.receive(LOOK_S):
-            _, name, message = opened(sample)
+        for _, name, message in sound(bus.receive(LOOK_S)):
             if isinstance(message, m.FusedMap) and message.final:
                 return
             folds = name == "central" or name.startswith("robot/")
@@ -146,8 +145,7 @@ def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
 def _maps(bus: Bus, robots: set[str]) -> list[m.FusedMap]:
     """The maps that have come; the robots that anything speaks of are noted."""
     found = []
-    for sample in bus.receive(LOOK_S):
-        channel, name, message = opened(sample)
+    for channel, name, message in sound(bus.receive(LOOK_S)):
         if channel is ch.ROBOT_CONFIG:
             robots.add(name)
         elif channel is ch.TEAM_CONFIG:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 
+from team.door import MOST_LIVES
 from team.driver.node import SourceNode
 from team.keys.credentials import credentials_of
 from team.keys.roster import KeysError
@@ -157,15 +158,22 @@ class Link:
         """How far the robot's process is: measurements that this file has not are another's."""
         until = time.monotonic() + HEAR_S
         journal = self._node.journal
+        self._node.listening = True
         while time.monotonic() < until:
             shell.take(bus.receive(0.05))
+        self._node.listening = False
         incarnation, measurements = self._node.delivered
         mine = journal.count(incarnation)
         if incarnation <= journal.incarnation and measurements <= mine:
             return
         if incarnation < journal.first_incarnation:
             return
-        if not journal.incarnation:
+        if incarnation >= MOST_LIVES:
+            self._node.warnings.append(
+                f"the team is at incarnation {incarnation} of {journal.robot}, and nobody takes a "
+                "later one: start the team's processes again"
+            )
+        elif not journal.incarnation:
             with self._lock:
                 journal.mark("open", incarnation=incarnation + 1)
             self._node.warnings.append(

@@ -6,6 +6,7 @@ It is the source of one robot's stream, as a world is of all (`sim.publisher`). 
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from team.door import absurd
 from team.driver.journal import Journal
 from team.driver.source import BATCH, CREDIT_MEASUREMENTS, CREDIT_RECORDER, answered, channel_of
 from team.wire import channels as ch
@@ -51,6 +52,8 @@ class SourceNode:
         self._published = self.journal.count(self._incarnation)
         self._said: m.StreamHead | None = None
         self._others: set[str] = set()
+        self.listening = True
+        """Whether it is not known yet how far the team was with this robot before."""
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
@@ -129,6 +132,25 @@ class SourceNode:
     def has_more(self) -> bool:
         """There is something to be published, and whoever takes it has credit."""
         return self._has_credit and self._published < self.journal.count(self._incarnation)
+
+    def refusal(self, message: m.Message) -> str | None:
+        """Why a message can not be true of this stream: nobody has more than was numbered.
+
+        But for the robot itself, while it is not known whether another file has its measurements.
+        """
+        refused = absurd(message)
+        if refused is not None or not isinstance(message, m.Progress | m.Done):
+            return refused
+        if message.robot != self._robot or (isinstance(message, m.Progress) and self.listening):
+            return None
+        at = message.incarnation, message.measurements
+        here = self.journal.incarnation, self.journal.count(self.journal.incarnation)
+        if at > here:
+            return (
+                f"consumed {at[1]} measurements of incarnation {at[0]}; "
+                f"{self.journal.path} has {here[1]} of incarnation {here[0]}"
+            )
+        return None
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take progress, liveliness, orders, the final map; the answer is mostly empty."""

@@ -20,6 +20,8 @@ from team.wire.codec import WireError
 
 _HEAD = 128  # bytes of a message: its tag, stamp, robot, incarnation and number are within
 Kind = Literal["measurements", "submaps"]
+_ASKED_FOR = (ch.SIGHTING_FACTOR, ch.FINAL_MAP, *ch.REPLIES[ch.ORDERS_KEPT])
+"""What has no number of its own and is asked for."""
 
 
 class Stream(NamedTuple):
@@ -108,7 +110,7 @@ class Inventory:
         if found is None:
             return True
         channel, robot = found
-        if channel in (ch.SIGHTING_FACTOR, ch.FINAL_MAP):  # come once more where they are asked for
+        if channel in _ASKED_FOR:  # come once more where they are asked for
             name = hash((sample.key, sample.payload))
             known = name in self._contents
             self._contents.add(name)

@@ -19,6 +19,7 @@ from team.wire.channels import (
     CONCLUDED,
     FINAL_MAP,
     MEASUREMENTS,
+    ORDERS_KEPT,
     RECORDER_PROGRESS,
     SENSORS,
     SENT,
@@ -33,6 +34,7 @@ from team.wire.messages import (
     Liveliness,
     MeasurementsRequest,
     Message,
+    OrdersRequest,
     Progress,
     Status,
     SubmapsRequest,
@@ -88,6 +90,7 @@ class RecordLoop:
         for channel in CHANNELS:
             if channel.recorded and channel is not ALIVE:
                 bus.subscribe(channel, whole=True)
+        bus.request(ORDERS_KEPT, "", OrdersRequest(stamp_ns=0))  # who gave them does not stay
         bus.watch_alive()
         bus.declare_alive(NODE)
 

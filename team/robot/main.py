@@ -19,6 +19,8 @@ from team.wire.codec import WireError, decoded
 SECOND_PATIENCE_S = 6.0
 """The token of a process that was cut off is there for the lease of its link: 5 s of silence."""
 SECOND_PERIOD_S = 0.5
+CONFIRMED_S = 1.0
+"""Between two questions at the source, in which incarnation its stream is."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -42,11 +44,14 @@ class RobotShell:
         self._patience_s = patience_s
         self._config, self._exchange = config, exchange
         self.node = RobotNode(config, exchange)
+        self._begun: dict[int, Sample] = {}
+        self._confirm_at = 0.0
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
 
     def run_in(self, shell: Shell) -> None:
         """The shell of this process' node."""
         self.shell = shell
+        shell.believed = self._believed
         self._missing = MissingMeasurements(shell)
 
     def run(self) -> None:
@@ -159,3 +164,51 @@ class RobotShell:
             )
             if not replies or self.node.next_measurement == first:
                 return
+
+    def _believed(self, samples: Sequence[Sample]) -> list[Sample]:
+        """The samples, less the beginnings of incarnations that the source knows nothing of.
+
+        A robot that begins a new incarnation leaves the one before, so it takes nobody's word for
+        it but the source's own answer; where no source answers (a replayed log) there is only the
+        message itself.
+        """
+        passed = []
+        for sample in samples:
+            found = _beginning(sample, self.node.robot)
+            if found is None or found <= self.node.incarnation:
+                passed.append(sample)
+            else:
+                self._begun[found] = sample
+        if self._begun and time.monotonic() >= self._confirm_at:
+            self._confirm_at = time.monotonic() + CONFIRMED_S
+            last = self._incarnation_at_source()
+            begun, self._begun = self._begun, {}
+            for incarnation, sample in sorted(begun.items()):
+                if last is None or incarnation <= last:
+                    passed.append(sample)
+                else:
+                    why = f"of incarnation {incarnation}, of which its source knows nothing"
+                    self.shell.boundary.refuse(sample, why)
+        return passed
+
+    def _incarnation_at_source(self) -> int | None:
+        """In which incarnation the stream is by its source's word; None: nobody answers."""
+        request = m.MeasurementsRequest(
+            stamp_ns=0, robot=self.node.robot, incarnation=0, first=0, last=0
+        )
+        try:
+            replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, request, ASK_TIMEOUT_S)
+            return max((reply_of(r, m.Measurement).incarnation for r in replies), default=None)
+        except (BusError, WireError) as error:
+            _LOG.warning("%s", error)
+            return None
+
+
+def _beginning(sample: Sample, robot: str) -> int | None:
+    """The incarnation of the robot's stream that a sample begins; None: it is something else."""
+    if sample.key != ch.START.key(robot):
+        return None
+    try:
+        return decoded(sample.payload, m.InitialPose).incarnation
+    except WireError:
+        return None  # the door counts it

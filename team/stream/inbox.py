@@ -143,7 +143,8 @@ class Inbox:
         end.
         """
         gap = self.gap
-        if gap is not None:
+        last = None if end is None else (end.incarnation, end.measurements)
+        if gap is not None and (last is None or gap[:2] < last):
             return gap
         if end is None or self.complete(end) or self.waiting or end.incarnation < self.incarnation:
             return None

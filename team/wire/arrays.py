@@ -105,7 +105,8 @@ def check_semidefinite(data: Floats, n: int, what: str) -> None:
     if not (variances >= 0.0).all() or matrix[variances == 0.0].any():
         raise ValueError(f"not positive definite: {what}")
     sigmas = np.sqrt(np.where(variances > 0.0, variances, 1.0))
-    scaled = np.clip(matrix / sigmas / sigmas[:, None], -2.0, 2.0)
+    with np.errstate(over="ignore"):  # beyond ±2 either way
+        scaled = np.clip(matrix / sigmas / sigmas[:, None], -2.0, 2.0)
     if np.abs(scaled - scaled.T).max(initial=0.0) > 1e-9:
         raise ValueError(f"not symmetric: {what}")
     if np.linalg.eigvalsh(scaled).min(initial=0.0) < -1e-9:

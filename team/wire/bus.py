@@ -5,9 +5,10 @@ team time, the publisher's wall clock and its counter of this key. A node never 
 shell takes samples from it, decodes them at the door, and publishes what the node returns.
 """
 
+import logging
 import re
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -30,6 +31,8 @@ from team.wire.messages import (
     TeamEnd,
     Withdrawal,
 )
+
+_LOG = logging.getLogger("teamslam")
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,17 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
             "wrong field", f"a message of {str(said_by)[:80]!r} on the key {sample.key!r}"
         )
     return channel, name, message
+
+
+def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
+    """What of samples is sound, each as `opened` has it, for who only looks on: the rest is no
+    message of the team's, whoever has sent it.
+    """
+    for sample in samples:
+        try:
+            yield opened(sample)
+        except WireError as error:
+            _LOG.debug("dropped %s: %s", sample.key[:80], error)
 
 
 def _said_by(channel: Channel, message: Message) -> str | None:

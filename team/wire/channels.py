@@ -194,7 +194,7 @@ FINAL_KEPT = Channel(name="final_kept", template="router/final", message=m.Final
                      meaning="a query; the reply is the final map, when the centre has left, too")  # fmt: skip
 
 ORDERS_KEPT = Channel(name="orders_kept", template="router/orders", message=m.OrdersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
-                      meaning="a query; the replies are the orders `given_up` that hold, when who gave them has left, too")  # fmt: skip
+                      meaning="a query; the replies are the operator's orders that hold, when who gave them has left, too")  # fmt: skip
 
 TEAM_CONFIG = Channel(name="team_config", template="robot/{robot}/team/config", message=m.Configuration, rate="once", delivery="latest", recorded=True,
                       recomputable=False, meaning="the configuration of the peer's own fold: a centre's")  # fmt: skip
@@ -232,7 +232,7 @@ REPLIES = {
     MEASUREMENTS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
     SENT: (START, SUBMAP, SIGHTING_FACTOR),
-    ORDERS_KEPT: (GIVEN_UP,),
+    ORDERS_KEPT: (GIVEN_UP, ORDER, VERDICT, END_ORDER),
     MEMBERS: (CARRIED,),
     FOLD: (TEAM_MAP,),
 }

@@ -92,6 +92,8 @@ def test_a_robot_that_nobody_has_named_is_admitted_only_where_the_scenario_says_
     assert closed.final is not None
     refused = CentralNode(CentralConfig(), ["r1"])
     assert "not in this team" in refused.refusal(begun("r2"))
+    absurd = Live("r1", admit=True).tell(begun("r2", 2**62))
+    assert list(absurd.centre.robots) == ["r1"]
     team = Live("r1", admit=True).tell(begun("r2")).robot("r1")
     assert team.final is None
     assert team.centre.status().warnings == ("admitted, though not in the scenario: r2",)

@@ -2,10 +2,12 @@
 
 import os
 
+import msgspec
 import pytest
 
 from team.driver import journal as j
 from team.driver.journal import JournalError, opened
+from team.driver.node import SourceNode
 from team.driver.order import Sorter
 from team.wire import messages as m
 from team.wire.codec import encoded
@@ -110,3 +112,26 @@ def test_a_sorter_gives_back_nothing_that_something_may_still_come_before():
     assert sorter.put((111, j.ODOMETRY), 4) == [3, 1]
     assert sorter.released == (100, j.ODOMETRY)
     assert sorter.flush() == [2, 4]
+
+
+def test_nobody_has_consumed_more_than_the_driver_has_numbered(tmp_path):
+    """A far word of a stranger on robot, centre or recorder took the driver's credit away."""
+    node = SourceNode(filled(tmp_path / "r1.stream"))
+    node.listening = False
+    here = node.journal.count(1)
+    whole = m.Progress(
+        stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=here, submaps=0
+    )
+    done = m.Done(
+        stamp_ns=0, robot="r1", incarnation=2, measurements=0, steps=0, submaps=0, ledger=()
+    )
+    assert node.refusal(whole) is None
+    for far in (
+        msgspec.structs.replace(whole, measurements=here + 1),
+        msgspec.structs.replace(whole, node="recorder", incarnation=2, measurements=0),
+        done,
+    ):
+        assert f"has {here} of incarnation 1" in str(node.refusal(far))
+    assert node.refusal(msgspec.structs.replace(whole, incarnation=2**62)) is not None
+    node.listening = True  # another file may have what this one has not
+    assert node.refusal(msgspec.structs.replace(whole, incarnation=2)) is None

@@ -121,3 +121,16 @@ def test_a_certificate_of_another_robot_is_nobodys_proof(nodes: dict[str, PeerNo
     )
     refused = proofs_of(nodes["r3"]).refusal(as_r1, nodes["r3"].replica)
     assert refused == "a certificate of robot-r2 of t, not of robot-r1 of t"
+
+
+def test_a_robot_that_signs_anothers_member_does_not_take_the_others_signature(
+    nodes: dict[str, PeerNode],
+) -> None:
+    (of_r1,) = parcel("r1", 7)
+    hearing = proofs_of(nodes["r2"])
+    hearing.hear(proofs_of(nodes["r1"]).signed(of_r1), "r1")
+    good = hearing.of(of_r1)
+    junk = m.Signature(stamp_ns=0, robot="r3", member=of_r1.hash, signature=bytes(len(good)))
+    hearing.hear(junk, "r3")
+    assert good
+    assert hearing.of(of_r1) == good

@@ -1,13 +1,16 @@
 """The robot's process: one of a name."""
 
 import threading
+from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from team.robot.main import RobotShell
 from team.wire import channels as ch
-from team.wire.bus import BusError, MemoryBus, MemoryNetwork
-from tests.teams import config
+from team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing
+from team.wire.codec import encoded
+from tests.teams import config, published, stream
 
 
 def test_a_second_process_of_a_robot_is_refused_and_says_nothing_to_the_team() -> None:
@@ -31,3 +34,51 @@ def test_a_robot_whose_earlier_life_has_gone_begins() -> None:
     stop.set()
     RobotShell(MemoryBus(network), config("r1"), stop, patience_s=0.0).run()
     assert len(viewer.receive()) == 1
+
+
+class Source:
+    """The source of r1's stream on a bus: it answers for what it has published."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        self.bus = MemoryBus(network)
+        self.start = published(stream("r1", 3))[0]
+        self.bus.answer(ch.MEASUREMENTS, "r1", lambda request: [encoded(self.start)])
+
+    def begins(self, incarnation: int) -> None:
+        said = msgspec.structs.replace(self.start, incarnation=incarnation)
+        self.bus.publish(Outgoing(ch.START, "r1", said))
+
+
+def lived(network: MemoryNetwork, bus: MemoryBus, act: Callable[[], None]) -> RobotShell:
+    """A robot's process that hears what `act` brings about, and is told to stop."""
+    stop = threading.Event()
+    shell = RobotShell(bus, config("r1"), stop, patience_s=0.0)
+    shell.shell.begin = act  # when it has subscribed
+    duty, turns = shell._duty, iter(range(5))
+    shell._duty = lambda: stop.set() if next(turns, None) is None else duty()
+    shell.run()
+    return shell
+
+
+def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone() -> None:
+    """One message of a stranger made a robot leave its stream, and wait for another for ever."""
+    network = MemoryNetwork()
+    source = Source(network)
+
+    def act() -> None:
+        source.begins(4)  # a stranger's
+        source.begins(1)
+
+    shell = lived(network, MemoryBus(network), act)
+    assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
+    assert shell.shell.boundary.refused == 1
+    warnings = str(shell.shell.boundary.warnings)
+    assert "of incarnation 4, of which its source knows nothing" in warnings
+
+
+def test_where_no_source_answers_the_message_itself_is_believed() -> None:
+    network = MemoryNetwork()
+    source = Source(network)
+    network.answers.clear()  # a replayed log
+    shell = lived(network, MemoryBus(network), lambda: source.begins(3))
+    assert (shell.node.incarnation, shell.node.next_measurement) == (3, 1)

@@ -13,7 +13,8 @@ import zenoh
 from team.driver.measured import MeasurementError
 from team.ros2.keys import of_rmw, of_token
 from team.ros2.topics import RobotTopics, TopicsError, load_topics
-from team.ros2_driver import Ros2Driver
+from team.ros2.translator import Measured
+from team.ros2_driver import MOST_REASONS, Ros2Driver
 from team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
@@ -191,3 +192,28 @@ def test_a_mistake_in_a_file_of_topics_is_named(tmp_path: Path, text: str, words
         load_topics(tmp_path / "topics.toml")
     assert words in str(error.value)
     assert "topics.toml" in str(error.value)
+
+
+def test_a_sound_message_that_can_not_be_translated_is_set_aside_and_the_driver_goes_on() -> None:
+    robot = Robot()
+    driver = Ros2Driver(robot, TOPICS)
+    key = by_rmw("/r1/odom", ODOMETRY)
+
+    def broken(topic: str, record: object) -> list[Measured]:
+        raise ZeroDivisionError("no such rotation")
+
+    whole, driver._translator.take = driver._translator.take, broken  # type: ignore[method-assign]
+    driver.take(ForeignSample(key, odometry(1)))
+    driver._translator.take = whole  # type: ignore[method-assign]
+    for k in range(2, 4):
+        driver.take(ForeignSample(key, odometry(k)))
+    assert driver.dropped == {"/r1/odom: set aside": 1}
+    assert len(robot.calls) == 2
+
+
+def test_the_reasons_that_are_told_apart_are_bounded() -> None:
+    driver = Ros2Driver(Robot(), TOPICS)
+    for k in range(2 * MOST_REASONS):
+        driver.take(ForeignSample(f"0/r1/odom/what::msg::dds_::Ever{k}_/RIHS01_0", b""))
+    assert len(driver.dropped) == MOST_REASONS + 1
+    assert driver.dropped["for other reasons"] == MOST_REASONS

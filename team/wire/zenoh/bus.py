@@ -13,7 +13,7 @@ import logging
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -37,6 +37,8 @@ if TYPE_CHECKING:  # a node without keys needs none of it
 
 _ATTACHMENT = struct.Struct("<qqq")
 _ALIVE_TIMEOUT_S = 5.0
+MOST_WAITING = 20_000
+"""Samples that wait for an onlooker before what it can do without is dropped."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -63,8 +65,10 @@ class ZenohBus:
         connect: str,
         patience_s: float = 10.0,
         keys: "Credentials | None" = None,
+        sheds: Collection[Channel] = (),
     ) -> None:
         self._prefix = f"team/{team}/"
+        self._sheds = frozenset(channel.name for channel in sheds)
         self._queue: SimpleQueue[_Item] = SimpleQueue()
         self._publishers: dict[str, Publisher] = {}
         self._counters: dict[str, int] = {}
@@ -173,9 +177,15 @@ class ZenohBus:
         if whole:
             self._recovery.take_whole(channel.name)
         key = self._prefix + channel.key(_every(channel, name))
-        subscribe(self._session, key, channel, self._queue.put, whole=whole)
+        put = self._shed if channel.name in self._sheds else self._queue.put
+        subscribe(self._session, key, channel, put, whole=whole)
         if channel.delivery != "stream":
             self._recovery.watch(key)
+
+    def _shed(self, item: _Item) -> None:
+        """Queue what an onlooker can do without, unless it is too far behind already."""
+        if self._queue.qsize() < MOST_WAITING:
+            self._queue.put(item)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """All that has arrived, in order; waits at most `timeout_s` for the first.

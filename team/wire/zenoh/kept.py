@@ -2,14 +2,18 @@
 
 The final map is kept for who was away as it came. Whether a process that begins belongs to the run
 that has ended or to a new one it can not know itself; the router knows who was in that run and has
-never said a last word (`Tally`): a node of that name is a straggler, and is told so once. Orders to
-give a robot up hold until the final map is out or nobody of the team is there any more.
+never said a last word (`Tally`): a node of that name is a straggler, and is told so once. Orders
+(a robot withdrawn or given up, verdicts on landmarks, the end of a live team) hold until the final
+map is out or nobody of the team is there any more.
 """
 
 import threading
 from dataclasses import dataclass, field
 
 from team.wire.messages import FinalMapReply
+
+MOST_ORDERS = 10_000
+"""Orders to a team that are kept: whoever has given more repeats them himself."""
 
 
 @dataclass
@@ -20,7 +24,7 @@ class Kept:
     _silent: set[str] = field(default_factory=set, init=False)
     _owed: set[str] = field(default_factory=set, init=False)
     _final: tuple[float, bytes] | None = field(default=None, init=False)
-    _orders: dict[str, bytes] = field(default_factory=dict, init=False)
+    _orders: dict[bytes, None] = field(default_factory=dict, init=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def token(self, node: str, *, alive: bool) -> bool:
@@ -48,15 +52,16 @@ class Kept:
             self._owed = set(self._silent)
             self._orders.clear()
 
-    def order(self, node: str, given_up: bytes) -> None:
-        """An operator orders that nobody waits for a node any more."""
+    def order(self, order: bytes) -> None:
+        """An operator orders something; of more than MOST_ORDERS the first ones."""
         with self._lock:
-            self._orders[node] = given_up
+            if len(self._orders) < MOST_ORDERS:
+                self._orders[order] = None
 
     def orders(self) -> list[bytes]:
-        """The orders that hold, by node."""
+        """The orders that hold, the oldest first."""
         with self._lock:
-            return [order for _, order in sorted(self._orders.items())]
+            return list(self._orders)
 
     def answer(self, node: str, now_s: float) -> FinalMapReply | None:
         """The final map for a node that asks for it; None while there is none."""

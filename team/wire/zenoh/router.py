@@ -12,13 +12,14 @@ import zenoh
 from zenoh.handlers import Callback
 
 from team.keys.roster import Roster
-from team.wire.bus import BusError
+from team.wire.bus import BusError, Sample
+from team.wire.bus import opened as opened_order
 from team.wire.channels import (
     ALIVE,
     FINAL_KEPT,
     FINAL_MAP,
-    GIVEN_UP,
     ORDERS_KEPT,
+    REPLIES,
     TALLY,
     TEAM_FINAL,
 )
@@ -78,7 +79,7 @@ class _Keeper:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._teams: defaultdict[str, Kept] = defaultdict(Kept)
-        for channel in (FINAL_MAP, TEAM_FINAL, GIVEN_UP, TALLY):
+        for channel in (FINAL_MAP, TEAM_FINAL, TALLY, *REPLIES[ORDERS_KEPT]):
             key = f"team/*/{channel.key('**')}"
             session.declare_subscriber(key, Callback(self._take, indirect=False))
         session.liveliness().declare_subscriber(
@@ -97,8 +98,11 @@ class _Keeper:
         kept, key = self._of(sample.key_expr)
         if key == FINAL_MAP.key() or TEAM_FINAL.owner(key) is not None:
             kept.end(sample.payload.to_bytes(), time.monotonic())
-        elif (node := GIVEN_UP.owner(key)) is not None:
-            kept.order(node, sample.payload.to_bytes())
+        elif any(channel.owner(key) is not None for channel in REPLIES[ORDERS_KEPT]):
+            with suppress(WireError):  # what nobody would follow is no order
+                order = Sample(key, sample.payload.to_bytes(), 0, 0, 0)
+                opened_order(order)
+                kept.order(order.payload)
         elif (node := TALLY.owner(key)) is not None:
             kept.last_word(node)
 

@@ -10,10 +10,11 @@ from central.config import CentralConfig
 from central.node import CentralNode
 from sim.cli.main import app
 from sim.launch import withdraw as orders
+from sim.launch.verdict import judge, local_landmark
 from sim.launch.withdraw import WithdrawError, give_up, withdraw
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, opened
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from tests.support import examples, on_its_key, wait_until
 
 FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
@@ -126,3 +127,26 @@ def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(
         over.set()
         thread.join()
     assert "r3 is given up" in node.status().warnings[0]
+
+
+def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A stranger's bytes on every key that the commands look at, before and while they wait."""
+    monkeypatch.setattr(orders, "CENTRE_S", 0.3)
+    network = MemoryNetwork()
+    stranger = MemoryBus(network)
+    stranger.declare_alive("central")
+    stranger.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
+    for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP):
+        stranger.publish_raw(Sample(channel.key("r4"), b"\xc1", 0, 0, 0))
+    judgement = m.Judgement(
+        first=local_landmark("r3/1/2/3"), second=local_landmark("r3/1/4/5"), same=True
+    )
+    for order in (
+        lambda bus: withdraw(bus, "r3", "", 0.2),
+        lambda bus: give_up(bus, "r3", "", 0.2),
+        lambda bus: judge(bus, judgement, "", 0.2),
+    ):
+        with pytest.raises(WithdrawError, match=r"within 0.2 s; the (order|verdict) stands"):
+            order(MemoryBus(network))

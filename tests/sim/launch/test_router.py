@@ -1,0 +1,36 @@
+"""A router that dies while a launch starts is started again, like every process of a team."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from sim.launch.launch import entered
+from sim.launch.processes import Starter
+from sim.launch.supervisor import Supervised, end_all
+from team.wire.bus import BusError
+from team.wire.zenoh.bus import ZenohBus
+
+
+def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
+    tmp_path: Path,
+) -> None:
+    """It listens where it had listened; only then is the rest of the team told where that is."""
+    with Starter(time.time_ns(), None, tmp_path / "template.log") as starter:
+        router = Supervised("router", ["router", "--listen", "tcp/127.0.0.1:0"], tmp_path, starter)
+        tried: list[str] = []
+
+        def enter(endpoint: str) -> ZenohBus:
+            tried.append(endpoint)
+            if len(tried) == 1:
+                os.kill(router.child.pid, signal.SIGKILL)
+                while router.child.exit is None:
+                    time.sleep(0.01)
+                raise BusError("no router answers")
+            return ZenohBus("team", endpoint)
+
+        endpoint, bus = entered(router, enter)
+        bus.close()
+        end_all([router.child])
+    assert tried == [endpoint, endpoint]
+    assert router.restarts == 1
