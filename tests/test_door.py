@@ -290,8 +290,8 @@ def test_what_a_team_can_say_is_refused_in_no_order(order: int) -> None:
 def test_an_end_against_anybodys_word_is_believed_when_all_robots_are_done_there():
     """One far progress of a stranger made the centre refuse the end, and wait for ever."""
     (*said, end) = run()
-    done = [each for each in said if each[0] is ch.ROBOT_DONE]
-    before = [each for each in said if each[0] is not ch.ROBOT_DONE]
+    done = [each for each in said if each[0] == ch.ROBOT_DONE]
+    before = [each for each in said if each[0] != ch.ROBOT_DONE]
     honest, misled = (CentralNode(CentralConfig(), list(STREAMS)) for _ in range(2))
     given(Boundary("central"), honest, *before, end, *done)
     boundary = Boundary("central")

@@ -5,6 +5,9 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
+
+from sim.launch import launch as launching
 from sim.launch.launch import entered
 from sim.launch.processes import Starter
 from sim.launch.supervisor import Supervised, end_all
@@ -13,9 +16,10 @@ from team.wire.zenoh.bus import ZenohBus
 
 
 def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It listens where it had listened; only then is the rest of the team told where that is."""
+    monkeypatch.setattr(launching, "ROUTER_PATIENCE_S", 120.0)  # a busy machine
     with Starter(time.time_ns(), None, tmp_path / "template.log") as starter:
         router = Supervised("router", ["router", "--listen", "tcp/127.0.0.1:0"], tmp_path, starter)
         tried: list[str] = []
@@ -27,7 +31,7 @@ def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
                 while router.child.exit is None:
                     time.sleep(0.01)
                 raise BusError("no router answers")
-            return ZenohBus("team", endpoint)
+            return ZenohBus("team", endpoint, 60.0)
 
         endpoint, bus = entered(router, enter)
         bus.close()
