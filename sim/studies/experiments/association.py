@@ -65,14 +65,15 @@ FIGURES = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each axis, value, system and seed."""
-    return [
+    """Each axis, value, system and seed, each run once: the axes meet."""
+    runs = [
         task
         for axis in AXES
         for value in _values(axis, options)
         for system in SYSTEMS
         for task in _tasks(axis, value, system, options)
     ]
+    return list({task.name: task for task in runs}.values())
 
 
 def _values(axis: str, options: Options) -> Sequence[float]:
