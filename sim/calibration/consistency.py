@@ -143,9 +143,7 @@ def _apart(
     return graph, solved
 
 
-def _between(
-    mean: Float[np.ndarray, " 4n"], covariance: Float[np.ndarray, "4n 4n"]
-) -> Disagreement:
+def _between(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> Disagreement:
     """D of two maps of n landmarks, the one behind the other, and their joint covariance."""
     a, b = mean.reshape(2, -1, 2)
     a_from_b = rigid_alignment(a, b)
