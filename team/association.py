@@ -49,7 +49,7 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     ratio: Annotated[float, Meta(ge=1.0)] = 1.5
     island_pairs: Few = 8
     island_llr: float = 15.0
-    context: NonNegative = 1.0
+    context: NonNegative = 2.0
     share: Share = 0.7
     undone_below: Share = 0.5
     audited: Annotated[int, Meta(ge=0, le=1000)] = 12
