@@ -22,7 +22,13 @@ from team.estimation.baselines.batch_factors import Factors, Linear, Measurement
 from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian, information
 from team.estimation.geometry import Pose, compose, tangent
-from team.estimation.map_joining.least_squares import STUCK, Values, iterated, robust_scale
+from team.estimation.map_joining.least_squares import (
+    STUCK,
+    Point,
+    Values,
+    iterated,
+    robust_scale,
+)
 from team.estimation.models import located, variances
 from team.estimation.scans import of_each
 from team.estimation.sparse_cholesky import sparse
@@ -38,7 +44,7 @@ until it is c: what is far off since a pose was dead-reckoned is not taken for a
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class Batch(Point):
     """An estimate of everything, in the map frame.
 
     poses:     (x [m], y [m], θ [rad]), in the order in which they came.

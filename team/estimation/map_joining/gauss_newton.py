@@ -87,7 +87,7 @@ UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, eq=False)
-class Island:
+class Island(least_squares.Point):
     """One frame: its graph, the state (poses and landmarks by node) and the factors' ages.
 
     age, sighting_age: iterations that each submap and each sighting has lived through; the robust

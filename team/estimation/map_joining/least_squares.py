@@ -6,7 +6,8 @@ factor has lived through, so that what is far off at first is not taken for an o
 """
 
 import math
-from typing import NamedTuple, Protocol, Self, TypeVar, runtime_checkable
+from abc import ABC, abstractmethod
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -25,31 +26,36 @@ ROUNDING = 1e-10
 """A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
 
 
-@runtime_checkable
-class Point(Protocol):
+class Point(ABC):
     """An estimate of all unknowns, with the cost's parabola there."""
 
     @property
+    @abstractmethod
     def normal_equations(self) -> tuple[Values, Values]:
         """A = Σ w JᵀP⁻¹J in the layout of a block pattern, and the gradient Σ w JᵀP⁻¹r."""
 
     @property
+    @abstractmethod
     def diagonal(self) -> Int64[np.ndarray, " n"]:
         """The places of A's diagonal entries among its values."""
 
     @property
+    @abstractmethod
     def posterior(self) -> sparse.Cholesky:
         """Cholesky factor of A."""
 
+    @abstractmethod
     def factorised(self, values: Values) -> sparse.Cholesky:
         """Cholesky factor of another matrix in A's layout."""
 
+    @abstractmethod
     def cost_of(self, other: Self) -> float:
         """Σ w χ² of another point with this one's weights and noise: what a step lowers.
 
         Its fall is a fall of the robust cost too, since each loss lies below its parabola.
         """
 
+    @abstractmethod
     def moved(self, step: Values) -> Self:
         """The point a step further."""
 
