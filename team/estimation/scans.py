@@ -66,9 +66,10 @@ def point_scan(
     reach = np.maximum(ranges, NEAREST_M)
     c, s = np.cos(bearings), np.sin(bearings)
     xx, xy, yy = covariances.T
-    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
-    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / reach
-    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (reach * reach)
+    with np.errstate(over="ignore", invalid="ignore"):  # `sensible` refuses what is not finite
+        rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
+        rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / reach
+        bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (reach * reach)
     return Scan(ids, ranges, bearings, np.column_stack((rr, rb, bb, np.full(len(ids), POINT))))
 
 
@@ -103,9 +104,10 @@ def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[
     if not own.size:
         return np.ones(len(own), dtype=np.bool_)
     (least_m, most_m), (least_rad, most_rad) = bounds.sigma_m, bounds.sigma_rad
-    r, b = np.sqrt(own[:, 0]), np.sqrt(own[:, 2])
     point = own[:, 3] == POINT
-    across = np.where(point, b * np.maximum(ranges, NEAREST_M), b)
+    with np.errstate(over="ignore", invalid="ignore"):
+        r, b = np.sqrt(own[:, 0]), np.sqrt(own[:, 2])
+        across = np.where(point, b * np.maximum(ranges, NEAREST_M), b)
     low, high = np.where(point, least_m, least_rad), np.where(point, most_m, most_rad)
     within: Bool[np.ndarray, " n"] = (
         (r >= least_m) & (r <= most_m) & (across >= low) & (across <= high)

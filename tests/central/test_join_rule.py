@@ -109,7 +109,8 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
 
 def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
     """What r1 has just closed is out though r2 is a window behind, and no broadcast is due."""
-    found, roll = rule(CentralConfig(tick_s=100.0, broadcast_s=100.0)), Roll.of(["r1", "r2"])
+    config = CentralConfig(tick_s=100.0, broadcast_s=100.0)
+    found, roll = rule(config), Roll.of(["r1", "r2"])
     said = []
     for name, k in (("r1", 0), ("r2", 0), ("r1", 1)):
         found.take_submap(SUBMAPS[name][k])
@@ -120,7 +121,7 @@ def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
     assert all(fused.provisional for fused in maps)
     for submap in ALL:
         found.take_submap(submap)
-    assert encoded(final(found)) == encoded(final(whole(found._config))), "it leaves no trace"
+    assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
 
 
 def test_no_map_has_less_than_the_one_before_it():

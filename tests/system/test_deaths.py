@@ -125,7 +125,7 @@ async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map
     await team.none_left(0.0)
     result = json.loads((team.folder / "result.json").read_text())
     assert result["given_up"] == ["robot-r1"]
-    assert result["restarts"] == {"robot-r1": FRUITLESS - 1}
+    assert result["restarts"] == {"robot-r1": FRUITLESS - 1}, launch.said()
     texts = "\n".join(result["failures"])
     assert "it died 5 times without getting any further, and is given up" in texts
     assert "the final map is provisional: r1 lost, and not wholly in it" in texts

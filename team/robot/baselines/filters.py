@@ -231,7 +231,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         lambda state: ekf_slam.pose_gaussian(state.slam),
         lambda state: ekf_slam.landmark_gaussian(state.slam),
         lambda state, *step: ekf_slam.innovation(state.slam, *step[:-1]),
-        took=lambda state: np.concatenate(state.took),
+        took=lambda state: np.concatenate((np.empty(0, np.int64), *state.took)),
     ),
     "fastslam1": with_association(_plain("fastslam1")),
     "fastslam2": _plain("fastslam2"),

@@ -47,6 +47,7 @@ class RunningEstimator:
         self._config = config
         self._filter = FILTERS[config.estimator]
         self.associates = self._filter.took is not None and config.fusion == "alone"
+        self._taken: list[slice] = []
         self._looks: list[Look] = []
         maps_at_keyframes = config.fusion in FEEDBACK
         self._map_every_ns = 0 if maps_at_keyframes else round(config.front_end.window_s * 1e9)
@@ -139,7 +140,9 @@ class RunningEstimator:
         for look in keyframe.looks:
             self._looks.append(look)
             seen = look.ids, look.ranges, look.bearings, look.own
+            first = self._took()
             self._advance(look.at_ns, look.motion or Increment.identity(), *seen)
+            self._taken.append(slice(first, self._took()))
         seen = keyframe.ids, keyframe.ranges, keyframe.bearings, keyframe.own
         motion = keyframe.increment if keyframe.rest is None else keyframe.rest
         if not keyframe.looks or len(keyframe.ids) or motion.mean.any():
@@ -150,13 +153,22 @@ class RunningEstimator:
         if not self._looks or self._filter.took is None:
             return None
         numbers = self._filter.took(self._state)
+        of_look = [
+            numbers[taken] if len(numbers[taken]) == len(look.ids) else np.zeros(len(look.ids))
+            for look, taken in zip(self._looks, self._taken, strict=True)
+        ]
+        landmarks = np.concatenate(of_look).astype(np.int64)
         return Became(
             stamps=np.array([look.stamp_ns for look in self._looks], np.int64),
             counts=np.array([len(look.ids) for look in self._looks], np.int64),
             rows=np.concatenate([look.ids for look in self._looks]).astype(np.int64) - UNNAMED,
-            landmarks=numbers,
-            clutter=np.zeros(len(numbers), np.bool_),
+            landmarks=landmarks,
+            clutter=np.zeros(len(landmarks), np.bool_),
         )
+
+    def _took(self) -> int:
+        """How many detections the filter has a landmark for; a scan that led nowhere adds none."""
+        return 0 if self._filter.took is None else len(self._filter.took(self._state))
 
     def _advance(
         self,
