@@ -286,6 +286,35 @@ def test_receive_waits_for_the_first_and_no_longer(endpoint: str) -> None:
         assert time.monotonic() - before >= 0.05
 
 
+def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What comes while it reads waits for the next time, or a slow reader would never be back."""
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
+        flowing(source, sink)
+        read, back = sink._take, threading.Event()
+
+        def slowly(item: object, samples: list[Sample]) -> None:
+            time.sleep(0.005)
+            read(item, samples)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(sink, "_take", slowly)
+
+        def speak() -> None:
+            until = time.monotonic() + 10.0
+            while not back.is_set() and time.monotonic() < until:
+                source.publish_raw(Sample("source/probe/sightings", b"", 0, 0, 0))
+                time.sleep(0.001)
+
+        speaker = threading.Thread(target=speak)
+        speaker.start()
+        wait_until(lambda: bool(sink.receive(0.1)))
+        heard = speaker.is_alive()
+        back.set()
+        speaker.join()
+    assert heard, "it was back while the other still spoke"
+
+
 def test_close_wakes_a_receiver_and_ends_the_bus(endpoint: str) -> None:
     bus = ZenohBus("t", endpoint)
     got: list[list[Sample]] = []

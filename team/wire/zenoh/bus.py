@@ -192,19 +192,26 @@ class ZenohBus:
 
         Queries are answered here, on the caller's thread: a node's state needs no lock. What has
         been missing for a while is asked for; it comes as it arrives, behind what came after it.
+        What arrives while the rest is taken waits for the next time: a team that speaks faster than
+        this node reads does not keep it here.
         """
         self._check_open()
         if self._door is not None:
             self._door.look(time.monotonic())
         samples: list[Sample] = []
         until = time.monotonic() + timeout_s
+        waiting: int | None = None
         with suppress(Empty):
-            while True:
+            while waiting is None or waiting > 0:
                 wait = 0.0 if samples else until - time.monotonic()
                 item = self._queue.get(timeout=wait) if wait > 0.0 else self._queue.get_nowait()
                 if item is None:
                     break
                 self._take(item, samples)
+                if waiting is not None:
+                    waiting -= 1
+                elif samples or time.monotonic() >= until:
+                    waiting = self._queue.qsize()
         samples += self._recovery.overdue(time.monotonic())
         if self.tap is not None and samples:
             self.tap(samples)
