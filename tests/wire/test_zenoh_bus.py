@@ -17,6 +17,7 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import MAPS_KEPT, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
+from team.wire.zenoh import bus as zenoh_bus
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 from tests.support import ROOT, Link, examples, odometry, received, submap, wait_until
@@ -313,6 +314,28 @@ def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(
         back.set()
         speaker.join()
     assert heard, "it was back while the other still spoke"
+
+
+def test_what_an_onlooker_does_not_keep_up_with_is_dropped_and_not_asked_for(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of poses, that is: of everything else it gets all."""
+    monkeypatch.setattr(zenoh_bus, "MOST_WAITING", 10)
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint, sheds=[c.OWN_POSE]) as sink:
+        sink.subscribe(c.OWN_POSE)
+        flowing(source, sink, c.SUBMAP)
+        for i in range(100):
+            source.publish_raw(Sample("robot/alpha/own/pose", b"", i, 0, 0))
+            source.publish(Outgoing(c.SUBMAP, "alpha", submap(i)))
+        time.sleep(0.5)  # nobody reads meanwhile
+        found: list[Sample] = []
+        until = time.monotonic() + 2.0
+        while time.monotonic() < until:
+            found += sink.receive(0.1)
+        assert not sink.lacking()
+    keys = [sample.key for sample in found]
+    assert 0 < keys.count("robot/alpha/own/pose") < 100
+    assert keys.count("robot/alpha/submap") == 100
 
 
 def test_close_wakes_a_receiver_and_ends_the_bus(endpoint: str) -> None:

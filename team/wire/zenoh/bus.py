@@ -24,7 +24,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from team.wire.bus import Answer, BusError, Outgoing, Sample
-from team.wire.channels import ALIVE, TALLY, Channel
+from team.wire.channels import ALIVE, TALLY, Channel, row_of
 from team.wire.codec import LARGEST_PAYLOAD, encoded
 from team.wire.messages import Liveliness, Message, Tally
 from team.wire.zenoh.delivery import Publisher, declared, subscribe
@@ -37,8 +37,11 @@ if TYPE_CHECKING:  # a node without keys needs none of it
 
 _ATTACHMENT = struct.Struct("<qqq")
 _ALIVE_TIMEOUT_S = 5.0
-MOST_WAITING = 20_000
-"""Samples that wait for an onlooker before what it can do without is dropped."""
+MOST_WAITING = 1_000
+"""Samples that wait for an onlooker before what it can do without is dropped.
+
+Each keeps the buffer alive that it came in: some 10 kB.
+"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -179,8 +182,12 @@ class ZenohBus:
         key = self._prefix + channel.key(_every(channel, name))
         put = self._shed if channel.name in self._sheds else self._queue.put
         subscribe(self._session, key, channel, put, whole=whole)
-        if channel.delivery != "stream":
+        if channel.delivery != "stream" and channel.name not in self._sheds:
             self._recovery.watch(key)
+
+    def _can_do_without(self, key: str) -> bool:
+        row = row_of(key) if self._sheds else None
+        return row is not None and row.name in self._sheds
 
     def _shed(self, item: _Item) -> None:
         """Queue what an onlooker can do without, unless it is too far behind already."""
@@ -243,7 +250,7 @@ class ZenohBus:
         key = str(item.key_expr).removeprefix(self._prefix)
         stamp_ns, wall_ns, counter = _ATTACHMENT.unpack(item.attachment.to_bytes())
         sample = Sample(key, item.payload.to_bytes(), stamp_ns, wall_ns, counter)
-        if item.source_info is None:  # of a plain publisher
+        if item.source_info is None or self._can_do_without(key):  # what is lost is not asked for
             samples.append(sample)
         else:
             samples += self._recovery.arrived(sample, item.source_info)
