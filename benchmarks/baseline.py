@@ -6,6 +6,7 @@ figure may be worse. Ratios of two halves of one run hold on any machine; others
 """
 
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,3 +53,17 @@ def worse(figures: Mapping[str, float], name: str) -> list[str]:
         for row in held(figures, baselines()[name])
         if row.is_worse
     ]
+
+
+def concluded(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: str) -> int:
+    """Print the figures, write them to `file` if there is one, and judge them by the baseline.
+
+    wrong: what else the run has found wrong. Returns the exit status: 1 if anything is.
+    """
+    text = json.dumps(figures, indent=1)
+    print(text)
+    if file is not None:
+        file.write_text(text + "\n")
+    problems = [*wrong, *worse(figures, name)]
+    print("\n".join(problems) or "nothing worse", file=sys.stderr)
+    return 1 if problems else 0

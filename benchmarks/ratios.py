@@ -9,7 +9,6 @@ is the least of its rounds. Held against benchmarks/ratios.json; exit status 1 i
 """
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import concluded
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal, stepped
 from team.estimation.hybrid_slam.innovation import innovation
@@ -107,12 +106,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
     figures = measured(told.rounds)
-    print(json.dumps(figures, indent=1))
-    if told.json:
-        told.json.write_text(json.dumps(figures, indent=1) + "\n")
-    problems = worse(figures, "ratios")
-    print("\n".join(problems) or "nothing worse", file=sys.stderr)
-    return 1 if problems else 0
+    return concluded(figures, "ratios", told.json)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import concluded
 from sim.scenarios.scenario import dumps, load, with_options
 from team.recording.check import checked
 from team.recording.reader import open_log
@@ -218,13 +218,8 @@ def main() -> int:
         return 0
     with tempfile.TemporaryDirectory() as folder:
         figures = measured(told.robots, told.hz, told.seconds, Path(folder))
-    print(json.dumps(figures, indent=1))
-    if told.json:
-        told.json.write_text(json.dumps(figures, indent=1) + "\n")
-    problems = [*figures["findings"], *(f"{k}: {v}" for k, v in figures["lost"].items())]
-    problems += worse(figures, "recorder")
-    print("\n".join(problems) or "nothing lost, nothing worse", file=sys.stderr)
-    return 1 if problems else 0
+    lost = (f"{k}: {v}" for k, v in figures["lost"].items())
+    return concluded(figures, "recorder", told.json, *figures["findings"], *lost)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ ratios of the two launches are held against benchmarks/start.json: the machine i
 """
 
 import argparse
-import json
 import subprocess
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import concluded
 from sim.launch.launch import launch
 from sim.launch.plan import Plan
 from sim.launch.processes import Starter
@@ -87,12 +86,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
     figures = measured(with_options(load(told.scenario), robots=told.robots))
-    print(json.dumps(figures, indent=1))
-    if told.json:
-        told.json.write_text(json.dumps(figures, indent=1) + "\n")
-    problems = worse(figures, "start")
-    print("\n".join(problems) or "nothing worse", file=sys.stderr)
-    return 1 if problems else 0
+    return concluded(figures, "start", told.json)
 
 
 if __name__ == "__main__":

@@ -327,7 +327,7 @@ def test_what_an_onlooker_does_not_keep_up_with_is_dropped_and_not_asked_for(
         for i in range(100):
             source.publish_raw(Sample("robot/alpha/own/pose", b"", i, 0, 0))
             source.publish(Outgoing(c.SUBMAP, "alpha", submap(i)))
-        time.sleep(0.5)  # nobody reads meanwhile
+        wait_until(lambda: sink._queue.qsize() >= 100)  # all has come, and nobody has read
         found: list[Sample] = []
         until = time.monotonic() + 2.0
         while time.monotonic() < until:
