@@ -54,6 +54,11 @@ class KeptSet:
             self._store.append(news)
         except StoreError as error:
             _LOG.error("the set is not kept any more: %s", error)
+            self.close()
+
+    def close(self) -> None:
+        """The file is complete; nothing more is kept."""
+        if self._store is not None:
             self._store.close()
             self._store = None
 

@@ -87,6 +87,8 @@ class CentralShell:
             self._hear_orders()
             self._shell.report()
         self._shell.report(last=True)
+        if self._kept is not None:
+            self._kept.close()
         final = self.node.final
         if final is None:
             _LOG.info("ended without a final map")

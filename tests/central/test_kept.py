@@ -1,0 +1,75 @@
+"""The set of a centre on disk: each member once, what is none not, and all of it back."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from central.kept import KeptSet
+from team.peers.store import StoreError
+from team.wire import channels as ch
+from team.wire.bus import Sample
+from team.wire.codec import encoded
+from tests.support import odometry, submap
+
+SENT = [Sample(ch.SUBMAP.key("alpha"), encoded(submap(i)), 0, 0, i) for i in range(3)]
+
+
+@contextmanager
+def a_life(path: Path) -> Iterator[KeptSet]:
+    """A centre's set from its start to its end."""
+    kept = KeptSet(path)
+    yield kept
+    kept.close()
+
+
+def heard(found: list[Sample]) -> list[tuple[str, bytes]]:
+    return [(sample.key, sample.payload) for sample in found]
+
+
+def kept_in(path: Path) -> list[tuple[str, bytes]]:
+    """What a next life finds."""
+    with a_life(path) as kept:
+        return heard(kept.samples())
+
+
+def test_a_later_life_hears_each_member_once_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "central.set"
+    measured = Sample(ch.ODOMETRY.key("alpha"), encoded(odometry(1)), 0, 0, 0)
+    unsound = Sample(ch.SUBMAP.key("alpha"), b"no message", 0, 0, 0)
+    with a_life(path) as kept:
+        assert kept.samples() == []
+        kept.note([SENT[0], measured, unsound, SENT[0]])
+        kept.note(SENT[:2])
+    with a_life(path) as again:
+        again.note(SENT)
+        assert heard(again.samples()) == heard(SENT[:2])
+        assert again.samples() == []
+    assert kept_in(path) == heard(SENT)
+
+
+def test_what_a_death_tore_is_cut_off_and_the_rest_is_there(tmp_path: Path) -> None:
+    path = tmp_path / "central.set"
+    with a_life(path) as kept:
+        kept.note(SENT)
+    path.write_bytes(path.read_bytes()[:-1])
+    with a_life(path) as torn:
+        assert heard(torn.samples()) == heard(SENT[:2])
+        torn.note(SENT)
+    assert kept_in(path) == heard(SENT)
+
+
+def test_after_its_end_nothing_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "central.set"
+    with a_life(path) as kept:
+        pass
+    kept.note(SENT)
+    assert kept_in(path) == []
+
+
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "central.set"
+    path.write_text("something else")
+    with pytest.raises(StoreError, match="is no set of a peer: give --set another file"):
+        KeptSet(path)
