@@ -10,7 +10,7 @@ import argparse
 import heapq
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ DRIVE_S = 300
 WINDOW_S = 10
 LANDMARKS = 6
 CUT_S = (100, 200)
+WAY_NS = 50_000_000
 TEAMS = (2, 5, 10, 50)
 TOPOLOGIES = ("all", "line", "ring", "meetings", "partition")
 SECOND_NS = 10**9
@@ -97,6 +98,15 @@ class Team:
         self._way: list[tuple[int, int, str, str, m.Message | Member]] = []
         self._count = 0
 
+    def begin(self) -> None:
+        """Each robot has an initial pose, which nobody else knows yet."""
+        for name in self.names:
+            pose = m.InitialPose(
+                stamp_ns=0, robot=name, incarnation=1, number=0, pose=b"", covariance=b""
+            )
+            member = Member(ch.START.key(about(pose)), encoded(pose), pose)
+            self.nodes[name].take(member, name)
+
     def send(
         self, sender: str, to: str, what: m.Message | Member, now_ns: int, size: int = 0
     ) -> None:
@@ -105,7 +115,7 @@ class Team:
         for at_ns in self.air.arrivals(sender, to, size, now_ns):
             self._count += 1
             self.heard[to] += size
-            heapq.heappush(self._way, (at_ns + 50_000_000, self._count, sender, to, what))
+            heapq.heappush(self._way, (at_ns + WAY_NS, self._count, sender, to, what))
 
     def spread(self, name: str, out: list[Outgoing], now_ns: int) -> None:
         """What a node says: a question to one, all else to everyone in reach."""
@@ -122,18 +132,33 @@ class Team:
         now_ns = now_s * SECOND_NS
         if 0 < now_s <= DRIVE_S and now_s % WINDOW_S == 0:
             for name in self.names:
-                message = submap(name, now_s // WINDOW_S - 1)
-                member = Member(ch.SUBMAP.key(name), encoded(message), message)
-                self.nodes[name].take(member, name)
-                self.said[name] += member.size
-                for other in self.names:
-                    if other != name:
-                        self.send(name, other, member, now_ns)
+                self.close(name, now_s // WINDOW_S - 1, now_ns)
+        self.talk(now_ns, SECOND_NS)
+
+    def close(self, name: str, sequence: int, now_ns: int) -> None:
+        """A robot has closed a submap, and says it."""
+        message = submap(name, sequence)
+        member = Member(ch.SUBMAP.key(name), encoded(message), message)
+        self.nodes[name].take(member, name)
+        self.said[name] += member.size
+        for other in self.names:
+            if other != name:
+                self.send(name, other, member, now_ns)
+
+    def talk(self, now_ns: int, length_ns: int) -> None:
+        """What peers have to say now, and what reaches them within the time."""
         for name, node in self.nodes.items():
-            self.spread(name, node.tick(float(now_s)), now_ns)
-        while self._way and self._way[0][0] < now_ns + SECOND_NS:
+            self.spread(name, node.tick(now_ns * 1e-9), now_ns)
+        while self._way and self._way[0][0] < now_ns + length_ns:
             at_ns, _, sender, to, what = heapq.heappop(self._way)
             self._arrive(sender, to, what, at_ns)
+
+    def held(self, aims: Mapping[str, int]) -> dict[str, int]:
+        """How many of the first so many submaps of each robot each node has."""
+        return {
+            name: sum(min(node.replica.share_of((r, 1)).count, n) for r, n in aims.items())
+            for name, node in self.nodes.items()
+        }
 
     def _arrive(self, sender: str, to: str, what: m.Message | Member, now_ns: int) -> None:
         node = self.nodes[to]
@@ -159,11 +184,7 @@ class Team:
 def measured(topology: str, robots: int) -> dict[str, float]:
     """Bytes per robot and second against the star, and when all agree."""
     team = Team(topology, robots)
-    start = {n: m.InitialPose(stamp_ns=0, robot=n, incarnation=1, number=0, pose=b"",
-                              covariance=b"") for n in team.names}  # fmt: skip
-    for name, pose in start.items():
-        member = Member(ch.START.key(about(pose)), encoded(pose), pose)
-        team.nodes[name].take(member, name)
+    team.begin()
     healed_s = CUT_S[1] if topology == "partition" else DRIVE_S
     agreed_s = None
     for now_s in range(DRIVE_S + 600):
