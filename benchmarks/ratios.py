@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.baseline import concluded
 from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation.hybrid_slam.fastslam import Particles, Proposal, stepped
+from team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
 from team.estimation.hybrid_slam.innovation import innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.models import Increment, increment_of
@@ -78,7 +78,7 @@ def steps() -> list[Callable[[], None]]:
     def step(proposal: Proposal) -> Callable[[], None]:
         def taken() -> None:
             for _ in range(30):
-                stepped(particles, motion, SENSOR, *seen, proposal, np.random.default_rng(2))
+                filter_step(particles, motion, SENSOR, *seen, proposal, np.random.default_rng(2))
 
         return taken
 

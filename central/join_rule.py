@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
+from central.attendance import TeamAttendance
 from central.fused import JOINT_LANDMARKS, receivable, version_entry
 from central.monitor import NOTHING, finding, miscalibrations
-from central.news import News
-from central.roll import Roll
 from central.rule import Inputs, Stream, Tail
+from central.sent_priors import SentPriors
 from central.submap_rule import SubmapRule
 from central.tick_fold import TickFold
 from team import translate
@@ -40,7 +40,7 @@ class JoinRule(SubmapRule):
         super().reset()
         self._ticks = TickFold(self.config)
         self._quiet_ns: int | None = None
-        self._news: News | None = News(PRIOR_LANDMARKS)
+        self._sent_priors: SentPriors | None = SentPriors(PRIOR_LANDMARKS)
         self._published: Mapping[Stream, int] = {}
         self.finding = NOTHING
         self._announced: dict[str, str] = {}
@@ -61,7 +61,7 @@ class JoinRule(SubmapRule):
         ):
             self.reset()
         self._ticks.convicts = False
-        self._news = None  # every prior that a map may have brought
+        self._sent_priors = None  # every prior that a map may have brought
         for order in inputs.withdrawals.values():
             self.take_withdrawal(order)
         for verdict in sorted(verdicts):
@@ -106,27 +106,30 @@ class JoinRule(SubmapRule):
     @property
     def findings(self) -> tuple[str, ...]:
         """The monitor's, and why robots are not joined or the map is to be doubted, in words."""
-        unconfirmed = self.hearsay.unconfirmed(self.withdrawn)
+        unconfirmed = self.withdrawal_witnesses.unconfirmed(self.withdrawn)
         return (*self.finding.warnings, *self.reasons, *unconfirmed)
 
-    def advance(self, roll: Roll) -> list[Outgoing]:
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """A broadcast, when one is due."""
-        watermark_ns = roll.watermark_ns(self.dealt, self.count)
-        return self.broadcasts(watermark_ns, roll.now_ns)
+        watermark_ns = attendance.watermark_ns(self.dealt, self.count)
+        return self.broadcasts(watermark_ns, attendance.now_ns)
 
-    def refresh(self, roll: Roll) -> list[Outgoing]:
+    def refresh(self, attendance: TeamAttendance) -> list[Outgoing]:
         """A map with every submap that is here, if the last one lacks any.
 
         It waits for no tick's end and no teammate: what lies ahead of the watermark is provisional.
         """
         if not self._lacks(self._published, float("inf")):
             return []
-        watermark_ns = roll.watermark_ns(self.dealt, self.count)
+        watermark_ns = attendance.watermark_ns(self.dealt, self.count)
         self._ticks.take_until(watermark_ns)
         fold = self._ticks.provisional()
         ahead = any(each.end_ns > watermark_ns for each in fold.contributions[-1:])
         tail: Tail = "provisional" if ahead else "closed"
-        return [*self._withdrawals(roll.now_ns), *self._broadcast(fold, tail, roll.now_ns)]
+        return [
+            *self._withdrawals(attendance.now_ns),
+            *self._broadcast(fold, tail, attendance.now_ns),
+        ]
 
     def broadcasts(self, watermark_ns: float, newest_ns: int) -> list[Outgoing]:
         """Fold what the watermark allows; a broadcast when one is due."""
@@ -324,10 +327,12 @@ class JoinRule(SubmapRule):
             latest[robot] = max(latest.get(robot, 0), incarnation)
         streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
         shown = self._shown(fold)
-        if self._news is not None:
+        if self._sent_priors is not None:
             blocks = marginals.landmark_blocks(fold, shown)
             poses = ((each, marginals.last_pose(fold, each)) for each in streams)
-            streams = [each for each, pose in poses if self._news.is_worth(each, pose, blocks)]
+            streams = [
+                each for each, pose in poses if self._sent_priors.is_worth(each, pose, blocks)
+            ]
         if not streams:
             return []
         priors = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, shown)

@@ -8,9 +8,9 @@ from collections.abc import Collection, Iterable, Sequence
 
 import msgspec
 
+from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.roll import Roll
 from central.rule import rule_of
 from team import translate
 from team.door import Door, absurd
@@ -39,7 +39,7 @@ class CentralNode:
         self._admitted: list[str] = []
         self.announcement = translate.configured("central", 0, 0, config)
         self._door = Door(robots)
-        self._roll = Roll.of(robots)
+        self._attendance = TeamAttendance.of(robots)
         self._rule = rule_of(config, self.announcement.digest, sorted(robots))
         self._broadcasts = 0
         self._newest: m.FusedMap | None = None
@@ -70,9 +70,9 @@ class CentralNode:
         self._admit(message)
         refused = self._door.refusal(message)
         if refused is None and isinstance(message, m.End):
-            refused = self._roll.contradicts(message)
+            refused = self._attendance.contradicts(message)
             if refused is not None:
-                self._roll.doubt(message)
+                self._attendance.consider_end(message)
         return refused
 
     def _admit(self, message: m.Message) -> None:
@@ -80,10 +80,10 @@ class CentralNode:
         robot = message.robot if isinstance(message, m.InitialPose) else None
         if isinstance(message, m.Configuration):
             robot = ch.robot_of(message.node)
-        if not self._admits or robot is None or robot in self._roll.robots or absurd(message):
+        if not self._admits or robot is None or robot in self._attendance.robots or absurd(message):
             return
-        if len(self._roll.robots) < MOST_ROBOTS:
-            for admits in (self._door, self._roll, self._rule):
+        if len(self._attendance.robots) < MOST_ROBOTS:
+            for admits in (self._door, self._attendance, self._rule):
                 admits.admit(robot)
             self._admitted.append(robot)
 
@@ -92,12 +92,12 @@ class CentralNode:
         if isinstance(message, m.FusedMap):
             return self._take_final(message)
         self._credit = None
-        known = self._roll.ordered
-        self._roll.take(message)
+        known = self._attendance.ordered
+        self._attendance.take(message)
         if isinstance(message, m.TeamEnd):  # who comes later hears of it from the centre
             repeated = [] if known else [Outgoing(ch.TEAM_END, "", message)]
             return repeated + self._advance()
-        self._credit = self._rule.take(message, self._roll.now_ns)
+        self._credit = self._rule.take(message, self._attendance.now_ns)
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
@@ -108,7 +108,7 @@ class CentralNode:
         """
         out, self._credit = self._credit, []
         if out is None:
-            out = self._rule.refuse(message, why, self._roll.now_ns)
+            out = self._rule.refuse(message, why, self._attendance.now_ns)
         if self._concluding and not self.finished:
             return out + self._conclude_anyway(why)
         return out + (self._advance() if self._is_over else [])
@@ -122,23 +122,23 @@ class CentralNode:
     @property
     def robots(self) -> Collection[str]:
         """Who is in the team."""
-        return self._roll.robots.keys()
+        return self._attendance.robots.keys()
 
     @property
     def awaited(self) -> list[str]:
         """The robots that are not there and that the final map waits for."""
-        return [] if self.finished else self._roll.awaited(self._rule.dealt)
+        return [] if self.finished else self._attendance.awaited(self._rule.dealt)
 
     @property
     def ends(self) -> bool:
         """Whether all streams have ended, by the word of the world or of their drivers."""
-        return self._roll.end is not None
+        return self._attendance.end is not None
 
     def _advance(self) -> list[Outgoing]:
         if self.finished:
             return []
-        self._roll.withdrawn = frozenset(self._rule.withdrawn)
-        out = self._counted(self._rule.advance(self._roll))
+        self._attendance.withdrawn = frozenset(self._rule.withdrawn)
+        out = self._counted(self._rule.advance(self._attendance))
         return out + self._conclude() if self._is_over else out
 
     def _counted(self, out: list[Outgoing]) -> list[Outgoing]:
@@ -149,24 +149,24 @@ class CentralNode:
 
     def refresh(self) -> list[Outgoing]:
         """A map of all that is here, if the last one lacks something; for when there is time."""
-        return [] if self.finished else self._counted(self._rule.refresh(self._roll))
+        return [] if self.finished else self._counted(self._rule.refresh(self._attendance))
 
     @property
     def _is_over(self) -> bool:
         """The streams have ended, and nobody and nothing of them is waited for."""
-        end = self._roll.end
-        over = end is not None and self._roll.concluded(self._rule.dealt)
+        end = self._attendance.end
+        over = end is not None and self._attendance.concluded(self._rule.dealt)
         return over and end is not None and self._rule.complete(end)
 
     def _conclude_anyway(self, why: str) -> list[Outgoing]:
         newest = self._newest
         if newest is None:
-            digest, now_ns = self.announcement.digest, self._roll.now_ns
+            digest, now_ns = self.announcement.digest, self._attendance.now_ns
             newest = fused_message(
                 self.config, digest, NO_LANDMARKS, (), stamp_ns=now_ns, joint=False
             )
         reasons = (*newest.reasons, f"not the final map, which raised: {why}")
-        lost = tuple(self._roll.missing(self._rule.dealt))
+        lost = tuple(self._attendance.missing(self._rule.dealt))
         final = msgspec.structs.replace(
             newest, final=True, provisional=True, reasons=reasons, lost=lost
         )
@@ -175,11 +175,11 @@ class CentralNode:
 
     def _conclude(self) -> list[Outgoing]:
         self._concluding = True
-        out = self._rule.conclude(self._roll.now_ns)
+        out = self._rule.conclude(self._attendance.now_ns)
         self.finished = True
         final = out[-1].message
         assert isinstance(final, m.FusedMap)
-        lost = tuple(self._roll.missing(self._rule.dealt))
+        lost = tuple(self._attendance.missing(self._rule.dealt))
         if lost:
             final = msgspec.structs.replace(final, provisional=True, lost=lost)
         self.final = final
@@ -187,7 +187,7 @@ class CentralNode:
 
     def wanted(self) -> list[m.MeasurementsRequest]:
         """The measurements that are missing and must be asked for at their source."""
-        return [] if self.finished else self._rule.wanted(self._roll.now_ns)
+        return [] if self.finished else self._rule.wanted(self._attendance.now_ns)
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:
         """The answer to `SubmapsRequest`: what is here of the robot, its latest incarnation
@@ -198,7 +198,7 @@ class CentralNode:
 
     def lacking(self) -> list[m.SubmapsRequest]:
         """What robots have sent by their own word and is not here: to be asked of them."""
-        return [] if self.finished else self._rule.lacking(self._roll)
+        return [] if self.finished else self._rule.lacking(self._attendance)
 
     def status(self) -> m.Status:
         """What the centre is doing, for people."""
@@ -206,13 +206,13 @@ class CentralNode:
             "broadcasts": float(self._broadcasts),
             "submaps": float(self._rule.submaps),
             "landmarks": float(self._rule.landmarks),
-            "team_time_s": self._roll.now_ns * 1e-9,
+            "team_time_s": self._attendance.now_ns * 1e-9,
             "refused": 0.0,
         }
         state = "done" if self.finished else "joining"
         given_up = [
             f"{robot} is given up: nobody waits for it, and the final map will be provisional"
-            for robot in self._roll.given_up
+            for robot in self._attendance.given_up
         ]
         admitted = (
             (f"admitted, though not in the scenario: {', '.join(self._admitted)}",)
@@ -220,7 +220,7 @@ class CentralNode:
             else ()
         )
         warnings = (*given_up, *admitted, *self._rule.findings, *self.warnings[-3:])
-        now_ns = self._roll.now_ns
+        now_ns = self._attendance.now_ns
         return m.Status(
             stamp_ns=now_ns,
             node="central",

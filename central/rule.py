@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+from central.attendance import TeamAttendance
 from central.config import CentralConfig
-from central.roll import Roll
 from team.pairs import RULES
 from team.registry import loaded
 from team.wire import channels as ch
@@ -80,10 +80,10 @@ class FusionRule(ABC):
         """Take one message; the credit that it gives."""
 
     @abstractmethod
-    def advance(self, roll: Roll) -> list[Outgoing]:
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """The maps that are due."""
 
-    def refresh(self, roll: Roll) -> list[Outgoing]:
+    def refresh(self, attendance: TeamAttendance) -> list[Outgoing]:
         """The newest map at once, whether or not one is due, if it has more than the last one."""
         return []
 
@@ -131,7 +131,7 @@ class FusionRule(ABC):
         """
         return ()
 
-    def lacking(self, roll: Roll) -> list[m.SubmapsRequest]:
+    def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
         """What robots say that they have sent, and what is not here."""
         return []
 

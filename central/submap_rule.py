@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
+from central.attendance import TeamAttendance
 from central.config import CentralConfig
-from central.hearsay import Hearsay
-from central.roll import Roll
 from central.rule import FusionRule, Stream
 from central.submap_set import SubmapSet
+from central.withdrawal_witnesses import WithdrawalWitnesses
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -19,13 +19,13 @@ class SubmapRule(FusionRule):
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
         super().__init__(config, digest, robots)
-        self.hearsay = Hearsay(robots)
+        self.withdrawal_witnesses = WithdrawalWitnesses(robots)
         self.reset()
 
     def admit(self, robot: str) -> None:
         """From now on the robot is in the team, and may be heard of others."""
         super().admit(robot)
-        self.hearsay.admit(robot)
+        self.withdrawal_witnesses.admit(robot)
 
     def reset(self) -> None:
         """Nothing is here."""
@@ -66,7 +66,7 @@ class SubmapRule(FusionRule):
             case m.Verdict():
                 self._judges(message)
             case m.WithdrawalHeard():
-                order = self.hearsay.take(message)
+                order = self.withdrawal_witnesses.take(message)
                 return [] if order is None else self._follow(order)
             case _:
                 pass
@@ -186,9 +186,9 @@ class SubmapRule(FusionRule):
                 found += [each for submap in chain for each in self.members.sightings(submap)]
         return found
 
-    def lacking(self, roll: Roll) -> list[m.SubmapsRequest]:
+    def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
         """What robots say that they have sent, and what is not in the map's reach."""
-        said = (s for robot in roll.robots.values() for s in (robot.progress, robot.done))
+        said = (s for robot in attendance.robots.values() for s in (robot.progress, robot.done))
         sent: dict[Stream, int] = {}
         for each in said:
             if each is not None:
@@ -197,7 +197,10 @@ class SubmapRule(FusionRule):
         here = {stream: self.count(stream) for stream in sent}
         return [
             m.SubmapsRequest(
-                stamp_ns=roll.now_ns, robot=stream[0], incarnation=stream[1], first=here[stream]
+                stamp_ns=attendance.now_ns,
+                robot=stream[0],
+                incarnation=stream[1],
+                first=here[stream],
             )
             for stream in sorted(sent)
             if here[stream] < sent[stream]

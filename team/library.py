@@ -279,7 +279,7 @@ def batch_map(
         if keyframe is not None
         for at in (keyframe.calibrated(sensors[robot]),)
     ]
-    grown = batches.extended(batches.begun(starts, robust_c), steps)
+    grown = batches.extended(batches.initial_state(starts, robust_c), steps)
     solution = batches.solved(grown, _BATCH_ITERATIONS, _BATCH_DECREMENT)
     landmarks = batches.landmark_gaussian(solution)
     return BatchMap(

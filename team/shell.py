@@ -15,7 +15,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import msgspec
 
 from team.containment import Boundary
-from team.spare import Spare
+from team.spare_time import SpareTime
 from team.the_end import TheEnd
 from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
 from team.wire.channels import ALIVE, FAULT, QUERIES, STATUS, Channel
@@ -99,7 +99,7 @@ class Shell:
         self._bytes = 0
         self._since = time.monotonic()
         self._refresh: Callable[[], list[Outgoing]] | None = None
-        self._spare = Spare(1.0)
+        self._spare_time = SpareTime(1.0)
         self._stale = False
 
     def refresh_by(self, refresh: Callable[[], list[Outgoing]], share: float) -> None:
@@ -107,23 +107,23 @@ class Shell:
 
         So what is worth most while it is new does not wait for when it would be due.
         """
-        self._refresh, self._spare = refresh, Spare(share)
+        self._refresh, self._spare_time = refresh, SpareTime(share)
 
     def receive(self) -> list[Sample]:
         """What has come within WAIT_S; when nothing more has, what there is to refresh is said."""
         refreshes = self._stale and self._refresh is not None
-        wait_s = min(WAIT_S, self._spare.wait_s) if refreshes else WAIT_S
+        wait_s = min(WAIT_S, self._spare_time.wait_s) if refreshes else WAIT_S
         samples = self.bus.receive(wait_s)
         if samples:
             self._stale = True
-        elif refreshes and not self._spare.wait_s and self._refresh is not None:
+        elif refreshes and not self._spare_time.wait_s and self._refresh is not None:
             self._stale = False
             began = time.monotonic()
             out = self.contained("refresh", self._refresh)
             if out is None:
-                self._spare.failed()
+                self._spare_time.failed()
             else:
-                self._spare.note(began, useful=bool(out))
+                self._spare_time.note(began, useful=bool(out))
                 self.publish(out)
         return samples
 
@@ -274,8 +274,8 @@ class Shell:
             self._remind_due = now + REMIND_S
             _LOG.info("%s", "; ".join(warnings) or "waiting")
         warnings = (*warnings, *self.boundary.warnings)
-        if self._spare.took_s is not None:
-            rates["fresh_s"] = self._spare.took_s
+        if self._spare_time.took_s is not None:
+            rates["fresh_s"] = self._spare_time.took_s
         if self.boundary.faults:
             rates["faults"] = float(self.boundary.faults)
         status = msgspec.structs.replace(status, figures=status.figures | rates, warnings=warnings)

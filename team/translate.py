@@ -137,7 +137,7 @@ def motion_of(message: m.AnyOdometry, config: RobotConfig) -> Interval:
             return Interval(end_ns, duration_ns, float(rates[0]), float(rates[2]), motion)
 
 
-def looks_of(
+def detections_of(
     message: m.Sightings,
 ) -> tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """(teammates, ranges [m], bearings [rad]) in the machine's byte order."""

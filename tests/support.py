@@ -134,9 +134,11 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
 
 def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
     """The message as the node says it that publishes on the channel's key for this name."""
-    speaker = channel.speaker(name)
+    publisher = channel.publisher(name)
     says = m.Configuration | m.Progress | m.Status | m.Liveliness | m.Fault | m.SetSummary
-    return msgspec.structs.replace(message, node=speaker) if isinstance(message, says) else message
+    return (
+        msgspec.structs.replace(message, node=publisher) if isinstance(message, says) else message
+    )
 
 
 def peers_examples(digest: bytes) -> Iterator[m.Message]:

@@ -15,7 +15,7 @@ MOST = 7
 FOLDERS = ("team", "central", "sim", "tests", "benchmarks", "examples")
 COMPILED = (
     "_condition_noise_on_measurement", "_predict", "_predictive", "add_sightings", "add_submaps",
-    "agreement", "left_out", "normal_equations", "step", "stepped",
+    "agreement", "left_out", "normal_equations", "step", "filter_step",
 )  # fmt: skip
 """Compiled kernels and the steps of estimators, which share one order: state, motion, sensor, …"""
 COMMANDS = ("_ip", "ip")

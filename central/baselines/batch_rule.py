@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from central.baselines.measurement_rules import MeasurementRule, Told
+from central.baselines.measurement_rules import MapContent, MeasurementRule
 from central.baselines.team_keyframes import RobotKeyframe
 from central.config import CentralConfig
 from team import translate
@@ -60,7 +60,7 @@ class BatchRule(MeasurementRule):
         return tuple(self._findings)
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        self._batch = batch.begun(starts, self.config.robust_c)
+        self._batch = batch.initial_state(starts, self.config.robust_c)
         self._findings += taken_as_white(self.models)
 
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
@@ -70,7 +70,7 @@ class BatchRule(MeasurementRule):
             self._stamps[each.robot].append(each.stamp_ns)
         return []
 
-    def _told(self, *, final: bool) -> Told:
+    def _content(self, *, final: bool) -> MapContent:
         self._grow()
         if final:
             self._batch = self._solved(self._batch.renewed, FINAL_ITERATIONS, FINAL_DECREMENT)
@@ -83,7 +83,7 @@ class BatchRule(MeasurementRule):
             self._batch = self._solved(self._batch, RUNNING_ITERATIONS, RUNNING_DECREMENT)
         landmarks = batch.landmark_gaussian(self._batch)
         said = (*self._poses(), *(self._paths() if final else ()))
-        return Told(landmarks, self._batch.cost, self._batch.dof, said)
+        return MapContent(landmarks, self._batch.cost, self._batch.dof, said)
 
     def _grow(self) -> None:
         """Take the turns that wait; without what they saw, or not at all, where none is solved."""

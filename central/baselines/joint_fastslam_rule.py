@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from central.baselines.measurement_rules import MeasurementRule, Told
+from central.baselines.measurement_rules import MapContent, MeasurementRule
 from central.baselines.team_keyframes import RobotKeyframe
 from central.config import CentralConfig
 from team.config import RobotConfig
@@ -46,20 +46,20 @@ class JointFastSlamRule(MeasurementRule):
         self._generator = generator(first.seed, "team", 0, 0)
         poses = {name: pose for name, (pose, _) in starts.items()}
         particles = self.config.particles
-        self._state = joint_fastslam.begun(poses, particles, "fastslam1", RESAMPLE_BELOW)
+        self._state = joint_fastslam.initial_state(poses, particles, "fastslam1", RESAMPLE_BELOW)
         turns = [
             _uncertain(name, pose, covariance, self.models[name])
             for name, (pose, covariance) in starts.items()
             if covariance is not None
         ]
         if turns:
-            self._state = joint_fastslam.stepped(self._state, turns, self._generator)
+            self._state = joint_fastslam.filter_step(self._state, turns, self._generator)
 
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
         blind = [turn.blind for turn in turns]
         for some in (turns, blind):  # at the last the particles stay where they are
             with suppress(NotACovarianceError, np.linalg.LinAlgError), np.errstate(all="ignore"):
-                after = joint_fastslam.stepped(self._state, some, self._generator)
+                after = joint_fastslam.filter_step(self._state, some, self._generator)
                 if np.isfinite(after.poses).all() and np.isfinite(after.log_weights).all():
                     self._state = after
                     break
@@ -74,8 +74,8 @@ class JointFastSlamRule(MeasurementRule):
         mean, covariance = joint_fastslam.pose_gaussian(self._state, robot)
         return PoseGaussian(mean, covariance + POSE_FLOOR)
 
-    def _told(self, *, final: bool) -> Told:
-        return Told(joint_fastslam.landmark_gaussian(self._state))
+    def _content(self, *, final: bool) -> MapContent:
+        return MapContent(joint_fastslam.landmark_gaussian(self._state))
 
 
 def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> RobotStep:

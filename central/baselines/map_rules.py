@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
+from central.attendance import TeamAttendance
 from central.baselines.feedback_rule import FeedbackRule
 from central.baselines.map_fusion import fused_totally, kalman
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.roll import Roll
 from central.rule import FusionRule, Inputs, Stream, Tail
 from central.submap_set import SubmapSet
 from team import translate
@@ -36,7 +36,7 @@ class ExchangeRule(FusionRule):
             return self.conclude(inputs.stamp_ns)
         for estimate in inputs.maps:
             self._rounds.take_map(estimate)
-        return self.advance(Roll.of(()))
+        return self.advance(TeamAttendance.of(()))
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """File a map for its round."""
@@ -51,9 +51,11 @@ class ExchangeRule(FusionRule):
                 pass
         return []
 
-    def advance(self, roll: Roll) -> list[Outgoing]:
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """Every round that no robot is missing from."""
-        out = self._rounds.advance(lambda name, _round: roll.takes_part(name), list(roll.robots))
+        out = self._rounds.advance(
+            lambda name, _round: attendance.takes_part(name), list(attendance.robots)
+        )
         self.landmarks = self._rounds.landmarks
         return out
 
@@ -149,13 +151,13 @@ class LatestRule(_OwnMaps):
             super().dealt(done) and (done.robot, done.incarnation) in self._placed
         )
 
-    def advance(self, roll: Roll) -> list[Outgoing]:
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """A broadcast, when one is due and there is something new in it."""
         maps = self._known()
         members = tuple(_member(x) for x in maps)
-        if not self.is_due(roll.now_ns) or not members or members == self._said:
+        if not self.is_due(attendance.now_ns) or not members or members == self._said:
             return []
-        self.broadcast_ns, self._said = roll.now_ns, members
+        self.broadcast_ns, self._said = attendance.now_ns, members
         return self.fuse(Inputs(maps=maps), "closed")
 
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
@@ -179,7 +181,7 @@ class AloneRule(_OwnMaps):
 
     listens = (ch.OWN_MAP,)
 
-    def advance(self, roll: Roll) -> list[Outgoing]:
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """There is nothing to broadcast."""
         return []
 

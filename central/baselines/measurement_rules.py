@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from central.attendance import TeamAttendance
 from central.baselines.team_keyframes import RobotKeyframe, TeamKeyframes
 from central.config import CentralConfig
 from central.fused import START_POSES, fused_message
-from central.roll import Roll
 from central.rule import FusionRule, Inputs, Tail
 from team import translate
 from team.config import RobotConfig
@@ -25,7 +25,7 @@ from team.wire.bus import Outgoing
 
 
 @dataclass(frozen=True)
-class Told:
+class MapContent:
     """What a map is made of: the landmarks and, where the rule has one, the joint cost.
 
     before: messages that go out before it.
@@ -67,7 +67,7 @@ class MeasurementRule(FusionRule):
         """One step of the team, which the members already name; the poses that it gives."""
 
     @abstractmethod
-    def _told(self, *, final: bool) -> Told:
+    def _content(self, *, final: bool) -> MapContent:
         """The map of all steps so far."""
 
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
@@ -77,7 +77,7 @@ class MeasurementRule(FusionRule):
         self._fused = True
         for message in inputs.heard:
             self.take(message, 0)
-        out = self.advance(Roll.of(self.team))
+        out = self.advance(TeamAttendance.of(self.team))
         ended = any(isinstance(message, m.End) for message in inputs.heard)
         return out + self.conclude(0) if ended else out
 
@@ -106,7 +106,7 @@ class MeasurementRule(FusionRule):
         """Every measurement of every stream has been used."""
         return self._keyframes.complete
 
-    def advance(self, roll: Roll) -> list[Outgoing]:
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """Every step whose turn has come: the poses, and the map at broadcasts."""
         if not self.models and not self._begin():
             return []
@@ -118,7 +118,7 @@ class MeasurementRule(FusionRule):
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
         """The map after the last step."""
-        return self._said(final=True)
+        return self._map_messages(final=True)
 
     def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
         """Measurements that the link has lost."""
@@ -217,7 +217,7 @@ class MeasurementRule(FusionRule):
         if stamp_ns - self.broadcast_ns < self.config.broadcast_s * 1e9:
             return []
         self.broadcast_ns = stamp_ns
-        return self._said(final=False)
+        return self._map_messages(final=False)
 
     @property
     def digest(self) -> bytes:
@@ -226,19 +226,19 @@ class MeasurementRule(FusionRule):
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
         return translate.digest_of(self.config_digest, named)
 
-    def _said(self, *, final: bool) -> list[Outgoing]:
-        told = self._told(final=final) if self.models else Told()
-        self.landmarks = len(told.landmarks.ids)
+    def _map_messages(self, *, final: bool) -> list[Outgoing]:
+        content = self._content(final=final) if self.models else MapContent()
+        self.landmarks = len(content.landmarks.ids)
         lost = [f"{robot}: its stream began anew" for robot in self._keyframes.broken]
         fused = fused_message(
             self.config,
             self.digest,
-            told.landmarks,
+            content.landmarks,
             tuple(self.members[robot] for robot in sorted(self.members)),
             stamp_ns=self.now_ns,
             final=final,
             frame=self._frame,
-            cost=(told.chi2, told.dof),
+            cost=(content.chi2, content.dof),
             reasons=(*self._reasons, *lost, *self.findings) if final else (),
         )
-        return [*told.before, Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]
+        return [*content.before, Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]

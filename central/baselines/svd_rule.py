@@ -12,9 +12,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.fused import fused_message, version_entry
-from central.roll import Roll
 from central.rule import Inputs, Stream, Tail
 from central.submap_rule import SubmapRule
 from team import translate
@@ -72,16 +72,16 @@ class SvdJoinRule(SubmapRule):
     @property
     def findings(self) -> tuple[str, ...]:
         """Orders that are not believed."""
-        return self.hearsay.unconfirmed(self.withdrawn)
+        return self.withdrawal_witnesses.unconfirmed(self.withdrawn)
 
-    def advance(self, roll: Roll) -> list[Outgoing]:
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """A broadcast of what is here, when one is due; a later one may put any of it elsewhere."""
-        if not self.is_due(roll.now_ns):
+        if not self.is_due(attendance.now_ns):
             return []
         inputs = self._inputs()
         if not inputs.submaps:
             return []
-        self.broadcast_ns = roll.now_ns
+        self.broadcast_ns = attendance.now_ns
         return self.fuse(inputs, "closed")
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
@@ -145,7 +145,7 @@ class SvdJoinRule(SubmapRule):
         Running maps have the solution that each submap has moved on; the final one is solved to the
         end, wrong minima looked for.
         """
-        begin = svd_joining.begun(
+        begin = svd_joining.initial_state(
             {stream[0]: np.zeros(3) if told is None else told}, self._weighting
         )
         before = self._joined.get(stream)
@@ -172,7 +172,7 @@ def _stepped(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining
     """The map with one more submap; None where it has no solution or no covariance."""
     try:
         with np.errstate(all="ignore"):
-            after = svd_joining.stepped(state, robot, local)
+            after = svd_joining.filter_step(state, robot, local)
             landmarks = svd_joining.landmark_gaussian(after)
     except UNSOLVABLE:
         return None

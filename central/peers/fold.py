@@ -120,14 +120,14 @@ class PeerFold:
             self._waits = False
         out = self._end_by_others()
         again = self._peer.rebuild
-        news = [] if again else list(self._peer.news())
+        new_messages = [] if again else list(self._peer.new_messages())
         if self.centre.finished and not again:
-            again = any(not isinstance(each, m.Concluded) for each in news)
+            again = any(not isinstance(each, m.Concluded) for each in new_messages)
         if again:
             self._peer.again()
-            news = list(self._peer.news())
+            new_messages = list(self._peer.new_messages())
             self._begin()
-        for message in news:
+        for message in new_messages:
             out += self._give(message)
         return out
 

@@ -91,7 +91,7 @@ class Peer:
         """Take one message of a robot, a peer, the world or an operator."""
         found = ch.channel_of(sample.key)
         channel, name = (None, "") if found is None else found
-        if channel in TALK and channel.speaker(name) != self.name:
+        if channel in TALK and channel.publisher(name) != self.name:
             self.downlink += len(sample.payload)
         heard = self._hear(message, sample)
         return self._take(message, sample, channel, name) if heard is None else heard
@@ -106,8 +106,8 @@ class Peer:
                 found = ch.channel_of(sample.key)
                 if self.peer.proofs is not None and found is not None:
                     channel, name = found
-                    speaker = OPERATOR if channel is ch.ORDER_SIGNATURE else name
-                    self.peer.proofs.hear(message, speaker)
+                    publisher = OPERATOR if channel is ch.ORDER_SIGNATURE else name
+                    self.peer.proofs.hear(message, publisher)
                 return []
             case m.SetSummary():
                 return self.counted(self.peer.hear(message))
@@ -144,7 +144,7 @@ class Peer:
         """Take a member."""
         if channel is None or channel not in CHANNELS:
             return []
-        self.peer.take_sample(sample, channel.speaker(name))
+        self.peer.take_sample(sample, channel.publisher(name))
         return self.grown()
 
     def tick(self, now_s: float) -> list[Outgoing]:

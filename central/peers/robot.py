@@ -133,7 +133,7 @@ class PeerRobot(Peer):
         """Take a member, a measurement, or what else an estimator hears."""
         out: list[Outgoing] = []
         if channel is not None and channel in CHANNELS:
-            self.peer.take_sample(sample, channel.speaker(name))
+            self.peer.take_sample(sample, channel.publisher(name))
             if isinstance(message, m.InitialPose) and name == self.robot:
                 out += self._vouched(Outgoing(ch.START, name, message))
             out += self.grown()

@@ -35,7 +35,7 @@ from sim.cli.options import (
     scenario_of,
 )
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
-from sim.scenarios.scenario import Scenario, doubts, with_options
+from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 
 if TYPE_CHECKING:
     from sim.launch.launch import Outcome
@@ -141,7 +141,7 @@ def launch(
     _check_world(resolved)
     if resolved.is_live and listen == ANY_PORT:
         listen = LOOPBACK  # drivers have to find it
-    for text in (*doubts(resolved), *([missing] if missing else [])):
+    for text in (*scenario_warnings(resolved), *([missing] if missing else [])):
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)

@@ -32,7 +32,7 @@ from sim.cli.options import (
     refuse_open_door,
     scenario_of,
 )
-from sim.scenarios.scenario import Scenario, doubts, with_options
+from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 from team.wire.arrays import ids
 
 NAME = "[a-z][a-z0-9_]{0,31}"
@@ -117,7 +117,7 @@ def world(
     streams = streams_of(resolved)
     with process("world") as stop, connected(resolved.team, connect, keys, "world") as bus:
         _connected(resolved, connect)
-        for text in doubts(resolved):
+        for text in scenario_warnings(resolved):
             _LOG.warning("%s", text)
         run_world(bus, resolved, streams, stop, speed=pace, recorder=recorder, cache=cache)
 

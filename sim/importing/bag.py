@@ -130,22 +130,22 @@ def _static_frames(bag: Bag) -> Frames:
 def proposed_topics(path: Path) -> str:
     """A bag's topics, and a file that says which are what; raises BagError."""
     with opened_bag(path) as bag:
-        robots, doubts = _proposed(bag, None)
-        return _question(path, bag, robots, doubts)
+        robots, warnings = _proposed(bag, None)
+        return _question(path, bag, robots, warnings)
 
 
 def decided(bag: Bag, path: Path, robot: str | None) -> Topics:
     """The topics of each robot, if they say so themselves; raises UndecidedError."""
-    robots, doubts = _proposed(bag, robot)
-    if doubts:
-        raise UndecidedError(_question(path, bag, robots, doubts))
+    robots, warnings = _proposed(bag, robot)
+    if warnings:
+        raise UndecidedError(_question(path, bag, robots, warnings))
     return Topics(robots=robots)
 
 
-def _question(path: Path, bag: Bag, robots: dict[str, RobotTopics], doubts: list[str]) -> str:
+def _question(path: Path, bag: Bag, robots: dict[str, RobotTopics], warnings: list[str]) -> str:
     return (
         f"{path}: which topics are what?\n{listing(bag.topics)}\n"
-        + "".join(f"{doubt}\n" for doubt in doubts)
+        + "".join(f"{doubt}\n" for doubt in warnings)
         + "Write it into a file, as topics.toml, beginning with this:\n\n"
         + as_toml(robots)
         + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml\n"
@@ -157,26 +157,26 @@ def _proposed(bag: Bag, robot: str | None) -> tuple[dict[str, RobotTopics], list
     found = bag.topics
     tagged = _tags_in(bag)
     robots: dict[str, RobotTopics] = {}
-    doubts: list[str] = []
+    warnings: list[str] = []
     spaces = sorted({_namespace(topic.name) for topic in found if topic.kind in ODOMETRY})
     for space in spaces:
         odometry, detections, truth = _candidates(found, tagged, space, alone=len(spaces) == 1)
         name = _robot_name(space, robot if len(spaces) == 1 else None)
         if len(odometry) != 1:
-            doubts.append(f"{name}: {len(odometry)} topics may be its odometry")
+            warnings.append(f"{name}: {len(odometry)} topics may be its odometry")
         if not detections:
-            doubts.append(f"{name}: no topic with detections of landmarks")
+            warnings.append(f"{name}: no topic with detections of landmarks")
         if len(truth) > 1:
-            doubts.append(f"{name}: {len(truth)} topics may be its truth")
+            warnings.append(f"{name}: {len(truth)} topics may be its truth")
         robots[name] = RobotTopics(
             odometry=odometry[0] if odometry else "/odom",
             detections=tuple(detections),
             truth=truth[0] if truth else "",
         )
     if not spaces:
-        doubts.append("no topic with odometry")
+        warnings.append("no topic with odometry")
         robots[robot or "r1"] = RobotTopics(odometry="/odom", detections=("/detections",))
-    return robots, doubts
+    return robots, warnings
 
 
 def _candidates(

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from central.desk.voices import Voices
+from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, Sample, opened
@@ -55,7 +55,7 @@ class Watch:
     concluded: dict[str, m.Concluded] = field(default_factory=dict)
     concluded_s: dict[str, float] = field(default_factory=dict)
     signer: "Signs | None" = None
-    _voices: Voices = field(default_factory=Voices)
+    _centre: PeersAsCentre = field(default_factory=PeersAsCentre)
 
     @property
     def world(self) -> m.Status | None:
@@ -91,7 +91,7 @@ class Watch:
         """Take what has come since."""
         for sample in bus.receive(TURN_S):
             self._take(sample)
-            said = self._voices.of(sample) if self.peers else None
+            said = self._centre.of(sample) if self.peers else None
             if said is not None:
                 self._take(said)
 

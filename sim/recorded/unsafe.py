@@ -9,7 +9,7 @@ from team import translate
 from team.config import Exchange, RobotConfig
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.map_joining.conditioning import RobotPrior
-from team.estimation.map_joining.whole_map import WholeMap, begun, joined
+from team.estimation.map_joining.whole_map import WholeMap, initial_map, joined
 from team.estimation.submap import LocalMap
 from team.robot.node import RobotNode
 from team.wire import messages as m
@@ -65,7 +65,7 @@ def _seen_from_its_pose(whole: WholeMap, ids: np.ndarray) -> WholeMap:
     """
     kept = np.flatnonzero(np.isin(whole.ids, ids))
     if not len(kept):
-        return begun(np.zeros(3), None)
+        return initial_map(np.zeros(3), None)
     x, y, heading = whole.mean[:3]
     c, s = np.cos(heading), np.sin(heading)
     turn = np.array([[c, s], [-s, c]])

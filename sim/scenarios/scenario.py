@@ -36,8 +36,8 @@ from team.config import Estimator, Exchange, FusionRule, RobotConfig
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from team.registry import absence
 
-__all__ = ["Scenario", "ScenarioError", "builtin_names", "doubts", "dumps", "load", "loads",
-           "with_options"]  # fmt: skip
+__all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads",
+           "scenario_warnings", "with_options"]  # fmt: skip
 
 FAR_M = 10.0
 """The end of a sensor's view where nothing says it."""
@@ -192,7 +192,7 @@ def loads(text: str) -> Scenario:
     return _converted(fields)
 
 
-def doubts(scenario: Scenario) -> list[str]:
+def scenario_warnings(scenario: Scenario) -> list[str]:
     """What is valid, but hardly meant, in words: a simulated robot whose odometry has no noise."""
     if not isinstance(scenario.world, SimulatedWorld):
         return []
@@ -207,8 +207,10 @@ def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
     """So many robots: the first ones as they are, further ones after their pattern in turn."""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
-    spare = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
-    further = [robots[i % len(robots)] | {"id": next(spare)} for i in range(len(robots), count)]
+    spare_time = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
+    further = [
+        robots[i % len(robots)] | {"id": next(spare_time)} for i in range(len(robots), count)
+    ]
     return [*robots[:count], *further]
 
 

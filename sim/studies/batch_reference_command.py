@@ -33,20 +33,20 @@ def batch_reference(
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
     from sim.recorded.data_set import log_or_run
     from sim.studies.batch_reference.g2o import g2o_lines
-    from sim.studies.batch_reference.measurements import LimitError
+    from sim.studies.batch_reference.measurements import BatchReferenceError
     from sim.studies.batch_reference.reference import batch_map
 
     if g2o is not None:
         try:
             lines = list(g2o_lines(log_or_run(log).samples()))
-        except LimitError as error:
+        except BatchReferenceError as error:
             fail(str(error), FAILED)
         g2o.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
         typer.echo(f"wrote {g2o}: {len(lines)} lines")
         return
     try:
         result = batch_map(log_or_run(log).samples(), noise)
-    except LimitError as error:
+    except BatchReferenceError as error:
         fail(str(error), FAILED)
     figures = result.to_json()
     typer.echo(json.dumps(figures, indent=2))

@@ -256,7 +256,7 @@ class Driver:
     @property
     def team_has_ended(self) -> bool:
         """The team's final map is out, or an operator has ended it: nothing more is taken."""
-        return self._node.finished or self._node.told_to_end
+        return self._node.finished or self._node.ordered_to_end
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:

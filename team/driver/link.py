@@ -191,12 +191,12 @@ class Link:
         while True:
             out = self._node.publish()
             now = time.monotonic()
-            if not out and (now >= head_due or self._node.is_news):
+            if not out and (now >= head_due or self._node.has_new_state):
                 out = self._node.head()
                 head_due = now + HEAD_S
             shell.publish(out)
             shell.take(bus.receive(0.0 if out else PACE_S))
-            if self._node.told_to_end and self._node.journal.state == "open":
+            if self._node.ordered_to_end and self._node.journal.state == "open":
                 with self._lock:
                     self._node.journal.mark("ended")
             shell.look_for_the_end()

@@ -33,7 +33,7 @@ class SourceNode:
 
     journal: Journal
     finished: bool = field(default=False, init=False)
-    told_to_end: bool = field(default=False, init=False)
+    ordered_to_end: bool = field(default=False, init=False)
     delivered: Stream = field(default=(0, 0), init=False)
     recorded: Stream = field(default=(0, 0), init=False)
     done: tuple[int, int, int] = field(default=(0, 0, 0), init=False)
@@ -47,8 +47,8 @@ class SourceNode:
         self._robot = self.journal.robot
         self.alive: set[str] = set()
         """The nodes of the team that are there."""
-        begun = self.journal.incarnations
-        self._incarnation = begun[0] if begun else 0
+        incarnations = self.journal.incarnations
+        self._incarnation = incarnations[0] if incarnations else 0
         self._published = self.journal.count(self._incarnation)
         self._said: m.StreamHead | None = None
         self._others: set[str] = set()
@@ -124,7 +124,7 @@ class SourceNode:
         return [Outgoing(ch.HEAD, self._robot, said)]
 
     @property
-    def is_news(self) -> bool:
+    def has_new_state(self) -> bool:
         """The stream has ended, or its driver leaves, and nobody has been told."""
         return self._said is not None and self._said.state != self.journal.state
 
@@ -170,7 +170,7 @@ class SourceNode:
             case m.Liveliness():
                 (self.alive.add if message.alive else self.alive.discard)(message.node)
             case m.TeamEnd():
-                self.told_to_end = True
+                self.ordered_to_end = True
             case m.FusedMap() if message.final:
                 self.finished = True
             case m.SetSummary() | m.Concluded():

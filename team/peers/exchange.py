@@ -90,7 +90,7 @@ def named(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
 def _contradicts(replica: Replica, holding: m.Holding) -> bool:
     """Whether a node's same sequences of a stream are others than the replica's."""
     stream = holding.robot, holding.incarnation
-    mine = replica.told_of(stream)
+    mine = replica.announced_of(stream)
     same = mine is not None and (mine.start, mine.sequences) == (holding.start, holding.sequences)
     return same and mine is not None and mine.digest != holding.digest
 

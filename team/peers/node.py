@@ -91,7 +91,7 @@ class PeerNode:
         self._given = Given()
         self._known = frozenset({*map(ch.robot_node, robots), "central"})
         self._fed: dict[Stream, int] = {}
-        self._news: list[m.Message] = []
+        self._new_messages: list[m.Message] = []
         self.rebuild = False
         self.carried: dict[str, Carried] = defaultdict(Carried)
         self.refused = 0
@@ -116,7 +116,7 @@ class PeerNode:
         self.unsaved.append(member)
         self.stamp_ns = max(self.stamp_ns, member.message.stamp_ns)
         if not isinstance(member.message, m.InitialPose | m.Submap | m.SightingFactor):
-            self._news.append(member.message)
+            self._new_messages.append(member.message)
         elif outcome == "replaced":
             self.rebuild = True
         return True
@@ -131,7 +131,7 @@ class PeerNode:
 
     def take_carried(self, carried: m.Members) -> list[Member]:
         """Take what another node carries; the members that were news."""
-        news = []
+        new_messages = []
         for key, payload, signature in zip(
             carried.keys, carried.payloads, carried.signatures, strict=True
         ):
@@ -145,14 +145,14 @@ class PeerNode:
             if why is not None:
                 self._refuse(f"{key[:80]} from {carried.node}: {why}")
             elif self.take(member, carried.node):
-                news.append(member)
-        return news
+                new_messages.append(member)
+        return new_messages
 
     def _refuse(self, why: str) -> None:
         self.refused += 1
         self.last_refused = why
 
-    def news(self) -> Iterator[m.Message]:
+    def new_messages(self) -> Iterator[m.Message]:
         """What a fold can take now and has not yet been handed, in order."""
         for stream, share in sorted(self.replica.streams.items()):
             fed = self._fed.get(stream, -1)
@@ -163,14 +163,14 @@ class PeerNode:
             for sequence in range(max(fed, 0), share.count):
                 yield from (member.message for member in share.parcel(sequence))
             self._fed[stream] = share.count
-        told, self._news = self._news, []
+        told, self._new_messages = self._new_messages, []
         yield from told
 
     def again(self) -> None:
         """Hand everything on once more: a fold begins anew."""
         self.rebuild = False
         self._fed.clear()
-        self._news = [
+        self._new_messages = [
             member.message
             for robot in self.replica.robots
             for _, member in sorted(self.replica.statements[robot].items())

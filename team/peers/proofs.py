@@ -57,10 +57,10 @@ class Proofs:
             signature=signature,
         )
 
-    def hear(self, said: m.Signature, speaker: str) -> None:
+    def hear(self, said: m.Signature, publisher: str) -> None:
         """Keep a signature that a robot, or an operator, says on its own key: of its own only."""
-        kept = self._signatures.setdefault(speaker, {})
-        if len(kept) < MOST_SIGNATURES and (speaker == OPERATOR or speaker == said.robot):
+        kept = self._signatures.setdefault(publisher, {})
+        if len(kept) < MOST_SIGNATURES and (publisher == OPERATOR or publisher == said.robot):
             kept[said.member] = said.signature
 
     def of(self, member: Member) -> bytes:
@@ -69,10 +69,10 @@ class Proofs:
         """
         if isinstance(member.message, m.Certificate):
             return b""
-        speaker = signed_by(member)
-        kept = self._signatures.setdefault(speaker, {})
+        publisher = signed_by(member)
+        kept = self._signatures.setdefault(publisher, {})
         found = member.signature or kept.get(member.hash, b"")
-        if not found and speaker == self._robot:
+        if not found and publisher == self._robot:
             found = kept[member.hash] = self._signer.sign(member.hash)
         return found
 
@@ -99,7 +99,7 @@ class Proofs:
         return None
 
     def _refused_order(self, member: Member) -> str | None:
-        certificate, signature = _parted(member.signature)
+        certificate, signature = _split(member.signature)
         why = self._signer.refusal(OPERATOR, certificate)
         if why is not None:
             return f"an order with {why}"
@@ -123,6 +123,6 @@ def signed_order(signer: Signs, member: Member) -> m.Signature:
     )
 
 
-def _parted(proof: bytes) -> tuple[bytes, bytes]:
+def _split(proof: bytes) -> tuple[bytes, bytes]:
     length = int.from_bytes(proof[:2], "little")
     return proof[2 : 2 + length], proof[2 + length :]

@@ -116,7 +116,7 @@ class Replica:
         self.replacements = 0
         self._holdings: dict[Stream, m.Holding] = {}
         self._statements: dict[str, m.Statements] = {}
-        self._told: _Told | None = None
+        self._told: _Announced | None = None
 
     def add(self, member: Member) -> Outcome:
         """Take a member; RefusedError where it can not be of this team or there is no room."""
@@ -283,7 +283,7 @@ class Replica:
             statements=tuple(told.statements.values()),
         )
 
-    def told_of(self, stream: Stream) -> m.Holding | None:
+    def announced_of(self, stream: Stream) -> m.Holding | None:
         """What others are told of a stream."""
         return self._telling.holdings.get(stream)
 
@@ -292,7 +292,7 @@ class Replica:
         return self._telling.statements.get(robot)
 
     @property
-    def _telling(self) -> "_Told":
+    def _telling(self) -> "_Announced":
         if self._told is None:
             held = ((stream, self._held(stream)) for stream in sorted(self.streams))
             holdings = {stream: each for stream, each in held if each is not None}
@@ -306,11 +306,11 @@ class Replica:
                 whole.update(digest)
             for digest in (s.digest for s in statements.values()):
                 whole.update(digest)
-            self._told = _Told(whole.digest(), holdings, statements)
+            self._told = _Announced(whole.digest(), holdings, statements)
         return self._told
 
 
-class _Told(NamedTuple):
+class _Announced(NamedTuple):
     """What a summary says, kept until something comes."""
 
     digest: bytes

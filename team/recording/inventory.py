@@ -95,7 +95,7 @@ class Inventory:
         self._earlier.add(_name(sample))
         self.take(sample)
 
-    def news(self, sample: Sample) -> bool:
+    def is_new(self, sample: Sample) -> bool:
         """Note a sample; False where it is in the log already, or in an earlier part of it."""
         if self.has_earlier_parts:
             name = _name(sample)

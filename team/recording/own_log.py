@@ -30,7 +30,7 @@ def own_log(path: Path, team: str) -> Iterator[Callable[[list[Sample]], None]]:
         if failed:
             return
         try:
-            recorder.write([sample for sample in samples if inventory.news(sample)])
+            recorder.write([sample for sample in samples if inventory.is_new(sample)])
         except RecorderError as error:
             failed = True
             _LOG.error("its own log is not written any more: %s", error)

@@ -112,7 +112,7 @@ class RecordLoop:
         Progress is credit: while the writing thread is far behind, nothing is reported.
         """
         noted = [(sample, self._noted(sample)) for sample in samples]
-        self._write([said for sample, said in noted if self._inventory.news(sample)])
+        self._write([said for sample, said in noted if self._inventory.is_new(sample)])
         if self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND:
             return
         every = PROGRESS_EVERY if samples else 1
@@ -166,7 +166,7 @@ class RecordLoop:
     def tell(self, scenario: Sequence[Configuration]) -> None:
         """Write what a world would have said, where there is none."""
         said = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
-        self._write([each for each in said if self._inventory.news(each)])
+        self._write([each for each in said if self._inventory.is_new(each)])
 
     def close(self) -> None:
         """Complete the log; raises `RecorderError` if it can not be written."""

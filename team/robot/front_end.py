@@ -214,7 +214,7 @@ class FrontEnd:
     def sight(self, measurement: m.Sightings) -> Rejection | None:
         """Take inter-robot measurements; the reason if they are rejected."""
         self._goes_in(measurement)
-        teammates, ranges, bearings = translate.looks_of(measurement)
+        teammates, ranges, bearings = translate.detections_of(measurement)
         others = np.array([name != self._config.id for name in teammates], dtype=np.bool_)
         near = self._judge.near(ranges) & others
         rejected = self._judge.time(measurement.stamp_ns)

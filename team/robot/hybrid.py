@@ -16,7 +16,7 @@ from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.pose_grid import Looks
 from team.estimation.map_joining.conditioning import pose_now
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from team.estimation.map_joining.whole_map import WholeMap, absorbed, begun, joined
+from team.estimation.map_joining.whole_map import WholeMap, absorbed, initial_map, joined
 from team.estimation.odometry import Moved
 from team.estimation.plausible import are_landmarks
 from team.estimation.scans import Scan
@@ -48,7 +48,7 @@ class HybridEstimator:
         self._slam = HybridSlam(config, incarnation)
         self.associates = config.fusion == "join"
         origin = np.zeros(3) if initial.pose is None else initial.pose
-        self.whole: WholeMap = begun(origin, initial.covariance)
+        self.whole: WholeMap = initial_map(origin, initial.covariance)
         self._open: tuple[LocalMap | None] | None = None
 
     @property

@@ -44,7 +44,7 @@ class RobotShell:
         self._patience_s = patience_s
         self._config, self._exchange = config, exchange
         self.node = RobotNode(config, exchange)
-        self._begun: dict[int, Sample] = {}
+        self._first_of: dict[int, Sample] = {}
         self._confirm_at = 0.0
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
 
@@ -178,11 +178,11 @@ class RobotShell:
             if found is None or found <= self.node.incarnation:
                 passed.append(sample)
             else:
-                self._begun[found] = sample
-        if self._begun and time.monotonic() >= self._confirm_at:
+                self._first_of[found] = sample
+        if self._first_of and time.monotonic() >= self._confirm_at:
             self._confirm_at = time.monotonic() + CONFIRMED_S
             last = self._incarnation_at_source()
-            begun, self._begun = self._begun, {}
+            begun, self._first_of = self._first_of, {}
             for incarnation, sample in sorted(begun.items()):
                 if last is None or incarnation <= last:
                     passed.append(sample)

@@ -9,7 +9,7 @@ from team.pairs import PAIRS
 from team.robot.estimator import AbsorbsMaps
 from team.robot.front_end import FrontEnd
 from team.robot.pace import Pace
-from team.robot.statements import Speaker
+from team.robot.statements import MessageWriter
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 
@@ -37,37 +37,37 @@ class RunningMaps:
         """Its maps are numbered anew."""
         self.last = -1
 
-    def at(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+    def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
         """A new running map is there: for viewers, or for an exchange that is due."""
         self._map_ns = stamp_ns
         if not self._exchanges:
-            return [self._own_map(stamp_ns, front, speaker)]
+            return [self._own_map(stamp_ns, front, writer)]
         since = None if self._exchange_ns is None else stamp_ns - self._exchange_ns
         if since is not None and since < self._config.exchange_s * 1e9:
             return []
-        return self._exchange(stamp_ns, front, speaker)
+        return self._exchange(stamp_ns, front, writer)
 
-    def finish(self, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+    def finish(self, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
         """The stream has ended: the last map, if no exchange had it."""
         if self._map_ns is None or not self._exchanges or self._map_ns == self._exchange_ns:
             return []
-        return self._exchange(self._map_ns, front, speaker)
+        return self._exchange(self._map_ns, front, writer)
 
-    def _exchange(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+    def _exchange(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
         self._exchange_ns = stamp_ns
         self.last = front.estimator.sequence
         if self._pace.lockstep:
             self._pace.sent_map()
-        return [self._own_map(stamp_ns, front, speaker)]
+        return [self._own_map(stamp_ns, front, writer)]
 
-    def _own_map(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> Outgoing:
+    def _own_map(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> Outgoing:
         estimator = front.estimator
         landmarks = estimator.own_map()
         joint = self._exchanges and estimator.joint
         if joint and len(landmarks.ids) > JOINT_LANDMARKS:
             joint = False
             self._warnings.append("the own map is too large for a joint covariance")
-        return speaker.own_map(
+        return writer.own_map(
             stamp_ns,
             estimator.sequence,
             self._pace.awaited,

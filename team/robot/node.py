@@ -30,7 +30,7 @@ from team.robot.maps import RunningMaps
 from team.robot.outbox import Outbox
 from team.robot.pace import Pace
 from team.robot.poses import RunningPoses
-from team.robot.statements import Speaker
+from team.robot.statements import MessageWriter
 from team.robot.stream_end import EndOfStream
 from team.robot.warnings import driver_away, slipped, unexpected
 from team.stream.inbox import Inbox
@@ -397,30 +397,30 @@ class RobotNode:
 
     def _said_of(self, estimates: Estimates) -> list[Outgoing]:
         """What there is to say of what the estimator has given."""
-        closed, speaker = estimates.closed, self._speaker
+        closed, writer = estimates.closed, self._writer
         if closed is not None:
-            return [*speaker.cloud(closed.end_ns, estimates.cloud), *self._send(closed)]
+            return [*writer.cloud(closed.end_ns, estimates.cloud), *self._send(closed)]
         self._taken()
         out: list[Outgoing] = []
         if estimates.pose_ns is not None:
-            out += self._poses.at(estimates.pose_ns, self._front, speaker)
+            out += self._poses.at(estimates.pose_ns, self._front, writer)
         if estimates.judged is not None:
             judged, stamp_ns = estimates.judged
-            out.append(speaker.innovation(stamp_ns, self._front.estimator.sequence, judged))
+            out.append(writer.innovation(stamp_ns, self._front.estimator.sequence, judged))
         if estimates.map_ns is not None:
-            out += speaker.cloud(estimates.map_ns, estimates.cloud)
-            out += self._maps.at(estimates.map_ns, self._front, speaker)
+            out += writer.cloud(estimates.map_ns, estimates.cloud)
+            out += self._maps.at(estimates.map_ns, self._front, writer)
         sequence = self._front.estimator.sequence
-        return out + speaker.association(sequence, self._now_ns, estimates.became)
+        return out + writer.association(sequence, self._now_ns, estimates.became)
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
         """Send a submap; it is among what is to be said before anything else of it can raise."""
-        speaker = self._speaker
+        writer = self._writer
         if self._replaced is not None:
             prior = self._poses.prior_of(self._incarnation)
             closed = self._replaced(closed, prior, self._front.submaps)
-        factors = [speaker.sighting(closed, each) for each in closed.sightings]
-        messages = [*factors, speaker.submap(closed)]
+        factors = [writer.sighting(closed, each) for each in closed.sightings]
+        messages = [*factors, writer.submap(closed)]
         self._taken()
         self.ledger.close(closed)
         self.warnings += [slipped(slip) for slip in closed.slips]
@@ -428,10 +428,10 @@ class RobotNode:
         self._on_window(closed)
         self._pending += self._outbox.put(messages)
         return [
-            speaker.innovation(closed.end_ns, closed.sequence, closed.innovation),
-            *speaker.association(closed.sequence, closed.end_ns, closed.became),
-            *self._poses.at(closed.end_ns, self._front, speaker),
-            *self._maps.at(closed.end_ns, self._front, speaker),
+            writer.innovation(closed.end_ns, closed.sequence, closed.innovation),
+            *writer.association(closed.sequence, closed.end_ns, closed.became),
+            *self._poses.at(closed.end_ns, self._front, writer),
+            *self._maps.at(closed.end_ns, self._front, writer),
             self._progress(),
         ]
 
@@ -441,8 +441,8 @@ class RobotNode:
         return [*released, self._progress()] if released else []
 
     @property
-    def _speaker(self) -> Speaker:
-        return Speaker(self.robot, self._incarnation, self._announcement.digest)
+    def _writer(self) -> MessageWriter:
+        return MessageWriter(self.robot, self._incarnation, self._announcement.digest)
 
     def _progress(self) -> Outgoing:
         self._pace.unreported = 0
@@ -501,7 +501,7 @@ class RobotNode:
         self._done = True
         self._passed_ns = self._now_ns
         out = self._close_incarnation()
-        out += self._maps.finish(self._front, self._speaker)
+        out += self._maps.finish(self._front, self._writer)
         return out + self._last_words()
 
     def _last_words(self) -> list[Outgoing]:

@@ -8,7 +8,7 @@ from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond
 from team.robot.front_end import FrontEnd
-from team.robot.statements import Speaker
+from team.robot.statements import MessageWriter
 from team.robot.team_map import TeamMap
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -57,20 +57,24 @@ class RunningPoses:
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
 
-    def at(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+    def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
         """A new pose is known: what is said of it, if that is due."""
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
         self._posed_ns = stamp_ns
-        return self.posed(stamp_ns, self.prior_of(speaker.incarnation), front, speaker)
+        return self.posed(stamp_ns, self.prior_of(writer.incarnation), front, writer)
 
     def posed(
-        self, stamp_ns: int, prior: m.Prior | None, front: FrontEnd, speaker: Speaker
+        self,
+        stamp_ns: int,
+        prior: m.Prior | None,
+        front: FrontEnd,
+        writer: MessageWriter,
     ) -> list[Outgoing]:
         """The own pose, and given a prior the pose in the team's map."""
         sequence = front.estimator.sequence
         own = front.estimator.own_pose()
-        out = [speaker.pose(ch.OWN_POSE, stamp_ns, sequence, translate.NO_MAP, own)]
+        out = [writer.pose(ch.OWN_POSE, stamp_ns, sequence, translate.NO_MAP, own)]
         if prior is None:
             return out
         try:
@@ -80,4 +84,4 @@ class RunningPoses:
             self._warnings.append(f"no team pose from the fused map: {error}")
             return out
         self.sigma_m = max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0) ** 0.5
-        return [*out, speaker.pose(ch.TEAM_POSE, stamp_ns, sequence, prior.digest, posed)]
+        return [*out, writer.pose(ch.TEAM_POSE, stamp_ns, sequence, prior.digest, posed)]

@@ -21,7 +21,7 @@ from team.wire.bus import Outgoing
 
 
 @dataclass(frozen=True)
-class Speaker:
+class MessageWriter:
     """One incarnation of a robot's stream under an announced configuration (by its digest)."""
 
     robot: str

@@ -43,10 +43,10 @@ class TeamMap:
         posed = pose_now(given.whole, open_window)
         self.known = posed.known + sum(given.known[-1:])
         self.refused = posed.refused + sum(given.refused[-1:])
-        self.doubt = self._doubt(given)
+        self.doubt = self._warning(given)
         return posed._replace(pose=curved(posed.pose))
 
-    def _doubt(self, given: Followed) -> str:
+    def _warning(self, given: Followed) -> str:
         if is_majority(self.refused, self.known):
             return (
                 f"the pose in the team's map is in doubt: {self.refused} of {self.known} landmarks "

@@ -133,7 +133,7 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     if "{robot}" in channel.template and robot != name:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
     said_by = _said_by(channel, message)
-    if said_by not in (None, channel.speaker(name)):
+    if said_by not in (None, channel.publisher(name)):
         raise WireError(
             "wrong field", f"a message of {str(said_by)[:80]!r} on the key {sample.key!r}"
         )

@@ -62,7 +62,7 @@ class Channel:
         """The key for one robot or node."""
         return _PLACE.sub(name, self.template)
 
-    def speaker(self, name: str) -> str:
+    def publisher(self, name: str) -> str:
         """The node that publishes the key for one robot or node."""
         first, _, rest = self.template.partition("/")
         if first == "{node}":

@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.join_rule import JoinRule
-from central.roll import Roll
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -110,12 +110,12 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
 def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
     """What r1 has just closed is out though r2 is a window behind, and no broadcast is due."""
     config = CentralConfig(tick_s=100.0, broadcast_s=100.0)
-    found, roll = rule(config), Roll.of(["r1", "r2"])
+    found, attendance = rule(config), TeamAttendance.of(["r1", "r2"])
     said = []
     for name, k in (("r1", 0), ("r2", 0), ("r1", 1)):
         found.take_submap(SUBMAPS[name][k])
-        said.append(found.refresh(roll))
-        assert not found.refresh(roll)
+        said.append(found.refresh(attendance))
+        assert not found.refresh(attendance)
     maps = [of(out, ch.FUSED_MAP)[0] for out in said]
     assert [sum(each.sequence + 1 for each in fused.members) for fused in maps] == [1, 2, 3]
     assert all(fused.provisional for fused in maps)

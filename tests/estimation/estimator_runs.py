@@ -41,7 +41,7 @@ def keyframes_of(config, stream):
 
 
 def run(state, step, keyframes, config, *generator):
-    """The state after the keyframes, by an estimator's `stepped`."""
+    """The state after the keyframes, by an estimator's `filter_step`."""
     for increment, *measurements in keyframes:
         state = step(state, increment, config.sensor, *measurements, *generator)
     return state

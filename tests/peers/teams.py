@@ -195,4 +195,4 @@ class Storm:
     def fed(self, name: str) -> Iterator[m.Message]:
         """What a fold that begins now is handed."""
         self.nodes[name].again()
-        return self.nodes[name].news()
+        return self.nodes[name].new_messages()

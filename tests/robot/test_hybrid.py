@@ -41,7 +41,7 @@ def fed(member, measurements):
     return closed
 
 
-def begun():
+def fresh_estimator():
     return HybridEstimator(config(), 1)
 
 
@@ -56,7 +56,7 @@ def same(a, b):
 
 
 def test_windows_are_contiguous_in_measurements_and_time():
-    member = begun()
+    member = fresh_estimator()
     closed = fed(member, MEASUREMENTS)
     ended, uncovered = member.finish()
     assert uncovered == 0
@@ -72,8 +72,8 @@ def test_windows_are_contiguous_in_measurements_and_time():
 @settings(deadline=None, max_examples=12)
 @given(st.integers(0, 3), st.integers(1, 3))
 def test_a_member_that_takes_over_earlier_windows_goes_on_byte_for_byte(taken, looks):
-    whole = fed(begun(), MEASUREMENTS)
-    member = begun()
+    whole = fed(fresh_estimator(), MEASUREMENTS)
+    member = fresh_estimator()
     for closed in whole[:taken]:
         member.resume(closed)
     for _ in range(looks):
@@ -86,7 +86,7 @@ def test_a_member_that_takes_over_earlier_windows_goes_on_byte_for_byte(taken, l
 
 
 def _whole_of(measurements):
-    member = begun()
+    member = fresh_estimator()
     fed(member, measurements)
     return member.whole
 
@@ -106,25 +106,27 @@ def test_a_window_does_not_depend_on_what_was_read_before_it():
         else r
         for r in MEASUREMENTS
     ]
-    one, two = fed(begun(), MEASUREMENTS), fed(begun(), other)
+    one, two = fed(fresh_estimator(), MEASUREMENTS), fed(fresh_estimator(), other)
     assert not same(one[0], two[0])
     assert all(same(a, b) for a, b in zip(one[1:], two[1:], strict=True))
 
 
 @pytest.mark.parametrize("other", [config(seed=2), config("r2")])
 def test_a_window_depends_on_its_seed_and_its_robot(other):
-    assert not same(fed(HybridEstimator(other, 1), MEASUREMENTS)[0], fed(begun(), MEASUREMENTS)[0])
+    assert not same(
+        fed(HybridEstimator(other, 1), MEASUREMENTS)[0], fed(fresh_estimator(), MEASUREMENTS)[0]
+    )
 
 
 def test_a_window_depends_on_its_incarnation():
     assert not same(
-        fed(HybridEstimator(config(), 2), MEASUREMENTS)[0], fed(begun(), MEASUREMENTS)[0]
+        fed(HybridEstimator(config(), 2), MEASUREMENTS)[0], fed(fresh_estimator(), MEASUREMENTS)[0]
     )
 
 
 def test_what_no_odometry_covers_is_counted_at_the_end():
     measurements = published(stream("r1", 4, beyond=3))
-    member = begun()
+    member = fresh_estimator()
     closed = fed(member, measurements)
     ended, uncovered = member.finish()
     assert uncovered == 3
@@ -135,7 +137,7 @@ def test_what_no_odometry_covers_is_counted_at_the_end():
 
 def test_a_member_without_odometry_has_no_window_and_covers_nothing():
     measurements = published(stream("r1", 4, drives=False))
-    member = begun()
+    member = fresh_estimator()
     assert fed(member, measurements) == []
     ended, uncovered = member.finish()
     assert ended.closed is None

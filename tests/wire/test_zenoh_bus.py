@@ -307,12 +307,12 @@ def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(
                 source.publish_raw(Sample("source/probe/sightings", b"", 0, 0, 0))
                 time.sleep(0.001)
 
-        speaker = threading.Thread(target=speak)
-        speaker.start()
+        publisher = threading.Thread(target=speak)
+        publisher.start()
         wait_until(lambda: bool(sink.receive(0.1)))
-        heard = speaker.is_alive()
+        heard = publisher.is_alive()
         back.set()
-        speaker.join()
+        publisher.join()
     assert heard, "it was back while the other still spoke"
 
 

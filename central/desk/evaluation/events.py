@@ -50,7 +50,7 @@ class Event:
 
 
 @dataclass
-class EventTeller:
+class EventDetector:
     """Turns the messages of a run, in their order, into events; each is told once."""
 
     _alive: dict[str, bool] = field(default_factory=dict)

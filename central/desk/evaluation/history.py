@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.desk.evaluation.events import MOST, Event, EventTeller
+from central.desk.evaluation.events import MOST, Event, EventDetector
 from central.desk.evaluation.log import head_of
 from central.desk.evaluation.running import TrueLandmarks
-from central.desk.voices import Voices
+from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -159,7 +159,7 @@ class _Gathering:
     map_nees: _Column = field(default_factory=_Column)
     map_cost: _Column = field(default_factory=_Column)
     robot_cost: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
-    teller: EventTeller = field(default_factory=EventTeller)
+    detector: EventDetector = field(default_factory=EventDetector)
     events: list[Event] = field(default_factory=list)
     published: dict[tuple[str, int], _Clocks] = field(default_factory=lambda: defaultdict(_Clocks))
     unused: dict[tuple[str, int], dict[int, _Submap]] = field(
@@ -185,7 +185,7 @@ class _Gathering:
             _, name, message = opened(sample)
         except WireError:
             return  # the evaluation counts it
-        self.events += self.teller.take(message, sample.stamp_ns)
+        self.events += self.detector.take(message, sample.stamp_ns)
         del self.events[MOST:]
         match message:
             case m.Submap():
@@ -239,14 +239,14 @@ class _Gathering:
 def history(samples: Iterable[Sample]) -> History:
     """The history of one run, from its log's samples in the order of the log."""
     found = _Gathering()
-    voices = Voices()
+    centre = PeersAsCentre()
     rows: dict[str, ch.Channel | None] = {}
     for sample in samples:
         if sample.key not in rows:
             known = ch.channel_of(sample.key)
             rows[sample.key] = None if known is None else known[0]
         found.take(sample, rows[sample.key])
-        said = voices.of(sample)
+        said = centre.of(sample)
         if said is not None:
             as_centre = ch.channel_of(said.key)
             found.hear(said, None if as_centre is None else as_centre[0])

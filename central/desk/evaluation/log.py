@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from central.desk.voices import Voices
+from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -174,14 +174,14 @@ class Collected:
 def collected(samples: Iterable[Sample]) -> Collected:
     """What the samples of a log hold."""
     found = Collected()
-    voices = Voices()
+    centre = PeersAsCentre()
     channels: dict[str, tuple[str, str]] = {}
     for sample in samples:
         if sample.key not in channels:
             known = channel_of(sample.key)
             channels[sample.key] = ("", "") if known is None else (known[0].name, known[1])
         found.take(sample, *channels[sample.key])
-        said = voices.of(sample)
+        said = centre.of(sample)
         if said is not None:
             found.keep(said)
     return found

@@ -190,7 +190,7 @@ def traffic_picture(history: History, path: FilePath) -> bool:
     by_robot: dict[str, list[Traffic]] = {}
     for key, traffic in history.traffic.items():
         by_channel.setdefault(channel_name(key), []).append(traffic)
-        if (robot := speaker(key)) is not None:
+        if (robot := publisher(key)) is not None:
             by_robot.setdefault(robot, []).append(traffic)
     largest = sorted(by_channel, key=lambda name: -_bytes(by_channel[name]))
     shown = {name: by_channel[name] for name in largest[:SHOWN_KEYS]}
@@ -331,7 +331,7 @@ def channel_name(key: str) -> str:
     return "view" if key.startswith("view/") else "other"
 
 
-def speaker(key: str) -> str | None:
+def publisher(key: str) -> str | None:
     """The robot whose node publishes on this key; None of what others say, its sensors too."""
     found = channel_of(key)
     if found is None or found[0] in ch.SENSORS:

@@ -15,7 +15,7 @@ from team.robot.front_end import FrontEnd
 from team.robot.hybrid import HybridEstimator
 from team.robot.node import RobotNode
 from team.robot.poses import RunningPoses
-from team.robot.statements import Speaker
+from team.robot.statements import MessageWriter
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids, stamps
@@ -35,12 +35,12 @@ class RecordedPoses(RunningPoses):
         super().__init__(config, [])
         self._recorded = recorded
 
-    def at(self, stamp_ns: int, front: FrontEnd, speaker: Speaker) -> list[Outgoing]:
+    def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
         """The poses of this stamp, by every prior that one of them names."""
         out: list[Outgoing] = []
-        for prior in self._recorded.get((speaker.incarnation, stamp_ns), ()):
-            here = prior if prior is not None and prior.incarnation == speaker.incarnation else None
-            out += self.posed(stamp_ns, here, front, speaker)
+        for prior in self._recorded.get((writer.incarnation, stamp_ns), ()):
+            here = prior if prior is not None and prior.incarnation == writer.incarnation else None
+            out += self.posed(stamp_ns, here, front, writer)
         return out
 
 

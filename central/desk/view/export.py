@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
 from central.desk.view.node import ViewerNode
-from central.desk.voices import Voices, with_voices
 from team.recording.reader import Log
 from team.recording.recorder import Recorder
 from team.wire import channels as ch
@@ -46,11 +46,11 @@ class Viewing:
 
 def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
     """The samples, and behind each the views that it brings; earlier views are left out."""
-    viewing, voices = Viewing(), Voices()
+    viewing, centre = Viewing(), PeersAsCentre()
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
             yield sample
-            for said in with_voices(voices, [sample]):
+            for said in with_centre_messages(centre, [sample]):
                 yield from viewing.take(said, heard(said))
 
 

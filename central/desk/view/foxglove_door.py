@@ -62,7 +62,7 @@ def _name(host: str) -> str:
 def door(host: str, port: int, behind: str) -> Iterator[int]:
     """Listen, on a thread, for viewers of the server at `behind`; the port. OSError: it can not."""
     loop = asyncio.new_event_loop()
-    begun: list[tuple[int, asyncio.Event] | BaseException] = []
+    outcome: list[tuple[int, asyncio.Event] | BaseException] = []
     ready = threading.Event()
 
     async def main() -> None:
@@ -78,11 +78,11 @@ def door(host: str, port: int, behind: str) -> Iterator[int]:
                 max_size=None,
             )
         except OSError as error:
-            begun.append(error)
+            outcome.append(error)
             ready.set()
             return
         async with server:
-            begun.append((int(next(iter(server.sockets)).getsockname()[1]), stop))
+            outcome.append((int(next(iter(server.sockets)).getsockname()[1]), stop))
             ready.set()
             await stop.wait()
 
@@ -91,7 +91,7 @@ def door(host: str, port: int, behind: str) -> Iterator[int]:
     )
     thread.start()
     ready.wait()
-    (found,) = begun
+    (found,) = outcome
     if isinstance(found, BaseException):
         thread.join()
         loop.close()

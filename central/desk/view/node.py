@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from central.desk.drawing import colour_of, in_order
 from central.desk.evaluation.errors import PoseErrors
-from central.desk.evaluation.events import Event, EventTeller
+from central.desk.evaluation.events import Event, EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from central.desk.view import foxglove_scene as fox
 from central.desk.view.drawn import Landmarks, Track, landmarks_of
@@ -121,7 +121,7 @@ class ViewerNode:
         self._fused: m.FusedMap | None = None
         self._map_is_new = False
         self._status: dict[str, float] = {}
-        self._teller = EventTeller()
+        self._detector = EventDetector()
         self._now_ns: int | None = None
         self._turn = 0
         self._reach = (math.inf, math.inf, -math.inf, -math.inf)
@@ -134,7 +134,7 @@ class ViewerNode:
 
     def handle(self, channel: Channel, message: m.Message) -> list[Shown]:
         """Take one message of a channel; the views that are due, one per period of team time."""
-        out = [_logged(event) for event in self._teller.take(message, self.now_ns)]
+        out = [_logged(event) for event in self._detector.take(message, self.now_ns)]
         self._take(channel, message)
         reached = self._reached_ns()
         if reached is None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from central.desk.drawing import ROBOT_COLOURS
-from central.desk.evaluation.events import EventTeller
+from central.desk.evaluation.events import EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from central.desk.view.drawn import landmarks_of
 from central.desk.view.landmark_sets import sets_of
@@ -70,7 +70,7 @@ class PageFrames:
         self._origin_ns: int | None = None
         self._streams: dict[str, _Stream] = defaultdict(_Stream)
         self._traffic: dict[tuple[str, int], list[int]] = {}
-        self._teller = EventTeller()
+        self._detector = EventDetector()
         self._truth = TrueLandmarks()
         self._map_ns: int | None = None
         self._figures_s: dict[str, tuple[int, float, float]] = {}
@@ -132,7 +132,7 @@ class PageFrames:
             self._newest_ns = max(self._newest_ns, message.stamp_ns)
         timeless = isinstance(message, m.Liveliness | m.Status)
         at_ns = self._newest_ns if timeless else message.stamp_ns
-        for event in self._teller.take(message, at_ns):
+        for event in self._detector.take(message, at_ns):
             self._say("ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text)
         match message:
             case m.PoseEstimate():

@@ -136,7 +136,7 @@ class PageServer:
         self._host = host
         self._growing = growing
         self._files = page_files()
-        self._news = asyncio.Condition()
+        self._frame_ready = asyncio.Condition()
 
     async def start(self, port: int) -> tuple[Server, int]:
         """Listen; the server, and the port that it is bound to."""
@@ -154,8 +154,8 @@ class PageServer:
         """Read the log until its end or until `stop`."""
         while not (self._feed.ended or stop.is_set()):
             some = await asyncio.to_thread(self._feed.look, growing=self._growing)
-            async with self._news:
-                self._news.notify_all()
+            async with self._frame_ready:
+                self._frame_ready.notify_all()
             if not some:
                 await asyncio.sleep(LOOK_S)
 
@@ -196,7 +196,7 @@ class PageServer:
                         size += len(frames[sent])
                         sent += 1
                     await connection.send(f"[{','.join(batch)}]")
-                async with self._news:
+                async with self._frame_ready:
                     if sent == len(frames):
                         await self._wait(connection)
         except ConnectionClosed:
@@ -205,7 +205,7 @@ class PageServer:
     async def _wait(self, connection: ServerConnection) -> None:
         """Until there is news, or a while has passed; a page that has gone is noticed."""
         try:
-            await asyncio.wait_for(self._news.wait(), 5.0)
+            await asyncio.wait_for(self._frame_ready.wait(), 5.0)
         except TimeoutError:
             await connection.ping()
 
@@ -217,7 +217,7 @@ def _is_loopback(host: str) -> bool:
 @contextmanager
 def serving(feed: Feed, host: str, port: int, *, growing: bool) -> Iterator[str]:
     """Serve the page on a thread until the context ends; its URL. Raises ServerError."""
-    begun = threading.Event()
+    ready = threading.Event()
     ends: dict[str, object] = {}
 
     async def main() -> None:
@@ -231,13 +231,13 @@ def serving(feed: Feed, host: str, port: int, *, growing: bool) -> Iterator[str]
             ends["error"] = error
             return
         finally:
-            begun.set()
+            ready.set()
         async with server:
             await asyncio.gather(page.read(stop), stop.wait())
 
     thread = threading.Thread(target=lambda: asyncio.run(main()), name="page", daemon=True)
     thread.start()
-    begun.wait()
+    ready.wait()
     error = ends.get("error")
     if isinstance(error, OSError):
         raise ServerError(

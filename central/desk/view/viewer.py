@@ -4,8 +4,8 @@ import threading
 import time
 from dataclasses import replace
 
+from central.desk.peers_as_centre import LISTENS, PeersAsCentre, with_centre_messages
 from central.desk.view.export import Viewing, heard
-from central.desk.voices import LISTENS, Voices, with_voices
 from team.containment import Boundary
 from team.shell import STATUS_S, WAIT_S, judge
 from team.the_end import TheEnd
@@ -22,7 +22,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
     Raises FaultyRunError, at its end, where the map lacks a robot or something could not be drawn.
     """
     viewing = Viewing()
-    voices = Voices()
+    centre = PeersAsCentre()
     for channel in (*viewing.node.listens, *LISTENS):
         bus.subscribe(channel)
     bus.watch_alive()
@@ -40,7 +40,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
                 stamp_ns=0, node=NODE, state="viewing", figures={"messages": float(published)}
             )
             bus.publish(Outgoing(ch.STATUS, NODE, status))
-        for sample in with_voices(voices, (*bus.receive(WAIT_S), *end.missed())):
+        for sample in with_centre_messages(centre, (*bus.receive(WAIT_S), *end.missed())):
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
             try:

@@ -62,7 +62,7 @@ def bias_key(chain: int) -> int:
     return _BIASES + chain
 
 
-def looks_of(chains: Sequence[Chain]) -> list[Look]:
+def detections_of(chains: Sequence[Chain]) -> list[Look]:
     """All measurements of landmarks in the order of chain, pose and landmark."""
     looks: list[Look] = []
     for c, chain in enumerate(chains):
@@ -112,7 +112,7 @@ def profile_graph(
             held = [getattr(sigmas, b) if b in biases else 1e-6 for b in BIASES]
             model = gtsam.noiseModel.Diagonal.Sigmas(np.array(held))
             graph.push_back(gtsam.PriorFactorPoint3(bias_key(c), np.zeros(3), model))
-    for look in looks_of(chains):
+    for look in detections_of(chains):
         sensor = chains[look.chain].config.sensor
         graph.push_back(_process_factor(gtsam, look, sensor))
         distance, _ = predicted(poses[look.chain][look.pose], landmarks[look.landmark])
@@ -147,7 +147,7 @@ def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
     for c, i in _bases(chains):
         pose = values.atPose2(pose_key(c, i)).compose(gtsam.Pose2(*chains[c].mount).inverse())
         values.insert(_base_key(chains[c], c, i), pose)
-    for look in looks_of(chains):
+    for look in detections_of(chains):
         values.insert(look.key, np.zeros(2))
     for c, chain in enumerate(chains):
         if has_biases(chain):

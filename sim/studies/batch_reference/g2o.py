@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from central.desk.evaluation.evaluation import evaluate
 from sim.studies.batch_reference.graph import landmark_starts
-from sim.studies.batch_reference.measurements import Chain, LimitError, anchored, chains_of
+from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
 from sim.studies.batch_reference.reference import placed
 from team.estimation.baselines.batch import FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
@@ -27,11 +27,16 @@ Poses = Float[np.ndarray, "K 3"]
 
 
 def g2o_lines(samples: Iterable[Sample]) -> Iterator[str]:
-    """The lines of the file; raises LimitError for a log without a scenario or a joined map."""
+    """The lines of the file.
+
+    Raises BatchReferenceError for a log without a scenario or without a joined map.
+    """
     kept = list(samples)
     run = evaluate(kept)
     if run.scenario is None or run.map is None:
-        raise LimitError("the log has no scenario or no final map: record a run to its end")
+        raise BatchReferenceError(
+            "the log has no scenario or no final map: record a run to its end"
+        )
     chains, anchors, _ = placed(chains_of(kept, run.scenario), run)
     paths = [anchored(chain, anchor)[2] for chain, anchor in zip(chains, anchors, strict=True)]
     landmarks = landmark_starts(chains, paths, run.map)

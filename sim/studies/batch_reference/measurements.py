@@ -31,7 +31,7 @@ _ENDLESS_S = 1e9
 """The batch has one window."""
 
 
-class LimitError(RuntimeError):
+class BatchReferenceError(RuntimeError):
     """The limit can not be computed: what is missing and what to do."""
 
 
@@ -153,7 +153,7 @@ def _chain(
                 segmenter.observe(measurement.stamp_ns, *translate.scan_of(measurement))
             case m.Sightings() if grid is not None:
                 grid.observe(
-                    measurement.stamp_ns, measurement.number, translate.looks_of(measurement)
+                    measurement.stamp_ns, measurement.number, translate.detections_of(measurement)
                 )
             case m.Odometry() | m.Increment() | m.Steering():
                 keyframes += segmenter.drive(*translate.motion_of(measurement, config))

@@ -31,7 +31,7 @@ from central.desk.evaluation.errors import (
 from central.desk.evaluation.evaluation import Evaluation, evaluate
 from sim.studies.batch_reference.errors import add_errors, bias_key, has_biases, profile_graph
 from sim.studies.batch_reference.graph import factor_graph, landmark_starts, pose_key, values_of
-from sim.studies.batch_reference.measurements import Chain, LimitError, anchored, chains_of
+from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
 from team.estimation.gaussian import Matrix, PoseGaussian
 from team.estimation.geometry import inverse, tangent
 from team.estimation.mount import moved_by
@@ -47,7 +47,7 @@ NO_BIASES = (None, None, None)
 
 
 @dataclass(frozen=True)
-class Limit:
+class BatchReference:
     """The optimum. cost = Σ‖r‖² there, initial_cost at the best of the starts.
 
     gradient_norm: of the optimum's cost, in the units of the state; newton_decrement: √(gᵀH⁻¹g).
@@ -113,22 +113,24 @@ def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
     }
 
 
-def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
+def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchReference:
     """The batch MAP of a log of a run under the rule `join` or `batch`, from start to end.
 
-    Raises LimitError without GTSAM, without a scenario, without a joined map, or when the optimiser
-    does not come to rest.
+    Raises BatchReferenceError without GTSAM, without a scenario, without a joined map, or when the
+    optimiser does not come to rest.
     """
     gtsam = _gtsam()
     kept = list(samples)
     run = evaluate(kept)
     if run.scenario is None or run.map is None:
-        raise LimitError("the log has no scenario or no final map: record a run to its end")
+        raise BatchReferenceError(
+            "the log has no scenario or no final map: record a run to its end"
+        )
     chains, anchors, left_out = placed(
         chains_of(kept, run.scenario, sightings=noise == "profile"), run
     )
     if not chains:
-        raise LimitError(
+        raise BatchReferenceError(
             "no robot's trajectory is in the log: the batch starts from the joined solution, "
             "so run the same scenario and seed with `--fusion join`"
         )
@@ -154,10 +156,10 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
     try:
         optimum, figures = _solved(gtsam, graph, initials, descend)
     except RuntimeError as error:
-        if isinstance(error, LimitError):
+        if isinstance(error, BatchReferenceError):
             raise
-        raise LimitError(f"GTSAM can not solve the batch: {str(error).strip()}") from error
-    return _limit(
+        raise BatchReferenceError(f"GTSAM can not solve the batch: {str(error).strip()}") from error
+    return _reference_figures(
         gtsam,
         graph,
         optimum,
@@ -174,17 +176,22 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> Limit:
 def _solved(
     gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, dict[str, float]]:
-    """The best optimum from all starts, and its figures; raises LimitError if it is none."""
+    """The best optimum from all starts, and its figures.
+
+    Raises BatchReferenceError if it is none.
+    """
     optima = [descend(gtsam, graph, initial) for initial in initials]
     costs = [2.0 * graph.error(optimum) for optimum in optima]
     initial_cost = min(2.0 * graph.error(initial) for initial in initials)
     best = int(np.argmin(costs))
     if costs[best] > initial_cost:
-        raise LimitError(f"the batch cost {costs[best]} lies above its start's, {initial_cost}")
+        raise BatchReferenceError(
+            f"the batch cost {costs[best]} lies above its start's, {initial_cost}"
+        )
     linear = graph.linearize(optima[best])
     _, decrement = _newton_step(gtsam, linear)
     if decrement > LARGEST_DECREMENT:
-        raise LimitError(
+        raise BatchReferenceError(
             f"the batch has not converged: the next Newton step goes {decrement:.2g} sigma, "
             f"{LARGEST_DECREMENT:g} allowed"
         )
@@ -200,7 +207,7 @@ def _gtsam() -> Any:
     try:
         import gtsam
     except ImportError:
-        raise LimitError(
+        raise BatchReferenceError(
             "the batch limit needs GTSAM: python -m pip install 'teamslam[limit]'"
         ) from None
     return gtsam
@@ -263,7 +270,7 @@ def _stepped(gtsam: Any, graph: Any, initial: Any) -> Any:
     return values
 
 
-def _limit(
+def _reference_figures(
     gtsam: Any,
     graph: Any,
     optimum: Any,
@@ -271,7 +278,7 @@ def _limit(
     landmarks: Sequence[int],
     run: Evaluation,
     **figures: Any,
-) -> Limit:
+) -> BatchReference:
     """The optimum's map, paths and covariances, against the truth."""
     assert run.map is not None
     marginals = gtsam.Marginals(graph, optimum)
@@ -306,7 +313,7 @@ def _limit(
         end = pose_errors(Path(path.stamps_ns[-1:], path.poses[-1:]), P[np.newaxis], true_path)
         if end is not None:
             nees[robot] = end.nees_per_dof
-    return Limit(
+    return BatchReference(
         ids=ids,
         means=means,
         covariance=covariance,

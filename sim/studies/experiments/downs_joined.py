@@ -203,13 +203,13 @@ def _joined(
     robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]
 ) -> SubmapJoining:
     """All submaps at once: what taking them one by one converges to."""
-    begun = svd_joining.begun({robot: start})
+    initial_state = svd_joining.initial_state({robot: start})
     contributions = [
         Contribution(robot, 0, k, k, weighted(translate.local_map_of(s).without_nodes, "identity"))
         for k, s in enumerate(submaps)
     ]
     return svd_joining.solved(
-        replace(begun, fold=joining.folded(begun.fold, contributions, SETTINGS))
+        replace(initial_state, fold=joining.folded(initial_state.fold, contributions, SETTINGS))
     )
 
 
@@ -262,7 +262,7 @@ def _looks(
     found: dict[str, dict[int, tuple[float, float]]] = {}
     for message in messages(samples, ch.SIGHTINGS.key(robot)):
         if isinstance(message, m.Sightings):
-            teammates, *read = translate.looks_of(message)
+            teammates, *read = translate.detections_of(message)
             ranges, bearings = corrected(sensor, *read)
             for name, seen, bearing in zip(teammates, ranges, bearings, strict=True):
                 look = float(seen) - sensor.marker_range_offset, float(bearing)

@@ -43,7 +43,7 @@ SHOWN: Shown = (
 )
 
 
-class Said(NamedTuple):
+class SurveyedMethod(NamedTuple):
     """A method of tables 2.1 and 2.2: what the thesis says, and the pair that stands for it."""
 
     method: str
@@ -55,22 +55,22 @@ class Said(NamedTuple):
 
 
 POSTERIOR, LIKELIEST = "posterior poses and map", "maximum likelihood map"
-SAID = (
-    Said("Kalman filter / EKF", POSTERIOR, "yes", "handles uncertainty, converges",
+SURVEYED = (
+    SurveyedMethod("Kalman filter / EKF", POSTERIOR, "yes", "handles uncertainty, converges",
          "computational complexity", ("ekf-slam", "alone")),
-    Said("graph based", LIKELIEST, "no", "linear memory",
+    SurveyedMethod("graph based", LIKELIEST, "no", "linear memory",
          "needs the whole path", None),
-    Said("expectation maximisation", LIKELIEST, "no", "optimal map, data association",
+    SurveyedMethod("expectation maximisation", LIKELIEST, "no", "optimal map, data association",
          "needs the whole path", None),
-    Said("sparse extended information filter", POSTERIOR, "yes", "fast for large maps",
+    SurveyedMethod("sparse extended information filter", POSTERIOR, "yes", "fast for large maps",
          "data association", None),
-    Said("thin junction tree filter", POSTERIOR, "yes", "less computation",
+    SurveyedMethod("thin junction tree filter", POSTERIOR, "yes", "less computation",
          "size of the tree", None),
-    Said("particle filter / FastSLAM", POSTERIOR, "yes", "low computational complexity",
+    SurveyedMethod("particle filter / FastSLAM", POSTERIOR, "yes", "low computational complexity",
          "over-confident, needs many particles", ("fastslam1", "alone")),
-    Said("sub-maps", POSTERIOR, "yes", "less memory, large places",
+    SurveyedMethod("sub-maps", POSTERIOR, "yes", "less memory, large places",
          "many maps to merge", OURS),
-    Said("hybrid, as in the thesis", POSTERIOR, "yes", "less memory",
+    SurveyedMethod("hybrid, as in the thesis", POSTERIOR, "yes", "less memory",
          "data association", ("hybrid-thesis", "alone")),
 )  # fmt: skip
 BATCH = "graph based"
@@ -102,7 +102,7 @@ def outcome(options: Options, results: Results) -> Outcome:
         for count in PARTICLES
     }
     tables += [_table_2_1(figures["thesis"]), _table_2_2(figures["thesis"], particles)]
-    absent = ", ".join(s.method for s in SAID if s.pair is None and s.method != BATCH)
+    absent = ", ".join(s.method for s in SURVEYED if s.pair is None and s.method != BATCH)
     return Outcome(
         "all estimators and rules on the same measurements",
         {"survey": figures, "fastslam_particles": particles},
@@ -163,7 +163,7 @@ def _fastslam(particles: int, options: Options) -> list[Task]:
 def _table_2_1(figures: dict[str, Figures]) -> Table:
     """Uncertainty and online, as printed and as measured."""
     rows = []
-    for said in SAID:
+    for said in SURVEYED:
         found = _found(said, figures)
         measured = cells_of(
             found,
@@ -189,7 +189,7 @@ def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Ta
     )
     rows = [
         (said.method, said.pros, said.cons, *cells_of(_found(said, figures), columns))
-        for said in SAID
+        for said in SURVEYED
     ]
     rows += [
         (f"… with {count} particles", "", "", *cells_of(found, columns))
@@ -202,7 +202,7 @@ def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Ta
     )
 
 
-def _found(said: Said, figures: dict[str, Figures]) -> Figures:
+def _found(said: SurveyedMethod, figures: dict[str, Figures]) -> Figures:
     if said.method == BATCH:
         return figures.get("batch", {})
     return {} if said.pair is None else figures.get(named(*said.pair), {})

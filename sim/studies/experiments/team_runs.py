@@ -12,8 +12,8 @@ from central.node import CentralNode
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, loads, with_options
 from sim.scenarios.source import streams_of
-from sim.studies.batch_reference.measurements import LimitError
-from sim.studies.batch_reference.reference import Limit, NoiseKind, batch_map
+from sim.studies.batch_reference.measurements import BatchReferenceError
+from sim.studies.batch_reference.reference import BatchReference, NoiseKind, batch_map
 from sim.studies.experiments.experiment import Dataset
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.true_minimum import true_minimum
@@ -110,8 +110,8 @@ def team_run(
             figures["minimum"] = found._asdict() | told
     if batch:
         try:
-            figures["batch"] = limit_figures(batch_map(samples, noise))
-        except LimitError as error:
+            figures["batch"] = reference_figures(batch_map(samples, noise))
+        except BatchReferenceError as error:
             figures["batch_error"] = str(error)
     return figures
 
@@ -230,9 +230,9 @@ def _robot_figures(robot: RobotResult) -> Figures:
     }
 
 
-def limit_figures(limit: Limit) -> Figures:
+def reference_figures(reference: BatchReference) -> Figures:
     """The figures of the batch MAP under the same names."""
-    errors = limit.errors
+    errors = reference.errors
     shape = None if errors is None else errors.shape
     return {
         "rmse": None if errors is None else errors.rmse_m,
@@ -241,8 +241,8 @@ def limit_figures(limit: Limit) -> Figures:
         "in_band": None if errors is None else errors.in_band,
         "shape_nees": None if shape is None else shape.nees_per_landmark,
         "coverage": None if shape is None else shape.coverage,
-        "position_rmse": rms(limit.position_rmse_m.values()),
-        "final_pose_nees": mean(limit.final_pose_nees_per_dof.values()),
+        "position_rmse": rms(reference.position_rmse_m.values()),
+        "final_pose_nees": mean(reference.final_pose_nees_per_dof.values()),
     }
 
 

@@ -224,13 +224,13 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     nothing = np.empty(0)
     none = np.empty(0, np.uint32)
     state = replace(
-        localisation.begun(run.start, PARTICLES, run.ids, run.landmarks), resample_below=0.0
+        localisation.initial_state(run.start, PARTICLES, run.ids, run.landmarks), resample_below=0.0
     )
     blind = [state]
     for each in run.keyframes:
         motion = each.keyframe.increment
         blind.append(
-            localisation.stepped(blind[-1], motion, sensor, none, nothing, nothing, random)
+            localisation.filter_step(blind[-1], motion, sensor, none, nothing, nothing, random)
         )
     last = run.keyframes[-1]
     true = run.truth[last.stamp_ns]
@@ -241,7 +241,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         last.keyframe.ranges[k : k + 1],
         last.keyframe.bearings[k : k + 1],
     )
-    weighed = localisation.stepped(blind[-1], Increment.identity(), sensor, *reading, random)
+    weighed = localisation.filter_step(blind[-1], Increment.identity(), sensor, *reading, random)
     cloud, _ = fastslam.resampled(weighed.cloud, random)
     resampled = replace(weighed, cloud=cloud)
     found: Figures = {
@@ -275,7 +275,7 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     assert isinstance(run.scenario.world, SimulatedWorld)
     random = generator(run.scenario.seed, config.id, 0, 0)
     side = run.scenario.world.size_m
-    state = localisation.begun_anywhere(
+    state = localisation.initial_state_anywhere(
         np.zeros(2), np.full(2, side), ANYWHERE_PARTICLES, run.ids, run.landmarks, random
     )
     found: Figures = {"0": _summary(state, run.start)}
@@ -285,7 +285,7 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         keyframe = each.keyframe
         far = np.argsort(keyframe.ranges)[-1:]  # with all of them the first step would do
         measurements = keyframe.ids[far], keyframe.ranges[far], keyframe.bearings[far]
-        state = localisation.stepped(
+        state = localisation.filter_step(
             state, keyframe.increment, config.sensor, *measurements, random
         )
         if k in ANYWHERE_STEPS:

@@ -207,7 +207,9 @@ class Batch(Point):
         return replace(self, age=np.zeros_like(self.age))
 
 
-def begun(starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | None) -> Batch:
+def initial_state(
+    starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | None
+) -> Batch:
     """The robots' start poses with their covariances in (x, y, θ); None: exactly known."""
     mean = np.array([pose for pose, _ in starts.values()]).reshape(-1, 3)
     order = np.arange(len(starts))

@@ -26,12 +26,12 @@ class DeadReckoning:
     pose: Increment
 
 
-def begun(pose: Pose) -> DeadReckoning:
+def initial_state(pose: Pose) -> DeadReckoning:
     """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
     return DeadReckoning(Increment(pose, np.zeros((3, 3))))
 
 
-def stepped(
+def filter_step(
     state: DeadReckoning,
     increment: Increment,
     sensor: Sensor,

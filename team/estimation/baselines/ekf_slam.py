@@ -33,12 +33,12 @@ class EkfSlam:
     covariance: Float[np.ndarray, "n n"]
 
 
-def begun(pose: Pose) -> EkfSlam:
+def initial_state(pose: Pose) -> EkfSlam:
     """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
     return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
 
 
-def stepped(
+def filter_step(
     state: EkfSlam,
     increment: Increment,
     sensor: Sensor,
@@ -82,7 +82,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Of the measurements that `stepped` would take; of landmarks that are known already."""
+    """Of the measurements that `filter_step` would take; of landmarks that are known already."""
     return joint_innovation(
         landmarks=state.ids,
         mean=state.mean,

@@ -34,7 +34,7 @@ class FastSlamMl:
     took: Int64[np.ndarray, "M N"]
 
 
-def begun(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> FastSlamMl:
+def initial_state(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> FastSlamMl:
     """Particles with these poses and logarithms of weights, and no landmark."""
     particles = len(poses)
     return FastSlamMl(
@@ -48,7 +48,7 @@ def begun(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> Fas
     )
 
 
-def stepped(
+def filter_step(
     state: FastSlamMl,
     increment: Increment,
     sensor: Sensor,

@@ -44,7 +44,7 @@ def started(pose: Pose) -> ThesisState:
     )
 
 
-def stepped(
+def filter_step(
     state: ThesisState,
     increment: Increment,
     sensor: Sensor,
@@ -59,7 +59,7 @@ def stepped(
     The landmarks that are not read keep their values exactly. ranges [m] and bearings [rad] are
     corrected by the calibration.
     """
-    after, _ = fastslam.stepped(
+    after, _ = fastslam.filter_step(
         particles=reset(state, ids, particles),
         increment=increment,
         sensor=sensor,

@@ -45,7 +45,7 @@ def started(pose: Pose, particles: int) -> CodedState:
     return CodedState(at, at)
 
 
-def stepped(
+def filter_step(
     state: CodedState,
     increment: Increment,
     sensor: Sensor,
@@ -59,7 +59,7 @@ def stepped(
     ranges [m] and bearings [rad] are corrected by the calibration.
     """
     known = len(state.particles.ids)
-    drawn, _ = fastslam.stepped(
+    drawn, _ = fastslam.filter_step(
         particles=state.particles,
         increment=increment,
         sensor=sensor,

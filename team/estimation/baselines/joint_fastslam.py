@@ -40,7 +40,7 @@ class JointFastSlam:
     resample_below: float
 
 
-def begun(
+def initial_state(
     poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
 ) -> JointFastSlam:
     """The poses exactly known; an uncertain one is a first turn by Increment(0, covariance)."""
@@ -57,7 +57,7 @@ def begun(
     )
 
 
-def stepped(
+def filter_step(
     state: JointFastSlam, turns: Sequence[RobotStep], generator: np.random.Generator
 ) -> JointFastSlam:
     """One step of the team: resample if the particles are thin, then the robots' turns in order.
@@ -79,7 +79,7 @@ def stepped(
         )
     for turn in turns:
         index = state.robots.index(turn.robot)
-        after, _ = fastslam.stepped(
+        after, _ = fastslam.filter_step(
             particles=_seen_by(state, index),
             increment=turn.increment,
             sensor=turn.sensor,

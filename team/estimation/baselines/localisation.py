@@ -40,7 +40,7 @@ class Localisation:
     resample_below: float = 0.5
 
 
-def begun(
+def initial_state(
     pose: Pose,
     particles: int,
     ids: UInt32[np.ndarray, " L"],
@@ -50,7 +50,7 @@ def begun(
     return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
 
 
-def begun_anywhere(
+def initial_state_anywhere(
     lowest: Float[np.ndarray, "2"],
     highest: Float[np.ndarray, "2"],
     particles: int,
@@ -67,7 +67,7 @@ def begun_anywhere(
     return Localisation(fastslam.at_poses(poses), ids, landmarks)
 
 
-def stepped(
+def filter_step(
     state: Localisation,
     increment: Increment,
     sensor: Sensor,
@@ -107,7 +107,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Of the measurements that `stepped` would take, where the map is exact.
+    """Of the measurements that `filter_step` would take, where the map is exact.
 
     A cloud of several modes predicts a broad mixture, so it says little, as its Gaussian does.
     """

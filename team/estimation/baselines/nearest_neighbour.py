@@ -30,12 +30,12 @@ class NearestNeighbour:
     took: tuple[Int64[np.ndarray, " _"], ...] = ()
 
 
-def begun(pose: Pose) -> NearestNeighbour:
+def initial_state(pose: Pose) -> NearestNeighbour:
     """The pose exactly known."""
-    return NearestNeighbour(ekf_slam.begun(pose))
+    return NearestNeighbour(ekf_slam.initial_state(pose))
 
 
-def stepped(
+def filter_step(
     state: NearestNeighbour,
     increment: Increment,
     sensor: Sensor,
@@ -47,12 +47,12 @@ def stepped(
     """Move, associate the detections (ids from UNNAMED on), and take all measurements at once."""
     unnamed = np.flatnonzero(ids >= UNNAMED)
     if not len(unnamed):
-        slam = ekf_slam.stepped(state.slam, increment, sensor, ids, ranges, bearings)
+        slam = ekf_slam.filter_step(state.slam, increment, sensor, ids, ranges, bearings)
         return replace(state, slam=slam)
-    slam = ekf_slam.stepped(state.slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
+    slam = ekf_slam.filter_step(state.slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
     given = ids.copy()
     given[unnamed] = _associated(slam, sensor, gate, ranges[unnamed], bearings[unnamed])
-    slam = ekf_slam.stepped(slam, Increment.identity(), sensor, given, ranges, bearings)
+    slam = ekf_slam.filter_step(slam, Increment.identity(), sensor, given, ranges, bearings)
     return NearestNeighbour(slam, (*state.took, given[unnamed].astype(np.int64)))
 
 

@@ -34,13 +34,15 @@ class PlainFastSlam:
     resample_below: float
 
 
-def begun(pose: Pose, particles: int, proposal: Proposal, resample_below: float) -> PlainFastSlam:
+def initial_state(
+    pose: Pose, particles: int, proposal: Proposal, resample_below: float
+) -> PlainFastSlam:
     """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
     poses = np.tile(pose, (particles, 1))
     return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
 
 
-def stepped(
+def filter_step(
     state: PlainFastSlam,
     increment: Increment,
     sensor: Sensor,

@@ -66,7 +66,7 @@ class SubmapJoining:
     weighting: Weighting
 
 
-def begun(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> SubmapJoining:
+def initial_state(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> SubmapJoining:
     """No submap yet; every robot's start pose is exactly known."""
     fold = EMPTY_FOLD
     for robot, pose in poses.items():
@@ -74,7 +74,7 @@ def begun(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> Subma
     return SubmapJoining(fold, weighting)
 
 
-def stepped(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining:
+def filter_step(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining:
     """Take a robot's next submap, which begins where its last one ended, and iterate."""
     count = len(state.fold.contributions)
     sequence = state.fold.next_sequence((robot, 0))

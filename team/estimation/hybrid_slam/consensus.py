@@ -190,7 +190,7 @@ def _smoothed(
         if singular or not np.isfinite(inverse).all():
             return None
         covariance = np.tril(inverse) + np.tril(inverse, -1).T
-        path, landmarks = kernel.stepped(path, landmarks, covariance @ g)
+        path, landmarks = kernel.filter_step(path, landmarks, covariance @ g)
     return path, landmarks, covariance
 
 

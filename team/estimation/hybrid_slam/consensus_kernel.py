@@ -294,7 +294,7 @@ def left_out(
 
 
 @compiled
-def stepped(
+def filter_step(
     path: Float[np.ndarray, "K 3"],
     landmarks: Float[np.ndarray, "L 2"],
     step: Float[np.ndarray, " n"],

@@ -148,13 +148,13 @@ def propagated_and_updated(
     parents = None
     if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):
         particles, parents = resampled(particles, generator)
-    moved, log_evidence = stepped(
+    moved, log_evidence = filter_step(
         particles, increment, sensor, ids, ranges, bearings, proposal, generator, own=own
     )
     return moved, StepInfo(effective_sample_size(moved.log_weights), parents, log_evidence)
 
 
-def stepped(
+def filter_step(
     particles: Particles,
     increment: Increment,
     sensor: Sensor,
@@ -205,7 +205,7 @@ def propagated(
     """Motion without measurements: pose ∘ mean ∘ Exp(xi), weights and landmarks as they were."""
     nothing = np.empty(0)
     ids = np.empty(0, np.uint32)
-    moved, _ = stepped(
+    moved, _ = filter_step(
         particles, increment, Sensor(), ids, nothing, nothing, "fastslam1", generator
     )
     return replace(moved, log_weights=particles.log_weights)

@@ -138,21 +138,21 @@ def _apart(
 
 def associated(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
     """The fold after tracking, near ones and sweeping of a tick's submaps."""
-    news: dict[Stream, list[Contribution]] = {}
+    arrived: dict[Stream, list[Contribution]] = {}
     for contribution in contributions:
-        news.setdefault(fold.home[contribution.stream], []).append(contribution)
-    for key in sorted(news):
-        fold = _followed(fold, key, news[key])
+        arrived.setdefault(fold.home[contribution.stream], []).append(contribution)
+    for key in sorted(arrived):
+        fold = _followed(fold, key, arrived[key])
     return fold
 
 
-def _followed(fold: Fold, key: Stream, news: Sequence[Contribution]) -> Fold:
+def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
     """Tracking, near ones, sweeping: of the news of one island."""
     island = fold.islands[key]
     view = View(island, fold.landmarks)
     order = {id(each.contribution): k for k, each in enumerate(island.graph.submaps)}
     view.agreed(fold.landmarks)
-    for contribution in news:
+    for contribution in arrived:
         k = order.get(id(contribution))
         if k is None or not len(contribution.local.unnamed.counts):
             continue

@@ -226,17 +226,17 @@ def folded(
     """
     _check(fold, contributions)
     home = dict(fold.home)
-    news: dict[Stream, list[Contribution]] = {}
+    arrived: dict[Stream, list[Contribution]] = {}
     for contribution in contributions:
         stream = contribution.stream
         if stream not in home:
             common = [home[other] for other in home if other in fold.starts]
             home[stream] = common[0] if common and stream in fold.starts else stream
-        news.setdefault(home[stream], []).append(contribution)
+        arrived.setdefault(home[stream], []).append(contribution)
     waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
     landmarks, numbers = founded(fold.landmarks, contributions)
     islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
-    for key, taken in news.items():
+    for key, taken in arrived.items():
         island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
         graph, state = extended(
             island.graph,

@@ -34,7 +34,7 @@ UNLIKELY = float(chdtri(1, 1e-3))
 """Where the cost has risen by more is not looked at: χ² of 1, 99.9 %."""
 
 
-class Bend(NamedTuple):
+class UnderstatedUncertainty(NamedTuple):
     """A place of a pose so far [m] away: the rise of the cost, and χ² by the pose's covariance."""
 
     distance: float
@@ -78,7 +78,7 @@ def ends(island: Island) -> list[tuple[Stream, str, int]]:
     ]
 
 
-def bend(island: Island, node: int) -> Bend | None:
+def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty | None:
     """Of a pose of an island at its minimum: the likely place that its covariance denies most.
 
     None where it denies none.
@@ -95,7 +95,7 @@ def bend(island: Island, node: int) -> Bend | None:
         pose = walked.state[at : at + 3]
         eta = logarithm(compose(inverse(mean), pose))
         distance = float(np.hypot(*(pose - mean)[:2]))
-        found.append(Bend(distance, rise, float(eta @ metric @ eta)))
+        found.append(UnderstatedUncertainty(distance, rise, float(eta @ metric @ eta)))
     worst = max(found, key=lambda each: each.ratio, default=None)
     return None if worst is None or worst.ratio < BENT else worst
 
@@ -107,7 +107,7 @@ def nonlinearity_warnings(island: Island) -> list[str]:
     """
     said = []
     for stream, where, node in ends(island):
-        found = bend(island, node)
+        found = understated_uncertainty(island, node)
         given = island.graph.fixed[island.graph.streams[stream][0]]
         if found is not None and not given:
             said.append(

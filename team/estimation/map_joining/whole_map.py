@@ -29,7 +29,9 @@ class WholeMap:
     covariance: Float[np.ndarray, "n n"]
 
 
-def begun(pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"] | None) -> WholeMap:
+def initial_map(
+    pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"] | None
+) -> WholeMap:
     """A map with a pose only; covariance None: the pose is exactly known."""
     spread = np.zeros((3, 3)) if covariance is None else covariance
     return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)

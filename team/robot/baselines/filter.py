@@ -18,8 +18,8 @@ IN_POSE = "in the running pose"
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """The motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the noises
 that they claim (`team.estimation.scans`) at its end."""
-Begun = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
-Stepped = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
+InitialState = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
+FilterStep = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
 Judged = Callable[
     [Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Innovation
 ]
@@ -34,8 +34,8 @@ class Filter(NamedTuple):
     measurements, as the state before it predicts them.
     """
 
-    begun: Begun
-    stepped: Stepped
+    initial_state: InitialState
+    filter_step: FilterStep
     pose: Callable[[Any], PoseGaussian]
     landmarks: Callable[[Any], LandmarkGaussian]
     innovation: Judged

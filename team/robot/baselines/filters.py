@@ -25,44 +25,46 @@ from team.estimation.geometry import tangent
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import Increment
-from team.robot.baselines.filter import IN_POSE, Begun, Filter, Judged, Step, Stepped
+from team.robot.baselines.filter import IN_POSE, Filter, FilterStep, InitialState, Judged, Step
 from team.robot.baselines.likelihood import with_association
 from team.robot.estimator import InitialPose, KnownMap
 
 
-def _random(stepped: Callable[..., Any]) -> Stepped:
+def _random(filter_step: Callable[..., Any]) -> FilterStep:
     """The step of an estimator that draws random numbers."""
 
     def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
         increment, *scan, _ = step
-        return stepped(state, increment, config.sensor, *scan, generator)
+        return filter_step(state, increment, config.sensor, *scan, generator)
 
     return step
 
 
-def _exact(begun: Callable[..., Any], stepped: Callable[..., Any]) -> tuple[Begun, Stepped]:
+def _exact(
+    initial_state: Callable[..., Any], filter_step: Callable[..., Any]
+) -> tuple[InitialState, FilterStep]:
     """Start and step of an estimator that draws none."""
 
     def start(
         config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
     ) -> Any:
-        return _with_start(begun, stepped, initial)
+        return _with_start(initial_state, filter_step, initial)
 
     def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
         increment, *scan, _ = step
-        return stepped(state, increment, config.sensor, *scan)
+        return filter_step(state, increment, config.sensor, *scan)
 
     return start, step
 
 
-def _thesis_begun(
+def _thesis_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> hybrid_thesis.ThesisState:
     """The thesis knows the start exactly."""
     return hybrid_thesis.started(np.zeros(3) if initial.pose is None else initial.pose)
 
 
-def _thesis_stepped(
+def _thesis_step(
     state: hybrid_thesis.ThesisState,
     config: RobotConfig,
     step: Step,
@@ -70,7 +72,7 @@ def _thesis_stepped(
 ) -> hybrid_thesis.ThesisState:
     increment, ids, ranges, bearings, _ = step
     particles = config.front_end.particles
-    return hybrid_thesis.stepped(
+    return hybrid_thesis.filter_step(
         state=state,
         increment=increment,
         sensor=config.sensor,
@@ -105,7 +107,7 @@ def _thesis_absorbed(
     return hybrid_thesis.absorbed(state, ids, means, translate.blocks_of(covariance))
 
 
-def _coded_begun(
+def _coded_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> CodedState:
     """The start is known exactly, as in the thesis."""
@@ -123,8 +125,8 @@ S = TypeVar("S")
 
 
 def _with_start(
-    begun: Callable[[np.ndarray], S],
-    stepped: Callable[..., S],
+    initial_state: Callable[[np.ndarray], S],
+    filter_step: Callable[..., S],
     initial: InitialPose,
     *generator: np.random.Generator,
 ) -> S:
@@ -133,21 +135,21 @@ def _with_start(
     The noise is turned into the pose's own axes: C = GᵀPG, G = blkdiag(R(θ), 1).
     """
     at = np.zeros(3) if initial.pose is None else initial.pose
-    state = begun(at)
+    state = initial_state(at)
     if initial.covariance is None:
         return state
     G = tangent(at[2])
     own = G.T @ initial.covariance @ G
     nothing = np.empty(0)
     still = Increment(np.zeros(3), 0.5 * (own + own.T))
-    return stepped(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
+    return filter_step(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
 
 
-def _plain_stepped(
+def _plain_step(
     state: PlainFastSlam, config: RobotConfig, step: Step, generator: np.random.Generator
 ) -> PlainFastSlam:
     increment, ids, ranges, bearings, own = step
-    return plain_fastslam.stepped(
+    return plain_fastslam.filter_step(
         state=state,
         increment=increment,
         sensor=config.sensor,
@@ -162,19 +164,21 @@ def _plain_stepped(
 def _plain(proposal: Proposal) -> Filter:
     """FastSLAM over the whole stream, whatever the front end's own proposal is."""
 
-    def begun(
+    def initial_state(
         config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
     ) -> PlainFastSlam:
         front = config.front_end
 
         def at(pose: np.ndarray) -> PlainFastSlam:
-            return plain_fastslam.begun(pose, front.particles, proposal, front.resample_below)
+            return plain_fastslam.initial_state(
+                pose, front.particles, proposal, front.resample_below
+            )
 
-        return _with_start(at, plain_fastslam.stepped, initial, generator)
+        return _with_start(at, plain_fastslam.filter_step, initial, generator)
 
     return Filter(
-        begun,
-        _plain_stepped,
+        initial_state,
+        _plain_step,
         plain_fastslam.pose_gaussian,
         plain_fastslam.landmark_gaussian,
         _of_particles(lambda state: state.particles),
@@ -183,7 +187,7 @@ def _plain(proposal: Proposal) -> Filter:
     )
 
 
-def _localisation_begun(
+def _localisation_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> Localisation:
     """At an unknown start anywhere from where the sensor may see a landmark of the known map.
@@ -195,21 +199,21 @@ def _localisation_begun(
     if initial.pose is None and len(landmarks):
         lowest, highest = landmarks.min(axis=0), landmarks.max(axis=0)
         reach = min(config.sensor.max_range, 0.5 * float((highest - lowest).max()))
-        state = localisation.begun_anywhere(
+        state = localisation.initial_state_anywhere(
             lowest - reach, highest + reach, front.particles, *known, generator
         )
         return replace(state, resample_below=front.resample_below)
 
     def at(pose: np.ndarray) -> Localisation:
-        state = localisation.begun(pose, front.particles, *known)
+        state = localisation.initial_state(pose, front.particles, *known)
         return replace(state, resample_below=front.resample_below)
 
-    return _with_start(at, localisation.stepped, initial, generator)
+    return _with_start(at, localisation.filter_step, initial, generator)
 
 
 FILTERS: Mapping[Estimator, Filter] = {
     "dead-reckoning": Filter(
-        *_exact(dead_reckoning.begun, dead_reckoning.stepped),
+        *_exact(dead_reckoning.initial_state, dead_reckoning.filter_step),
         dead_reckoning.pose_gaussian,
         dead_reckoning.landmark_gaussian,
         lambda *measurements: NOTHING,
@@ -218,8 +222,8 @@ FILTERS: Mapping[Estimator, Filter] = {
         maps=False,
     ),
     "localisation": Filter(
-        _localisation_begun,
-        _random(localisation.stepped),
+        _localisation_initial_state,
+        _random(localisation.filter_step),
         localisation.pose_gaussian,
         lambda state: NO_LANDMARKS,  # it was told its map, so there is nothing to say of one
         _without_claims(localisation.innovation),
@@ -227,7 +231,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         maps=False,
     ),
     "ekf-slam": Filter(
-        *_exact(nearest_neighbour.begun, nearest_neighbour.stepped),
+        *_exact(nearest_neighbour.initial_state, nearest_neighbour.filter_step),
         lambda state: ekf_slam.pose_gaussian(state.slam),
         lambda state: ekf_slam.landmark_gaussian(state.slam),
         lambda state, *step: ekf_slam.innovation(state.slam, *step[:-1]),
@@ -236,8 +240,8 @@ FILTERS: Mapping[Estimator, Filter] = {
     "fastslam1": with_association(_plain("fastslam1")),
     "fastslam2": _plain("fastslam2"),
     "hybrid-thesis": Filter(
-        _thesis_begun,
-        _thesis_stepped,
+        _thesis_initial_state,
+        _thesis_step,
         lambda state: PoseGaussian(state.pose, state.pose_covariance),
         _thesis_landmarks,
         _of_particles(lambda state: hybrid_thesis.reset(state, state.ids, 1)),
@@ -245,8 +249,8 @@ FILTERS: Mapping[Estimator, Filter] = {
         joint=False,
     ),
     "hybrid-thesis-coded": Filter(
-        _coded_begun,
-        _random(hybrid_thesis_coded.stepped),
+        _coded_initial_state,
+        _random(hybrid_thesis_coded.filter_step),
         hybrid_thesis_coded.pose_gaussian,
         hybrid_thesis_coded.landmark_gaussian,
         _of_particles(lambda state: state.particles),

@@ -22,14 +22,16 @@ def with_association(plain: Filter) -> Filter:
     assert plain.particles is not None
     particles_of = plain.particles
 
-    def stepped(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
+    def filter_step(
+        state: Any, config: RobotConfig, step: Step, generator: np.random.Generator
+    ) -> Any:
         increment, ids, ranges, bearings, _ = step
         if not isinstance(state, FastSlamMl):
             if not (ids >= UNNAMED).any():
-                return plain.stepped(state, config, step, generator)
+                return plain.filter_step(state, config, step, generator)
             particles = particles_of(state)
-            state = fastslam_ml.begun(particles.poses, particles.log_weights)
-        return fastslam_ml.stepped(
+            state = fastslam_ml.initial_state(particles.poses, particles.log_weights)
+        return fastslam_ml.filter_step(
             state=state,
             increment=increment,
             sensor=config.sensor,
@@ -59,7 +61,7 @@ def with_association(plain: Filter) -> Filter:
         return fastslam_ml.taken(state) if known else np.empty(0, np.int64)
 
     return plain._replace(
-        stepped=stepped,
+        filter_step=filter_step,
         pose=pose,
         landmarks=landmarks,
         innovation=innovation,

@@ -58,7 +58,7 @@ class RunningEstimator:
         self._unsaid = NOTHING
         self._mount = np.array(config.sensor.mount)
         start = _of_sensor(initial, self._mount) if config.sensor.is_mounted else initial
-        self._state: Any = self._filter.begun(config, start, known, self._generator)
+        self._state: Any = self._filter.initial_state(config, start, known, self._generator)
         self.sequence = 0
         self.unsolved = 0
         self.last_keyframe_ns: int | None = None
@@ -202,7 +202,7 @@ class RunningEstimator:
             with suppress(NotACovarianceError):  # then it is not known how well
                 judged = self._filter.innovation(self._state, increment, self._config.sensor, *scan)
             try:
-                state = self._filter.stepped(self._state, self._config, step, self._generator)
+                state = self._filter.filter_step(self._state, self._config, step, self._generator)
                 pose = self._filter.pose(state)
             except (NotACovarianceError, np.linalg.LinAlgError):
                 return None

@@ -22,7 +22,7 @@ class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
 
 class WithdrawalHeard(Message, frozen=True, kw_only=True, tag="withdrawal_heard/1"):
     """A robot has heard that the team goes on without `withdrawn`, and keeps the order for a centre
-    that is started again. Hearsay, which a centre weighs (`central.hearsay`).
+    that is started again. Hearsay, which a centre weighs (`central.withdrawal_witnesses`).
 
     robot: who says so. by, reason: as the order had them.
     """

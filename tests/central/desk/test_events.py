@@ -1,6 +1,6 @@
 """The events of a run in words: each is told once, when it happens, to the report and the page."""
 
-from central.desk.evaluation.events import MOST, EventTeller, without_decimals
+from central.desk.evaluation.events import MOST, EventDetector, without_decimals
 from central.desk.evaluation.history import history
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -10,8 +10,8 @@ from tests.support import fused_map
 
 
 def told(*messages: m.Message) -> list[tuple[str, str]]:
-    teller = EventTeller()
-    return [(e.kind, e.text) for message in messages for e in teller.take(message, 5)]
+    detector = EventDetector()
+    return [(e.kind, e.text) for message in messages for e in detector.take(message, 5)]
 
 
 def alive(there: bool, node: str = "robot/r1") -> m.Liveliness:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from central.desk.evaluation.history import History, history
-from central.desk.pictures.time import BINS, binned, speaker
+from central.desk.pictures.time import BINS, binned, publisher
 from sim.in_memory.team import run_team
 from team import translate
 from team.wire import channels as ch
@@ -153,10 +153,10 @@ def test_bins_lose_nothing_and_take_what_lies_outside_at_the_ends(run: History) 
 
 
 def test_a_robot_speaks_on_its_nodes_keys_and_not_on_its_sensors() -> None:
-    assert speaker(ch.SUBMAP.key("r1")) == "r1"
-    assert speaker(ch.STATUS.key("robot/r1")) == "r1"
+    assert publisher(ch.SUBMAP.key("r1")) == "r1"
+    assert publisher(ch.STATUS.key("robot/r1")) == "r1"
     for key in (ch.ODOMETRY.key("r1"), ch.PRIOR.key("r1"), ch.STATUS.key("central"), "view/x"):
-        assert speaker(key) is None
+        assert publisher(key) is None
 
 
 def test_without_truth_there_is_the_cost_and_no_nees() -> None:

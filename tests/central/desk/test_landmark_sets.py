@@ -1,7 +1,7 @@
 import msgspec
 
 from central.desk.evaluation.association import AssociationResult, Pairs
-from central.desk.evaluation.events import EventTeller
+from central.desk.evaluation.events import EventDetector
 from central.desk.report.identities import decision_rows, score_note, score_rows
 from central.desk.view.landmark_sets import sets_of
 from team.wire import messages as m
@@ -20,8 +20,8 @@ def test_the_page_says_of_a_landmark_who_its_members_are_and_by_which_step() -> 
 
 
 def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone() -> None:
-    teller = EventTeller()
-    first = [each for each in teller.take(FUSED, 0) if each.kind == "closure"]
+    detector = EventDetector()
+    first = [each for each in detector.take(FUSED, 0) if each.kind == "closure"]
     assert [each.text for each in first] == [
         "alpha (incarnation 1) and bravo (incarnation 0) merged by their maps: 12 landmarks, "
         "log-likelihood ratio 40 against 6, share 0.75, 0 absent"
@@ -38,10 +38,10 @@ def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone() -> None:
     )
     fields = {name: getattr(FUSED, name) for name in m.FusedMap.__struct_fields__}
     again = m.FusedMap(**(fields | {"decisions": (decision, undone)}))
-    assert [each.kind for each in teller.take(again, 0) if each.kind in ("closure", "undone")] == [
-        "undone"
-    ]
-    assert not [each for each in teller.take(again, 0) if each.kind in ("closure", "undone")]
+    assert [
+        each.kind for each in detector.take(again, 0) if each.kind in ("closure", "undone")
+    ] == ["undone"]
+    assert not [each for each in detector.take(again, 0) if each.kind in ("closure", "undone")]
 
 
 def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why() -> None:

@@ -120,7 +120,7 @@ def test_the_derivatives_of_measurements_are_those_of_their_residuals(pose, dist
 @pytest.mark.parametrize("robust_c", [None, 1.0])
 def test_the_gradient_is_the_slope_of_the_cost(robust_c):
     rounds, _ = team_run(3, steps=4)
-    start = batch.begun({"r1": (STARTS["r1"], UNSURE), "r2": KNOWN["r2"]}, robust_c)
+    start = batch.initial_state({"r1": (STARTS["r1"], UNSURE), "r2": KNOWN["r2"]}, robust_c)
     here = batch.extended(start, turns_of(rounds))
     _, gradient = here.normal_equations
     split = 3 * len(here.poses)
@@ -209,7 +209,7 @@ def test_it_is_the_dense_gauss_newton(sensor):
         turns = [turn._replace(sensor=sensor) for turn in turns]
     starts = {"r1": (STARTS["r1"], UNSURE), "r2": KNOWN["r2"]}
     x, P, column = dense_solution(starts, turns)
-    found = converged(batch.begun(starts, None), turns)
+    found = converged(batch.initial_state(starts, None), turns)
     landmarks = batch.landmark_gaussian(found)
     ids = landmarks.ids.tolist()
     at = np.array([column[id_] + axis for id_ in ids for axis in range(2)])
@@ -234,8 +234,8 @@ def test_it_is_the_dense_gauss_newton(sensor):
 
 def test_how_it_has_grown_does_not_matter():
     rounds, _ = team_run(7, steps=9)
-    whole = converged(batch.begun(KNOWN, None), turns_of(rounds))
-    grown = batch.begun(KNOWN, None)
+    whole = converged(batch.initial_state(KNOWN, None), turns_of(rounds))
+    grown = batch.initial_state(KNOWN, None)
     for k in range(0, 9, 3):
         grown = batch.extended(grown, turns_of(rounds[k : k + 3]))
         grown = batch.solved(grown, 2, 1e-2)
@@ -247,7 +247,7 @@ def test_how_it_has_grown_does_not_matter():
 
 
 def test_before_any_turn_it_is_the_start_poses():
-    alone = converged(batch.begun({"r1": (STARTS["r1"], UNSURE)}, None), [])
+    alone = converged(batch.initial_state({"r1": (STARTS["r1"], UNSURE)}, None), [])
     mean, covariance = batch.pose_gaussian(alone, "r1")
     np.testing.assert_allclose(mean, STARTS["r1"], atol=1e-12)
     np.testing.assert_allclose(covariance, UNSURE, rtol=1e-9)
@@ -258,12 +258,12 @@ def test_before_any_turn_it_is_the_start_poses():
 def test_a_robot_without_a_start_is_refused():
     rounds, _ = team_run(1, steps=1)
     with pytest.raises(ValueError, match="r2 has no start"):
-        batch.extended(batch.begun({"r1": KNOWN["r1"]}, None), rounds[0])
+        batch.extended(batch.initial_state({"r1": KNOWN["r1"]}, None), rounds[0])
 
 
 def test_too_few_iterations_are_told_by_the_decrement():
     rounds, _ = team_run(2)
-    whole = batch.extended(batch.begun(KNOWN, None), turns_of(rounds))
+    whole = batch.extended(batch.initial_state(KNOWN, None), turns_of(rounds))
     assert not batch.solved(whole, 1, 1e-6).converged(1e-6)
     assert batch.solved(whole, 50, 1e-6).converged(1e-6)
 
@@ -276,9 +276,9 @@ def test_a_robust_batch_leaves_garbage_out(robust):
     ranges = victim.ranges.copy()
     ranges[0] += 20.0
     spoilt = [*turns[:9], victim._replace(ranges=ranges), *turns[10:]]
-    clean = batch.landmark_gaussian(converged(batch.begun(KNOWN, None), turns))
+    clean = batch.landmark_gaussian(converged(batch.initial_state(KNOWN, None), turns))
     found = batch.solved(
-        batch.extended(batch.begun(KNOWN, 2.0 if robust else None), spoilt), 200, 1e-6
+        batch.extended(batch.initial_state(KNOWN, 2.0 if robust else None), spoilt), 200, 1e-6
     )
     assert found.converged(1e-6)
     off = (batch.landmark_gaussian(found).means - clean.means).ravel()
@@ -298,7 +298,7 @@ def test_it_is_consistent_and_a_measurement_used_twice_is_found(twice):
     for seed in range(runs):
         rounds, truth = team_run(seed, steps=6)
         turns = [told_twice(turn) if twice else turn for turn in turns_of(rounds)]
-        found = batch.solved(batch.extended(batch.begun(KNOWN, None), turns), 20, 1e-4)
+        found = batch.solved(batch.extended(batch.initial_state(KNOWN, None), turns), 20, 1e-4)
         ids, means, covariance = batch.landmark_gaussian(found)
         total += nees((means - LANDMARKS[ids]).ravel(), covariance)
         mean, P = batch.pose_gaussian(found, "r2")
@@ -311,7 +311,7 @@ def test_it_is_consistent_and_a_measurement_used_twice_is_found(twice):
 def test_the_same_measurements_give_the_same_bits():
     rounds, _ = team_run(4)
     one, two = (
-        batch.landmark_gaussian(converged(batch.begun(KNOWN, 1.0), turns_of(rounds)))
+        batch.landmark_gaussian(converged(batch.initial_state(KNOWN, 1.0), turns_of(rounds)))
         for _ in range(2)
     )
     assert [each.tobytes() for each in one] == [each.tobytes() for each in two]

@@ -26,9 +26,9 @@ increments = st.builds(
 
 
 def reckoned(steps, start=START, measurements=NOTHING):
-    state = dead_reckoning.begun(start)
+    state = dead_reckoning.initial_state(start)
     for step in steps:
-        state = dead_reckoning.stepped(state, step, SENSOR, *measurements)
+        state = dead_reckoning.filter_step(state, step, SENSOR, *measurements)
     return state
 
 

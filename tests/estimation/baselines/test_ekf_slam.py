@@ -97,7 +97,7 @@ def test_a_step_is_the_textbooks_with_all_measurements_of_the_keyframe_at_once(s
     there = np.concatenate((compose(state.mean[:3], motion.mean), state.mean[3:]))
     measurements = [observed(there, k) + rng.normal(scale=[0.2, 0.03]) for k in slots]
     z = np.array(measurements)
-    after = ekf_slam.stepped(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
+    after = ekf_slam.filter_step(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
     mean, P, squared = textbook(state, motion, slots, measurements)
     judged = ekf_slam.innovation(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
     assert judged.dof == 2 * len(slots)
@@ -115,7 +115,7 @@ def test_a_first_sight_adds_the_landmark_with_its_cross_terms_and_changes_nothin
     state = some_state(rng)
     z = np.array([rng.uniform(2.0, 20.0), rng.uniform(-np.pi, np.pi)])
     new = np.array([33], np.uint32)
-    after = ekf_slam.stepped(state, STANDING, SENSOR, new, z[:1], z[1:])
+    after = ekf_slam.filter_step(state, STANDING, SENSOR, new, z[:1], z[1:])
     n = len(state.mean)
     np.testing.assert_allclose(after.mean[:n], state.mean)
     np.testing.assert_allclose(after.covariance[:n, :n], state.covariance)
@@ -144,10 +144,10 @@ def test_turning_and_moving_the_frame_moves_the_answer_with_it(seed):
         (np.arange(3, dtype=np.uint32), rng.uniform(4.0, 9.0, 3), np.array([-1.0, 0.5, 2.0]))
         for _ in motions
     ]
-    here, there = ekf_slam.begun(np.zeros(3)), ekf_slam.begun(shift)
+    here, there = ekf_slam.initial_state(np.zeros(3)), ekf_slam.initial_state(shift)
     for motion, keyframe in zip(motions, measurements, strict=True):
-        here = ekf_slam.stepped(here, motion, SENSOR, *keyframe)
-        there = ekf_slam.stepped(there, motion, SENSOR, *keyframe)
+        here = ekf_slam.filter_step(here, motion, SENSOR, *keyframe)
+        there = ekf_slam.filter_step(there, motion, SENSOR, *keyframe)
     c, s = np.cos(shift[2]), np.sin(shift[2])
     turn = np.eye(9)
     for at in (0, 3, 5, 7):
@@ -162,11 +162,11 @@ def test_turning_and_moving_the_frame_moves_the_answer_with_it(seed):
 def test_further_measurements_of_a_new_landmark_update_it_as_in_a_keyframe_of_their_own():
     first = (np.array([5], np.uint32), np.array([8.0]), np.array([0.4]))
     again = (np.array([5], np.uint32), np.array([8.3]), np.array([0.38]))
-    start = ekf_slam.begun(np.array([1.0, 2.0, 0.3]))
+    start = ekf_slam.initial_state(np.array([1.0, 2.0, 0.3]))
     together = tuple(np.concatenate(pair) for pair in zip(first, again, strict=True))
-    one = ekf_slam.stepped(start, STANDING, SENSOR, *together)
-    two = ekf_slam.stepped(start, STANDING, SENSOR, *first)
-    two = ekf_slam.stepped(two, STANDING, SENSOR, *again)
+    one = ekf_slam.filter_step(start, STANDING, SENSOR, *together)
+    two = ekf_slam.filter_step(start, STANDING, SENSOR, *first)
+    two = ekf_slam.filter_step(two, STANDING, SENSOR, *again)
     np.testing.assert_array_equal(one.mean, two.mean)
     np.testing.assert_array_equal(one.covariance, two.covariance)
 
@@ -176,8 +176,8 @@ def test_the_order_of_a_keyframes_measurements_does_not_matter():
     state = some_state(rng)
     ids = np.append(state.ids, np.array([40, 41], np.uint32))
     ranges, bearings = rng.uniform(5.0, 15.0, 6), rng.uniform(-3.0, 3.0, 6)
-    forth = ekf_slam.stepped(state, STANDING, SENSOR, ids, ranges, bearings)
-    back = ekf_slam.stepped(
+    forth = ekf_slam.filter_step(state, STANDING, SENSOR, ids, ranges, bearings)
+    back = ekf_slam.filter_step(
         state, STANDING, SENSOR, ids[::-1].copy(), ranges[::-1].copy(), bearings[::-1].copy()
     )
     for one, other in zip(
@@ -205,10 +205,12 @@ def test_the_map_grows_to_a_thousand_landmarks():
     points = rng.uniform(-100.0, 100.0, (1000, 2))
     ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
     ids = rng.permutation(1000).astype(np.uint32)
-    state = ekf_slam.begun(np.zeros(3))
+    state = ekf_slam.initial_state(np.zeros(3))
     for part in np.split(np.arange(1000), 4):
-        state = ekf_slam.stepped(state, STANDING, SENSOR, ids[part], ranges[part], bearings[part])
-    state = ekf_slam.stepped(state, STANDING, SENSOR, ids[:3], ranges[:3], bearings[:3])
+        state = ekf_slam.filter_step(
+            state, STANDING, SENSOR, ids[part], ranges[part], bearings[part]
+        )
+    state = ekf_slam.filter_step(state, STANDING, SENSOR, ids[:3], ranges[:3], bearings[:3])
     np.testing.assert_allclose(ekf_slam.landmark_gaussian(state).means[ids], points, atol=1e-9)
     once, twice = (state.covariance[3 + 2 * k, 3 + 2 * k] for k in (3, 0))
     xx = np.cos(bearings) ** 2 * (0.04 + (0.01 * ranges) ** 2)
@@ -225,7 +227,7 @@ def short_run(seed, repeat):
     landmarks = rng.uniform(-12.0, 12.0, (6, 2))
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.005)
     motion = Increment(np.array([0.5, 0.0, 0.15]), np.diag([0.02, 0.01, 0.01]) ** 2)
-    truth, state, judged = np.zeros(3), ekf_slam.begun(np.zeros(3)), innovations.NOTHING
+    truth, state, judged = np.zeros(3), ekf_slam.initial_state(np.zeros(3)), innovations.NOTHING
     for _ in range(10):
         xi = np.array([0.02, 0.01, 0.01]) * rng.standard_normal(3)
         truth = compose(compose(truth, motion.mean), exponential(xi))
@@ -238,7 +240,7 @@ def short_run(seed, repeat):
         z = np.repeat(z, repeat, axis=0)
         keyframe = ids, z[:, 0], wrap(z[:, 1])
         judged = judged.plus(ekf_slam.innovation(state, motion, sensor, *keyframe))
-        state = ekf_slam.stepped(state, motion, sensor, *keyframe)
+        state = ekf_slam.filter_step(state, motion, sensor, *keyframe)
     local = ekf_slam.local_map(state)
     error = state_error(local.mean, np.concatenate((truth, landmarks[local.ids].ravel())))
     return nees(error, local.covariance), len(error), *judged
@@ -269,9 +271,9 @@ def test_over_a_long_run_it_is_over_confident_by_nature(name, at_least):
     for seed in range(1, 5):
         robots, streams = world(name, seed)
         for config, stream in zip(robots, streams.streams, strict=True):
-            state = ekf_slam.begun(stream.start.pose)
+            state = ekf_slam.initial_state(stream.start.pose)
             landmarks = ekf_slam.landmark_gaussian(
-                run(state, ekf_slam.stepped, keyframes_of(config, stream), config)
+                run(state, ekf_slam.filter_step, keyframes_of(config, stream), config)
             )
             error = map_errors(landmarks, streams)
             values.append(nees(error, landmarks.covariance) / len(error))
@@ -287,7 +289,7 @@ def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
         np.full(3, 9.0),
         np.array([0.1, 1.0, -2.0]),
     )
-    once, twice = (ekf_slam.stepped(state, motion, SENSOR, *keyframe) for _ in range(2))
+    once, twice = (ekf_slam.filter_step(state, motion, SENSOR, *keyframe) for _ in range(2))
     for field, before in zip(dataclasses.fields(state), kept, strict=True):
         assert getattr(once, field.name).tobytes() == getattr(twice, field.name).tobytes()
         np.testing.assert_array_equal(getattr(state, field.name), before)
@@ -300,4 +302,4 @@ def test_a_state_whose_covariance_is_none_any_more_is_named_not_carried_on():
     broken = dataclasses.replace(state, covariance=state.covariance - np.eye(11))
     measurements = (state.ids[:1], np.array([9.0]), np.array([0.1]))
     with pytest.raises(NotACovarianceError, match="prediction of measurements"):
-        ekf_slam.stepped(broken, STANDING, SENSOR, *measurements)
+        ekf_slam.filter_step(broken, STANDING, SENSOR, *measurements)

@@ -31,8 +31,8 @@ def ids(*values):
     return np.array(values, np.uint32)
 
 
-def stepped(state, motion, seen, ranges, bearings, particles=2000, seed=0):
-    return hybrid_thesis.stepped(
+def filter_step(state, motion, seen, ranges, bearings, particles=2000, seed=0):
+    return hybrid_thesis.filter_step(
         state,
         motion,
         SENSOR,
@@ -45,7 +45,7 @@ def stepped(state, motion, seen, ranges, bearings, particles=2000, seed=0):
 
 
 def test_a_landmark_that_is_not_read_keeps_its_exact_values():
-    after = stepped(KNOWN, MOTION, [5], [7.0], [-1.0])
+    after = filter_step(KNOWN, MOTION, [5], [7.0], [-1.0])
     np.testing.assert_array_equal(after.ids, KNOWN.ids)
     for k in (0, 2):
         np.testing.assert_array_equal(after.landmarks[k], KNOWN.landmarks[k])
@@ -57,7 +57,7 @@ def test_standing_still_a_measurement_updates_its_landmark_as_the_kalman_filter_
     offset = KNOWN.landmarks[1] - KNOWN.pose[:2]
     r = np.hypot(*offset)
     z = np.array([r + 0.3, np.arctan2(offset[1], offset[0]) - KNOWN.pose[2] + 0.02])
-    after = stepped(KNOWN, STANDING, [5], z[:1], z[1:], particles=10)
+    after = filter_step(KNOWN, STANDING, [5], z[:1], z[1:], particles=10)
     e = offset / r
     H = np.array([e, [-e[1] / r, e[0] / r]])
     S = H @ KNOWN.covariances[1] @ H.T + np.diag([0.04, 0.0009])
@@ -69,12 +69,12 @@ def test_standing_still_a_measurement_updates_its_landmark_as_the_kalman_filter_
 
 def test_a_new_landmark_has_the_covariance_of_its_measurement_and_of_the_steps_spread():
     state = hybrid_thesis.started(np.array([1.0, 2.0, 0.5]))
-    after = stepped(state, STANDING, [4], [10.0], [0.2], particles=10)
+    after = filter_step(state, STANDING, [4], [10.0], [0.2], particles=10)
     c, s = np.cos(0.7), np.sin(0.7)
     np.testing.assert_allclose(after.landmarks, [[1.0 + 10.0 * c, 2.0 + 10.0 * s]])
     G = np.array([[c, -10.0 * s], [s, 10.0 * c]])
     np.testing.assert_allclose(after.covariances[0], G @ np.diag([0.04, 0.0009]) @ G.T)
-    spread = stepped(state, MOTION, [4], [10.0], [0.2], particles=5000)
+    spread = filter_step(state, MOTION, [4], [10.0], [0.2], particles=5000)
     across = np.array([-np.sin(0.8), np.cos(0.8)])
     # Range 10 m: bearing and heading noise add in variance across the line of sight.
     expected = 100.0 * (0.03**2 + 0.05**2) + 0.02**2
@@ -87,8 +87,8 @@ def test_measurements_pull_the_mean_pose_by_the_weights():
     offset = tight.landmarks - true_pose[:2]
     ranges = np.hypot(offset[:, 0], offset[:, 1])
     bearings = np.arctan2(offset[:, 1], offset[:, 0]) - true_pose[2]
-    blind = stepped(tight, MOTION, [], [], [], particles=5000)
-    seeing = stepped(tight, MOTION, [2, 5, 8], ranges, bearings, particles=5000)
+    blind = filter_step(tight, MOTION, [], [], [], particles=5000)
+    seeing = filter_step(tight, MOTION, [2, 5, 8], ranges, bearings, particles=5000)
     wrong_blind, wrong_seeing = (
         np.abs(np.angle(np.exp(1j * (state.pose[2] - 3.15)))) for state in (blind, seeing)
     )
@@ -99,7 +99,7 @@ def test_measurements_pull_the_mean_pose_by_the_weights():
 def test_the_poses_uncertainty_is_forgotten_at_every_step():
     state = hybrid_thesis.started(np.zeros(3))
     for k in range(50):
-        state = stepped(state, MOTION, [], [], [], seed=k)
+        state = filter_step(state, MOTION, [], [], [], seed=k)
     sigma = np.sqrt(np.diag(state.pose_covariance))
     np.testing.assert_allclose(sigma[2], 0.05, rtol=0.1)
     assert max(sigma[:2]) < 0.06
@@ -121,7 +121,7 @@ def test_an_absorbed_map_replaces_what_it_knows_and_adds_what_it_does_not():
 def test_the_same_inputs_give_the_same_bytes_and_stay_untouched(seen):
     kept = [getattr(KNOWN, f.name).copy() for f in dataclasses.fields(KNOWN)]
     arguments = (MOTION, seen, [8.0] * len(seen), [0.1] * len(seen))
-    once, twice = (stepped(KNOWN, *arguments) for _ in range(2))
+    once, twice = (filter_step(KNOWN, *arguments) for _ in range(2))
     for field, before in zip(dataclasses.fields(KNOWN), kept, strict=True):
         assert getattr(once, field.name).tobytes() == getattr(twice, field.name).tobytes()
         np.testing.assert_array_equal(getattr(KNOWN, field.name), before)
@@ -136,7 +136,7 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least):
         stream = streams.streams[0]
         state = hybrid_thesis.started(stream.start.pose)
         for increment, *measurements in keyframes_of(config, stream):
-            state = hybrid_thesis.stepped(
+            state = hybrid_thesis.filter_step(
                 state, increment, config.sensor, *measurements, 100, generator(seed, "r1", 1, 0)
             )
         landmarks = LandmarkGaussian(state.ids, state.landmarks, block_diag(*state.covariances))

@@ -22,7 +22,7 @@ def run(steps: int, particles: int = 50, seed: int = 1) -> list[CodedState]:
     for k in range(1, steps + 1):
         offset = np.array([10.0 - k, 5.0])
         measurement = np.array([np.hypot(*offset)]), np.array([np.arctan2(offset[1], offset[0])])
-        state = hybrid_thesis_coded.stepped(state, MOTION, SENSOR, ID, *measurement, generator)
+        state = hybrid_thesis_coded.filter_step(state, MOTION, SENSOR, ID, *measurement, generator)
         states.append(state)
     return states
 
@@ -48,7 +48,7 @@ def test_weights_go_on_until_few_particles_carry_them() -> None:
 def test_a_new_landmark_begins_with_15_m_and_the_printed_matrix() -> None:
     generator = np.random.default_rng(1)
     started = hybrid_thesis_coded.started(np.zeros(3), 4)
-    state = hybrid_thesis_coded.stepped(
+    state = hybrid_thesis_coded.filter_step(
         started, Increment.identity(), SENSOR, ID, np.array([10.0]), np.array([0.3]), generator
     )
     s, c = np.sin(0.3), np.cos(0.3)

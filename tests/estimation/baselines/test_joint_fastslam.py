@@ -19,7 +19,7 @@ STANDING = Increment.identity()
 
 def filtered(rounds, state, random):
     for turns in rounds:
-        state = joint_fastslam.stepped(state, turns, random)
+        state = joint_fastslam.filter_step(state, turns, random)
     return state
 
 
@@ -33,14 +33,14 @@ def bytes_of(state):
 def test_a_team_of_one_is_plain_fastslam_bit_for_bit(proposal, resample_below):
     start = {"r1": STARTS["r1"]}
     rounds, _ = team_run(1, start, steps=15)
-    joint = joint_fastslam.begun(start, 50, proposal, resample_below)
+    joint = joint_fastslam.initial_state(start, 50, proposal, resample_below)
     joint = filtered(rounds, joint, np.random.default_rng(0))
     plain, random = (
-        plain_fastslam.begun(start["r1"], 50, proposal, resample_below),
+        plain_fastslam.initial_state(start["r1"], 50, proposal, resample_below),
         np.random.default_rng(0),
     )
     for ((_, *turn),) in rounds:
-        plain = plain_fastslam.stepped(plain, *turn[:-1], random)
+        plain = plain_fastslam.filter_step(plain, *turn[:-1], random)
     for name in ("poses", "log_weights", "ids", "means", "covariances"):
         ours = getattr(joint, name)
         assert ours.tobytes() == getattr(plain.particles, name).tobytes()
@@ -50,7 +50,7 @@ def test_a_team_of_one_is_plain_fastslam_bit_for_bit(proposal, resample_below):
         strict=True,
     ):
         assert [part.tobytes() for part in ours] == [part.tobytes() for part in theirs]
-    never = joint_fastslam.begun(start, 50, proposal, 0.0)
+    never = joint_fastslam.initial_state(start, 50, proposal, 0.0)
     assert bytes_of(filtered(rounds, never, np.random.default_rng(0))) != bytes_of(joint)
 
 
@@ -59,12 +59,15 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
     seen = {"r1": np.array([0, 1]), "r2": np.array([2, 3])}
     rounds, _ = team_run(2, seen=seen, steps=3)
     random = np.random.default_rng(1)
-    joint = filtered(rounds, joint_fastslam.begun(STARTS, 40, proposal, 0.0), random)
+    joint = filtered(rounds, joint_fastslam.initial_state(STARTS, 40, proposal, 0.0), random)
     random = np.random.default_rng(1)
-    alone = {robot: plain_fastslam.begun(pose, 40, proposal, 0.0) for robot, pose in STARTS.items()}
+    alone = {
+        robot: plain_fastslam.initial_state(pose, 40, proposal, 0.0)
+        for robot, pose in STARTS.items()
+    }
     for turns in rounds:
         for robot, *turn in turns:
-            alone[robot] = plain_fastslam.stepped(alone[robot], *turn[:-1], random)
+            alone[robot] = plain_fastslam.filter_step(alone[robot], *turn[:-1], random)
     product = sum(state.particles.log_weights for state in alone.values())
     np.testing.assert_allclose(joint.log_weights, fastslam.normalised(product)[0], atol=1e-9)
     for index, state in enumerate(alone.values()):
@@ -79,7 +82,7 @@ def test_turns_in_one_step_are_turns_in_steps_of_their_own_but_for_resampling(se
     at_once, one_by_one, often = (
         filtered(
             each,
-            joint_fastslam.begun(STARTS, 30, proposal, below),
+            joint_fastslam.initial_state(STARTS, 30, proposal, below),
             np.random.default_rng(seed),
         )
         for each, below in ((rounds, 0.0), (apart, 0.0), (rounds, 1.0))
@@ -94,11 +97,11 @@ def test_the_order_of_the_robots_does_not_matter_beyond_the_random_numbers(propo
     states, effective = [], []
     for seed, each in enumerate((rounds, reversed_rounds)):
         state, random = (
-            joint_fastslam.begun(STARTS, count, proposal, 0.5),
+            joint_fastslam.initial_state(STARTS, count, proposal, 0.5),
             np.random.default_rng(seed),
         )
         for turns in each:
-            state = joint_fastslam.stepped(state, turns, random)
+            state = joint_fastslam.filter_step(state, turns, random)
             effective.append(fastslam.effective_sample_size(state.log_weights))
         states.append(state)
     close = 5.0 * np.sqrt(2.0 / min(effective))
@@ -127,8 +130,8 @@ def test_standing_robots_measurements_of_one_landmark_are_fused_as_gaussians():
         P = G @ np.diag([sensor.range_sigma, sensor.bearing_sigma]) ** 2 @ G.T
         informations.append(np.linalg.inv(P))
         weighted.append(informations[-1] @ (pose[:2] + r * e))
-    state = joint_fastslam.begun(STARTS, 5, "fastslam2", 0.5)
-    state = joint_fastslam.stepped(state, turns, np.random.default_rng(0))
+    state = joint_fastslam.initial_state(STARTS, 5, "fastslam2", 0.5)
+    state = joint_fastslam.filter_step(state, turns, np.random.default_rng(0))
     _, means, P = joint_fastslam.landmark_gaussian(state)
     expected = np.linalg.inv(sum(informations))
     np.testing.assert_allclose(P, expected, rtol=0.02, atol=1e-5)
@@ -147,7 +150,7 @@ def short_run(seed, repeat):
         ]
         for turns in rounds
     ]
-    state = joint_fastslam.begun(STARTS, 300, "fastslam2", 0.5)
+    state = joint_fastslam.initial_state(STARTS, 300, "fastslam2", 0.5)
     landmarks = joint_fastslam.landmark_gaussian(
         filtered(rounds, state, np.random.default_rng(seed))
     )
@@ -170,7 +173,7 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least):
         robots, streams = world(name, seed)
         starts = {stream.robot: stream.start.pose for stream in streams.streams}
         teams = zip(*map(keyframes_of, robots, streams.streams), strict=True)
-        state = joint_fastslam.begun(starts, 200, "fastslam1", 0.5)
+        state = joint_fastslam.initial_state(starts, 200, "fastslam1", 0.5)
         rounds = [
             [
                 RobotStep(robot.id, e.increment, robot.sensor, e.ids, e.ranges, e.bearings)
@@ -189,7 +192,7 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least):
 @pytest.mark.parametrize("proposal", PROPOSALS)
 def test_the_same_inputs_give_the_same_bytes_and_stay_untouched(proposal):
     rounds, _ = team_run(6)
-    start = joint_fastslam.begun(STARTS, 20, proposal, 1.0)
+    start = joint_fastslam.initial_state(STARTS, 20, proposal, 1.0)
     middle = filtered(rounds[:4], start, np.random.default_rng(5))
     kept = bytes_of(middle)
     once, twice = (filtered(rounds[4:], middle, np.random.default_rng(6)) for _ in range(2))
@@ -199,8 +202,8 @@ def test_the_same_inputs_give_the_same_bytes_and_stay_untouched(proposal):
 
 def test_a_robot_that_the_team_does_not_know_is_refused():
     rounds, _ = team_run(7, steps=1)
-    state = joint_fastslam.begun({"r1": np.zeros(3)}, 5, "fastslam1", 0.5)
+    state = joint_fastslam.initial_state({"r1": np.zeros(3)}, 5, "fastslam1", 0.5)
     with pytest.raises(ValueError):
-        joint_fastslam.stepped(state, rounds[0], np.random.default_rng(0))
+        joint_fastslam.filter_step(state, rounds[0], np.random.default_rng(0))
     with pytest.raises(ValueError):
         joint_fastslam.pose_gaussian(state, "r2")

@@ -68,10 +68,10 @@ def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
 
     random = np.random.default_rng(0)
     low, high = np.array([-5.0, -5.0]), np.array([5.0, 5.0])
-    state = localisation.begun_anywhere(low, high, 200_000, IDS, LANDMARKS, random)
+    state = localisation.initial_state_anywhere(low, high, 200_000, IDS, LANDMARKS, random)
     state = dataclasses.replace(state, resample_below=0.0)
-    state = localisation.stepped(state, STANDING, SENSOR, IDS[:2], r1[:2], b1[:2], random)
-    state = localisation.stepped(state, exact, SENSOR, IDS[2:], r2[2:], b2[2:], random)
+    state = localisation.filter_step(state, STANDING, SENSOR, IDS[:2], r1[:2], b1[:2], random)
+    state = localisation.filter_step(state, exact, SENSOR, IDS[2:], r2[2:], b2[2:], random)
     found, spread = localisation.pose_gaussian(state)
     sigma = np.sqrt(np.diag(P))
     effective = fastslam.effective_sample_size(state.cloud.log_weights)
@@ -82,7 +82,7 @@ def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
 
 def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
     truth, random = np.array([0.5, -1.0, 0.4]), np.random.default_rng(1)
-    state = localisation.begun(truth, 500, IDS, LANDMARKS)
+    state = localisation.initial_state(truth, 500, IDS, LANDMARKS)
     particles = fastslam.Particles(
         state.cloud.poses,
         state.cloud.log_weights,
@@ -100,7 +100,7 @@ def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
         assert localisation.innovation(state, MOTION, SENSOR, *keyframe).squared == pytest.approx(
             judged.squared, rel=1e-9
         )
-        state = localisation.stepped(state, MOTION, SENSOR, *keyframe, random)
+        state = localisation.filter_step(state, MOTION, SENSOR, *keyframe, random)
         particles, _ = fastslam.propagated_and_updated(
             particles, MOTION, SENSOR, *keyframe, "fastslam1", 0.5, other
         )
@@ -114,14 +114,14 @@ def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter():
     sensor = Sensor(range_sigma=0.2, bearing_sigma=0.003)
     random = np.random.default_rng(2)
     start = np.diag([0.1, 0.1, 0.005]) ** 2
-    state = localisation.begun(np.zeros(3), 20_000, IDS, far)
-    state = localisation.stepped(state, Increment(np.zeros(3), start), sensor, *NOTHING, random)
+    state = localisation.initial_state(np.zeros(3), 20_000, IDS, far)
+    state = localisation.filter_step(state, Increment(np.zeros(3), start), sensor, *NOTHING, random)
     motion = Increment(np.array([1.0, 0.0, 0.1]), np.diag([0.1, 0.05, 0.004]) ** 2)
     truth, mean, P = np.array([0.1, -0.05, 0.003]), np.zeros(3), start
     for k in range(3):
         truth = compose(truth, motion.mean)
         z = np.array(sights(truth, far)) + np.array([[0.2], [0.003]]) * [1.0, -0.5, 0.3 * k]
-        state = localisation.stepped(state, motion, sensor, IDS, z[0], z[1], random)
+        state = localisation.filter_step(state, motion, sensor, IDS, z[0], z[1], random)
         c, s = np.cos(mean[2]), np.sin(mean[2])
         F = np.array([[1.0, 0.0, -s], [0.0, 1.0, c], [0.0, 0.0, 1.0]])
         mean = compose(mean, motion.mean)
@@ -151,9 +151,9 @@ def test_turning_and_moving_the_frame_moves_the_cloud_with_it(start):
     clouds = []
     for pose, landmarks in ((np.zeros(3), LANDMARKS), (shift, moved)):
         random = np.random.default_rng(7)
-        state = localisation.begun(pose, 40, IDS, landmarks)
+        state = localisation.initial_state(pose, 40, IDS, landmarks)
         for _ in range(2):
-            state = localisation.stepped(state, MOTION, SENSOR, IDS, *sights(truth), random)
+            state = localisation.filter_step(state, MOTION, SENSOR, IDS, *sights(truth), random)
         clouds.append(state.cloud)
     here, there = clouds
     np.testing.assert_allclose(here.log_weights, there.log_weights, atol=1e-8)
@@ -163,7 +163,7 @@ def test_turning_and_moving_the_frame_moves_the_cloud_with_it(start):
 
 
 def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
-    state = localisation.begun(np.zeros(3), 50, IDS, LANDMARKS)
+    state = localisation.initial_state(np.zeros(3), 50, IDS, LANDMARKS)
     ranges, bearings = sights(np.array([1.0, 0.0, 0.2]))
     known = (IDS, ranges, bearings)
     more = (
@@ -172,7 +172,7 @@ def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
         np.array([0.5, *bearings, 0.6]),
     )
     one, other = (
-        localisation.stepped(state, MOTION, SENSOR, *keyframe, np.random.default_rng(0))
+        localisation.filter_step(state, MOTION, SENSOR, *keyframe, np.random.default_rng(0))
         for keyframe in (known, more)
     )
     assert one.cloud.poses.tobytes() == other.cloud.poses.tobytes()
@@ -180,10 +180,10 @@ def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
 
 
 def test_without_measurements_the_cloud_spreads_and_stays_equally_weighted():
-    state = localisation.begun(np.zeros(3), 2000, IDS, LANDMARKS)
+    state = localisation.initial_state(np.zeros(3), 2000, IDS, LANDMARKS)
     random = np.random.default_rng(3)
     for _ in range(4):
-        state = localisation.stepped(state, MOTION, SENSOR, *NOTHING, random)
+        state = localisation.filter_step(state, MOTION, SENSOR, *NOTHING, random)
     np.testing.assert_array_equal(state.cloud.log_weights, np.full(2000, -np.log(2000)))
     spread = localisation.pose_gaussian(state).covariance
     np.testing.assert_allclose(spread[2, 2], 4 * 0.05**2, rtol=0.15)
@@ -193,7 +193,7 @@ def test_without_measurements_the_cloud_spreads_and_stays_equally_weighted():
 def short_run(seed, repeat):
     """NEES of the pose after eight steps and their NIS, each measurement told `repeat` times."""
     random, judged = np.random.default_rng(seed), innovations.NOTHING
-    truth, state = np.zeros(3), localisation.begun(np.zeros(3), 1000, IDS, LANDMARKS)
+    truth, state = np.zeros(3), localisation.initial_state(np.zeros(3), 1000, IDS, LANDMARKS)
     for _ in range(8):
         xi = np.array([0.1, 0.05, 0.05]) * random.standard_normal(3)
         truth = compose(compose(truth, MOTION.mean), exponential(xi))
@@ -203,7 +203,7 @@ def short_run(seed, repeat):
         bearings = wrap(bearings + 0.15 * random.standard_normal(3))
         keyframe = [np.repeat(part, repeat) for part in (IDS, ranges, bearings)]
         judged = judged.plus(localisation.innovation(state, MOTION, SENSOR, *keyframe))
-        state = localisation.stepped(state, MOTION, SENSOR, *keyframe, random)
+        state = localisation.filter_step(state, MOTION, SENSOR, *keyframe, random)
     pose = localisation.pose_gaussian(state)
     return nees(state_error(pose.mean, truth), pose.covariance), 3, *judged
 
@@ -222,13 +222,15 @@ def test_in_the_thesis_world_it_finds_itself_from_an_unknown_start(name):
     robots, streams = world(name, 1)
     config, stream = robots[0], streams.streams[0]
     random = np.random.default_rng(4)
-    state = localisation.begun_anywhere(
+    state = localisation.initial_state_anywhere(
         np.zeros(2), np.full(2, 100.0), 20_000, streams.landmark_ids, streams.landmarks, random
     )
     lost = localisation.pose_gaussian(state)
     assert min(np.diag(lost.covariance)[:2]) > 25.0**2
     keyframes = keyframes_of(config, stream)[:150]
-    pose = localisation.pose_gaussian(run(state, localisation.stepped, keyframes, config, random))
+    pose = localisation.pose_gaussian(
+        run(state, localisation.filter_step, keyframes, config, random)
+    )
     error = state_error(pose.mean, stream.truth[150])
     assert np.hypot(*error[:2]) < 2.0
     assert nees(error, pose.covariance) < 25.0
@@ -236,7 +238,7 @@ def test_in_the_thesis_world_it_finds_itself_from_an_unknown_start(name):
 
 def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
     random = np.random.default_rng(5)
-    state = localisation.begun_anywhere(
+    state = localisation.initial_state_anywhere(
         np.array([-1.0, -2.0]), np.array([3.0, 2.0]), 30, IDS, LANDMARKS, random
     )
     low, high = state.cloud.poses.min(axis=0), state.cloud.poses.max(axis=0)
@@ -245,7 +247,7 @@ def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
     kept = state.cloud.poses.copy(), state.cloud.log_weights.copy()
     keyframe = (IDS, *sights(np.zeros(3)))
     once, twice = (
-        localisation.stepped(state, MOTION, SENSOR, *keyframe, np.random.default_rng(6))
+        localisation.filter_step(state, MOTION, SENSOR, *keyframe, np.random.default_rng(6))
         for _ in range(2)
     )
     assert once.cloud.poses.tobytes() == twice.cloud.poses.tobytes()

@@ -23,7 +23,7 @@ def filtered(drive_, sensor, state, random, repeat=1):
     for (distance, turn), keyframe in zip(drive_.motions, drive_.keyframes, strict=True):
         measurements = (np.repeat(part, repeat) for part in keyframe)
         increment = increment_of(ROBOT, 1.0, distance, turn)
-        state = plain_fastslam.stepped(state, increment, sensor, *measurements, random)
+        state = plain_fastslam.filter_step(state, increment, sensor, *measurements, random)
     return state
 
 
@@ -31,7 +31,7 @@ def filtered(drive_, sensor, state, random, repeat=1):
 def test_it_is_a_window_that_never_closes(proposal):
     told = drive(1, COARSE, steps=20)
     window = driven(told, COARSE, 60, proposal=proposal)
-    state = plain_fastslam.begun(np.zeros(3), 60, proposal, 0.5)
+    state = plain_fastslam.initial_state(np.zeros(3), 60, proposal, 0.5)
     state = filtered(told, COARSE, state, generator(0, "r1", 0, 0))
     for field in dataclasses.fields(Particles):
         ours, theirs = (getattr(each.particles, field.name) for each in (state, window))
@@ -46,7 +46,7 @@ def test_another_start_pose_moves_the_answer_with_it(start):
         filtered(
             told,
             ACCURATE,
-            plain_fastslam.begun(pose, 20, "fastslam2", 0.0),
+            plain_fastslam.initial_state(pose, 20, "fastslam2", 0.0),
             np.random.default_rng(0),
         )
         for pose in (np.zeros(3), shift)
@@ -64,7 +64,7 @@ def test_another_start_pose_moves_the_answer_with_it(start):
 
 def test_the_map_is_the_mixture_of_the_particles_maps_by_id():
     told = drive(3, COARSE)
-    state = plain_fastslam.begun(np.zeros(3), 30, "fastslam2", 0.5)
+    state = plain_fastslam.initial_state(np.zeros(3), 30, "fastslam2", 0.5)
     particles = filtered(told, COARSE, state, np.random.default_rng(1)).particles
     ids, means, P = plain_fastslam.landmark_moments(particles)
     order = np.argsort(particles.ids)
@@ -97,7 +97,7 @@ def test_the_threshold_says_when_a_step_begins_with_a_resampling():
     told = drive(4, ACCURATE)
     survivors = {}
     for below in (0.0, 0.5, 1.0):
-        start = tagged(plain_fastslam.begun(np.zeros(3), 200, "fastslam1", below))
+        start = tagged(plain_fastslam.initial_state(np.zeros(3), 200, "fastslam1", below))
         end = filtered(told, ACCURATE, start, np.random.default_rng(2)).particles
         survivors[below] = len(np.unique(end.means[:, 0, 0]))
     assert survivors[0.0] == 200 > 2 * survivors[0.5] > 0
@@ -107,7 +107,7 @@ def test_the_threshold_says_when_a_step_begins_with_a_resampling():
 def short_run(seed, repeat):
     """NEES and dof of the map after a short drive, each measurement told `repeat` times."""
     told = drive(seed, ACCURATE, steps=8)
-    start = plain_fastslam.begun(np.zeros(3), 500, "fastslam2", 0.5)
+    start = plain_fastslam.initial_state(np.zeros(3), 500, "fastslam2", 0.5)
     state = filtered(told, ACCURATE, start, np.random.default_rng(seed), repeat)
     landmarks = plain_fastslam.landmark_gaussian(state)
     error = (landmarks.means - told.landmarks[landmarks.ids]).ravel()
@@ -131,10 +131,10 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least, proposa
     for seed in (1, 2):
         robots, streams = world(name, seed)
         for config, stream in zip(robots, streams.streams, strict=True):
-            state = plain_fastslam.begun(stream.start.pose, 50, proposal, 0.5)
+            state = plain_fastslam.initial_state(stream.start.pose, 50, proposal, 0.5)
             keyframes = keyframes_of(config, stream)
             random = generator(seed, config.id, 0, 0)
-            state = run(state, plain_fastslam.stepped, keyframes, config, random)
+            state = run(state, plain_fastslam.filter_step, keyframes, config, random)
             landmarks = plain_fastslam.landmark_gaussian(state)
             error = map_errors(landmarks, streams)
             values.append(nees(error, landmarks.covariance) / len(error))
@@ -147,7 +147,7 @@ def test_over_a_whole_run_it_is_over_confident_by_nature(name, at_least, proposa
 @pytest.mark.parametrize("proposal", PROPOSALS)
 def test_the_same_inputs_give_the_same_bytes_and_stay_untouched(proposal):
     told = drive(5, COARSE)
-    start = plain_fastslam.begun(np.ones(3), 25, proposal, 1.0)
+    start = plain_fastslam.initial_state(np.ones(3), 25, proposal, 1.0)
     kept = [getattr(start.particles, f.name).copy() for f in dataclasses.fields(Particles)]
     once, twice = (filtered(told, COARSE, start, np.random.default_rng(3)) for _ in range(2))
     for field, before in zip(dataclasses.fields(Particles), kept, strict=True):

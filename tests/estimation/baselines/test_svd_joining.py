@@ -27,9 +27,9 @@ quick = settings(deadline=None, max_examples=30)
 
 
 def joined(made, weighting):
-    state = svd_joining.begun({start.robot: start.pose for start in made.starts}, weighting)
+    state = svd_joining.initial_state({start.robot: start.pose for start in made.starts}, weighting)
     for each in made.submaps:
-        state = svd_joining.stepped(state, each.robot, each.local)
+        state = svd_joining.filter_step(state, each.robot, each.local)
     return svd_joining.solved(state)
 
 
@@ -129,7 +129,9 @@ def map_nees(weighting, honest, runs=200):
     for seed in range(runs):
         made = team(seed, robots=2, submaps=3, sigmas=(0.05, 0.05, 0.05))
         rng = np.random.default_rng(seed)
-        state = svd_joining.begun({start.robot: start.pose for start in made.starts}, weighting)
+        state = svd_joining.initial_state(
+            {start.robot: start.pose for start in made.starts}, weighting
+        )
         for each in made.submaps:
             start = made.starts[int(each.robot[1])].pose
             start = made.paths[each.robot][each.sequence - 1] if each.sequence else start
@@ -140,7 +142,7 @@ def map_nees(weighting, honest, runs=200):
             if not honest:
                 noise[:2] += 4.0 * 0.05 * rng.standard_normal()
             local = LocalMap(each.local.ids, truth + noise, 0.05**2 * np.eye(len(truth)))
-            state = svd_joining.stepped(state, each.robot, local)
+            state = svd_joining.filter_step(state, each.robot, local)
         landmarks = svd_joining.landmark_gaussian(svd_joining.solved(state))
         error = (landmarks.means - made.landmarks[landmarks.ids]).ravel()
         values.append((nees(error, landmarks.covariance), len(error)))
@@ -266,11 +268,11 @@ def test_after_a_long_run_an_exchange_is_over_confident_by_nature():
         maps = []
         for config, stream in zip(robots, streams.streams, strict=True):
             keyframes = keyframes_of(config, stream)
-            state = svd_joining.begun({config.id: stream.start.pose})
+            state = svd_joining.initial_state({config.id: stream.start.pose})
             for k in range(0, len(keyframes), 20):
-                window = ekf_slam.begun(np.zeros(3))
-                window = run(window, ekf_slam.stepped, keyframes[k : k + 20], config)
-                state = svd_joining.stepped(state, config.id, ekf_slam.local_map(window))
+                window = ekf_slam.initial_state(np.zeros(3))
+                window = run(window, ekf_slam.filter_step, keyframes[k : k + 20], config)
+                state = svd_joining.filter_step(state, config.id, ekf_slam.local_map(window))
             maps.append(svd_joining.landmark_gaussian(svd_joining.solved(state)))
         landmarks = svd_joining.exchanged(*maps).landmarks
         error = map_errors(landmarks, streams)

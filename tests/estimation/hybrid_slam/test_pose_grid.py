@@ -20,7 +20,7 @@ MOTION = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.0
 FRONT = FrontEnd(node_s=2.0, window_s=7.0, sighting_s=1.0, teammate_speed=0.0)
 
 
-def begun(front=FRONT, sensor=None, keyframe_s=0.0, at_ns=0):
+def initial_state(front=FRONT, sensor=None, keyframe_s=0.0, at_ns=0):
     grid = PoseGrid(sensor or Sensor(), front)
     segmenter = Segmenter(MOTION, sensor or Sensor(), keyframe_s, grid)
     segmenter.begin(at_ns)
@@ -48,7 +48,7 @@ def arc(seconds, forward=0.6, yaw_rate=0.25):
 
 @pytest.mark.parametrize("step_ns", [SECOND, 300_000_000, 7 * SECOND])
 def test_each_grid_time_within_the_window_is_a_keyframe_of_its_own(step_ns):
-    _, segmenter = begun(at_ns=500_000_000)
+    _, segmenter = initial_state(at_ns=500_000_000)
     nodes = [each.stamp_ns for each in drive(segmenter, 20.0, step_ns) if each.is_node]
     assert nodes == [2 * SECOND, 4 * SECOND, 6 * SECOND]
 
@@ -56,7 +56,7 @@ def test_each_grid_time_within_the_window_is_a_keyframe_of_its_own(step_ns):
 @settings(deadline=None, max_examples=40)
 @given(st.lists(st.integers(0, 7 * SECOND - 1), max_size=5), st.sampled_from([0.0, 0.5]))
 def test_no_motion_is_lost_or_counted_twice_at_nodes_and_sightings(stamps, keyframe_s):
-    grid, with_nodes = begun(keyframe_s=keyframe_s)
+    grid, with_nodes = initial_state(keyframe_s=keyframe_s)
     plain = Segmenter(MOTION, Sensor(), keyframe_s)
     plain.begin(0)
     scan = (np.array([1], np.uint32), np.array([2.0]), np.array([0.0]))
@@ -80,7 +80,7 @@ def test_no_motion_is_lost_or_counted_twice_at_nodes_and_sightings(stamps, keyfr
 @given(st.floats(1.01, 2.99), st.floats(0.5, 8.0), st.floats(-3.0, 3.0))
 def test_a_sighting_is_carried_along_the_arc_to_its_node(at_s, distance, bearing):
     """The teammate stands; from the node it lies where the geometry of the circle says."""
-    grid, segmenter = begun()
+    grid, segmenter = initial_state()
     observer = arc(at_s)
     point = observer[0] + 1j * observer[1] + distance * np.exp(1j * (observer[2] + bearing))
     assert grid.observe(round(at_s * SECOND), 5, look("r2", distance, bearing)) is None
@@ -97,7 +97,7 @@ def test_a_teammate_that_may_move_is_known_less_well_the_farther_its_node_is_in_
     moving = msgspec.structs.replace(FRONT, teammate_speed=0.5)
     variances = []
     for at_ns in (2 * SECOND, 2_500_000_000, 3 * SECOND - 1):
-        grid, segmenter = begun(moving)
+        grid, segmenter = initial_state(moving)
         grid.observe(at_ns, 1, look())
         drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
         variances.append(grid.sightings()[0].covariance[0, 0])
@@ -106,7 +106,7 @@ def test_a_teammate_that_may_move_is_known_less_well_the_farther_its_node_is_in_
 
 
 def test_looks_at_one_teammate_near_one_node_are_one_sighting_of_the_median():
-    grid, segmenter = begun()
+    grid, segmenter = initial_state()
     for counter, (at_s, distance) in enumerate([(1.6, 3.0), (1.9, 3.1), (2.2, 9.0), (2.4, 3.2)]):
         grid.observe(round(at_s * SECOND), counter, look("r3", distance))
     grid.observe(2_300_000_000, 9, look("r2", 5.0))
@@ -122,13 +122,13 @@ def test_looks_at_one_teammate_near_one_node_are_one_sighting_of_the_median():
     [(0.9, 1.0), (2.9, 0.5), (7.6, 1.0)],
 )
 def test_a_sighting_without_a_node_near_it_in_the_window_is_rejected(stamp_s, near_s):
-    grid, _ = begun(msgspec.structs.replace(FRONT, sighting_s=near_s))
+    grid, _ = initial_state(msgspec.structs.replace(FRONT, sighting_s=near_s))
     assert grid.observe(round(stamp_s * SECOND), 1, look()) == "no pose node near it"
 
 
 def test_the_sensors_calibration_and_the_markers_offset_are_taken_off():
     sensor = Sensor(range_offset=0.1, range_scale=2.0, marker_range_offset=0.5, max_range=9.0)
-    grid, segmenter = begun(sensor=sensor)
+    grid, segmenter = initial_state(sensor=sensor)
     looks = (("r2", "r3", "r4"), np.array([4.1, 9.5, 0.9]), np.zeros(3))
     assert grid.observe(2 * SECOND, 1, looks) is None
     drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
@@ -138,7 +138,7 @@ def test_the_sensors_calibration_and_the_markers_offset_are_taken_off():
 
 
 def test_a_window_begins_without_the_sightings_of_the_one_before():
-    grid, segmenter = begun()
+    grid, segmenter = initial_state()
     grid.observe(1_500_000_000, 1, look())
     drive(segmenter, 4.0)
     grid.observe(5_900_000_000, 2, look())

@@ -23,7 +23,7 @@ def ticks_of(world):
     return [[each for each in world.submaps if each.end_ns == end] for end in ends]
 
 
-def begun(world):
+def empty_fold(world):
     fold = EMPTY_FOLD
     for start in world.starts:
         fold = started(fold, start)
@@ -32,7 +32,7 @@ def begun(world):
 
 def both(world, settings):
     """The full fold and the bounded one."""
-    full = bounded = begun(world)
+    full = bounded = empty_fold(world)
     for tick in ticks_of(world):
         full = folded(full, tick, settings)
         bounded = folded(condensed(bounded, LAG, begin=0), tick, settings)

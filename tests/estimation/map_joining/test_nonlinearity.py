@@ -9,7 +9,7 @@ from team.estimation.map_joining import nonlinearity
 from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, solved_with_fixed
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
 from team.estimation.map_joining.minima import minimum, searched, warnings
-from team.estimation.map_joining.nonlinearity import bend
+from team.estimation.map_joining.nonlinearity import understated_uncertainty
 from team.estimation.submap import LocalMap
 from tests.estimation.submap_world import drawn, local_truth
 
@@ -62,7 +62,7 @@ def test_a_number_is_held_where_the_rest_has_the_least_cost():
 @pytest.mark.parametrize("seed", range(3))
 def test_the_start_of_a_robot_that_drove_long_without_a_landmark_is_said(seed):
     fold = latecomer(blind=14, seed=seed)
-    found = bend(fold.main, start_node(fold))
+    found = understated_uncertainty(fold.main, start_node(fold))
     assert found.ratio > nonlinearity.BENT
     assert found.rise < nonlinearity.UNLIKELY
     assert any("r1 (incarnation 0) may have started farther off" in text for text in fold.warnings)
@@ -87,7 +87,7 @@ def test_a_robot_that_sees_landmarks_soon_is_not_said(monkeypatch):
     fold = latecomer(blind=1)
     assert fold.warnings == ()
     monkeypatch.setattr(nonlinearity, "STRAIGHT_RAD", 0.0)
-    assert bend(fold.main, start_node(fold)) is None, "nor is it bent"
+    assert understated_uncertainty(fold.main, start_node(fold)) is None, "nor is it bent"
 
 
 def test_a_straight_valley_is_no_bend_however_wide():
@@ -98,5 +98,5 @@ def test_a_straight_valley_is_no_bend_however_wide():
     fold = folded(fold, submaps, OPTIONS)
     local = LocalMap(np.zeros(0, np.uint32), np.zeros(3), 1e-4 * np.eye(3))
     fold = folded(fold, [Contribution("r1", 0, 0, 2000, local)], OPTIONS)
-    assert bend(fold.main, start_node(fold)) is None
+    assert understated_uncertainty(fold.main, start_node(fold)) is None
     assert not [text for text in warnings(searched([fold.main])) if "farther off" in text]

@@ -8,14 +8,14 @@ import pytest
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
 from team.estimation.map_joining.marginals import prior_for
-from team.estimation.map_joining.whole_map import absorbed, begun, joined
+from team.estimation.map_joining.whole_map import absorbed, initial_map, joined
 from tests.estimation.submap_world import correlated, team
 
 LINEAR = (0.1, 1e-5, 0.2)
 
 
 def whole_of(world, count=None):
-    whole = begun(world.starts[0].pose, world.starts[0].covariance)
+    whole = initial_map(world.starts[0].pose, world.starts[0].covariance)
     for each in world.submaps[:count]:
         whole = joined(whole, each.local)
     return whole

@@ -60,44 +60,44 @@ def by_hand(estimator, robot, start=None):
     """(pose, landmarks) after the stream's keyframes; `start` is the pose's covariance."""
     drawn = generator(robot.seed, robot.id, 1, 0)
     front = robot.front_end
-    begun, stepped, of_pose, of_map, draws = {
+    initial_state, filter_step, of_pose, of_map, draws = {
         "dead-reckoning": (
-            dead_reckoning.begun, dead_reckoning.stepped, dead_reckoning.pose_gaussian,
+            dead_reckoning.initial_state, dead_reckoning.filter_step, dead_reckoning.pose_gaussian,
             dead_reckoning.landmark_gaussian, False,
         ),
         "ekf-slam": (
-            ekf_slam.begun, ekf_slam.stepped, ekf_slam.pose_gaussian, ekf_slam.landmark_gaussian,
-            False,
+            ekf_slam.initial_state, ekf_slam.filter_step, ekf_slam.pose_gaussian,
+            ekf_slam.landmark_gaussian, False,
         ),
         "localisation": (
-            lambda pose: localisation.begun(pose, front.particles, *KNOWN), localisation.stepped,
-            localisation.pose_gaussian, lambda _: NO_LANDMARKS, True,
+            lambda pose: localisation.initial_state(pose, front.particles, *KNOWN),
+            localisation.filter_step, localisation.pose_gaussian, lambda _: NO_LANDMARKS, True,
         ),
         "fastslam1": plain(front, "fastslam1"),
         "fastslam2": plain(front, "fastslam2"),
     }[estimator]  # fmt: skip
-    state, more = begun(np.zeros(3)), (drawn,) if draws else ()
+    state, more = initial_state(np.zeros(3)), (drawn,) if draws else ()
     nothing = np.empty(0)
     if start is not None:
         still = Increment(np.zeros(3), start)
         none = np.empty(0, np.uint32)
-        state = stepped(state, still, robot.sensor, none, nothing, nothing, *more)
+        state = filter_step(state, still, robot.sensor, none, nothing, nothing, *more)
     told, seen = STREAM.intervals, STREAM.landmark_detections
     for k in range(len(told.end_ns)):
         step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
         rows = seen.rows(k)
         measurements = corrected(robot.sensor, seen.ranges[rows], seen.bearings[rows])
         increment = increment_of(robot.motion, *map(float, step))
-        state = stepped(state, increment, robot.sensor, seen.ids[rows], *measurements, *more)
+        state = filter_step(state, increment, robot.sensor, seen.ids[rows], *measurements, *more)
     return of_pose(state), of_map(state)
 
 
 def plain(front, proposal):
-    def begun(pose):
-        return plain_fastslam.begun(pose, front.particles, proposal, front.resample_below)
+    def initial_state(pose):
+        return plain_fastslam.initial_state(pose, front.particles, proposal, front.resample_below)
 
     gaussians = plain_fastslam.pose_gaussian, plain_fastslam.landmark_gaussian
-    return begun, plain_fastslam.stepped, *gaussians, True
+    return initial_state, plain_fastslam.filter_step, *gaussians, True
 
 
 @pytest.mark.parametrize("start", [None, SPREAD], ids=["known start", "uncertain start"])

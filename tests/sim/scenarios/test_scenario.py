@@ -6,7 +6,14 @@ import msgspec
 import pytest
 
 from sim.scenarios.checks import ScenarioError
-from sim.scenarios.scenario import builtin_names, doubts, dumps, load, loads, with_options
+from sim.scenarios.scenario import (
+    builtin_names,
+    dumps,
+    load,
+    loads,
+    scenario_warnings,
+    with_options,
+)
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld, UtiasWorld
 from team.association import AssociationProfile
@@ -294,13 +301,13 @@ def test_json_that_is_no_resolved_scenario_is_refused(text: str) -> None:
 
 def test_a_simulated_robot_whose_odometry_has_no_noise_is_doubted(tmp_path: Path) -> None:
     noisy = "[[robots]]\nmotion = { turn = { per_rad = 0.1 } }\n[[robots]]\n"
-    (said,) = doubts(load(written(tmp_path, SMALL + noisy)))
+    (said,) = scenario_warnings(load(written(tmp_path, SMALL + noisy)))
     assert said.startswith("r2: odometry without noise")
 
 
 @pytest.mark.parametrize("name", builtin_names())
 def test_a_built_in_scenario_is_not_doubted(name: str) -> None:
-    assert doubts(load(name)) == []
+    assert scenario_warnings(load(name)) == []
 
 
 def test_hidden_identities_take_thresholds_in_the_lengths_of_the_sensor() -> None:

@@ -14,8 +14,14 @@ from scipy.stats import chi2
 from central.desk.evaluation.errors import Path
 from sim.scenarios.scenario import Scenario
 from sim.studies.batch_reference.graph import factor_graph, values_of
-from sim.studies.batch_reference.measurements import Chain, LimitError, Scan, anchored, chains_of
-from sim.studies.batch_reference.reference import Limit, batch_map
+from sim.studies.batch_reference.measurements import (
+    BatchReferenceError,
+    Chain,
+    Scan,
+    anchored,
+    chains_of,
+)
+from sim.studies.batch_reference.reference import BatchReference, batch_map
 from team.config import MotionModel, MotionNoise, RobotConfig
 from team.estimation.baselines.batch import FLOOR_SIGMAS
 from team.estimation.geometry import between, compose, exponential, tangent
@@ -112,7 +118,7 @@ def test_the_limit_of_a_log_is_the_same_every_time() -> None:
     assert first.covariance.tobytes() == second.covariance.tobytes()
 
 
-def nees_of(of: Scenario, *, twice: bool) -> Limit:
+def nees_of(of: Scenario, *, twice: bool) -> BatchReference:
     world = msgspec.structs.replace(of.world, steps=8)
     log = joined_log(msgspec.structs.replace(of, world=world), 0.02)
     return batch_map(counted_twice(log) if twice else log)
@@ -147,16 +153,16 @@ def test_an_unknown_start_is_found_where_the_map_lies() -> None:
 
 def test_a_log_without_trajectories_says_what_to_run() -> None:
     log = [s for s in joined_log(scenario(), 0.1) if s.key != ch.TRAJECTORY.key("r1")]
-    with pytest.raises(LimitError, match="--fusion join"):
+    with pytest.raises(BatchReferenceError, match="--fusion join"):
         batch_map(log)
 
 
 def test_a_run_that_did_not_end_has_no_limit() -> None:
-    with pytest.raises(LimitError, match="record a run to its end"):
+    with pytest.raises(BatchReferenceError, match="record a run to its end"):
         batch_map(world_log(scenario()))
 
 
 def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(LimitError, match=r"teamslam\[limit\]"):
+    with pytest.raises(BatchReferenceError, match=r"teamslam\[limit\]"):
         batch_map([])

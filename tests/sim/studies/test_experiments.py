@@ -199,21 +199,21 @@ def few_run(
     return figures | {"robots": robots, "not_joined": [], "said": said}
 
 
-SAID = ["another map fits about as well"]
+SURVEYED = ["another map fits about as well"]
 
 
 @pytest.mark.parametrize(
     ("run", "wrong", "silent", "beyond", "untold", "alarms"),
     [
         (few_run(2.0, 2.0, []), 0, 0, 0, 0, 0),
-        (few_run(2.0, 2.0, SAID), 0, 0, 0, 0, 1),
+        (few_run(2.0, 2.0, SURVEYED), 0, 0, 0, 0, 1),
         (few_run(2.0, 2.0, ["r2 (incarnation 1) is placed weakly: …"]), 0, 0, 0, 0, 0),
         (few_run(20.0, 2.0, []), 0, 0, 1, 1, 0),
         (few_run(2.0, 12.0, []), 0, 0, 1, 1, 0),
-        (few_run(20.0, 2.0, SAID), 0, 0, 1, 0, 0),
+        (few_run(20.0, 2.0, SURVEYED), 0, 0, 1, 0, 0),
         (few_run(None, 2.0, []), 0, 0, 0, 0, 0),
         (few_run(2.0, 2.0, [], wrong=True), 1, 1, 0, 0, 0),
-        (few_run(2.0, 2.0, SAID, wrong=True), 1, 0, 0, 0, 0),
+        (few_run(2.0, 2.0, SURVEYED, wrong=True), 1, 0, 0, 0, 0),
     ],
 )
 def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(

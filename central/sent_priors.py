@@ -25,7 +25,7 @@ SURER = 0.8
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Sent:
     """The map that a robot was told of, and its nearest landmarks that it was told; since:
     broadcasts since then.
     """
@@ -35,12 +35,12 @@ class _Told:
     since: int
 
 
-class News:
+class SentPriors:
     """What each stream was told last. A function of the broadcasts before, not of the set."""
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._told: dict[Stream, _Told] = {}
+        self._sent: dict[Stream, _Sent] = {}
 
     def is_worth(
         self, stream: Stream, pose: Float[np.ndarray, "3"], blocks: LandmarkBlocks
@@ -48,15 +48,15 @@ class News:
         """Whether a prior at this pose in this map is to be sent; it counts as told then."""
         offsets = blocks.means - pose[:2]
         nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
-        old = self._told.get(stream)
-        if old is None or old.since + 1 >= EVERY or _is_news(old, blocks, nearest[:NEEDED]):
-            self._told[stream] = _Told(blocks, np.sort(blocks.ids[nearest[: self._most]]), 0)
+        old = self._sent.get(stream)
+        if old is None or old.since + 1 >= EVERY or _has_changed(old, blocks, nearest[:NEEDED]):
+            self._sent[stream] = _Sent(blocks, np.sort(blocks.ids[nearest[: self._most]]), 0)
             return True
-        self._told[stream] = replace(old, since=old.since + 1)
+        self._sent[stream] = replace(old, since=old.since + 1)
         return False
 
 
-def _is_news(old: _Told, now: LandmarkBlocks, needed: Int64[np.ndarray, " k"]) -> bool:
+def _has_changed(old: _Sent, now: LandmarkBlocks, needed: Int64[np.ndarray, " k"]) -> bool:
     ids = now.ids[needed]
     if not np.isin(ids, old.ids).all():
         return True

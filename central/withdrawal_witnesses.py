@@ -16,7 +16,7 @@ LEAST_WITNESSES = 2
 """Robots that say the same of another one: nobody withdraws a teammate alone."""
 
 
-class Hearsay:
+class WithdrawalWitnesses:
     """Who has said what about whose withdrawal."""
 
     def __init__(self, robots: Sequence[str]) -> None:

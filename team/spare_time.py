@@ -6,7 +6,7 @@ FAILED_S = 10.0
 """Work that raised is tried again after this time."""
 
 
-class Spare:
+class SpareTime:
     """Decides by the wall clock when the next piece of such work may begin.
 
     share: of the time, at the most. took_s: how long the last piece that did something took; None:

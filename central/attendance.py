@@ -1,4 +1,4 @@
-"""The roll of a team: who is there, how far each robot is, and who is waited for."""
+"""The attendance of a team: which robots are present, how far each is, and which are awaited."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -52,25 +52,26 @@ class Attendance:
 
 
 @dataclass
-class Roll:
-    """The team's robots by name; `now_ns` is the newest team time that anyone has spoken of.
+class TeamAttendance:
+    """What the centre knows of each robot of the team.
 
-    withdrawn: the robots that the team goes on without; nobody waits for one that has left.
-    world_end: the end that a world has said. doubted: one that contradicts what robots have said to
-    have consumed; their last words may yet say that it is right. ordered: a live team was told to
-    end.
+    now_ns: the newest team time in any message. withdrawn: the robots that the team goes on
+    without; nobody waits for one that has left. world_end: the last counters that the world has
+    announced. contradicting_end: an announced end with fewer measurements than robots say they have
+    consumed; it becomes world_end if the robots' `Done` messages confirm it. ordered: an operator
+    has ordered the live team to end.
     """
 
     robots: dict[str, Attendance]
     world_end: m.End | None = None
-    doubted: m.End | None = None
+    contradicting_end: m.End | None = None
     now_ns: int = 0
     withdrawn: frozenset[str] = frozenset()
     ordered: bool = False
     _names: tuple[str, ...] = field(default=(), init=False)
 
     @classmethod
-    def of(cls, robots: Sequence[str]) -> "Roll":
+    def of(cls, robots: Sequence[str]) -> "TeamAttendance":
         """A team of which nobody has been heard of."""
         return cls({robot: Attendance() for robot in sorted(robots)})
 
@@ -92,7 +93,7 @@ class Roll:
                 # A robot's last word is that of its last incarnation, in whichever order they come.
                 if robot.done is None or robot.done.incarnation <= message.incarnation:
                     robot.done = message
-                    self.doubt(self.doubted)
+                    self.consider_end(self.contradicting_end)
             case m.End():
                 self.world_end = later_end(message, self.world_end)
             case m.TeamEnd():
@@ -112,19 +113,19 @@ class Roll:
             case _:
                 pass
 
-    def doubt(self, end: m.End | None) -> None:
-        """Keep an end that contradicts robots' progress until all of them are done at its counts.
+    def consider_end(self, end: m.End | None) -> None:
+        """Keep an end that contradicts the robots' progress until all are done at its counts.
 
-        A word on how far a robot is may be anybody's where there are no keys; a robot that is done
-        there has had the same end from its source.
+        Without keys anybody may publish progress in a robot's name. A robot whose `Done` has the
+        same counts got the same end from its own source, which confirms it.
         """
-        self.doubted = end
+        self.contradicting_end = end
         if end is None:
             return
         dones = {r: a.done for r, a in self.robots.items() if a.done is not None}
         counts = {(d.robot, d.incarnation, d.measurements) for d in dones.values()}
         if counts == {(s.robot, s.incarnation, s.measurements) for s in end.streams}:
-            self.world_end, self.doubted = later_end(end, self.world_end), None
+            self.world_end, self.contradicting_end = later_end(end, self.world_end), None
 
     def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
         robot.began = max(robot.began, message.incarnation)

@@ -31,12 +31,12 @@ _LAST = (ch.TEAM_FINAL, ch.TEAM_TRAJECTORY)
 """What counts for the team unless a centre has said it: one that comes back late may lack some."""
 
 
-class Voices:
+class PeersAsCentre:
     """Gives samples a centre's key, one after the other."""
 
     def __init__(self) -> None:
         self._centre = self._concluded = False
-        self._voice: str | None = None
+        self._robot: str | None = None
 
     def of(self, sample: Sample) -> Sample | None:
         """The sample as a centre would have said it; None: nothing of the kind."""
@@ -55,8 +55,8 @@ class Voices:
         if as_channel is None:
             return None
         if channel is ch.TEAM_MAP or channel is ch.TEAM_CONFIG:
-            self._voice = name if self._voice is None else self._voice
-            if name != self._voice:
+            self._robot = name if self._robot is None else self._robot
+            if name != self._robot:
                 return None
         renamed = replace(sample, key=as_channel.key(name))
         return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
@@ -71,7 +71,7 @@ class Voices:
 
     def _status(self, sample: Sample, node: str) -> Sample | None:
         """What the voice says of its fold, as a centre's status."""
-        if self._voice is None or node != ch.robot_node(self._voice):
+        if self._robot is None or node != ch.robot_node(self._robot):
             return None
         try:
             status = decoded(sample.payload, m.Status)
@@ -95,10 +95,10 @@ def _is_alive(token: Sample) -> bool:
         return True
 
 
-def with_voices(voices: Voices, samples: Iterable[Sample]) -> Iterator[Sample]:
+def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:
     """The samples, and behind each what it says in a centre's place."""
     for sample in samples:
         yield sample
-        said = voices.of(sample)
+        said = centre.of(sample)
         if said is not None:
             yield said
