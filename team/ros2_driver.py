@@ -1,7 +1,8 @@
 """A ROS 2 robot's driver, with no ROS on our side: its topics on Zenoh become a robot's stream.
 
 What comes is decoded, translated as a bag's messages are, and handed to the driver. Damaged
-messages, and what the driver refuses, are counted and named; nothing of it ends the process.
+messages, what the driver refuses, and what was lost on its way are counted and named; nothing of it
+ends the process.
 """
 
 import logging
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from team.containment import place_of
 from team.driver.measured import MeasurementError
+from team.ros2.arrivals import MOST_WAITING, Backlog, Lost
 from team.ros2.decoding import READERS, DamagedError, Record, TransformsRecord, decode
 from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token
 from team.ros2.topics import RobotTopics
@@ -30,6 +32,8 @@ MOST_REASONS = 100
 """Reasons for which messages are dropped that are told apart: a key's type may be any text."""
 WARN_S = 10.0
 """Between two words about what is dropped."""
+BEHIND_S = 1.0
+"""A message that waits longer says that the driver is slower than its topics."""
 NANO = Decimal(10) ** -9
 _LOG = logging.getLogger("teamslam")
 
@@ -58,7 +62,8 @@ class Robot(Protocol):
 class Ros2Driver:
     """Takes what is published on a robot's topics, and hands it to its driver.
 
-    taken: messages by topic; dropped: by reason.
+    taken: messages by topic; dropped: by reason; lost: published, and never here. What waits is
+    handed over in the order of its stamps, since topics come in no order among themselves.
     """
 
     def __init__(self, robot: Robot, topics: RobotTopics, domain: int = 0) -> None:
@@ -70,11 +75,14 @@ class Ros2Driver:
         if topics.odometry:
             self._kinds.setdefault(topics.odometry, ODOMETRY)
         self._held: dict[str, deque[bytes]] = {}
+        self._backlog = Backlog()
+        self._translated: dict[str, deque[Measured]] = {}
         self._speeds: Speeds | None = None
         self._said: Counter[str] = Counter()
         self._said_at = float("-inf")
         self.taken: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.lost = Lost()
         self._names = {topics.odometry, *topics.detections, STATIC} - {""}
 
     @property
@@ -85,58 +93,90 @@ class Ros2Driver:
     tokens = (BRIDGE_TOKENS,)
 
     def take(self, sample: ForeignSample) -> None:
-        """One publication, or a token that tells a topic's type."""
+        """One publication, handed over at once, with all that waited."""
+        self.put(sample)
+        self.deliver()
+
+    def put(self, sample: ForeignSample) -> None:
+        """One publication, which waits for its turn, or a token that tells a topic's type."""
         if sample.token:
             told = of_token(sample.key)
             if told is not None and sample.alive:
                 self._learn(*told)
             return
         named = of_rmw(sample.key, self._domain)
-        if named is not None:
-            topic, kind = named[0], named[1][:80]
+        topic, kind = ("/" + sample.key.strip("/"), "") if named is None else named
+        if topic not in self._names:
+            return
+        kind = kind[:80] or self._kinds.get(topic, "")
+        self.lost.take(topic, sample.attachment)
+        if not kind:
+            self._held.setdefault(topic, deque(maxlen=HELD)).append(sample.payload)
+            self._note(f"{topic}: no bridge has told its type; give it in `types`")
+        elif topic == STATIC:
+            self._decoded(topic, kind, sample.payload)
         else:
-            topic = "/" + sample.key.strip("/")
-            kind = self._kinds.get(topic, "")
-            if not kind:
-                self._held.setdefault(topic, deque(maxlen=HELD)).append(sample.payload)
-                self._note(f"{topic}: no bridge has told its type; give it in `types`")
-                return
-        self._decoded(topic, kind, sample.payload)
+            self._backlog.put(topic, kind, sample.payload)
 
     def _learn(self, topic: str, kind: str) -> None:
         if topic in self._names and kind in READERS:
             self._kinds[topic] = kind
             for payload in self._held.pop(topic, ()):
-                self._decoded(topic, kind, payload)
+                self._backlog.put(topic, kind, payload)
 
-    def _decoded(self, topic: str, kind: str, payload: bytes) -> None:
-        if topic not in self._names:
-            return
+    @property
+    def waiting(self) -> int:
+        """Messages that came and were not handed over yet."""
+        return len(self._backlog) + sum(map(len, self._translated.values()))
+
+    def deliver(self, most: int | None = None) -> None:
+        """Hand over what waits, so many measurements at most: the earliest stamp of all topics is
+        next, and of one topic whatever came first.
+        """
+        count = 0
+        while most is None or count < most:
+            earliest = self._earliest()
+            if earliest is None:
+                return
+            count += 1
+            try:
+                self._hand_over(self._translated[earliest].popleft())
+            except (MeasurementError, OverflowError) as error:
+                self._note(f"{earliest}: refused", str(error))
+
+    def _earliest(self) -> str | None:
+        """The topic whose next measurement has the earliest stamp."""
+        heads = []
+        for topic in self._backlog.waiting:
+            queue = self._translated.setdefault(topic, deque())
+            while not queue and (arrived := self._backlog.next_of(topic)) is not None:
+                queue.extend(self._decoded(topic, arrived.kind, arrived.payload))
+            if queue:
+                heads.append((queue[0].stamp_ns, topic))
+        return min(heads)[1] if heads else None
+
+    def _decoded(self, topic: str, kind: str, payload: bytes) -> list[Measured]:
+        """The measurements of one message; a static transform has none."""
         self.taken[topic] += 1
         if kind not in READERS:
             self._note(f"{topic}: messages of type {kind} are not read")
-            return
+            return []
         try:
             record = decode(kind, payload)
         except DamagedError as error:
             self._note(f"{topic}: damaged", str(error))
-            return
-        if topic.endswith(STATIC):
+            return []
+        if topic == STATIC:
             if isinstance(record, TransformsRecord):
                 for transform in record.transforms:
                     self._translator.frames.take(transform)
-            return
+            return []
         try:
-            found = self._translator.take(topic, _stamped(record))
+            return self._translator.take(topic, _stamped(record))
         except Exception as error:  # a sound message that the translation does not know how to take
             place = place_of(error.__traceback__)
             self._note(f"{topic}: set aside", f"{type(error).__name__} at {place}: {error}")
-            return
-        for measured in found:
-            try:
-                self._hand_over(measured)
-            except (MeasurementError, OverflowError) as error:
-                self._note(f"{topic}: refused", str(error))
+            return []
 
     def _hand_over(self, measured: Measured) -> None:
         t = measured.stamp_ns * NANO
@@ -168,6 +208,38 @@ class Ros2Driver:
             _LOG.warning("%s (first: %s)", reason, detail)
             self._said[reason] = self.dropped[reason]
 
+    def figures(self) -> dict[str, float]:
+        """Messages: that came, were lost on their way, wait, and were dropped here."""
+        return {
+            "messages": float(self.taken.total()),
+            "messages_lost": float(self.lost.count.total()),
+            "messages_waiting": float(self.waiting),
+            "messages_waiting_s": self._backlog.oldest_s,
+            "messages_dropped": float(self.dropped.total() + self._backlog.dropped.total()),
+        }
+
+    def warnings(self) -> tuple[str, ...]:
+        """What is lost or late, why, and what to do."""
+        said = [
+            f"{topic}: {count:,} messages were published and never came, "
+            f"{100.0 * count / (count + self.lost.numbered[topic]):.1f} %: a queue of the "
+            "publisher's or of a router was full. Free their CPU or link, or publish as reliable "
+            "with the history keep_all: then Zenoh waits instead of dropping"
+            for topic, count in self.lost.count.items()
+        ]
+        late_s = self._backlog.oldest_s
+        if late_s > BEHIND_S:
+            said.append(
+                f"{self.waiting:,} messages wait, the oldest for {late_s:.0f} s: the topics are "
+                "faster than this driver. Give it a free core, or throttle them"
+            )
+        said += [
+            f"{topic}: {count:,} messages were dropped, since {MOST_WAITING:,} waited: the topic "
+            "is faster than this driver. Give it a free core, or throttle it"
+            for topic, count in self._backlog.dropped.items()
+        ]
+        return tuple(said)
+
     def report(self) -> None:
         """Say what was dropped since the last word, at most every WARN_S seconds."""
         now = time.monotonic()
@@ -179,6 +251,8 @@ class Ros2Driver:
             if count > self._said[reason]:
                 _LOG.warning("%s: %d messages so far", reason, count)
         self._said = Counter(both)
+        for text in self.warnings():
+            _LOG.warning("%s", text)
         for text in self._translator.said:
             _LOG.warning("%s", text)
         self._translator.said.clear()

@@ -1,6 +1,7 @@
 """The command `teamslam driver`: a ROS 2 robot's topics become its stream."""
 
 import logging
+import time
 import warnings
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,10 @@ from sim.cli.options import FAILED, LOOPBACK, WRONG_USE, Connect, Keys, fail, ov
 app = typer.Typer()
 _LOG = logging.getLogger("teamslam")
 WAIT_S = 0.2
+LAST_S = 0.2
+"""At the end, what is on its way comes within this."""
+AT_ONCE = 500
+"""Measurements that are handed over before the next look at what has come."""
 
 
 @app.command()
@@ -33,7 +38,11 @@ def driver(
         typer.Option(help="Where all measurements are kept; default: ROBOT.stream here."),
     ] = None,
     start: Annotated[
-        str | None, typer.Option(help="Where it starts (m, rad).", metavar="x,y,theta")
+        str | None,
+        typer.Option(
+            help="Where it starts, and how well that is known (m, rad).",
+            metavar="x,y,theta[,sigma,sigma]",
+        ),
     ] = None,
     latency: Annotated[
         float, typer.Option(help="What is seen may come so much later than odometry [s].", min=0.0)
@@ -43,6 +52,8 @@ def driver(
 
     Topics come by rmw_zenoh or by zenoh-bridge-ros2dds.
     """
+    import numpy as np
+
     from team.driver.driver import Driver, DriverError
     from team.driver.measured import DriverWarning
     from team.ros2.topics import TopicsError, load_topics
@@ -59,7 +70,8 @@ def driver(
         fail(str(error), WRONG_USE)
     if robot not in topics.robots:
         fail(f"{ros2}: no [robots.{robot}]; it has {', '.join(topics.robots)}", WRONG_USE)
-    pose = None if start is None else parsed_start(start)[1]
+    pose = () if start is None else parsed_start(start)[1]
+    variances = [pose[3] ** 2, pose[3] ** 2, pose[4] ** 2] if len(pose) == 5 else None
     try:
         with (
             process(f"driver-{robot}", endless=True) as stop,
@@ -69,7 +81,8 @@ def driver(
                 connect=connect if keys is None else over_tls(connect),
                 keys=keys,
                 file=file,
-                start=None if pose is None else pose[:3],
+                start=pose[:3] or None,
+                start_covariance=None if variances is None else np.diag(variances),
                 latency_s=latency,
             ) as source,
         ):
@@ -79,14 +92,22 @@ def driver(
             ) as foreign:
                 _LOG.info("listening to %s", ", ".join(translated.keys))
                 while not (stop.is_set() or source.team_has_ended):
-                    for sample in foreign.receive(WAIT_S):
-                        translated.take(sample)
+                    for sample in foreign.receive(0.0 if translated.waiting else WAIT_S):
+                        translated.put(sample)
+                    translated.deliver(AT_ONCE)
+                    source.tell(translated.figures(), translated.warnings())
                     translated.report()
-                for sample in foreign.receive(0.0):
-                    translated.take(sample)
+                until = time.monotonic() + LAST_S
+                while time.monotonic() < until:  # what is on its way; a topic need not fall silent
+                    for sample in foreign.receive(LAST_S):
+                        translated.put(sample)
+                translated.deliver()
+                source.tell(translated.figures(), translated.warnings())
             for topic, count in translated.taken.items():
                 _LOG.info("%s: %d messages", topic, count)
             for reason, count in translated.dropped.items():
                 _LOG.warning("%s: %d", reason, count)
+            for text in translated.warnings():
+                _LOG.warning("%s", text)
     except DriverError as error:
         fail(str(error), FAILED)

@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from types import TracebackType
@@ -266,6 +266,10 @@ class Driver:
     def status(self) -> m.Status:
         """How far the stream is, who has it, and what is wrong."""
         return self._link.status()
+
+    def tell(self, figures: Mapping[str, float], warnings: Iterable[str]) -> None:
+        """Figures and warnings of what feeds this driver; they are in its status from now on."""
+        self._node.fed = dict(figures), tuple(warnings)
 
     # The end.
 

@@ -52,6 +52,8 @@ class SourceNode:
         self._published = self.journal.count(self._incarnation)
         self._said: m.StreamHead | None = None
         self._others: set[str] = set()
+        self.fed: tuple[dict[str, float], tuple[str, ...]] = {}, ()
+        """Figures and warnings of what feeds the driver, as a ROS 2 robot's topics."""
         self.listening = True
         """Whether it is not known yet how far the team was with this robot before."""
 
@@ -239,6 +241,7 @@ class SourceNode:
             "published": float(self._published),
             "delivered": float(self.delivered[1]),
             "team_time_s": 1e-9 * self.journal.newest_ns if self.journal.incarnation else 0.0,
+            **self.fed[0],
         }
         state = self.journal.state if self.journal.incarnation else "waiting"
         waits = (f"waiting for {self.waits_for}",) if self.waits_for else ()
@@ -248,7 +251,7 @@ class SourceNode:
             node=ch.source_node(self._robot),
             state="measuring" if state == "open" else state,
             figures=figures,
-            warnings=(*waits, *idle, *self.warnings[-3:]),
+            warnings=(*waits, *idle, *self.fed[1], *self.warnings[-3:]),
         )
 
     @property

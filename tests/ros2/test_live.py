@@ -1,6 +1,8 @@
 """A ROS 2 robot live: keys of rmw_zenoh and of a bridge, from a publisher that is not ours."""
 
 import socket
+import struct
+import time
 from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
@@ -10,11 +12,14 @@ import numpy as np
 import pytest
 import zenoh
 
+from team.driver.journal import Journal
 from team.driver.measured import MeasurementError
+from team.driver.node import SourceNode
+from team.ros2.arrivals import MOST_PUBLISHERS, Backlog, Lost, number_of
 from team.ros2.keys import of_rmw, of_token
 from team.ros2.topics import RobotTopics, TopicsError, load_topics
 from team.ros2.translator import Measured
-from team.ros2_driver import MOST_REASONS, Ros2Driver
+from team.ros2_driver import BEHIND_S, MOST_REASONS, Ros2Driver
 from team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
@@ -217,3 +222,91 @@ def test_the_reasons_that_are_told_apart_are_bounded() -> None:
         driver.take(ForeignSample(f"0/r1/odom/what::msg::dds_::Ever{k}_/RIHS01_0", b""))
     assert len(driver.dropped) == MOST_REASONS + 1
     assert driver.dropped["for other reasons"] == MOST_REASONS
+
+
+def numbered(number: int, gid: bytes = b"a" * 16) -> bytes:
+    """What rmw_zenoh attaches, as its C++ serializer writes it."""
+    named = struct.pack("<B15sqB16sq", 15, b"sequence_number", number, 16, b"source_timestamp", S)
+    return named + struct.pack("<B10sB16s", 10, b"source_gid", 16, gid)
+
+
+def plainly_numbered(number: int, gid: bytes = b"a" * 16) -> bytes:
+    return struct.pack("<qqB16s", number, S, 16, gid)
+
+
+@pytest.mark.parametrize("attached", [numbered, plainly_numbered])
+def test_messages_that_never_came_are_counted_by_their_publisher_s_numbers(
+    attached: Callable[..., bytes],
+) -> None:
+    driver = Ros2Driver(Robot(), TOPICS)
+    key = by_rmw("/r1/odom", ODOMETRY)
+    for k in (1, 2, 5, 6):
+        driver.take(ForeignSample(key, odometry(k), attached(k)))
+    driver.take(ForeignSample(key, odometry(7), attached(1, b"b" * 16)))  # started again: another
+    driver.take(ForeignSample(key, odometry(8), attached(2, b"b" * 16)))
+    assert driver.lost.count == {"/r1/odom": 2}
+    figures = driver.figures()
+    assert (figures["messages"], figures["messages_lost"]) == (6.0, 2.0)
+    (said,) = driver.warnings()
+    assert "/r1/odom: 2 messages were published and never came, 25.0 %" in said
+    assert "keep_all" in said
+
+
+def test_hostile_numbers_lose_nothing_and_fill_nothing() -> None:
+    lost = Lost()
+    random = np.random.default_rng(5)
+    for k in range(2 * MOST_PUBLISHERS):
+        lost.take("/odom", numbered(k, random.bytes(16)))
+        lost.take("/odom", random.bytes(int(random.integers(90))))
+    lost.take("/odom", numbered(-(2**63)))
+    lost.take("/odom", numbered(2**63 - 1))
+    lost.take("/odom", numbered(3))
+    assert not lost.count
+    assert len(lost._last) == MOST_PUBLISHERS
+    assert number_of(b"") is None
+    assert number_of(numbered(7)[:-1]) is None
+    assert number_of(numbered(7).replace(b"sequence", b"sequense")) is None
+
+
+def test_what_waits_is_handed_over_in_the_order_of_its_stamps() -> None:
+    robot = Robot()
+    driver = Ros2Driver(robot, TOPICS)
+    for k in range(1, 400):  # all odometry first, as a reader that fell behind finds it
+        driver.put(ForeignSample(by_rmw("/r1/odom", ODOMETRY), odometry(k)))
+    for k in range(1, 400):
+        driver.put(ForeignSample(by_rmw("/r1/tags", TAGS), tags(k)))
+    while driver.waiting:
+        driver.deliver(7)
+    times = [call[1] for call in robot.calls]
+    assert len(times) == 399 * 3
+    assert times == sorted(times)
+
+
+def test_a_driver_that_falls_behind_says_so_in_its_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("team.ros2.arrivals.MOST_WAITING", 3)
+    driver = Ros2Driver(Robot(), TOPICS)
+    for k in range(1, 6):
+        driver.put(ForeignSample(by_rmw("/r1/odom", ODOMETRY), odometry(k)))
+    now = time.monotonic()
+    monkeypatch.setattr("team.ros2.arrivals.time.monotonic", lambda: now + 5.0 * BEHIND_S)
+    node = SourceNode(Journal(tmp_path / "r1.stream", "r1"))
+    node.fed = driver.figures(), driver.warnings()
+    status = node.status()
+    assert status.figures["messages_waiting"] == 3.0
+    assert status.figures["messages_dropped"] == 2.0
+    said = " ".join(status.warnings)
+    assert "3 messages wait, the oldest for 5 s" in said
+    assert "/r1/odom: 2 messages were dropped" in said
+
+
+def test_a_backlog_keeps_the_order_of_each_topic() -> None:
+    backlog = Backlog()
+    for k in range(3):
+        backlog.put("/a", "kind", bytes([k]))
+    assert [arrived.payload for _ in range(3) if (arrived := backlog.next_of("/a"))] == [
+        b"\x00", b"\x01", b"\x02",
+    ]  # fmt: skip
+    assert backlog.next_of("/a") is None
+    assert backlog.oldest_s == 0.0

@@ -5,6 +5,7 @@ radians; NEES is per degree of freedom, 1 where the covariance is right.
 """
 
 import hashlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -176,7 +177,12 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         robots=robots,
         true_landmarks=positions,
         channels={key: log.traffic[key] for key in sorted(log.traffic)},
-        notes=(*(end.notes if isinstance(end, m.End) else ()), *_lost(fused), *_set_aside(faults)),
+        notes=(
+            *(end.notes if isinstance(end, m.End) else ()),
+            *_lost(fused),
+            *_never_came(log),
+            *_set_aside(faults),
+        ),
         unsound=log.unsound,
         cost_by_robot=_by_robot(log, "joint_cost_per_dof."),
         faults=len(faults),
@@ -205,6 +211,21 @@ def _lost(fused: MapResult | None) -> list[str]:
     """Of whom the final map has not all that it was to have."""
     lost = () if fused is None else fused.lost
     return [f"the final map is provisional: {robot} lost, and not wholly in it" for robot in lost]
+
+
+def _never_came(log: Collected) -> list[str]:
+    """Whose driver lacks messages that its robot had published, by the driver's last status."""
+    said = []
+    for robot in log.robots:
+        status = log.sound(log.latest.get(ch.STATUS.key(ch.source_node(robot))))
+        figures = status.figures if isinstance(status, m.Status) else {}
+        lost = figures.get("messages_lost", 0.0) + figures.get("messages_dropped", 0.0)
+        if lost and math.isfinite(lost):
+            said.append(
+                f"{robot}: {lost:,.0f} messages of its topics are not in its stream, beside "
+                f"{figures.get('messages', 0.0):,.0f} that are; its driver's warnings say why"
+            )
+    return said
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:

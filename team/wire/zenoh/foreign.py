@@ -1,24 +1,36 @@
 """Keys that are not a team's, as those of ROS 2: what is published there, as it comes."""
 
 import json
+import time
 from collections.abc import Sequence
-from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import zenoh
+from zenoh.handlers import FifoChannel
 
 from team.wire.bus import BusError
 
 TOKENS_S = 5.0
 """How long to wait for the tokens that are there."""
+CAPACITY = 65_536
+"""Messages of a subscription that wait for `receive`; only a full channel holds up Zenoh's thread,
+and with it the router, which then drops messages.
+"""
+AT_ONCE = 10_000
+"""Messages of a subscription that one call of `receive` takes at most."""
+LOOK_S = 0.005
+"""Between two looks while nothing has come."""
 
 
 class ForeignSample(NamedTuple):
-    """One publication; of a liveliness token the payload is empty and alive says which way."""
+    """One publication, and what was attached to it; of a liveliness token both are empty, and
+    alive says which way.
+    """
 
     key: str
     payload: bytes
+    attachment: bytes = b""
     token: bool = False
     alive: bool = True
 
@@ -26,7 +38,9 @@ class ForeignSample(NamedTuple):
 class ForeignKeys:
     """Subscriptions to keys and tokens at a router or peer; raises BusError where none answers.
 
-    Received on Zenoh's thread into one queue; `receive` takes from it.
+    What comes waits in a channel for each subscription, which Zenoh's thread fills without Python:
+    a process that is busy decoding does not hold it up. `receive` takes from them; of one key the
+    order is that of its publisher, between keys there is none.
     """
 
     def __init__(
@@ -46,14 +60,19 @@ class ForeignKeys:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise BusError(f"nobody answers at {connect} ({patience_s:g} s): {error}") from None
-        self._queue: SimpleQueue[ForeignSample] = SimpleQueue()
-        for token in tokens:  # those that are there come before all samples
-            for reply in self._session.liveliness().get(token, timeout=TOKENS_S):
-                if reply.ok is not None:
-                    self._take_token(reply.ok)
-            self._session.liveliness().declare_subscriber(token, self._take_token)
-        for key in keys:
-            self._session.declare_subscriber(key, self._take)
+        self._first = [
+            reply.ok
+            for token in tokens
+            for reply in self._session.liveliness().get(token, timeout=TOKENS_S)
+            if reply.ok is not None
+        ]
+        liveliness = self._session.liveliness()
+        self._tokens: list[Any] = [
+            liveliness.declare_subscriber(token, FifoChannel(CAPACITY)) for token in tokens
+        ]
+        self._samples: list[Any] = [
+            self._session.declare_subscriber(key, FifoChannel(CAPACITY)) for key in keys
+        ]
 
     def __enter__(self) -> Self:
         return self
@@ -67,18 +86,37 @@ class ForeignKeys:
         self._session.close()  # type: ignore[no-untyped-call] # zenoh leaves out `-> None`
 
     def receive(self, timeout_s: float) -> list[ForeignSample]:
-        """All that has come; waits for the first so long."""
-        found: list[ForeignSample] = []
-        try:
-            found.append(self._queue.get(timeout=timeout_s))
-            while True:
-                found.append(self._queue.get_nowait())
-        except Empty:
-            return found
+        """All that has come, AT_ONCE of a subscription at most; waits for the first so long."""
+        until = time.monotonic() + timeout_s
+        while True:
+            found = self._taken()
+            if found or time.monotonic() >= until:
+                return found
+            time.sleep(LOOK_S)
 
-    def _take(self, sample: zenoh.Sample) -> None:
-        self._queue.put(ForeignSample(str(sample.key_expr), sample.payload.to_bytes()))
+    def _taken(self) -> list[ForeignSample]:
+        """Tokens first: they tell the types of what follows."""
+        found = [_of_token(sample) for sample in self._first]
+        self._first.clear()
+        for channel in self._tokens:
+            found += [_of_token(sample) for sample in _some_of(channel)]
+        for channel in self._samples:
+            found += [_of_sample(sample) for sample in _some_of(channel)]
+        return found
 
-    def _take_token(self, sample: zenoh.Sample) -> None:
-        alive = sample.kind == zenoh.SampleKind.PUT
-        self._queue.put(ForeignSample(str(sample.key_expr), b"", token=True, alive=alive))
+
+def _some_of(channel: Any) -> list[zenoh.Sample]:
+    found: list[zenoh.Sample] = []
+    while len(found) < AT_ONCE and (sample := channel.try_recv()) is not None:
+        found.append(sample)
+    return found
+
+
+def _of_token(sample: zenoh.Sample) -> ForeignSample:
+    alive = sample.kind == zenoh.SampleKind.PUT
+    return ForeignSample(str(sample.key_expr), b"", token=True, alive=alive)
+
+
+def _of_sample(sample: zenoh.Sample) -> ForeignSample:
+    attached = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    return ForeignSample(str(sample.key_expr), sample.payload.to_bytes(), attached)
