@@ -49,12 +49,12 @@ def measured(range_m: float | None, steps: int) -> Rows:
     truth = {each.robot: each for each in streams.streams}
     poses: dict[str, list[tuple[float, float]]] = {robot: [] for robot in truth}
     maps: dict[str, list[tuple[float, float, float]]] = {robot: [] for robot in truth}
-    initial_state: set[str] = set()
+    located: set[str] = set()
     for sample in team.run(peer_world(scenario, streams)):
         channel, robot = ch.channel_of(sample.key) or (None, "")
-        if channel is ch.TEAM_POSE or (channel is ch.OWN_POSE and robot not in initial_state):
+        if channel is ch.TEAM_POSE or (channel is ch.OWN_POSE and robot not in located):
             if channel is ch.TEAM_POSE:
-                initial_state.add(robot)
+                located.add(robot)
             pose = decoded(sample.payload, m.PoseEstimate)
             at = floats(pose.pose, "pose")[:2]
             off = np.hypot(*(at - _true(truth[robot], pose.stamp_ns)))

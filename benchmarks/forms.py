@@ -43,13 +43,13 @@ CLAIMED = {"odometry": "increments", "odometry_claims": True, "odometry_correlat
 CASES = {
     "speeds, ranges": ({}, MOTION, None),
     "increments, ranges": (INCREMENTS, MOTION, None),
-    "increments with covariances, points": (CLAIMED | {"landmarks_told": "points"}, MOTION, None),
+    "increments with covariances, points": (CLAIMED | {"landmark_form": "points"}, MOTION, None),
     "speeds, points with covariances": (
-        {"landmarks_told": "points", "landmark_claims": (0.5, 2.0)}, MOTION, None,
+        {"landmark_form": "points", "landmark_claims": (0.5, 2.0)}, MOTION, None,
     ),
     "speeds, ranges with covariances": ({"landmark_claims": (0.5, 2.0)}, MOTION, None),
     "all claimed, mounted": (
-        CLAIMED | {"landmarks_told": "points", "landmark_claims": (0.5, 2.0)}, MOTION, MOUNT,
+        CLAIMED | {"landmark_form": "points", "landmark_claims": (0.5, 2.0)}, MOTION, MOUNT,
     ),
     "car, mounted": ({"odometry": "steering", "speed_m_s": 2.0}, CAR, MOUNT),
 }  # fmt: skip

@@ -121,7 +121,7 @@ CASES: Mapping[str, Case] = {
         {},
     ),
     "points": Case(
-        _world(landmarks_told="points", landmark_claims=(0.4, 3.0)),
+        _world(landmark_form="points", landmark_claims=(0.4, 3.0)),
         _robot(),
         {"turned by a right angle": _turned, "claims halved": _sensor_factor(0.5)},
     ),

@@ -44,7 +44,7 @@ def drive(count: int) -> list[ros.Message]:
 
 
 def plain_s(bag: Path) -> float:
-    """Seconds of reading and deserialising everything."""
+    """Seconds of measurement and deserialising everything."""
     began = time.perf_counter()
     with AnyReader([bag], default_typestore=types()) as reader:
         for connection, _, data in reader.messages():

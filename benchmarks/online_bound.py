@@ -187,11 +187,11 @@ def _around(angle: float) -> float:
 
 def longest_s(stamps_ns: np.ndarray, far: np.ndarray) -> float:
     """The longest time in a row in which this holds [s]."""
-    longest, initial_state = 0.0, None
+    longest, far_since = 0.0, None
     for stamp_ns, is_far in zip(stamps_ns.tolist(), far.tolist(), strict=True):
-        initial_state = None if not is_far else stamp_ns if initial_state is None else initial_state
-        if initial_state is not None:
-            longest = max(longest, (stamp_ns - initial_state) * 1e-9)
+        far_since = None if not is_far else stamp_ns if far_since is None else far_since
+        if far_since is not None:
+            longest = max(longest, (stamp_ns - far_since) * 1e-9)
     return longest
 
 

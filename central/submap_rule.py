@@ -37,7 +37,7 @@ class SubmapRule(FusionRule):
         self.refused = 0
 
     def _enters(self, submap: m.Submap, sightings: Sequence[m.SightingFactor]) -> None:
-        """A submap is there without a gap, and all sightings from it."""
+        """A submap is there without a gap, and all inter-robot measurements from it."""
 
     def _began(self, start: m.InitialPose) -> None:
         """A stream begins."""
@@ -51,7 +51,9 @@ class SubmapRule(FusionRule):
     # What comes.
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Admit a submap or a sighting; the last sighting of a submap completes it."""
+        """Admit a submap or an inter-robot measurement; the last inter-robot measurement of a
+        submap completes it.
+        """
         match message:
             case m.InitialPose():
                 self.take_start(message)
@@ -88,7 +90,7 @@ class SubmapRule(FusionRule):
         return self._dealt_with(stream, self.members.count(stream))
 
     def take_sighting(self, sighting: m.SightingFactor) -> int:
-        """Admit a sighting; how many submaps of its stream have been dealt with."""
+        """Admit an inter-robot measurement; how many submaps of its stream have been dealt with."""
         stream = (sighting.robot, sighting.incarnation)
         self._judge(sighting, self.members.admit_sighting(sighting))
         self._enter(stream)
@@ -131,14 +133,16 @@ class SubmapRule(FusionRule):
     # What is refused.
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
-        """Nobody need wait for a submap, or a sighting from it, that raised."""
+        """Nobody need wait for a submap, or an inter-robot measurement from it, that raised."""
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
         self._judge(message, why)
         return _credit(message, self.count((message.robot, message.incarnation)), now_ns)
 
     def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
-        """A refused submap, or one with a refused sighting, may never be in the map."""
+        """A refused submap, or one with a refused inter-robot measurement, may never be in the
+        map.
+        """
         if reason is not None:
             self.refused += 1
             self.warnings.append(f"refused: {reason}")

@@ -1,8 +1,8 @@
 """The set of submaps: a union, so duplicates and any order of arrival change nothing.
 
-A submap is complete when the sightings from it, of which it says how many there are, are here too.
-Admission is the ledger's gate: a submap whose measurements overlap another's, or that says
-something else under a name that is taken, is refused with its reason.
+A submap is complete when the inter-robot measurements from it, of which it says how many there are,
+are here too. Admission is the ledger's gate: a submap whose measurements overlap another's, or that
+says something else under a name that is taken, is refused with its reason.
 """
 
 from collections.abc import Mapping
@@ -16,11 +16,12 @@ Stream = tuple[str, int]
 
 @dataclass
 class SubmapSet:
-    """Submaps by stream and sequence, as they came; sightings by stream, sequence, what and when.
+    """Submaps by stream and sequence, as they came; inter-robot measurements by stream, sequence,
+    what and when.
 
-    used: the sighting that each measurement of a stream went into, by (measurement, teammate).
-    chains: of each stream, as far as `chain` has found it; what is in a set stays there, so it only
-    grows.
+    used: the inter-robot measurement that each measurement of a stream went into, by (measurement,
+    teammate). chains: of each stream, as far as `chain` has found it; what is in a set stays there,
+    so it only grows.
     """
 
     streams: dict[Stream, dict[int, Submap]] = field(default_factory=dict)
@@ -63,7 +64,9 @@ class SubmapSet:
         return None
 
     def admit_sighting(self, sighting: SightingFactor) -> str | None:
-        """Take a sighting; the reason if it is refused. Law 1: each look is used once."""
+        """Take an inter-robot measurement; the reason if it is refused. Law 1: each look is used
+        once.
+        """
         stream, teammate = (sighting.robot, sighting.incarnation), sighting.teammate
         from_submap = self.seen.setdefault(stream, {}).setdefault(sighting.sequence, {})
         name = f"a sighting of {teammate} by {sighting.robot}, incarnation {sighting.incarnation}"
@@ -82,7 +85,7 @@ class SubmapSet:
         return None
 
     def sightings(self, submap: Submap) -> list[SightingFactor]:
-        """The sightings from a submap that are here, by stamp and teammate."""
+        """The inter-robot measurements from a submap that are here, by stamp and teammate."""
         stream = self.seen.get((submap.robot, submap.incarnation), {})
         found = stream.get(submap.sequence, {})
         return [found[key] for key in sorted(found)]

@@ -137,7 +137,8 @@ class TickFold:
         self._starts[(start.robot, start.incarnation)] = start
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor] = ()) -> None:
-        """Put a submap in its tick, with the sightings from it, all of which `digest` names.
+        """Put a submap in its tick, with the inter-robot measurements from it, all of which
+        `digest` names.
 
         The fold goes back to before that tick if it was taken.
         """
@@ -176,7 +177,8 @@ class TickFold:
         return max(known) if len(known) == len(ticks) else None
 
     def withdraw(self, robot: str) -> None:
-        """Leave out a robot's submaps, and the sightings by it or of it, now and in future.
+        """Leave out a robot's submaps, and the inter-robot measurements by it or of it, now and in
+        future.
 
         What is left is what there would be had the robot never been; the fold goes back to the
         checkpoint before it first said something, or was first seen, and takes the ticks again.

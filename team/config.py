@@ -223,14 +223,14 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window_s: a window closes with the first odometry interval that ends this long after its start.
     window_m: a window in which the odometry drove less than this goes on, up to standing_s: what a
     robot sees from one place it sees with one error, which is counted once for each window.
-    keyframe_s: sightings within this time are reduced to one per landmark (median, moved with the
-    odometry to the keyframe's end); 0 takes every observation message as a keyframe of its own.
+    keyframe_s: measurements within this time are reduced to one per landmark (median, moved with
+    the odometry to the keyframe's end); 0 takes every observation message as a keyframe of its own.
     node_s: each submap carries the robot's poses at the multiples of this team time that lie in its
-    window, so that sightings of teammates are factors between poses; 0: none, sightings unused.
-    sighting_s: a sighting is used if such a time is no farther from it than this. teammate_speed:
-    how fast a teammate may move in between [m/s].
-    garbage: the share of measurements that may have nothing to do with their landmark; above 0 a
-    window takes only measurements that others of it confirm
+    window, so that inter-robot measurements are factors between poses; 0: none,
+    inter-robot measurements unused. sighting_s: an inter-robot measurement is used if such a time
+    is no farther from it than this. teammate_speed: how fast a teammate may move in between [m/s].
+    outlier_share: the share of measurements that may have nothing to do with their landmark; above
+    0 a window takes only measurements that others of it confirm
     (`team.estimation.hybrid_slam.consensus`). biases: the errors shared by all of the robot's
     windows that the centre estimates; each submap carries its derivative by each of them.
     """
@@ -245,7 +245,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     node_s: NonNegative = 0.0
     sighting_s: NonNegative = 0.5
     teammate_speed: NonNegative = 0.2
-    garbage: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
+    outlier_share: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     biases: tuple[Bias, ...] = ()
     association: Association = Association()
 

@@ -159,7 +159,9 @@ def submap_message(
     sightings: int = 0,
     gated: int = 0,
 ) -> m.Submap:
-    """A local map with the names of its inputs, how many sightings belong to it, what was gated."""
+    """A local map with the names of its inputs, how many inter-robot measurements belong to it,
+    what was gated.
+    """
     return m.Submap(
         stamp_ns=span_ns[1],
         robot=robot,

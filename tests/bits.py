@@ -57,9 +57,11 @@ def pair(estimator: str, fusion: str) -> Scenario:
 
 def outliers() -> Scenario:
     """Three measurements in ten have nothing to do with their landmark; the robots know it."""
-    scenario = world("thesis", garbage=0.3)
+    scenario = world("thesis", outlier_share=0.3)
     robots = tuple(
-        msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, garbage=0.3))
+        msgspec.structs.replace(
+            r, front_end=msgspec.structs.replace(r.front_end, outlier_share=0.3)
+        )
         for r in scenario.robots
     )
     central = msgspec.structs.replace(scenario.central, landmark_submaps=2, robust_c=2.0)

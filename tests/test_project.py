@@ -169,7 +169,7 @@ def test_everything_that_runs_with_us_has_a_permissive_licence() -> None:
 
 
 def test_two_licences_needed_reading_among_what_users_install() -> None:
-    installed = set(closure("teamslam[limit,parquet,studies]"))
+    installed = set(closure("teamslam[batch-reference,parquet,studies]"))
     assert set(REVIEWED) & installed == {"apsw", "eclipse-zenoh"}
     assert set(REVIEWED) <= set(closure("teamslam[dev]"))
 

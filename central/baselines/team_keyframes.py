@@ -101,7 +101,7 @@ class TeamKeyframes:
     """The team's keyframes by (stamp, robot), as far as every robot's stream is known.
 
     So the sequence is a function of the streams alone. A stream that begins anew at an unknown pose
-    ends there; sightings of teammates are not used.
+    ends there; inter-robot measurements are not used.
     """
 
     def __init__(self, robots: Sequence[str]) -> None:

@@ -22,6 +22,7 @@ from sim.scenarios.document import (
     named_document,
     resolved,
 )
+from sim.scenarios.renamed import with_current_names
 from sim.world.config import (
     FolderWorld,
     LiveWorld,
@@ -184,12 +185,12 @@ def dumps(scenario: Scenario) -> str:
 
 
 def loads(text: str) -> Scenario:
-    """A resolved scenario from its JSON; raises ScenarioError."""
+    """A resolved scenario from its JSON, also of a log with former names; raises ScenarioError."""
     try:
         fields = msgspec.json.decode(text, type=dict[str, Any])
     except msgspec.DecodeError as error:
         raise ScenarioError(f"not a resolved scenario in JSON: {error}") from None
-    return _converted(fields)
+    return _converted(with_current_names(fields))
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
@@ -207,10 +208,8 @@ def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
     """So many robots: the first ones as they are, further ones after their pattern in turn."""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
-    spare_time = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
-    further = [
-        robots[i % len(robots)] | {"id": next(spare_time)} for i in range(len(robots), count)
-    ]
+    unused = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
+    further = [robots[i % len(robots)] | {"id": next(unused)} for i in range(len(robots), count)]
     return [*robots[:count], *further]
 
 

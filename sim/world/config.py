@@ -10,7 +10,7 @@ from msgspec import Meta
 from team.config import Fraction, NonNegative, Positive, RobotConfig
 
 Identities = Literal["known", "hidden"]
-GarbageKind = Literal["reading", "identity", "drop"]
+OutlierKind = Literal["measurement", "identity", "drop"]
 Steering = Literal["together", "turn-first"]
 OdometryForm = Literal["speeds", "increments", "steering"]
 LandmarkForm = Literal["ranges", "points"]
@@ -26,32 +26,30 @@ class SimulatedWorld(
     radius_m: the place is a disc about (0, 0) instead: random landmarks and way-points have a
     radius that is uniform up to it and a uniform direction, and robots start at its centre.
     landmarks: their positions, or landmark_count of them at random. layout: how those lie:
-    "uniform"; as "twins", each with another one twin_m beside it; or in "rooms": a grid of
-    rooms × rooms equal squares that all have the same pattern, which no map can tell apart.
-    paths: path i is the way-points of robot i. A robot without one drives to random way-points at
-    up to speed_m_s and turn_rate_rad_s, a way-point being reached within way_point_tolerance_m;
-    way_point_count: to so many of them, and the world ends, before `steps`, when all robots have.
-    steering: "together" turns and drives in one step; "turn-first" drives no step that turns.
-    look_at_start: there is a message of what is seen before the first step, too.
-    visible_from_m, visible_to_m: what lies at a *true* range between them is seen; absent: the
-    limits of the robot's sensor. They are the world's, since a robot that gates its noisy
-    measurements at the same limits selects by the noise, and its map is biased.
-    unknown_starts: the robots whose start pose is not told to the team; "*" is all of them, "!r1"
-    after it all but that one.
-    garbage: the probability of each measurement of a landmark to be spoilt. garbage_kind: "reading"
-    gives it a uniform range and bearing of what can be seen, "identity" the identity of another of
-    the world's landmarks; "drop" leaves out the very measurements that the others spoil, all else
-    being the same: what a run with garbage is compared with.
-    odometry: what it tells: "speeds", "increments" on SE(2) or a car's wheel speed and "steering".
-    odometry_claims: increments come with their covariance, that of the motion model's forward,
-    lateral and turn; the errors of the last two have the correlation odometry_correlation.
-    landmarks_told: as range and bearing, or as "points" in the sensor's frame. landmark_claims:
-    each comes with a covariance of its own, whose standard deviations are factors from the first to
-    the second of these of the sensor's, and with errors of that size.
-    claims_factor: what is claimed is the true covariance divided by this.
-    identities: "hidden" tells detections without them, but of the share `tagged` of landmarks.
-    missed: the probability of a measurement of a landmark to be left out. clutter: with hidden
-    identities, the share of detections that are of nothing at all.
+    "uniform"; as "twins", each with another one twin_m beside it; or in "rooms": a grid of rooms ×
+    rooms equal squares that all have the same pattern, which no map can tell apart. paths: path i
+    is the way-points of robot i. A robot without one drives to random way-points at up to speed_m_s
+    and turn_rate_rad_s, a way-point being reached within way_point_tolerance_m; way_point_count: to
+    so many of them, and the world ends, before `steps`, when all robots have. steering: "together"
+    turns and drives in one step; "turn-first" drives no step that turns. observe_at_start: there is
+    a message of what is seen before the first step, too. visible_from_m, visible_to_m: what lies at
+    a *true* range between them is seen; absent: the limits of the robot's sensor. They are the
+    world's, since a robot that gates its noisy measurements at the same limits selects by the
+    noise, and its map is biased. unknown_starts: the robots whose start pose is not told to the
+    team; "*" is all of them, "!r1" after it all but that one. outlier_share: the probability of
+    each measurement of a landmark to be spoilt. outlier_kind: "measurement" gives it a uniform
+    range and bearing of what can be seen, "identity" the identity of another of the world's
+    landmarks; "drop" leaves out the very measurements that the others spoil, all else being the
+    same: what a run with outliers is compared with. odometry: what it tells: "speeds", "increments"
+    on SE(2) or a car's wheel speed and "steering". odometry_claims: increments come with their
+    covariance, that of the motion model's forward, lateral and turn; the errors of the last two
+    have the correlation odometry_correlation. landmark_form: as range and bearing, or as "points"
+    in the sensor's frame. landmark_claims: each comes with a covariance of its own, whose standard
+    deviations are factors from the first to the second of these of the sensor's, and with errors of
+    that size. claims_factor: what is claimed is the true covariance divided by this. identities:
+    "hidden" tells detections without them, but of the share `tagged` of landmarks. missed: the
+    probability of a measurement of a landmark to be left out. clutter: with hidden identities, the
+    share of detections that are of nothing at all.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -69,16 +67,16 @@ class SimulatedWorld(
     way_point_tolerance_m: Positive = 1.0
     way_point_count: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
     steering: Steering = "together"
-    look_at_start: bool = False
+    observe_at_start: bool = False
     visible_from_m: NonNegative | None = None
     visible_to_m: Positive | None = None
     unknown_starts: tuple[str, ...] = ()
-    garbage: Fraction = 0.0
-    garbage_kind: GarbageKind = "reading"
+    outlier_share: Fraction = 0.0
+    outlier_kind: OutlierKind = "measurement"
     odometry: OdometryForm = "speeds"
     odometry_claims: bool = False
     odometry_correlation: Annotated[float, Meta(gt=-1.0, lt=1.0)] = 0.0
-    landmarks_told: LandmarkForm = "ranges"
+    landmark_form: LandmarkForm = "ranges"
     landmark_claims: tuple[Positive, Positive] | None = None
     claims_factor: Positive = 1.0
     identities: Identities = "known"
@@ -89,8 +87,8 @@ class SimulatedWorld(
     def __post_init__(self) -> None:
         if self.odometry_claims and self.odometry != "increments":
             raise ValueError('odometry_claims: only odometry = "increments" has a covariance')
-        if self.garbage and (self.landmark_claims or self.landmarks_told == "points"):
-            raise ValueError("garbage is of ranges and bearings without covariances of their own")
+        if self.outlier_share and (self.landmark_claims or self.landmark_form == "points"):
+            raise ValueError("outliers are of ranges and bearings without covariances of their own")
         if self.landmarks and self.landmark_count:
             raise ValueError("landmarks and landmark_count exclude each other: leave one away")
         for i, path in enumerate(self.paths):

@@ -1,7 +1,6 @@
-"""Measurements that have nothing to do with what is there: of the simulated world, if it is asked
-to.
+"""Outliers of the simulated world: measurements that have nothing to do with their landmark.
 
-Which measurements are spoilt is drawn for each of them, in the same way for every kind of garbage;
+Which measurements are spoilt is drawn for each of them, in the same way for every kind of outlier;
 so runs of different kinds, and the run in which the same measurements are left out, can be
 compared.
 """
@@ -9,14 +8,14 @@ compared.
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.world.config import GarbageKind
+from sim.world.config import OutlierKind
 from sim.world.streams import Detections
 
 
 def spoilt(
     seen: Detections,
     share: float,
-    kind: GarbageKind,
+    kind: OutlierKind,
     span: tuple[float, float],
     field_of_view: float,
     landmarks: int,
@@ -24,9 +23,9 @@ def spoilt(
 ) -> Detections:
     """The detections with a share of the measurements spoilt, from uniform numbers in [0, 1).
 
-    The first number of a row chooses it. "reading": the other two are the range, uniform in `span`
-    [m], and the bearing, uniform in the field of view. "identity": the second is which other of the
-    landmarks 1 … `landmarks` it is taken for. "drop": it is left out.
+    The first number of a row chooses it. "measurement": the other two are the range, uniform in
+    `span` [m], and the bearing, uniform in the field of view. "identity": the second is which other
+    of the landmarks 1 … `landmarks` it is taken for. "drop": it is left out.
     """
     chosen = uniforms[:, 0] < share
     if kind == "drop":

@@ -241,7 +241,7 @@ def _observations(
     seed: int,
 ) -> Detections:
     """One message a step, perhaps empty."""
-    first = 0 if world.look_at_start else 1
+    first = 0 if world.observe_at_start else 1
     at_ns = stamps_ns[first:]
     seen = _visible(world, robot, drive.poses[first:], landmarks[np.newaxis])
     offsets = np.searchsorted(seen.steps, np.arange(len(at_ns) + 1))
@@ -249,16 +249,16 @@ def _observations(
     if world.landmark_claims is not None:
         return _with_claims(world, robot, seen, (at_ns, offsets, ids), seed)
     ranges, bearings = _read(world, robot.sensor, seen, seed, robot.id, "observations")
-    if world.landmarks_told == "points":
+    if world.landmark_form == "points":
         points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
         return Detections(at_ns, offsets, ids, ranges, bearings, points)
     clean = Detections(at_ns, offsets, ids, ranges, bearings)
-    if not world.garbage:
+    if not world.outlier_share:
         return clean
     return spoilt(
         clean,
-        world.garbage,
-        world.garbage_kind,
+        world.outlier_share,
+        world.outlier_kind,
         _span(world, robot.sensor),
         robot.sensor.field_of_view,
         len(landmarks),
@@ -277,7 +277,7 @@ def _with_claims(
 ) -> Detections:
     """What is seen, each with a covariance of its own and an error of that size."""
     assert world.landmark_claims is not None
-    points = world.landmarks_told == "points"
+    points = world.landmark_form == "points"
     random = generator(seed, robot.id, "claims")
     uniform, normals = (
         random.random((len(seen.steps), 3)),

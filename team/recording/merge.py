@@ -25,9 +25,9 @@ class Merged(NamedTuple):
 def merge(logs: Sequence[Log], out: str | Path) -> Merged:
     """Write every sample of the logs once to a new log `out`, by team time.
 
-    Equal stamps stay in the order of the logs and of each file. Equal key, counter,
-    wall clock and payload is one publication that several recorders took; a robot that was started
-    again announces the same configuration by another. A measurement, a submap and a sighting are
+    Equal stamps stay in the order of the logs and of each file. Equal key, counter, wall clock and
+    payload is one publication that several recorders took; a robot that was started again announces
+    the same configuration by another. A measurement, a submap and an inter-robot measurement are
     what they are by their content: one recorder may have had to ask for what another heard. All
     samples are in memory at once. Raises `LogError` where the logs are of different teams or one is
     damaged, before `out` is made, and `RecorderError` when `out` exists.

@@ -203,7 +203,7 @@ class RobotNode:
 
     def status(self) -> m.Status:
         """What the robot is doing, for people."""
-        measurements, outliers = self._inbox.next_measurement, self.config.front_end.garbage
+        measurements, outliers = self._inbox.next_measurement, self.config.front_end.outlier_share
         nis = self._front.estimator.innovation
         figures = {
             "steps": float(self._steps_before + self._steps),

@@ -21,10 +21,10 @@ def unexpected(nis: Innovation, outliers: float) -> tuple[str, ...]:
     if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
         return ()
     remedy = (
-        f"is front_end.garbage = {outliers:g} too few, or the sensor's noise too small?"
+        f"is front_end.outlier_share = {outliers:g} too few, or the sensor's noise too small?"
         if outliers
         else "outliers, or noise that is larger than the sensor's sigmas? Outliers need "
-        "front_end.garbage (their share), central.robust_c = 2, central.landmark_submaps = 2"
+        "front_end.outlier_share (their share), central.robust_c = 2, central.landmark_submaps = 2"
     )
     return (
         f"measurements lie far from their predictions, NIS {ratio:.0f} per degree of freedom "

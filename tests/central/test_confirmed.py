@@ -1,4 +1,4 @@
-"""A landmark that one submap alone has does not enter the map where that may be garbage."""
+"""A landmark that one submap alone has does not enter the map where that may be an outlier."""
 
 import msgspec
 import numpy as np
@@ -78,7 +78,7 @@ def test_what_two_submaps_agree_on_enters_the_map_with_both() -> None:
 def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
     robust_c: float | None, stands: bool
 ) -> None:
-    """Without a robust loss nobody is doubted: the centre has been told to expect no garbage."""
+    """Without a robust loss nobody is doubted: the centre has been told to expect no outliers."""
     fused = final(rule(set(APART), landmark_submaps=2, robust_c=robust_c))
     assert (FALSE in ids(fused.ids, "ids")) == stands
 

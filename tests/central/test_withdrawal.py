@@ -18,7 +18,7 @@ from central.tick_fold import TickFold
 from central.withdrawal import convicted, disagreement
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, with_options
-from sim.world.config import GarbageKind, SimulatedWorld
+from sim.world.config import OutlierKind, SimulatedWorld
 from sim.world.simulator import simulated
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
@@ -260,24 +260,25 @@ def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong() -> None:
     assert messages(samples, m.Withdrawal) == []
 
 
-def in_garbage(kind: GarbageKind, seed: int) -> Scenario:
+def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
     """The small world with three in ten measurements spoilt, which windows and centre expect."""
     of = scenario(robust_c=2.0, landmark_submaps=2)
     replaced = msgspec.structs.replace
     team = tuple(
-        replaced(r, front_end=replaced(r.front_end, garbage=0.3, particles=40)) for r in of.robots
+        replaced(r, front_end=replaced(r.front_end, outlier_share=0.3, particles=40))
+        for r in of.robots
     )
-    world = replaced(of.world, garbage=0.3, garbage_kind=kind)
+    world = replaced(of.world, outlier_share=0.3, outlier_kind=kind)
     return replaced(of, world=world, robots=team, seed=seed)
 
 
-@pytest.mark.parametrize("kind", ["reading", "identity"])
+@pytest.mark.parametrize("kind", ["measurement", "identity"])
 @pytest.mark.parametrize("seed", [3, 4, 5])
-def test_no_good_robot_is_withdrawn_for_the_garbage_that_it_reads(
-    kind: GarbageKind, seed: int
+def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(
+    kind: OutlierKind, seed: int
 ) -> None:
     """Nor is anybody a suspect; by windows that take every measurement all are (2000 and more)."""
-    of = in_garbage(kind, seed)
+    of = with_outliers(kind, seed)
     samples = tuple(run(of))
     assert final_map(list(samples)).withdrawn == ()
     ticks = of_set(samples, central=of.central)
@@ -287,9 +288,9 @@ def test_no_good_robot_is_withdrawn_for_the_garbage_that_it_reads(
     assert max(found.values()) < 2.0
 
 
-@pytest.mark.parametrize("kind", ["reading", "identity"])
-def test_a_robot_that_is_wrong_is_withdrawn_in_garbage_too(kind: GarbageKind) -> None:
-    assert final_map(run(in_garbage(kind, 3), "odometry")).withdrawn == ("r3",)
+@pytest.mark.parametrize("kind", ["measurement", "identity"])
+def test_a_robot_that_is_wrong_is_withdrawn_with_outliers_too(kind: OutlierKind) -> None:
+    assert final_map(run(with_outliers(kind, 3), "odometry")).withdrawn == ("r3",)
 
 
 def test_a_robot_whose_withdrawal_only_an_operator_may_order_stays() -> None:

@@ -29,7 +29,7 @@ MOTION = MotionModel(
 
 def scenario(estimator: str = "hybrid", fusion: str = "join", **world: object) -> Scenario:
     base = with_options(load("thesis-b"), estimator=estimator, fusion=fusion)
-    forms = {"odometry": "increments", "odometry_claims": True, "landmarks_told": "points",
+    forms = {"odometry": "increments", "odometry_claims": True, "landmark_form": "points",
              "landmark_claims": (0.5, 2.0), "steps": 40} | world  # fmt: skip
     robots = tuple(
         msgspec.structs.replace(

@@ -63,7 +63,7 @@ def fused(ids=(1, 2), at=0.0, *, final=False, exchange=0):
     )
 
 
-garbage = st.one_of(
+noise = st.one_of(
     st.builds(
         prior,
         st.integers(-2, 20),
@@ -85,7 +85,7 @@ garbage = st.one_of(
 
 
 @settings(deadline=None, max_examples=25)
-@given(st.lists(st.tuples(st.integers(0, len(MEASUREMENTS) - 1), garbage), max_size=8))
+@given(st.lists(st.tuples(st.integers(0, len(MEASUREMENTS) - 1), noise), max_size=8))
 def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections):
     node, out = RobotNode(config()), []
     for i, measurement in enumerate(MEASUREMENTS):
@@ -99,7 +99,7 @@ def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections
 
 
 def test_the_prior_does_change_the_team_pose():
-    """The mutant's other half: the garbage above is really used, where it may be."""
+    """The mutant's other half: the noise above is really used, where it may be."""
     poses = []
     for at in (0.0, 3.0):
         node = RobotNode(config())
@@ -481,7 +481,7 @@ def test_measurements_far_from_their_predictions_are_said_with_what_to_configure
     assert status.figures["nis_dof"] > 60
     said = [each for each in status.warnings if "far from their predictions" in each]
     assert len(said) == (share > 0.0), status
-    assert all("front_end.garbage" in each for each in said)
+    assert all("front_end.outlier_share" in each for each in said)
 
 
 @pytest.mark.parametrize("exchange", ["continuous", "rendezvous"])

@@ -29,7 +29,7 @@ _AWAITED = (
     "waiting for ",
     "has not appeared yet",
     "no measurements of this team yet",
-    "no readings of this team yet",
+    "no measurements of this team yet",
 )
 """Nobody is there at once: that is no event."""
 

@@ -121,7 +121,9 @@ class Recorded:
         return found
 
     def sightings(self) -> Mapping[tuple[str, int, int], list[m.SightingFactor]]:
-        """The recorded sightings by (robot, incarnation, sequence) of their submap."""
+        """The recorded inter-robot measurements by (robot, incarnation, sequence) of their
+        submap.
+        """
         found: dict[tuple[str, int, int], list[m.SightingFactor]] = {}
         for sighting in self.of(ch.SIGHTING_FACTOR):
             assert isinstance(sighting, m.SightingFactor)

@@ -247,8 +247,8 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     """What the robot's node does with each measurement of an incarnation that it consumed, in its
     own words.
 
-    Without a centre nothing holds it up. Scans that no odometry covers and sightings whose pose
-    node did not come are known at the end only.
+    Without a centre nothing holds it up. Scans that no odometry covers and inter-robot measurements
+    whose pose node did not come are known at the end only.
     """
     config, digest = log.robot_config(robot)
     node = RecomputedRobot(config, digest, {})

@@ -8,10 +8,10 @@ A measurement (range r, bearing b) of a landmark at distance d from robot k at t
 with the shares w that the sensor calls white. e is a first-order Gauss-Markov process of unit
 variance for each robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ) with the
 sensor's correlation times; so it is in the simulator, and the robots' windows take it as constant.
-The biases are three numbers per robot with the centre's priors. A teammate's sighting is a factor
-between two poses of the same time, as the robots reduce them. A covariance that comes with a
-measurement is white, and all of its noise. GTSAM has no factor for such a
-measurement: it is a Python function of (pose, landmark, e, biases) with its own derivatives.
+The biases are three numbers per robot with the centre's priors. An inter-robot measurement is a
+factor between two poses of the same time, as the robots reduce them. A covariance that comes with a
+measurement is white, and all of its noise. GTSAM has no factor for such a measurement: it is a
+Python function of (pose, landmark, e, biases) with its own derivatives.
 """
 
 import math
@@ -101,8 +101,8 @@ def profile_graph(
 ) -> Any:
     """All factors. The range noise is the sensor's at the range that the joined solution predicts.
 
-    The Cauchy loss of scale c is on √(χ²/2) of each measurement and sighting, as the centre's is on
-    √(χ²/dim) of each submap.
+    The Cauchy loss of scale c is on √(χ²/2) of each measurement and inter-robot measurement, as the
+    centre's is on √(χ²/dim) of each submap.
     """
     graph = path_graph(gtsam, chains, poses)
     loss = None if robust_c is None else math.sqrt(2.0) * robust_c

@@ -106,8 +106,8 @@ def chains_of(
     """The chains of all robots by (robot, incarnation); measurements in the order of their counter,
     once.
 
-    With sightings there is a pose at each time of the team's grid (`front_end.node_s`) too.
-    Raises WireError for a measurement that is not sound.
+    With inter-robot measurements there is a pose at each time of the team's grid
+    (`front_end.node_s`) too. Raises WireError for a measurement that is not sound.
     """
     streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:

@@ -1,16 +1,16 @@
-"""The limit: the batch MAP over all raw measurements of a log, by GTSAM (the extra `limit`).
+"""The batch reference: the MAP over all raw measurements of a log, by GTSAM (extra
+`batch-reference`).
 
 One pose per keyframe of each robot: its sensor's, wherever that is mounted. Factors: the start
 poses; between consecutive poses the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of
 `increment_of`, which is GTSAM's `BetweenFactorPose2` with its logarithm; each accepted range and
 bearing, independent, with the sensor's noise or its own (under a Cauchy loss where the centre's
-`robust_c` asks for a robust join).
-Levenberg-Marquardt starts from the joined solution, so what it finds is never worse than that: from
-three ways to fill the paths between its poses (under the noise `profile` from the best of them).
-Under the noise `white` every measurement's error is its own and sightings of teammates are not
-used; under `profile` the sensor's errors persist as the scenario says, biases are estimated and
-sightings are factors (`errors`). Not modelled: an error of the odometry's scale at speeds that the
-profile has not seen.
+`robust_c` asks for a robust join). Levenberg-Marquardt starts from the joined solution, so what it
+finds is never worse than that: from three ways to fill the paths between its poses (under the noise
+`profile` from the best of them). Under the noise `white` every measurement's error is its own and
+inter-robot measurements are not used; under `profile` the sensor's errors persist as
+the scenario says, biases are estimated and inter-robot measurements are factors (`errors`). Not
+modelled: an error of the odometry's scale at speeds that the profile has not seen.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -208,7 +208,7 @@ def _gtsam() -> Any:
         import gtsam
     except ImportError:
         raise BatchReferenceError(
-            "the batch limit needs GTSAM: python -m pip install 'teamslam[limit]'"
+            "the batch reference needs GTSAM: python -m pip install 'teamslam[batch-reference]'"
         ) from None
     return gtsam
 

@@ -2,7 +2,7 @@
 
 from sim.studies.experiments import (
     accuracy_few,
-    accuracy_garbage,
+    accuracy_outliers,
     accuracy_starts,
     accuracy_utias,
     accuracy_worlds,
@@ -14,7 +14,7 @@ PARTS: tuple[Experiment, ...] = (
     accuracy_worlds,
     accuracy_starts,
     accuracy_few,
-    accuracy_garbage,
+    accuracy_outliers,
     accuracy_utias,
 )
 

@@ -47,7 +47,7 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each world and number of landmarks, with and without sightings of teammates."""
+    """Each world and number of landmarks, with and without inter-robot measurements."""
     return [task for case in _cases(options).values() for task in case]
 
 

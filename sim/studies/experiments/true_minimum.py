@@ -74,7 +74,7 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
 
 
 def final_fold(samples: Iterable[Sample]) -> Fold:
-    """The centre's final fold, from the submaps and sightings that a log has."""
+    """The centre's final fold, from the submaps and inter-robot measurements that a log has."""
     log = Recorded()
     for sample in samples:
         log.take(sample)

@@ -192,7 +192,7 @@ def as_coded(scenario: Scenario) -> Scenario:
         replace(robot, sensor=replace(robot.sensor, bearing_sigma=CODED_BEARING_SIGMA))
         for robot in scenario.robots
     )
-    world = replace(scenario.world, visible_from_m=0.0, look_at_start=True)
+    world = replace(scenario.world, visible_from_m=0.0, observe_at_start=True)
     return with_noise(replace(scenario, robots=robots, world=world), *CODED_NOISE)
 
 

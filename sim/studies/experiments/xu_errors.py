@@ -31,7 +31,7 @@ _READINGS = (
     "so that its particles spread by 2.5 mm and 0.16° a step instead of 5 cm and 3°. Its bearings "
     "have 5.6° instead of 10°, landmarks are seen from any distance below 20 m and from the pose "
     "before the motion, and weights are never set back. The appendix has Hybrid only; EKF-SLAM, "
-    "FastSLAM and ours get the same readings and controls."
+    "FastSLAM and ours get the same measurements and controls."
 )
 _FORGETS = (
     "Hybrid as written sets all particles to their mean after each step and so forgets how pose "
@@ -53,8 +53,8 @@ FIGURE_4_4 = ErrorFigure(
         "the runs stay within them and in their order, as stated every recursive filter is off by "
         "much more. True controls alone (the second reading) do not explain it; the small noise "
         "does.",
-        "As coded ours is no better than the others: that all readings are a step late is in no "
-        "model of noise, and its NEES says so. As stated it is.",
+        "As coded ours is no better than the others: that all measurements are a step late "
+        "is in no model of noise, and its NEES says so. As stated it is.",
         _FORGETS,
     ),
 )
@@ -112,8 +112,8 @@ FIGURE_5_2 = ErrorFigure(
         "The appendix' function that merges two maps multiplies a 2 × 1 by a 2 × 2 matrix from the "
         "wrong side and can not run as printed, so both readings merge by equations 5.1 to 5.4, "
         "with the sign of 5.1 and 5.3 set right.",
-        "The robots of multi-Hybrid absorb the fused map and send it again, so that every reading "
-        "is counted once more at each step: the error of the map may shrink, its covariance loses "
+        "The robots of multi-Hybrid absorb the fused map and send it again, so that every "
+        "measurement is counted once more at each step: the error may shrink, the covariance loses "
         "its meaning, and the poses, whose uncertainty is forgotten, drift.",
     ),
 )

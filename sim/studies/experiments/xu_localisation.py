@@ -217,7 +217,8 @@ def _heard(world: Mapping[str, Any]) -> _Run:
 
 
 def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """Predict over the whole stretch, weigh by one reading, resample; a summary of each cloud."""
+    """Predict over the whole stretch, weigh by one measurement, resample; a summary of each
+    cloud."""
     run = _heard(world)
     sensor = run.scenario.robots[0].sensor
     random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)
@@ -236,12 +237,14 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     true = run.truth[last.stamp_ns]
     # One landmark, the one farthest to the left: as in figure 3.3.
     k = int(np.argmax(last.keyframe.bearings))
-    reading = (
+    measurement = (
         last.keyframe.ids[k : k + 1],
         last.keyframe.ranges[k : k + 1],
         last.keyframe.bearings[k : k + 1],
     )
-    weighed = localisation.filter_step(blind[-1], Increment.identity(), sensor, *reading, random)
+    weighed = localisation.filter_step(
+        blind[-1], Increment.identity(), sensor, *measurement, random
+    )
     cloud, _ = fastslam.resampled(weighed.cloud, random)
     resampled = replace(weighed, cloud=cloud)
     found: Figures = {
@@ -262,14 +265,14 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         found["true"] = true.tolist()
         found["landmarks"] = run.landmarks.tolist()
         found["read"] = {
-            "landmark": run.landmarks[np.searchsorted(run.ids, reading[0][0])].tolist(),
-            "range_m": float(reading[1][0]),
+            "landmark": run.landmarks[np.searchsorted(run.ids, measurement[0][0])].tolist(),
+            "range_m": float(measurement[1][0]),
         }
     return found
 
 
 def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """The filter from a uniform cloud over the place, by the farthest reading of each step."""
+    """The filter from a uniform cloud over the place, by the farthest measurement of each step."""
     run = _heard(world)
     config = run.scenario.robots[0]
     assert isinstance(run.scenario.world, SimulatedWorld)
@@ -348,10 +351,10 @@ def _numbers(runs: list[Figures], name: str) -> Figures:
 def _captions(run: Figures) -> tuple[str, str, str]:
     steps = ", ".join(map(str, run["clouds"]["blind_steps"]))
     return (
-        f"As figure 3.2, prediction: the particles after {steps} steps without a reading, from a "
-        "start that is known exactly at the lower left; grey: the true path.",
-        "As figure 3.3, update: one reading of the landmark in the circle of its range; the darker "
-        "a particle, the higher its weight.",
+        f"As figure 3.2, prediction: the particles after {steps} steps without a measurement, "
+        "from a start that is known exactly at the lower left; grey: the true path.",
+        "As figure 3.3, update: one measurement of the landmark in the circle of its range; the "
+        "darker a particle, the higher its weight.",
         "As figure 3.4, resampling: particles in proportion to their weights, all with the same "
         "weight again.",
     )

@@ -40,7 +40,7 @@ STEPS = 500
 class MapFigure(NamedTuple):
     """Maps of some methods at some steps: one run drawn, and the error over the seeds.
 
-    shown: the methods, each in its reading of the thesis.
+    shown: the methods, each in its measurement of the thesis.
     """
 
     title: str
@@ -249,7 +249,7 @@ FIGURE_5_1 = MapFigure(
     (
         _PRINTED,
         "As written, the ellipses shrink to nothing far from the true landmarks: each exchange "
-        "counts every reading again.",
+        "counts every measurement again.",
     ),
 )
 FIGURE_4_5 = PathFigure(xu_errors.FIGURE_4_5)

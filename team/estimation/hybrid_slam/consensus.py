@@ -1,12 +1,12 @@
-"""Which measurements of one window agree: a landmark is taken when others confirm it, garbage is
-not.
+"""Which measurements of one window agree: a landmark is taken when others confirm it, an outlier
+is not.
 
-A measurement is good with probability 1 − ε and has the sensor's noise, or garbage and uniform over
-what the sensor can read, density u. It is taken if (1 − ε) p(z | the other taken ones, odometry) is
-above ε u; and a landmark is, if all its taken measurements together speak for it with odds of
-EVIDENCE, against garbage and against being another landmark of the window under a wrong name. Only
-measurements of the window itself are asked: a map or an earlier window could lock the robot out of
-what is true, and would use measurements twice.
+A measurement is good with probability 1 − ε and has the sensor's noise, or is an outlier, uniform
+over what the sensor can read, density u. It is taken if (1 − ε) p(z | the other taken ones,
+odometry) is above ε u; and a landmark is, if all its taken measurements together speak for it with
+odds of EVIDENCE, against outliers and against being another landmark of the window under a wrong
+name. Only measurements of the window itself are asked: a map or an earlier window could lock the
+robot out of what is true, and would use measurements twice.
 """
 
 import math
@@ -47,7 +47,7 @@ class _Measurements:
         measurements: Float[np.ndarray, "N 2"],
         own: Own,
         sensor: Sensor,
-        garbage: float,
+        outlier_share: float,
     ) -> None:
         seen, self.keyframes = np.unique(keyframes, return_inverse=True)
         _, self.slots = np.unique(ids, return_inverse=True)
@@ -57,7 +57,7 @@ class _Measurements:
         self.means, self.covariances = _between(motions, seen.tolist())
         reach = min(sensor.max_range, float(measurements[:, 0].max()))
         uniform = 1.0 / (reach * sensor.field_of_view)
-        self.prior = math.log((1.0 - garbage) / garbage)
+        self.prior = math.log((1.0 - outlier_share) / outlier_share)
         self.odds = self.prior - math.log(uniform)
         """Added to log p(z): the log odds that the measurement is good."""
 
@@ -69,17 +69,17 @@ def agreeing(
     measurements: Float[np.ndarray, "N 2"],
     own: Own,
     sensor: Sensor,
-    garbage: float,
+    outlier_share: float,
 ) -> Taken:
     """Measurements that agree with others of their landmark under the odometry alone.
 
     Of a landmark's measurements the one that the others support best places it, and they are taken
     with it. motions[k] leads to keyframe k; measurements are calibrated, own the noises
-    that they claim; 0 < garbage < 1 is ε.
+    that they claim; 0 < outlier_share < 1 is ε.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Measurements(motions, keyframes, ids, measurements, own, sensor, garbage)
+    window = _Measurements(motions, keyframes, ids, measurements, own, sensor, outlier_share)
     return _agreeing(window)[0]
 
 
@@ -90,7 +90,7 @@ def confirmed(
     measurements: Float[np.ndarray, "N 2"],
     own: Own,
     sensor: Sensor,
-    garbage: float,
+    outlier_share: float,
 ) -> Taken:
     """As `agreeing`, then by a smoother over the whole window until no measurement changes sides.
 
@@ -101,7 +101,7 @@ def confirmed(
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
-    window = _Measurements(motions, keyframes, ids, measurements, own, sensor, garbage)
+    window = _Measurements(motions, keyframes, ids, measurements, own, sensor, outlier_share)
     agreed, placed_by = _agreeing(window)
     taken = agreed
     path = np.zeros((len(window.means), 3))

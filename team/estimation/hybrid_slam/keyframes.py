@@ -203,7 +203,7 @@ class Segmenter:
         return len(self._waiting)
 
     def _nodes(self, until_ns: int, over: Interval) -> list[Keyframe]:
-        """The grid times up to until_ns; sightings up to there find their node."""
+        """The grid times up to until_ns; inter-robot measurements up to there find their node."""
         keyframes = []
         grid = self._grid
         while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:

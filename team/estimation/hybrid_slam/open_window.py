@@ -40,7 +40,7 @@ class OpenWindow:
     def __init__(self, config: RobotConfig, incarnation: int, sequence: int) -> None:
         self._config = config
         self._key = incarnation, sequence
-        self._gate = OutlierGate(config.sensor, config.front_end.garbage)
+        self._gate = OutlierGate(config.sensor, config.front_end.outlier_share)
         self._solvable = True
         self.motion = Increment.identity()
         self.last_keyframe_ns: int | None = None

@@ -20,16 +20,16 @@ class OutlierGate:
     is only confirmed by a later one.
     """
 
-    def __init__(self, sensor: Sensor, garbage: float) -> None:
+    def __init__(self, sensor: Sensor, outlier_share: float) -> None:
         self._sensor = sensor
-        self._garbage = garbage
+        self._outlier_share = outlier_share
         self._keyframes: list[Keyframe] = []
         self.gated = 0
 
     @property
     def judges(self) -> bool:
         """Whether there may be outliers; else all measurements pass."""
-        return self._garbage > 0.0
+        return self._outlier_share > 0.0
 
     def begin(self) -> None:
         """A window begins."""
@@ -43,14 +43,14 @@ class OutlierGate:
         self._keyframes.append(keyframe)
         if not len(keyframe.ids):
             return keyframe
-        taken = agreeing(*self._all(), self._sensor, self._garbage)
+        taken = agreeing(*self._all(), self._sensor, self._outlier_share)
         return keyframe.only(taken[-len(keyframe.ids) :])
 
     def settled(self) -> Sequence[Keyframe]:
         """All keyframes of the window with the measurements that are confirmed; counts the
         others.
         """
-        taken = confirmed(*self._all(), self._sensor, self._garbage)
+        taken = confirmed(*self._all(), self._sensor, self._outlier_share)
         self.gated = int(np.count_nonzero(~taken))
         bounds = np.cumsum([0, *(len(keyframe.ids) for keyframe in self._keyframes)])
         return [

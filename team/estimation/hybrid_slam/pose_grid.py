@@ -1,9 +1,10 @@
-"""The team's grid of times at which every robot has a pose node, and the sightings at these nodes.
+"""The team's grid of times at which every robot has a pose node, and the inter-robot measurements
+at these nodes.
 
 A robot does not know when it is seen, so all robots put nodes at the same times: the multiples of
-node_s. A sighting belongs to the grid time nearest to it, if that lies in the open window and not
-too far away. The observer's odometry carries it there; the sightings of one teammate at one node
-become one measurement.
+node_s. An inter-robot measurement belongs to the grid time nearest to it, if that lies in the open
+window and not too far away. The observer's odometry carries it there; the inter-robot measurements
+of one teammate at one node become one measurement.
 """
 
 from dataclasses import dataclass, replace
@@ -54,7 +55,8 @@ class _Look:
 
 
 class PoseGrid:
-    """The grid times and the sightings of the open window; the segmenter tells it of the motion.
+    """The grid times and the inter-robot measurements of the open window; the segmenter tells it of
+    the motion.
 
     since_node: the motion since the last pose node.
     """
@@ -84,7 +86,9 @@ class PoseGrid:
             self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
 
     def observe(self, stamp_ns: int, counter: int, looks: Looks) -> Rejection | None:
-        """Keep sightings until the odometry covers their time; the reason if all are rejected."""
+        """Keep inter-robot measurements until the odometry covers their time; the reason if all are
+        rejected.
+        """
         teammates, ranges, bearings = looks
         node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
         away_ns = abs(stamp_ns - node_ns)
@@ -105,7 +109,9 @@ class PoseGrid:
 
     @property
     def next_ns(self) -> int | None:
-        """Team time of the next node or sighting, whichever comes first; None: nothing is left."""
+        """Team time of the next node or inter-robot measurement, whichever comes first; None:
+        nothing is left.
+        """
         times = [look.stamp_ns for look in self._uncovered[:1]]
         if self._node_ns <= self._last_ns:
             times.append(self._node_ns)

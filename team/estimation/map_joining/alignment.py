@@ -179,8 +179,8 @@ def refusal(shared: Shared, alignment: Alignment | None, heading_sigma: float) -
 def disagreement(shared: Shared, chi2: float, confidence: float) -> str | None:
     """Why two maps that share these points are not of one place, or None.
 
-    chi2: the rise of the joint cost when their landmarks are made one and the sightings taken; χ²
-    of 2 per point less the 3 of the motion for maps that agree.
+    chi2: the rise of the joint cost when their landmarks are made one and the inter-robot
+    measurements taken; χ² of 2 per point less the 3 of the motion for maps that agree.
     """
     limit = float(chdtri(2 * sum(shared) - 3, 1.0 - confidence))
     if chi2 > limit:

@@ -1,9 +1,9 @@
 """The solution of a submap graph: Gauss-Newton, shortened or damped where the cost would rise.
 
-Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(sighting) + Σ ‖start − prior‖² + Σ ρ(bias − prior), where ρ is the
-identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A robust factor enters
-with a wide scale that narrows with each iteration it has lived through, so a true loop closure is
-not taken for an outlier before the chain has bent.
+Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖start − prior‖² + Σ ρ(bias − prior),
+where ρ is the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A
+robust factor enters with a wide scale that narrows with each iteration it has lived through, so a
+true loop closure is not taken for an outlier before the chain has bent.
 
 With a robust loss each landmark of a submap has a weight of its own besides, so that a landmark
 that was mistaken for another does not break the robot's chain: beyond the gate g its χ² counts
@@ -90,8 +90,8 @@ UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
 class Island(least_squares.Point):
     """One frame: its graph, the state (poses and landmarks by node) and the factors' ages.
 
-    age, sighting_age: iterations that each submap and each sighting has lived through; the robust
-    scale follows from it.
+    age, sighting_age: iterations that each submap and each inter-robot measurement has lived
+    through; the robust scale follows from it.
     """
 
     graph: Graph
@@ -107,7 +107,7 @@ class Island(least_squares.Point):
 
     @property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
-        """The robust scale c of each sighting at its age."""
+        """The robust scale c of each inter-robot measurement at its age."""
         return self._scale_at(self.sighting_age)
 
     def _scale_at(self, age: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
@@ -196,7 +196,7 @@ class Island(least_squares.Point):
 
     @property
     def sighting_weight(self) -> Float[np.ndarray, " S"]:
-        """Robust weight of each sighting, 1 without a robust loss."""
+        """Robust weight of each inter-robot measurement, 1 without a robust loss."""
         return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * self.sighting_scale**2))
 
     @cached_property

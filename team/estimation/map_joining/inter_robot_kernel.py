@@ -24,10 +24,11 @@ Values = Float[np.ndarray, " _"]
 
 
 class Sightings(NamedTuple):
-    """All sightings of a graph in flat arrays, in the order in which they were taken.
+    """All inter-robot measurements of a graph in flat arrays, in the order in which they were
+    taken.
 
-    nodes: observer's and teammate's pose node. first_pair: where the sightings' pairs of members
-    begin in the pattern's entries; each has 2 × 2.
+    nodes: observer's and teammate's pose node. first_pair: where the inter-robot measurements'
+    pairs of members begin in the pattern's entries; each has 2 × 2.
     """
 
     nodes: Int64[np.ndarray, "S 2"]

@@ -1,8 +1,8 @@
 """What ties two islands: points that are known in the frames of both.
 
 A shared landmark is such a point. So is a teammate that is seen from a pose node: in the observer's
-island it lies at pose ∘ (range, bearing), in its own at its pose node. One sighting and its reverse
-are two points.
+island it lies at pose ∘ (range, bearing), in its own at its pose node. One inter-robot measurement
+and its reverse are two points.
 """
 
 import math
@@ -40,7 +40,7 @@ class Tie(NamedTuple):
 
 
 def ties(main: Graph, other: Graph, sightings: Sequence[Sighting]) -> list[Tie]:
-    """Shared landmarks by id, then the sightings across in their order."""
+    """Shared landmarks by id, then the inter-robot measurements across in their order."""
     shared = sorted(main.landmarks.keys() & other.landmarks.keys())
     found = [Tie(main.landmarks[id_], other.landmarks[id_]) for id_ in shared]
     for each in sightings:

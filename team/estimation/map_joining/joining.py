@@ -1,10 +1,11 @@
 """The team's map as a fold over its submaps in their canonical order.
 
 Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over all submaps of
-all robots, and over the sightings of teammates between their pose nodes. The fold takes the submaps
-by ticks, each with the sightings from it; it is a pure function of their order and of the ticks'
-boundaries. Streams whose start in the common frame is unknown are islands of their own until shared
-landmarks and sightings tie them to the main island.
+all robots, and over the inter-robot measurements between their pose nodes. The fold
+takes the submaps by ticks, each with the inter-robot measurements from it; it is a pure function of
+their order and of the ticks' boundaries. Streams whose start in the common frame is unknown are
+islands of their own until shared landmarks and inter-robot measurements tie them to the main
+island.
 """
 
 import math
@@ -132,12 +133,12 @@ class Audit:
 class Fold:
     """What the submaps taken so far say.
 
-    home:       island (a key of `islands`) of each stream.
-    reasons:    why an island other than the main one is not merged, by its frame.
-    joined:     how an island was merged into another one and how sure that is, by its old frame.
-    warnings:   of the full solution, what speaks for another minimum, in words.
-    waiting:    sightings whose pose nodes are not both in one island, in canonical order.
-    judged, looked: number of submaps of two islands at their last failed merge attempt, with the
+    home:       island (a key of `islands`) of each stream. reasons:    why an island other than the
+    main one is not merged, by its frame. joined:     how an island was merged into another one and
+    how sure that is, by its old frame. warnings:   of the full solution, what speaks for another
+    minimum, in words. waiting:    inter-robot measurements whose pose nodes are not both in one
+    island, in canonical order. judged, looked: number of submaps of two islands at their last
+    failed merge attempt, with the
                 reason for the failure; of one island at its last failed search for a minimum.
     iterations, change: of the main island's last full solution: how many, the last step [m, rad].
     refused:    submaps that came and are not in the map, in canonical order, and why (`taken`).

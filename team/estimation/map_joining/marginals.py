@@ -72,10 +72,10 @@ class BiasEstimate(NamedTuple):
 class Agreement(NamedTuple):
     """Joint cost Σ w χ² and its degrees of freedom, in all, per robot and per submap.
 
-    A sighting counts with its observer, a discounted landmark as far as it is believed. Without a
-    robust loss the joint dof is the sum of the submaps' dimensions (and of the sightings' and the
-    priors') less the number of unknowns. A lasting chi2/dof above 1.1 is a warning, above 1.3 the
-    covariances are not to be trusted.
+    An inter-robot measurement counts with its observer, a discounted landmark as far as it is
+    believed. Without a robust loss the joint dof is the sum of the submaps' dimensions (and of the
+    inter-robot measurements' and the priors') less the number of unknowns. A lasting chi2/dof above
+    1.1 is a warning, above 1.3 the covariances are not to be trusted.
     """
 
     chi2: float

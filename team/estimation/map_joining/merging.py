@@ -1,9 +1,10 @@
 """Two islands become one when the points that both know leave one likely place for the other.
 
 A merge is tried from every place that the tied points propose: all of them, the landmarks alone,
-the sightings alone, and every heading at which the points fit well. Each is solved in full, and so
-is a start that owes nothing to any of them (`minima`). The lowest cost is taken if the two maps do
-not disagree there and no other place is about as likely; else the merge waits and says why.
+the inter-robot measurements alone, and every heading at which the points fit well. Each is solved
+in full, and so is a start that owes nothing to any of them (`minima`). The lowest cost is taken if
+the two maps do not disagree there and no other place is about as likely; else the merge waits and
+says why.
 """
 
 from collections.abc import Sequence
@@ -28,7 +29,9 @@ WORTH_TELLING = 1.0
 
 
 class Merge(NamedTuple):
-    """The islands as one, the sightings that still wait, and how sure it is, in words."""
+    """The islands as one, the inter-robot measurements that still wait, and how sure it is, in
+    words.
+    """
 
     best: Minimum
     waiting: tuple[Sighting, ...]
@@ -48,7 +51,9 @@ def ages(count: int) -> Int64[np.ndarray, " count"]:
 
 
 def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[Sighting, ...]]:
-    """The island with the sightings that it has both pose nodes of, and those that still wait."""
+    """The island with the inter-robot measurements that it has both pose nodes of, and those that
+    still wait.
+    """
     candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
     found = [between for _, between in candidates if between is not None]
     if not found:

@@ -106,8 +106,8 @@ def searched(starts: Sequence[Island]) -> Search:
     """The lowest minimum from some starts of one graph, and from the relaxation of its headings.
 
     The first start is the one that would be taken without a search. While the lowest cost is
-    suspicious, and always with few landmarks, starts that leave the sightings out or doubt every
-    factor are tried as well. A start that leads to no solution is left out; raises
+    suspicious, and always with few landmarks, starts that leave the inter-robot measurements out or
+    doubt every factor are tried as well. A start that leads to no solution is left out; raises
     NotDeterminedError where none leads to one.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
@@ -211,7 +211,7 @@ def _further(island: Island) -> Iterator[Island]:
             island, graph=replace(graph, sightings=()), sighting_age=island.sighting_age[:0]
         )
         alone = relaxed(unseen.graph, island.state)
-        if alone is not None:  # none, where only sightings tie the robots
+        if alone is not None:  # none, where only inter-robot measurements tie the robots
             for found in _minima([replace(unseen, state=alone)]):
                 yield replace(island, state=found.island.state)
     if guess is not None and island.settings.robust_c is None:

@@ -84,7 +84,9 @@ def _least_squares(
 
 
 def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
-    """What submaps, sightings and priors say; `at`: first of the numbers of each node."""
+    """What submaps, inter-robot measurements and priors say; `at`: first of the numbers of each
+    node.
+    """
     for contribution, nodes, _ in graph.submaps:
         local, start = contribution.local, int(at[nodes[0]])
         variances = np.diag(local.covariance)

@@ -1,4 +1,5 @@
-"""The factor graph of one frame: poses and landmarks, submaps and sightings, priors on starts.
+"""The factor graph of one frame: poses and landmarks, submaps and inter-robot measurements, priors
+on starts.
 
 A `Graph` is the structure; it stays while the state moves. Every function returns new values. The
 value of a node that is added is found by composition from the nodes that are there.
@@ -93,7 +94,9 @@ def _scaling(error: CommonError) -> Bias:
 
 
 class Encounter(NamedTuple):
-    """A sighting in the graph, between the pose nodes of the observer and of the teammate."""
+    """An inter-robot measurement in the graph, between the pose nodes of the observer and of the
+    teammate.
+    """
 
     sighting: Sighting
     observer: int
@@ -157,7 +160,9 @@ class Graph:
 
     @cached_property
     def sighting_factors(self) -> Sightings:
-        """The sightings in flat arrays, for the kernels; their entries follow the submaps'."""
+        """The inter-robot measurements in flat arrays, for the kernels; their entries follow the
+        submaps'.
+        """
         return Sightings(
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
             np.array([each.sighting.measurement for each in self.sightings]).reshape(-1, 2),
@@ -440,7 +445,9 @@ def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
 
 
 def encounter_of(graph: Graph, sighting: Sighting) -> Encounter | None:
-    """The sighting between its pose nodes; None while one of them is not in the graph."""
+    """The inter-robot measurement between its pose nodes; None while one of them is not in the
+    graph.
+    """
     observer = graph.poses.get((sighting.stream, sighting.stamp_ns))
     teammate = pose_node(graph, sighting.teammate, sighting.stamp_ns)
     return None if observer is None or teammate is None else Encounter(sighting, observer, teammate)

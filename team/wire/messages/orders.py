@@ -10,7 +10,8 @@ from team.wire.messages.base import Count, Message, Name, Text
 
 class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
     """The team goes on without a robot: the map is that of the set without its submaps, and without
-    the sightings by it or of it. A member of the set like a submap: there is no way back.
+    the inter-robot measurements by it or of it. A member of the set like a submap: there is no way
+    back.
 
     by: who ordered it, "operator" or "central". reason: in words.
     """

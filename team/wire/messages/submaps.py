@@ -117,9 +117,9 @@ class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"
     """A teammate seen from a pose node of submap (robot, incarnation, sequence); stamp_ns is the
     node's.
 
-    range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed
-    2 × 2 (range, bearing). measurements: the counters of the sightings that went into it,
-    ascending; with the submap's odometry and configuration they are its inputs.
+    range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed 2
+    × 2 (range, bearing). measurements: the counters of the inter-robot measurements that went into
+    it, ascending; with the submap's odometry and configuration they are its inputs.
     """
 
     robot: Name

@@ -34,7 +34,7 @@ def team_run(world, fusion, estimator, steps):
 
 @pytest.mark.parametrize(("world", "steps"), [("thesis", 150), ("thesis-b", 150)])
 def test_it_is_the_batch_map_of_gtsam_on_the_same_measurements(world, steps):
-    pytest.importorskip("gtsam", reason="pip install '.[limit]'")
+    pytest.importorskip("gtsam", reason="pip install '.[batch-reference]'")
     limit = batch_map(team_run(world, "join", "hybrid", steps))
     samples = team_run(world, "batch", "dead-reckoning", steps)
     (final,) = messages(samples, ch.FINAL_MAP)

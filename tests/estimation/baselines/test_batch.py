@@ -269,7 +269,7 @@ def test_too_few_iterations_are_told_by_the_decrement():
 
 
 @pytest.mark.parametrize("robust", [True, False], ids=["Cauchy", "mutant: plain squares"])
-def test_a_robust_batch_leaves_garbage_out(robust):
+def test_a_robust_batch_leaves_outliers_out(robust):
     rounds, _ = team_run(11, steps=12)
     turns = turns_of(rounds)
     victim = turns[9]

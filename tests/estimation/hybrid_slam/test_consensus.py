@@ -1,4 +1,4 @@
-"""Which measurements of a window are taken: what agrees stays, garbage goes, nobody else is
+"""Which measurements of a window are taken: what agrees stays, outliers go, nobody else is
 asked.
 """
 
@@ -36,9 +36,9 @@ class Drive:
     ids: np.ndarray
     measurements: np.ndarray
 
-    def judged(self, by=confirmed, garbage: float = 0.3, own=None) -> np.ndarray:
+    def judged(self, by=confirmed, outlier_share: float = 0.3, own=None) -> np.ndarray:
         seen = self.ids, self.measurements, unclaimed(len(self.ids)) if own is None else own
-        return by(self.motions, self.keyframes, *seen, SENSOR, garbage)
+        return by(self.motions, self.keyframes, *seen, SENSOR, outlier_share)
 
 
 def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
@@ -208,14 +208,14 @@ def test_of_a_landmarks_only_measurement_the_others_say_nothing():
     assert logs[0] < logs[1:].min() - 1.0 or logs[0] == -np.inf
 
 
-def world_of(name: str, kind: str, garbage: float) -> WorldStreams:
+def world_of(name: str, kind: str, outlier_share: float) -> WorldStreams:
     scenario = load(name)
-    world = msgspec.structs.replace(scenario.world, garbage=garbage, garbage_kind=kind)
+    world = msgspec.structs.replace(scenario.world, outlier_share=outlier_share, outlier_kind=kind)
     return streams_of(msgspec.structs.replace(scenario, world=world))
 
 
 def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
-    """The shares of good measurements that are kept and of garbage that passes, in windows of 12
+    """The shares of good measurements that are kept and of outliers that pass, in windows of 12
     s.
     """
     robots = load(name).robots
@@ -244,13 +244,13 @@ def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("name", "kind", "least_kept", "most_passed"),
     [
-        ("thesis", "reading", 0.94, 0.14),
+        ("thesis", "measurement", 0.94, 0.14),
         ("thesis", "identity", 0.94, 0.04),
-        ("thesis-b", "reading", 0.97, 0.02),
+        ("thesis-b", "measurement", 0.97, 0.02),
         ("thesis-b", "identity", 0.97, 0.02),
     ],
 )
-def test_of_three_tenths_garbage_little_passes_and_good_measurements_are_kept(
+def test_of_three_tenths_outliers_few_pass_and_good_measurements_are_kept(
     name: str, kind: str, least_kept: float, most_passed: float
 ) -> None:
     kept, passed = rates(name, kind)
@@ -265,7 +265,7 @@ def test_names_alone_are_not_enough_against_wrong_names(monkeypatch: pytest.Monk
 
 
 def test_the_smoother_finds_what_the_odometry_alone_lets_pass() -> None:
-    assert rates("thesis-b", "reading", agreeing)[1] > 2.0 * rates("thesis-b", "reading")[1]
+    assert rates("thesis-b", "measurement", agreeing)[1] > 2.0 * rates("thesis-b", "measurement")[1]
 
 
 @pytest.mark.parametrize("exactly", [False, True])

@@ -1,4 +1,4 @@
-"""A robot whose measurements are in part garbage: its submaps do without it, and it says how
+"""A robot whose measurements are in part outliers: its submaps do without it, and it says how
 much.
 """
 
@@ -20,10 +20,10 @@ from team.wire.arrays import ids
 from tests.teams import config, driven, published, stream
 
 
-def robot(garbage: float) -> RobotConfig:
+def robot(outlier_share: float) -> RobotConfig:
     """The small robot with a gate; windows of five steps."""
     plain = config()
-    front_end = msgspec.structs.replace(plain.front_end, garbage=garbage, window_s=5.0)
+    front_end = msgspec.structs.replace(plain.front_end, outlier_share=outlier_share, window_s=5.0)
     return msgspec.structs.replace(plain, front_end=front_end)
 
 
@@ -41,7 +41,7 @@ def submaps(of: RobotConfig, measurements: list[m.Measurement]) -> list[m.Submap
     return [each.message for each in sent if isinstance(each.message, m.Submap)]
 
 
-def test_a_submap_is_as_if_the_garbage_had_never_been_read() -> None:
+def test_a_submap_is_as_if_the_outliers_had_never_been_measured() -> None:
     clean = stream("r1", 20)
     seen = clean.landmark_detections
     rows = np.arange(len(seen.ids)) % 5 == 2
@@ -62,7 +62,7 @@ def test_a_submap_is_as_if_the_garbage_had_never_been_read() -> None:
 
 def test_of_clean_measurements_only_lone_ones_are_gated_and_the_rest_is_as_without_a_gate() -> None:
     measurements = published(stream("r1", 20))
-    gated, plain = (submaps(robot(garbage), measurements) for garbage in (0.05, 0.0))
+    gated, plain = (submaps(robot(outlier_share), measurements) for outlier_share in (0.05, 0.0))
     assert sum(s.gated for s in plain) == 0
     for one, other in zip(gated, plain, strict=True):
         if not one.gated:
@@ -93,15 +93,17 @@ def test_the_status_tells_how_many_measurements_were_gated() -> None:
 
 
 def world_with(kind: str, gate: float, steps: int = 200) -> Scenario:
-    """The thesis' world B in longer steps, three in ten measurements garbage, robust at the
+    """The thesis' world B in longer steps, three in ten measurements outliers, robust at the
     centre.
     """
     scenario = load("thesis-b")
-    world = msgspec.structs.replace(scenario.world, steps=steps, garbage=0.3, garbage_kind=kind)
+    world = msgspec.structs.replace(
+        scenario.world, steps=steps, outlier_share=0.3, outlier_kind=kind
+    )
     robots = tuple(
         msgspec.structs.replace(
             each,
-            front_end=msgspec.structs.replace(each.front_end, garbage=gate, particles=60),
+            front_end=msgspec.structs.replace(each.front_end, outlier_share=gate, particles=60),
             pose_s=1000.0,
         )
         for each in scenario.robots
@@ -124,12 +126,12 @@ def clean_rmse() -> float:
     return aligned_rmse(world_with("drop", 0.0))
 
 
-@pytest.mark.parametrize("kind", ["reading", "identity"])
-def test_with_garbage_the_map_is_nearly_that_of_the_good_measurements(
+@pytest.mark.parametrize("kind", ["measurement", "identity"])
+def test_with_outliers_the_map_is_nearly_that_of_the_good_measurements(
     kind: str, clean_rmse: float
 ) -> None:
     assert aligned_rmse(world_with(kind, 0.3)) < 1.3 * clean_rmse
 
 
-def test_without_a_gate_garbage_ruins_the_map(clean_rmse: float) -> None:
-    assert aligned_rmse(world_with("reading", 0.0, 80)) > 3.0 * clean_rmse
+def test_without_a_gate_outliers_ruin_the_map(clean_rmse: float) -> None:
+    assert aligned_rmse(world_with("measurement", 0.0, 80)) > 3.0 * clean_rmse

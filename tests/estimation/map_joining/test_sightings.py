@@ -170,7 +170,7 @@ def test_the_fold_without_a_robot_does_not_know_that_it_was_seen():
         assert one.tobytes() == other.tobytes()
 
 
-def test_one_sighting_that_is_garbage_does_not_bend_the_robust_map():
+def test_one_outlier_among_sightings_does_not_bend_the_robust_map():
     world = meeting(8, robots=3)
     options = JoinSettings(robust_c=1.0)
     wrong = replace(world.sightings[4], measurement=np.array([25.0, 2.0]))

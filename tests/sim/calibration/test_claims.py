@@ -41,7 +41,7 @@ def seen(assumed: tuple[float, float, float] = MOUNT, **changes: object) -> list
 
 @pytest.mark.parametrize("told", ["ranges", "points"])
 def test_the_factors_of_what_is_claimed_are_learnt(told: str) -> None:
-    data = seen(landmarks_told=told)
+    data = seen(landmark_form=told)
     assert odometry_factor(data)["covariance_factor"] == pytest.approx(4.0, rel=0.25)
     found = landmark_factor(data, ROBOTS[0].sensor)["covariance_factor"]
     assert found == pytest.approx(4.0, rel=0.1)

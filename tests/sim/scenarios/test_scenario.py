@@ -5,6 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from sim.scenarios import renamed
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import (
     builtin_names,
@@ -246,7 +247,7 @@ UTIAS = 'world = { kind = "utias" }\n'
             SMALL + "[defaults.motion]\nalphas = [0.1, 0.2]",
             "expected array of length 6, got 2 at defaults.motion.alphas",
         ),
-        (SMALL + "garbage_kind = 'rubbish'", 'expected one of "reading", "identity", "drop"'),
+        (SMALL + "outlier_kind = 'rubbish'", 'expected one of "measurement", "identity", "drop"'),
         (UTIAS + "[[robots]]\nid = 'alice'", "the robot alice: in a UTIAS world robots are r1, r2"),
         ("world = { kind = 'utias', start_sigma_m = 1 }", "are both 0 or both above 0"),
         (
@@ -319,3 +320,15 @@ def test_hidden_identities_take_thresholds_in_the_lengths_of_the_sensor() -> Non
     assert with_options(load("thesis"), seed=2).central.association == AssociationProfile()
     given = with_options(load("victoria"), identities="hidden").central.association
     assert given == load("victoria").central.association
+
+
+def test_a_scenario_of_a_log_with_former_names_is_read_with_todays() -> None:
+    outliers = {"outlier_share": 0.3, "outlier_kind": "measurement"}
+    world = msgspec.structs.replace(load("thesis").world, **outliers)
+    today = msgspec.structs.replace(load("thesis"), world=world)
+    former = dumps(today)
+    for name, now in renamed.FIELDS.items():
+        former = former.replace(f'"{now}":', f'"{name}":')
+    former = former.replace('"garbage_kind":"measurement"', '"garbage_kind":"reading"')
+    assert former.count("garbage") == 2 + len(today.robots)
+    assert loads(former) == today

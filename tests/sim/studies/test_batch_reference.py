@@ -164,5 +164,5 @@ def test_a_run_that_did_not_end_has_no_limit() -> None:
 
 def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(BatchReferenceError, match=r"teamslam\[limit\]"):
+    with pytest.raises(BatchReferenceError, match=r"teamslam\[batch-reference\]"):
         batch_map([])

@@ -91,7 +91,7 @@ def test_the_coded_inputs_are_the_appendix_numbers() -> None:
 
 
 def test_late_measurements_are_those_of_the_step_before() -> None:
-    streams = streams_of(scenario(steps=30, look_at_start=True))
+    streams = streams_of(scenario(steps=30, observe_at_start=True))
     now, late = (s.streams[0].landmark_detections for s in (streams, a_step_late(streams)))
     np.testing.assert_array_equal(late.stamps_ns, now.stamps_ns[1:])
     for k in range(len(late.stamps_ns)):

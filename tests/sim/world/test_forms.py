@@ -70,8 +70,8 @@ def test_measurements_err_by_the_covariances_that_come_with_them(points: bool) -
 def test_forms_that_do_not_fit_are_named() -> None:
     with pytest.raises(ValueError, match="odometry_claims"):
         msgspec.structs.replace(WORLD, odometry_claims=True)
-    with pytest.raises(ValueError, match="garbage"):
-        msgspec.structs.replace(WORLD, landmarks_told="points", garbage=0.1)
+    with pytest.raises(ValueError, match="outliers"):
+        msgspec.structs.replace(WORLD, landmark_form="points", outlier_share=0.1)
     steered = msgspec.structs.replace(WORLD, odometry="steering")
     with pytest.raises(ValueError, match="r1 needs motion"):
         simulated(steered, [RobotConfig("r1")], 1)

@@ -1,4 +1,4 @@
-"""Garbage of the simulated world: as much as asked, of its kind, and nothing else is touched."""
+"""Outliers of the simulated world: as many as asked, of its kind, and nothing else is touched."""
 
 import msgspec
 import numpy as np
@@ -11,15 +11,15 @@ from sim.world.streams import WorldStreams
 from tests.sim.world.test_simulator import content, true_detections
 
 
-def world_with(garbage: float, kind: str, name: str = "thesis-b") -> WorldStreams:
+def world_with(outlier_share: float, kind: str, name: str = "thesis-b") -> WorldStreams:
     scenario = load(name)
-    world = msgspec.structs.replace(scenario.world, garbage=garbage, garbage_kind=kind)
+    world = msgspec.structs.replace(scenario.world, outlier_share=outlier_share, outlier_kind=kind)
     return streams_of(msgspec.structs.replace(scenario, world=world))
 
 
 @pytest.fixture(scope="module")
 def clean() -> WorldStreams:
-    return world_with(0.0, "reading")
+    return world_with(0.0, "measurement")
 
 
 def joined(world: WorldStreams, field: str) -> np.ndarray:
@@ -29,7 +29,7 @@ def joined(world: WorldStreams, field: str) -> np.ndarray:
 def test_three_in_ten_measurements_are_spoilt_the_same_ones_for_every_kind(
     clean: WorldStreams,
 ) -> None:
-    spoilt = world_with(0.3, "reading")
+    spoilt = world_with(0.3, "measurement")
     other = world_with(0.3, "identity")
     dropped = world_with(0.3, "drop")
     bad = joined(spoilt, "ranges") != joined(clean, "ranges")
@@ -43,7 +43,7 @@ def test_three_in_ten_measurements_are_spoilt_the_same_ones_for_every_kind(
 
 
 def test_what_is_spoilt_is_the_landmarks_measurements_alone(clean: WorldStreams) -> None:
-    for kind in ("reading", "identity", "drop"):
+    for kind in ("measurement", "identity", "drop"):
         for before, after in zip(clean.streams, world_with(0.3, kind).streams, strict=True):
             assert np.array_equal(before.stamps_ns, after.stamps_ns), "no message is lost"
             assert np.array_equal(before.intervals.forward, after.intervals.forward)
@@ -54,7 +54,7 @@ def test_what_is_spoilt_is_the_landmarks_measurements_alone(clean: WorldStreams)
 
 
 def test_a_spoilt_measurement_is_uniform_over_what_can_be_seen(clean: WorldStreams) -> None:
-    spoilt = world_with(1.0, "reading")
+    spoilt = world_with(1.0, "measurement")
     assert kstest((joined(spoilt, "ranges") - 3.0) / 17.0, "uniform").pvalue > 1e-3
     assert kstest(joined(spoilt, "bearings") / (2.0 * np.pi) + 0.5, "uniform").pvalue > 1e-3
     assert kstest((joined(clean, "ranges") - 3.0) / 17.0, "uniform").pvalue < 1e-3
@@ -68,15 +68,15 @@ def test_a_spoilt_identity_is_any_other_landmarks(clean: WorldStreams) -> None:
     assert ahead.max() < 1.2 * len(was) / 17
 
 
-def test_a_world_without_garbage_is_as_it_was_whatever_its_kind(clean: WorldStreams) -> None:
+def test_a_world_without_outliers_is_as_it_was_whatever_its_kind(clean: WorldStreams) -> None:
     for before, after in zip(clean.streams, world_with(0.0, "drop").streams, strict=True):
         assert content(before) == content(after)
 
 
-def test_without_limits_of_sight_garbage_lies_within_the_place() -> None:
+def test_without_limits_of_sight_outliers_lie_within_the_place() -> None:
     scenario = load("waypoints")
     world = msgspec.structs.replace(
-        scenario.world, garbage=1.0, visible_to_m=None, visible_from_m=None, steps=50
+        scenario.world, outlier_share=1.0, visible_to_m=None, visible_from_m=None, steps=50
     )
     for stream in streams_of(msgspec.structs.replace(scenario, world=world)).streams:
         assert stream.landmark_detections.ranges.max() <= 100.0 * np.sqrt(2.0)

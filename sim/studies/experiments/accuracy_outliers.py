@@ -1,4 +1,4 @@
-"""Three measurements in ten are garbage: how much worse is the map than without them.
+"""Three measurements in ten are outliers: how much worse is the map than without them.
 
 The clean run of the same seed leaves out the very measurements that the others spoil, so it has as
 many good ones. A measurement is spoilt to a uniform range and bearing, or to the identity of
@@ -11,16 +11,16 @@ from sim.scenarios.scenario import Scenario, load, with_options
 from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
-from sim.world.config import GarbageKind, SimulatedWorld
+from sim.world.config import OutlierKind, SimulatedWorld
 
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
 LANDMARK_SUBMAPS = 2
-"""Of the centre, in the clean runs too: what one submap alone has may be garbage."""
+"""Of the centre, in the clean runs too: what one submap alone has may be an outlier."""
 ROBUST_C = 2.0
-"""Of the centre, in the clean runs too: garbage that agrees by chance is left to it."""
-KINDS: tuple[GarbageKind, ...] = ("drop", "reading", "identity")
-NAMES = {"drop": "clean", "reading": "random measurements", "identity": "random identities"}
+"""Of the centre, in the clean runs too: outliers that agree by chance are left to it."""
+KINDS: tuple[OutlierKind, ...] = ("drop", "measurement", "identity")
+NAMES = {"drop": "clean", "measurement": "random measurements", "identity": "random identities"}
 MOST_SEEDS = 30
 MOST_RATIO = 1.2
 SHOWN: Shown = (
@@ -35,12 +35,12 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each world, kind of garbage and seed."""
+    """Each world, kind of outlier and seed."""
     return [task for world in WORLDS for kind in KINDS for task in _tasks(world, kind, options)]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Every kind of garbage beside the clean runs."""
+    """Every kind of outlier beside the clean runs."""
     figures: dict[str, dict[str, Figures]] = {}
     goals = []
     for world in WORLDS:
@@ -67,23 +67,23 @@ def outcome(options: Options, results: Results) -> Outcome:
         for name, of_kind in of_world.items()
     )
     table = Table(
-        f"30 % garbage, {len(options.seeds[:MOST_SEEDS])} seeds",
+        f"30 % outliers, {len(options.seeds[:MOST_SEEDS])} seeds",
         ("world", *(heading for _, heading, _ in SHOWN)),
         rows,
         "not joined, withdrawn: runs in which a robot, all of them good, is not in the final map",
     )
-    return Outcome("garbage", {"garbage": figures}, (table,), goals=tuple(goals))
+    return Outcome("outliers", {"outliers": figures}, (table,), goals=tuple(goals))
 
 
-def _tasks(world: str, kind: GarbageKind, options: Options) -> list[Task]:
+def _tasks(world: str, kind: OutlierKind, options: Options) -> list[Task]:
     return [
         team_task(_spoilt(with_options(load(world), seed=seed), kind), note=NAMES[kind])
         for seed in options.seeds[:MOST_SEEDS]
     ]
 
 
-def _spoilt(scenario: Scenario, kind: GarbageKind) -> Scenario:
-    """The scenario with garbage among its measurements, which its windows and its centre expect.
+def _spoilt(scenario: Scenario, kind: OutlierKind) -> Scenario:
+    """The scenario with outliers among its measurements, which its windows and its centre expect.
 
     The clean run has the same centre, and windows that take every measurement.
     """
@@ -91,12 +91,12 @@ def _spoilt(scenario: Scenario, kind: GarbageKind) -> Scenario:
     assert isinstance(scenario.world, SimulatedWorld)
     expected = 0.0 if kind == "drop" else SHARE
     robots = tuple(
-        replace(robot, front_end=replace(robot.front_end, garbage=expected))
+        replace(robot, front_end=replace(robot.front_end, outlier_share=expected))
         for robot in scenario.robots
     )
     return replace(
         scenario,
-        world=replace(scenario.world, garbage=SHARE, garbage_kind=kind),
+        world=replace(scenario.world, outlier_share=SHARE, outlier_kind=kind),
         robots=robots,
         central=replace(scenario.central, robust_c=ROBUST_C, landmark_submaps=LANDMARK_SUBMAPS),
     )

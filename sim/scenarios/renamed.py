@@ -1,0 +1,26 @@
+"""Fields of a scenario that had another name once: logs of that time are still read."""
+
+from typing import Any
+
+FIELDS = {
+    "garbage": "outlier_share",
+    "garbage_kind": "outlier_kind",
+    "landmarks_told": "landmark_form",
+    "look_at_start": "observe_at_start",
+}
+"""The former name and today's, of fields of `world` and of a robot's `front_end`."""
+VALUES = {("outlier_kind", "reading"): "measurement"}
+"""Values that had another name, by today's name of their field."""
+
+
+def with_current_names(value: Any) -> Any:
+    """A resolved scenario, as it was decoded from JSON, with today's names at every depth."""
+    if isinstance(value, list):
+        return [with_current_names(each) for each in value]
+    if not isinstance(value, dict):
+        return value
+    named = ((FIELDS.get(name, name), each) for name, each in value.items())
+    return {
+        name: VALUES.get((name, each), each) if isinstance(each, str) else with_current_names(each)
+        for name, each in named
+    }
