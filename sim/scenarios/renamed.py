@@ -19,8 +19,8 @@ def with_current_names(value: Any) -> Any:
         return [with_current_names(each) for each in value]
     if not isinstance(value, dict):
         return value
-    named = ((FIELDS.get(name, name), each) for name, each in value.items())
+    current: dict[str, Any] = {FIELDS.get(name, name): each for name, each in value.items()}
     return {
         name: VALUES.get((name, each), each) if isinstance(each, str) else with_current_names(each)
-        for name, each in named
+        for name, each in current.items()
     }

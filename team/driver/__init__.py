@@ -1,1 +1,1 @@
-"""A robot's driver: what it measures goes onto the team, and nothing of it is lost on the way."""
+"""A robot's driver: passes the robot's measurements on to its team and loses none of them."""

@@ -1,8 +1,8 @@
-"""The driver: a program hands over what its robot measures; everything else is done here.
+"""The driver: takes a robot's measurements from a program and delivers them to the robot's process.
 
-Whatever is handed over is judged, written to the robot's file, and then goes out, on a thread of
-its own: a call never waits for the network. What a robot's process or the recorder has missed they
-ask for, and get from the file.
+Each measurement is checked, written to the robot's file and then published by a separate thread, so
+that a call never waits for the network. The robot's process and the recorder request measurements
+that they have missed; the driver answers from the file.
 """
 
 import logging
@@ -35,22 +35,24 @@ from team.wire.codec import encoded
 CONNECT = "tcp/127.0.0.1:7447"
 REMIND_S = 10.0
 GAP_S = 2.0
-"""Odometry without a duration covers no more than this."""
+"""Longest interval [s] that odometry without a duration covers."""
 BRIDGE_S = 5.0
-"""A gap between intervals that is no longer is bridged, by a motion of which little is known."""
+"""A gap between intervals up to this [s] is bridged, by a motion with a large covariance."""
 AWAY_S = 60.0
-"""A difference of poses is believed over no more than this: the odometry may have begun anew."""
+"""A difference of odometry poses is used up to this interval [s]; beyond it the odometry may have
+been reset."""
 AHEAD_S = 10.0
-"""What is seen may be stamped so far ahead of the odometry; beyond it they have two clocks."""
+"""A landmark measurement may be stamped this far [s] ahead of the odometry; beyond it the two are
+taken to have different clocks."""
 _LOG = logging.getLogger("teamslam")
 
 
 class DriverError(RuntimeError):
-    """The driver can not go on: why, and what to do."""
+    """The driver can not continue; the text says why and what to do."""
 
 
 class Driver:
-    """One robot's measurements on their way to its team; `with Driver(…) as robot`.
+    """Delivers one robot's measurements to its team; used as `with Driver(…) as robot`.
 
     robot: its name. team: the team's, a scenario's `team` or name. connect: where the router is.
     keys: a folder with the certificate `source-<robot>`. file: where all measurements are kept;
@@ -114,7 +116,9 @@ class Driver:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End the stream; where the block raised, leave only: it goes on with the next start."""
+        """End the stream. If the block raised, only leave: the stream continues at the next
+        start.
+        """
         if kind is None and not self._closed:
             self.end()
         self.close()
@@ -128,7 +132,7 @@ class Driver:
         yaw_rate: float,
         duration: float | Decimal | None = None,
     ) -> None:
-        """Mean speed [m/s] and yaw rate [rad/s] over the `duration` seconds until t.
+        """Take odometry: mean speed [m/s] and yaw rate [rad/s] over the `duration` seconds until t.
 
         Without a duration: since the last call; the first such call says when the robot begins.
         """
@@ -151,7 +155,8 @@ class Driver:
         covariance: ArrayLike | None = None,
         duration: float | Decimal | None = None,
     ) -> None:
-        """The motion (ahead [m], left [m], turn [rad]) over the `duration` seconds until t.
+        """Take odometry: the motion (ahead [m], left [m], turn [rad]) over `duration` seconds until
+        t.
 
         In the frame of its beginning; covariance: 3 × 3, of an error in the frame of its end.
         """
@@ -173,7 +178,8 @@ class Driver:
         theta: float,
         covariance: ArrayLike | None = None,
     ) -> None:
-        """The pose in the odometry's own frame at t [m, rad]; its differences count.
+        """Take odometry: the pose at t in the odometry's own frame [m, rad]; its differences are
+        used.
 
         covariance: 3 × 3, of the motion since the last call, in the frame of its end.
         """
@@ -201,7 +207,7 @@ class Driver:
         bearings: ArrayLike,
         covariances: ArrayLike | None = None,
     ) -> None:
-        """Landmarks seen at t: numbers, ranges [m] and bearings [rad] from the sensor's axis.
+        """Take landmarks seen at t: numbers, ranges [m] and bearings [rad] from the sensor's axis.
 
         covariances: of each its own 2 × 2 of (range, bearing); without: the sensor's.
         """
@@ -217,7 +223,8 @@ class Driver:
         xy: ArrayLike,
         covariances: ArrayLike | None = None,
     ) -> None:
-        """Landmarks seen at t: numbers, and points (ahead [m], left [m]) in the sensor's frame.
+        """Take landmarks seen at t: numbers, and points (ahead [m], left [m]) in the sensor's
+        frame.
 
         covariances: of each its own 2 × 2; without: the sensor's noise of range and bearing.
         """
@@ -233,7 +240,7 @@ class Driver:
         bearings: ArrayLike,
         covariances: ArrayLike | None = None,
     ) -> None:
-        """Landmarks without identities, seen at t in one scan: ranges [m] and bearings [rad]."""
+        """Take one scan of landmarks without identities at t: ranges [m] and bearings [rad]."""
         stamp_ns = measured.stamp_of(t, "detect")
         seen = measured.detections(self.robot, stamp_ns, (ranges, bearings), covariances)
         self._see(j.OBSERVATIONS, seen)
@@ -241,7 +248,7 @@ class Driver:
     def sight(
         self, t: float | Decimal, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
     ) -> None:
-        """Teammates seen at t: names, ranges [m] and bearings [rad]."""
+        """Take inter-robot measurements at t: teammates' names, ranges [m] and bearings [rad]."""
         stamp_ns = measured.stamp_of(t, "sight")
         seen = measured.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
         self._see(j.SIGHTINGS, seen)
@@ -250,21 +257,23 @@ class Driver:
 
     @property
     def last_time(self) -> float | None:
-        """The newest time that the file has [s]; None: nothing was measured."""
+        """The newest time in the file [s]; None where nothing was measured."""
         return 1e-9 * self._journal.newest_ns if self._journal.incarnation else None
 
     @property
     def team_has_ended(self) -> bool:
-        """The team's final map is out, or an operator has ended it: nothing more is taken."""
+        """True once the team's final map is out or an operator has ended the team; nothing more is
+        taken.
+        """
         return self._node.finished or self._node.ordered_to_end
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """(t, (x, y, theta)): where the robot was in the team's frame, as its process said last."""
+        """(t, (x, y, theta)) of the robot in the team's frame, as last published by its process."""
         return self._node.team_pose
 
     def status(self) -> m.Status:
-        """How far the stream is, who has it, and what is wrong."""
+        """The state of the stream: counts, who has received them, and problems."""
         return self._link.status()
 
     def tell(self, figures: Mapping[str, float], warnings: Iterable[str]) -> None:
@@ -274,10 +283,10 @@ class Driver:
     # The end.
 
     def end(self, patience_s: float | None = None) -> bool:
-        """Nothing more is measured: wait until the robot's process and a recorder have all of it.
+        """End the stream and wait until the robot's process and a recorder have all of it.
 
-        False if that took longer than patience_s; the file has it all, and a driver that is started
-        again delivers it.
+        Returns False if that took longer than patience_s. The file is complete then, too, and a
+        driver that is started again with it delivers the rest.
         """
         self._check_open()
         with self._lock:
@@ -301,7 +310,9 @@ class Driver:
         return True
 
     def close(self) -> None:
-        """Leave the team for now: who starts with the same file goes on from here."""
+        """Leave the team without ending the stream; a driver started with the same file continues
+        it.
+        """
         if self._closed:
             return
         self._closed = True
@@ -323,7 +334,9 @@ class Driver:
             )
 
     def _resume(self, stamp_ns: int) -> None:
-        """At the first call after a start with an old file: the same once more, or what follows."""
+        """After a start with an old file: whether the program repeats its calls or continues
+        them.
+        """
         self._check_open()
         if self.team_has_ended:
             raise DriverError(
@@ -345,7 +358,9 @@ class Driver:
         self._odometer.pose = self._journal.pose
 
     def _put(self, kind: int, stamp_ns: int, payload: bytes) -> None:
-        """Into the file, unless it is there already: a program may hand over all once more."""
+        """Write to the file unless it is there already: a program may hand over everything
+        again.
+        """
         if self._again is not None and self._again >= 0:
             calls = self._journal.calls
             if self._again < len(calls):
@@ -378,7 +393,7 @@ class Driver:
         self._put(kind, message.stamp_ns, encoded(named))
 
     def _begin(self, stamp_ns: int, *, known: bool) -> None:
-        """The stream begins, or begins anew, at this time."""
+        """Begin the stream, or a further incarnation of it, at this time."""
         first = self._journal.first_incarnation
         self._incarnation = self._incarnation + 1 if self._incarnation else first
         pose, covariance = self._start if known else (b"", b"")
@@ -393,7 +408,7 @@ class Driver:
         self._put(j.START, stamp_ns, encoded(start))
 
     def _begin_anew(self, end_ns: int, stamp_ns: int) -> None:
-        """No odometry says how the robot moved: what follows is tied to it by landmarks alone."""
+        """Begin a further incarnation: without odometry only landmarks tie it to the one before."""
         self._warn(
             f"gap{stamp_ns}",
             f"{self.robot}: no odometry from {1e-9 * end_ns:.3f} to {1e-9 * stamp_ns:.3f} s: its "
@@ -404,7 +419,9 @@ class Driver:
         self._odometer = Odometer(self.robot, self._bounds)
 
     def _head(self, stamp_ns: int) -> dict[str, Any]:
-        """What every measurement has; its incarnation and number come with its place."""
+        """The fields that every measurement has; incarnation and number are set when it is
+        ordered.
+        """
         return {"stamp_ns": stamp_ns, "robot": self.robot, "incarnation": 0, "number": 0}
 
     def _increment(
@@ -424,7 +441,9 @@ class Driver:
     def _until(
         self, stamp_ns: int, length_ns: int | None, call: str, longest_s: float = GAP_S
     ) -> int | None:
-        """How long the interval is that ends now; a stream that can not go on begins anew."""
+        """Length of the interval that ends now; begins a further incarnation where there is
+        none.
+        """
         self._resume(stamp_ns)
         end_ns = self._odometer.end_ns
         if length_ns is None and end_ns is not None and stamp_ns - end_ns > longest_s * 1e9:
@@ -434,7 +453,9 @@ class Driver:
     def _drive(
         self, stamp_ns: int, told: m.AnyOdometry | None, step: Pose, pose: Pose | None = None
     ) -> None:
-        """Put an interval of odometry into the file, and what bridges the gap before it."""
+        """Write an odometry interval to the file, and the interval that bridges the gap before
+        it.
+        """
         lasts_ns = 0 if told is None else told.duration_ns
         begin_ns = stamp_ns - lasts_ns
         gap_ns = self._odometer.gap_ns

@@ -1,4 +1,4 @@
-"""A driver's file: every measurement before it goes anywhere, in the order in which it came.
+"""A driver's file: holds every measurement, in order of arrival, before it is published.
 
 The file only grows. It begins with a head (MessagePack); a record is `<IBq`: the payload's length,
 its kind, its stamp [ns]; then the payload, an encoded measurement with number 0, and its CRC-32.
@@ -32,23 +32,23 @@ whether the stream goes on, and a pose in the odometry's frame, three floats.
 State = Literal["open", "left", "ended"]
 MAGIC = b"teamslam stream 1\n"
 OLD_S = 3600.0
-"""A stream that has not grown for so long, and was not ended, is another day's."""
+"""A stream that was not ended and has not grown for this long [s] is set aside as an old one."""
 _HEAD = struct.Struct("<IBq")
 _CHECK = struct.Struct("<I")
 _POSE = struct.Struct("<3d")
 
 
 class JournalError(RuntimeError):
-    """A driver's file that can not be used: which, why, and what to do."""
+    """A driver's file can not be used; the text says which, why and what to do."""
 
 
 @dataclass
 class Journal:
     """One robot's file, open for appending; `opened` makes it. Any thread may read.
 
-    incarnation: the one in progress; 0 before anything was measured. state: of the stream, as its
-    head says it; delivered: and nobody needs anything of it any more. calls: where each record but
-    marks begins, as they came. driven_ns, pose: where the odometry has come to.
+    incarnation: the one in progress; 0 before anything was measured. state: of the stream, as in
+    its head. delivered: every receiver has all of it. calls: the offsets of all records but marks,
+    in order of arrival. driven_ns, pose: end of the last odometry interval, and the odometry pose.
     """
 
     path: Path
@@ -69,22 +69,22 @@ class Journal:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file and release its lock."""
         os.close(self._file)
 
     @property
     def incarnations(self) -> list[int]:
-        """Those that the file has, in order."""
+        """The incarnations in the file, in order."""
         with self._lock:
             return sorted(self._numbered)
 
     def count(self, incarnation: int) -> int:
-        """How many measurements of an incarnation have their number."""
+        """Number of measurements of an incarnation that are numbered."""
         with self._lock:
             return len(self._numbered.get(incarnation, ()))
 
     def message(self, incarnation: int, number: int) -> m.Measurement:
-        """A measurement that has its number."""
+        """A numbered measurement."""
         with self._lock:
             at = self._numbered[incarnation][number]
         message: m.Message = decoded(self.payload(at))
@@ -92,17 +92,17 @@ class Journal:
         return msgspec.structs.replace(message, number=number)
 
     def payload(self, at: int) -> bytes:
-        """The payload of the record that begins there."""
+        """The payload of the record at this offset."""
         length = _HEAD.unpack(os.pread(self._file, _HEAD.size, at))[0]
         return os.pread(self._file, length, at + _HEAD.size)
 
     def too_late(self, stamp_ns: int, kind: int) -> bool:
-        """Whether what comes behind this place has been numbered already."""
+        """Whether a measurement behind this place has been numbered already."""
         released = self._sorter.released
         return released is not None and (stamp_ns, kind) < released
 
     def append(self, kind: int, stamp_ns: int, payload: bytes) -> None:
-        """Write a record to the file, then number what has its turn."""
+        """Write a record to the file, then number the measurements whose order is settled."""
         record = _HEAD.pack(len(payload), kind, stamp_ns) + payload
         record += _CHECK.pack(zlib.crc32(record))
         at = self._size
@@ -125,10 +125,10 @@ class Journal:
         incarnation: int | None = None,
         delivered: bool = False,
     ) -> None:
-        """Say whether the stream goes on; all that waits for its turn is numbered.
+        """Record the stream's state; all measurements that wait for their order are numbered.
 
-        incarnation: of the first that will be in a file that has none yet. delivered: who needs the
-        stream has all of it.
+        incarnation: number of the first incarnation of an empty file. delivered: every receiver has
+        all of the stream.
         """
         said = {
             "state": state,
@@ -170,11 +170,11 @@ class Journal:
 
     @property
     def next_incarnation(self) -> int:
-        """The number that the stream has when it begins, or begins anew."""
+        """The number of the incarnation that begins next."""
         return self.incarnation + 1 if self.incarnation else self.first_incarnation
 
     def read(self) -> None:
-        """Take the records that are there; what a crash has cut off is overwritten."""
+        """Read the records of the file; a record cut off by a crash will be overwritten."""
         at, end = self._size, os.fstat(self._file).st_size
         while at + _HEAD.size <= end:
             head = os.pread(self._file, _HEAD.size, at)
@@ -195,12 +195,11 @@ def pose_payload(pose: tuple[float, float, float]) -> bytes:
 
 
 def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
-    """The robot's file to go on in, and in words what was found there.
+    """The robot's journal, opened for appending, and a description of what it contains.
 
-    A stream that has ended and is with the robot's process, or has not grown for OLD_S, steps
-    aside; the new one begins with the next incarnation, so that nobody takes it for the same.
-    Raises JournalError for a file of another robot or of no driver, or one that another driver has
-    open.
+    A stream that has ended and is delivered, or that has not grown for OLD_S, is moved aside; the
+    new one begins with the next incarnation number, so that the two are not confused. Raises
+    JournalError for a file of another robot or of no driver, or one that another driver has open.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     found = path.stat() if path.exists() else None

@@ -1,4 +1,4 @@
-"""The thread on which a driver speaks: it connects, and connects again, until it is to leave."""
+"""The driver's publishing thread: it connects to the router, and reconnects, until it is closed."""
 
 import logging
 import threading
@@ -19,19 +19,19 @@ from team.wire.bus import BusError
 from team.wire.zenoh.bus import ZenohBus
 
 HEAD_S = 1.0
-"""Wall time between two words on how far the stream is."""
+"""Wall time [s] between two stream heads."""
 PACE_S = 0.01
-"""Wait when there is nothing to publish."""
+"""Wait [s] when there is nothing to publish."""
 ATTEMPT_S = 0.3
-"""An attempt to reach the router takes so long, where there is none."""
+"""Duration [s] of an attempt to reach a router that is not there."""
 AGAIN_S = 2.0
-"""Wait before another attempt to reach the router."""
+"""Wait [s] before another attempt to reach the router."""
 SECOND_PATIENCE_S = 6.0
-"""The token of a driver that was cut off is there for the lease of its link: 5 s of silence."""
+"""Wait [s] for another driver's token: that of a cut-off driver lasts for its lease of 5 s."""
 HEAR_S = 0.5
-"""The robot's process says within this how far it is, if it is there."""
+"""The robot's process, if present, reports its progress within this time [s]."""
 LAST_S = 5.0
-"""What is left to say takes no longer."""
+"""Longest time [s] for the remaining publications at the end."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -64,7 +64,9 @@ class Link:
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
 
     def open(self, patience_s: float) -> None:
-        """Begin; returns when the team's router is reached, raises the reason if it is not."""
+        """Start the thread; returns once the router is reached and raises the reason if it is
+        not.
+        """
         self._attempt_s = patience_s or ATTEMPT_S
         self._thread.start()
         until = time.monotonic() + patience_s + SECOND_PATIENCE_S
@@ -75,23 +77,23 @@ class Link:
             self._up.wait(0.02)
 
     def close(self) -> None:
-        """Say the last word and leave."""
+        """Publish the remaining messages and stop the thread."""
         self._leaving.set()
         self._thread.join(3.0 * LAST_S)
 
     @property
     def failure(self) -> str | None:
-        """What ended the thread that should not have; None: nothing did."""
+        """The exception that ended the thread; None where it runs or was closed."""
         failed = self._failure
         return None if failed is None else f"{type(failed).__name__}: {failed}"
 
     def wait(self, timeout_s: float) -> None:
-        """Return when something may have changed."""
+        """Wait until something may have changed."""
         with self._moved:
             self._moved.wait(timeout_s)
 
     def status(self) -> m.Status:
-        """The node's, with what is wrong with the link."""
+        """The node's status, with problems of the link."""
         status = self._node.status()
         if self._trouble is None:
             return status
@@ -99,7 +101,7 @@ class Link:
         return msgspec.structs.replace(status, warnings=warnings)
 
     def why_it_waits(self) -> str:
-        """What an end waits for, and what to do."""
+        """What `end` waits for, and what the user can do."""
         if self._trouble is not None:
             return str(self._trouble)
         robot = self._node.journal.robot
@@ -155,7 +157,9 @@ class Link:
                 )
 
     def _hear(self, shell: Shell, bus: ZenohBus) -> None:
-        """How far the robot's process is: measurements that this file has not are another's."""
+        """Hear the robot's progress: one beyond this file's counts means that another file is in
+        use.
+        """
         until = time.monotonic() + HEAR_S
         journal = self._node.journal
         self._node.listening = True

@@ -1,4 +1,6 @@
-"""What a program hands to its driver, judged at once, as messages without a number."""
+"""Checks what a program passes to its driver, and makes messages of it that are not numbered
+yet.
+"""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -15,18 +17,18 @@ from team.wire.codec import unsound
 M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"
 UNNAMED = 2**31
-"""Numbers from here on are for landmarks without names."""
+"""Landmark numbers from here on are reserved for landmarks without identity."""
 
 
 class MeasurementError(ValueError):
-    """What was handed over can not be a measurement of this robot: what, where, and what to do.
+    """A value can not be a measurement of this robot; the text says which, where and what to do.
 
-    Nothing of it was taken.
+    Nothing of the call was taken.
     """
 
 
 class DriverWarning(UserWarning):
-    """Something that is taken as it is, and is hardly meant."""
+    """A value is taken as it is, but is probably a mistake."""
 
 
 def stamp_of(t: float | Decimal, what: str) -> int:
@@ -178,7 +180,7 @@ def _blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
 
 
 def sound(message: M, what: str) -> M:
-    """The message, if every receiver takes it."""
+    """The message; raises MeasurementError where a receiver would refuse it."""
     why = unsound(message)
     if why is not None:
         raise MeasurementError(f"{what}: {why.detail}")

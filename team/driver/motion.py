@@ -1,4 +1,4 @@
-"""Odometry as it comes, to intervals that follow one another without a gap."""
+"""Turns odometry as it arrives into intervals that follow one another without a gap."""
 
 from dataclasses import dataclass, field
 
@@ -8,21 +8,21 @@ from team.config import Bounds
 from team.driver.measured import MeasurementError, wrapped
 
 TOLERANCE = 0.1
-"""A beginning may be off the last interval's end by this share of the interval, as clocks are."""
+"""An interval's start may differ from the last one's end by this share of it (clock jitter)."""
 LEAST_NS = 2_000_000
 """… or by this."""
 UNMEASURED = (1.0, 0.5)
-"""Where nothing was measured a motion is uncertain by as much as it is, by this [m/s, rad/s] at
-least."""
+"""Least standard deviation [m/s, rad/s] of a motion that was not measured; otherwise it is as large
+as the motion itself."""
 Pose = tuple[float, float, float]
 
 
 @dataclass
 class Odometer:
-    """Where the odometry has come to: the end of its last interval, and the pose there if told.
+    """The odometry so far: the end of its last interval, and the odometry pose there if given.
 
-    speeds: of the last interval, ahead [m/s] and turning [rad/s]. gap_ns: what no odometry covers
-    before the last interval, where that is more than clocks are off; 0: nothing.
+    speeds: of the last interval, ahead [m/s] and turning [rad/s]. gap_ns: time before
+    the last interval that no odometry covers, beyond clock jitter; 0: none.
     """
 
     robot: str
@@ -77,13 +77,13 @@ class Odometer:
             )
 
     def taken(self, stamp_ns: int, step: Pose, duration_ns: int, pose: Pose | None) -> None:
-        """The interval is in the file."""
+        """Note that the interval has been written to the file."""
         self.end_ns, self.pose = stamp_ns, pose
         if duration_ns:
             self.speeds = step[0] * 1e9 / duration_ns, step[2] * 1e9 / duration_ns
 
     def bridge(self) -> tuple[Pose, list[float]]:
-        """The motion over the gap if the last speeds went on, and how little is known of it.
+        """The motion over the gap at the last speeds, with a large covariance.
 
         Standard deviations: of as much as the motion is, UNMEASURED at least, within half a turn.
         """

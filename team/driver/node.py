@@ -1,4 +1,4 @@
-"""The driver's node: publishes what the file has, answers for what was missed, knows who waits.
+"""The driver's node: publishes the file's measurements, answers requests and tracks the receivers.
 
 It is the source of one robot's stream, as a world is of all (`sim.publisher`). It reads no clock.
 """
@@ -17,7 +17,7 @@ from team.wire.codec import decoded
 
 DAY_NS = 86_400 * 10**9
 Stream = tuple[int, int]
-"""(incarnation, measurements): how far somebody is."""
+"""(incarnation, measurements) that a receiver has consumed."""
 
 
 @dataclass
@@ -46,7 +46,7 @@ class SourceNode:
     def __post_init__(self) -> None:
         self._robot = self.journal.robot
         self.alive: set[str] = set()
-        """The nodes of the team that are there."""
+        """The nodes of the team that are present."""
         incarnations = self.journal.incarnations
         self._incarnation = incarnations[0] if incarnations else 0
         self._published = self.journal.count(self._incarnation)
@@ -55,7 +55,7 @@ class SourceNode:
         self.fed: tuple[dict[str, float], tuple[str, ...]] = {}, ()
         """Figures and warnings of what feeds the driver, as a ROS 2 robot's topics."""
         self.listening = True
-        """Whether it is not known yet how far the team was with this robot before."""
+        """True until the team's earlier progress with this robot is known."""
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
@@ -67,17 +67,19 @@ class SourceNode:
         ch.TEAM_END,
         ch.FINAL_MAP,
     )
-    """Of this robot or of the team; beside them the heads of all drivers and the robot's set."""
+    """Channels of this robot or of the team; besides, the heads of all drivers and the robot's
+    set.
+    """
 
     def begin(self) -> list[Outgoing]:
-        """The beginning of the stream for whoever missed it, and how far it is."""
+        """Publish the stream's initial pose again for receivers that missed it, and its head."""
         if not self._incarnation:
             return []
         start = self.journal.message(self._incarnation, 0)
         return [Outgoing(ch.START, self._robot, start), *self.head(again=True)]
 
     def publish(self) -> list[Outgoing]:
-        """The next measurements, BATCH at most: as many as credit allows."""
+        """The next measurements that credit allows, at most BATCH."""
         out: list[Outgoing] = []
         while len(out) < BATCH and self._has_credit and (number := self._next()) is not None:
             message = self.journal.message(self._incarnation, number)
@@ -107,7 +109,7 @@ class SourceNode:
         return "recorder" not in self.alive or self._published - recorded < CREDIT_RECORDER
 
     def head(self, *, again: bool = False) -> list[Outgoing]:
-        """How far the stream is, if that is news; again: in any case."""
+        """The stream's head if it has changed; again: in any case."""
         if not self._incarnation:
             return []
         last = self._incarnation == self.journal.incarnation
@@ -127,18 +129,18 @@ class SourceNode:
 
     @property
     def has_new_state(self) -> bool:
-        """The stream has ended, or its driver leaves, and nobody has been told."""
+        """True when the stream has ended or its driver leaves and this is not published yet."""
         return self._said is not None and self._said.state != self.journal.state
 
     @property
     def has_more(self) -> bool:
-        """There is something to be published, and whoever takes it has credit."""
+        """True when there are measurements to publish and credit for them."""
         return self._has_credit and self._published < self.journal.count(self._incarnation)
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message can not be true of this stream: nobody has more than was numbered.
+        """Why a message can not be true of this stream: it claims more than was numbered.
 
-        But for the robot itself, while it is not known whether another file has its measurements.
+        The robot's own progress is excepted until it is known whether another file is in use.
         """
         refused = absurd(message)
         if refused is not None or not isinstance(message, m.Progress | m.Done):
@@ -187,7 +189,7 @@ class SourceNode:
         return []
 
     def _compare(self, head: m.StreamHead) -> None:
-        """One clock for the team: a day between two drivers is no delay."""
+        """Warns when two drivers' stamps differ by a day: the team needs one clock."""
         if not self.journal.incarnation or head.robot in self._others:
             return
         apart_ns = self.journal.newest_ns - head.stamp_ns
@@ -211,9 +213,10 @@ class SourceNode:
 
     @property
     def is_delivered(self) -> bool:
-        """The robot is done with all that there is, the centre with all of its submaps (a peer has
-        the final map), and a recorder that is there has it: whoever dies now needs nothing of this
-        driver any more.
+        """True once nobody needs this driver any more, whoever fails.
+
+        The robot has consumed all measurements, the centre all of its submaps (a peer has the final
+        map), and a recorder, if present, has everything.
         """
         newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
         incarnation, measurements, submaps = self.done
@@ -222,19 +225,19 @@ class SourceNode:
 
     @property
     def recorder_lacks(self) -> bool:
-        """A recorder is there and has not everything."""
+        """True while a recorder is present and lacks measurements."""
         newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
         return "recorder" in self.alive and self.recorded < newest
 
     @property
     def waits_for(self) -> str:
-        """Who is not there that is needed, in words; empty: nobody."""
+        """The nodes that are needed and absent, in words; empty where none is."""
         needed = [ch.robot_node(self._robot), *([] if self.is_peer else ["central"])]
         missing = [node for node in needed if node not in self.alive]
         return " and ".join(missing)
 
     def status(self) -> m.Status:
-        """How far the driver is, for people."""
+        """The driver's status, for people."""
         figures = {
             "measurements": float(self.journal.count(self.journal.incarnation)),
             "incarnation": float(self.journal.incarnation),
@@ -256,7 +259,7 @@ class SourceNode:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """When [s] and where the robot was in the team's frame by its own last word."""
+        """Time [s] and pose of the robot in the team's frame, as it last published them."""
         if self.pose is None:
             return None
         x, y, theta = (float(v) for v in floats(self.pose.pose, "pose"))

@@ -1,18 +1,18 @@
-"""The order that a source owes: by stamp, and what was seen at a stamp before the odometry to it.
+"""Orders measurements as a source must: by stamp, landmarks before the odometry that ends there.
 
-A camera's frame may come tens of milliseconds after the odometry of its time. So what is measured
-waits until something newer by `latency_ns` has come; then its place is known. Which number a
+A camera's frame may arrive tens of milliseconds after the odometry of its time. So a measurement
+waits until one newer by `latency_ns` has arrived; then its place is known. Which number a
 measurement gets depends on the order of the calls alone, so it can be found again from a file.
 """
 
 from heapq import heappop, heappush
 
 Place = tuple[int, int]
-"""(stamp [ns], kind): of a smaller kind is what is seen, of the largest the odometry."""
+"""(stamp [ns], kind): at equal stamps smaller kinds come first, odometry last."""
 
 
 class Sorter:
-    """Takes items with their places; gives them back in order."""
+    """Collects items with their places and returns them in order."""
 
     def __init__(self, latency_ns: int) -> None:
         self.latency_ns = latency_ns
@@ -20,10 +20,10 @@ class Sorter:
         self._arrived = 0
         self._newest_ns: int | None = None
         self.released: Place | None = None
-        """The place of the last that was given back: nothing may come before it any more."""
+        """Place of the last returned item; nothing may be put before it."""
 
     def put(self, place: Place, item: int) -> list[int]:
-        """Take an item; those whose turn has come."""
+        """Take an item; returns the items whose place is settled now."""
         heappush(self._waiting, (place, self._arrived, item))
         self._arrived += 1
         newest_ns = place[0] if self._newest_ns is None else max(self._newest_ns, place[0])
@@ -31,7 +31,7 @@ class Sorter:
         return self._until(newest_ns - self.latency_ns)
 
     def flush(self) -> list[int]:
-        """All that wait."""
+        """Return all waiting items."""
         return [] if self._newest_ns is None else self._until(self._newest_ns + 1)
 
     def _until(self, until_ns: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""The source of a stream: what whoever publishes measurements owes, a world or a robot's driver."""
+"""The source of a stream, a world or a driver: credit, batches and answers to requests."""
 
 from collections.abc import Callable
 
@@ -7,13 +7,13 @@ from team.wire import messages as m
 from team.wire.codec import encoded
 
 CREDIT_MEASUREMENTS = 4096
-"""A source is at most this many measurements ahead of its living robot."""
+"""A source is at most this many measurements ahead of its robot, while that is present."""
 CREDIT_RECORDER = 16384
-"""… and this many, of all robots of a world together, ahead of a living recorder."""
+"""… and at most this many, over all robots of a world, ahead of a recorder that is present."""
 BATCH = 256
-"""Measurements between two looks at what has come in."""
+"""Measurements published between two checks of the inbox."""
 ANSWER = 8192
-"""Measurements in one answer to a query; who wants more asks again."""
+"""Measurements in one answer to a query; further ones need a further query."""
 FIRST_INCARNATION = 1
 
 

@@ -218,7 +218,8 @@ def _heard(world: Mapping[str, Any]) -> _Run:
 
 def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     """Predict over the whole stretch, weigh by one measurement, resample; a summary of each
-    cloud."""
+    cloud.
+    """
     run = _heard(world)
     sensor = run.scenario.robots[0].sensor
     random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)

@@ -131,15 +131,17 @@ class Audit:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """What the submaps taken so far say.
+    """The state of the fold: the islands solved so far, and what is known about them.
 
-    home:       island (a key of `islands`) of each stream. reasons:    why an island other than the
-    main one is not merged, by its frame. joined:     how an island was merged into another one and
-    how sure that is, by its old frame. warnings:   of the full solution, what speaks for another
-    minimum, in words. waiting:    inter-robot measurements whose pose nodes are not both in one
-    island, in canonical order. judged, looked: number of submaps of two islands at their last
-    failed merge attempt, with the
-                reason for the failure; of one island at its last failed search for a minimum.
+    home:       island (a key of `islands`) of each stream.
+    reasons:    why an island other than the main one is not merged, by its frame.
+    joined:     how an island was merged into another one and how certain that is, by its old frame.
+    warnings:   of the full solution, what speaks for another minimum, in words.
+    waiting:    inter-robot measurements whose pose nodes are not both in one island, in canonical
+                order.
+    judged:     number of submaps of two islands at their last failed merge attempt, and the reason
+                for the failure.
+    looked:     number of submaps of an island at its last failed search for a lower minimum.
     iterations, change: of the main island's last full solution: how many, the last step [m, rad].
     refused:    submaps that came and are not in the map, in canonical order, and why (`taken`).
     set_aside:  in words, what else was refused: initial poses, inter-robot measurements, and the
