@@ -19,7 +19,8 @@ def with_current_names(value: Any) -> Any:
         return [with_current_names(each) for each in value]
     if not isinstance(value, dict):
         return value
-    current: dict[str, Any] = {FIELDS.get(name, name): each for name, each in value.items()}
+    former: dict[str, Any] = value
+    current = {FIELDS.get(name, name): each for name, each in former.items()}
     return {
         name: VALUES.get((name, each), each) if isinstance(each, str) else with_current_names(each)
         for name, each in current.items()
