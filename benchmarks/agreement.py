@@ -5,7 +5,8 @@ once with a centre; then as peers, three ways: with a centre that is one more pe
 with one that dies half way and comes back at the end. Meanwhile 20 % of what robots say to each
 other is lost, 10 % comes twice, up to 2 s late, so out of order; partitions by chance; 30 deaths,
 each of which may tear the end of a disk; the second robot joins at half time, the last one only
-ever meets the first. `withdrawn`: an operator withdraws the second robot half way, and only the
+ever meets the first. CASE is a scenario, `eight`, or `utias-6`; with `@100` behind it so many steps
+or seconds of it; with `/withdrawn` an operator withdraws the second robot half way, and only the
 first one hears it.
 """
 
@@ -49,7 +50,13 @@ WAYS = ("with", "without", "dies")
 
 
 def scenario_of(case: str, utias: Path) -> Scenario:
-    """A case by its name."""
+    """A case by its name; with `@100` behind it so many steps of its world or seconds of its set."""
+    case, _, length = case.partition("@")
+    if length:
+        whole = scenario_of(case, utias)
+        which = "steps" if hasattr(whole.world, "steps") else "duration_s"
+        shorter = msgspec.structs.replace(whole.world, **{which: int(length)})
+        return msgspec.structs.replace(whole, world=shorter)
     if case.startswith("utias-"):
         path = utias / f"MRCLAM_Dataset{case.removeprefix('utias-')}.zip"
         return with_options(load("utias"), dataset=path)
@@ -104,8 +111,7 @@ class Storm:
             team.restart(self._config(self.late))
         if self.withdrawn and now_ns >= self.half_ns and not self.disks.get("order"):
             self.disks["order"] = [order_of(self.names[1])]
-            order = self.disks["order"][0]
-            team.hear(self.names[0], Sample(order.key, order.payload, 0, 0, 0))
+            self._order(team)
         self._centre(team, now_ns)
         while self.due and self.due[0] <= now_ns:
             self.due.pop(0)
@@ -116,6 +122,15 @@ class Storm:
             rest = [each for each in kept if about(each.message) != name]
             team.restart(self._config(name), own + rest[: len(rest) - self.rng.randrange(5)])
             self.deaths += 1
+            if name == self.names[0]:
+                self._order(team)
+
+    def _order(self, team: PeerTeam) -> None:
+        """The first robot hears the operator's order, and again from the router when it is back
+        from a death, which may have torn the order off its disk before anyone else had it.
+        """
+        for order in self.disks.get("order", ()):
+            team.hear(self.names[0], Sample(order.key, order.payload, 0, 0, 0))
 
     def _centre(self, team: PeerTeam, now_ns: int) -> None:
         if self.way == "without":

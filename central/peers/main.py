@@ -21,7 +21,7 @@ from team.robot.main import SECOND_PATIENCE_S, RobotShell
 from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import NO_COUNTER, Bus, Sample
+from team.wire.bus import NO_COUNTER, Bus, Sample, Tap
 
 LINGER_S = 5.0
 """A robot that knows that all others have concluded stays so long, so that they know of it, too."""
@@ -138,6 +138,8 @@ class PeerShell(RobotShell):
         goes_on = self._peer.restore(kept)
         self._peer.peer.unsaved.clear()
         self.node = self._peer.node
+        maps = m.InitialPose | m.Submap | m.SightingFactor
+        self._log([each for each in kept if isinstance(each.message, maps)])
         _LOG.info(
             "%d members of the set are kept, of this robot %d submaps",
             len(kept),
@@ -162,7 +164,11 @@ class PeerShell(RobotShell):
         so the log proves the robot's maps, and logs of a team can be merged.
         """
         members, self._peer.carried = self._peer.carried, []
-        tap = getattr(self.bus, "tap", None)
+        self._log(members)
+
+    def _log(self, members: Sequence[Member]) -> None:
+        """Into the robot's own log: what a death has torn off that may still be in the set."""
+        tap: Tap | None = getattr(self.bus, "tap", None)
         if tap is not None and members:
             tap([_as_heard(member) for member in members])
 

@@ -65,6 +65,7 @@ class PeerTeam:
         self._sent = 0
         self._log: list[Sample] = []
         self._counters: dict[str, int] = {}
+        self._latest: dict[str, tuple[ch.Channel, Sample]] = {}
 
     def seat(self, config: RobotConfig) -> None:
         """Put a robot there that knows nothing yet: at the start, or after a death."""
@@ -78,6 +79,7 @@ class PeerTeam:
         seat.node.keep(restored)
         self.seats[CENTRE] = seat
         self._enter(CENTRE, seat)
+        self._catch_up(CENTRE, seat)
 
     def leave(self, name: str) -> list[Member]:
         """A robot or the centre dies; what it had kept."""
@@ -144,7 +146,8 @@ class PeerTeam:
                 said = seat.boundary.take_reply(seat.node, key, reply, m.Measurement)
                 self._say(config.id, said)
             if seat.node.node.next_measurement == first:
-                return
+                break
+        self._catch_up(config.id, seat)
 
     def hear(self, name: str, sample: Sample) -> None:
         """One robot alone hears what an operator says."""
@@ -159,13 +162,19 @@ class PeerTeam:
             self._log.append(sample)
             found = ch.channel_of(sample.key)
             assert found is not None
+            if found[0].delivery == "latest" and found[0].template.startswith("world/"):
+                self._latest[sample.key] = found[0], sample
             for robot, seat in list(self.seats.items()):
-                listens = (
-                    seat.node.listens if isinstance(seat.node, PeerRobot) else seat.node.overhears
-                )
+                listens = _listened(seat.node)
                 mine = found[0] in listens and (robot == CENTRE or found[1] in ("", robot))
                 if mine:
                     self._say(robot, seat.boundary.take(seat.node, sample))
+
+    def _catch_up(self, robot: str, seat: _Seat) -> None:
+        """Who comes gets the latest of what the world has said once: that streams have ended."""
+        for channel, sample in self._latest.values():
+            if channel in _listened(seat.node):
+                self._say(robot, seat.boundary.take(seat.node, sample))
 
     def _to_world(self, out: Outgoing) -> None:
         sample = self._sample(out)
@@ -244,6 +253,11 @@ class PeerTeam:
     def _taken(self) -> list[Sample]:
         taken, self._log = self._log, []
         return taken
+
+
+def _listened(node: PeerRobot | PeerCentre) -> tuple[ch.Channel, ...]:
+    """What a robot subscribes to under its name, or a centre whoever it names."""
+    return node.listens if isinstance(node, PeerRobot) else node.overhears
 
 
 def peer_world(scenario: Scenario, streams: WorldStreams, late: Collection[str] = ()) -> WorldNode:

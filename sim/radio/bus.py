@@ -8,7 +8,7 @@ say is carried by radio; the world, the recorder and the operator are the test b
 
 import heapq
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from hashlib import blake2b
 from typing import cast
 
@@ -16,7 +16,7 @@ from sim.world.config import Radio
 from sim.world.radio import Reach
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Answer, Bus, Outgoing, Sample
+from team.wire.bus import Answer, Bus, Outgoing, Sample, Tap
 from team.wire.codec import WireError, decoded, encoded
 
 _RADIO = {
@@ -43,7 +43,7 @@ class RadioBus:
         self._now_ns = -(2**62)
         bus.subscribe(ch.RADIO)
         tap = getattr(bus, "tap", None)
-        self.tap: Callable[[list[Sample]], None] | None = tap
+        self.tap: Tap | None = tap
         self._tap(None)
 
     def __getattr__(self, name: str) -> object:
@@ -59,10 +59,20 @@ class RadioBus:
         finally:
             self._tap(None)
 
-    def _tap(self, tap: Callable[[list[Sample]], None] | None) -> None:
+    def _tap(self, tap: Tap | None) -> None:
         """A robot's own log has what the radio let through, not what came to its door."""
         if hasattr(self._bus, "tap"):
             self._bus.tap = tap
+
+    def ask(
+        self, channel: ch.Channel, name: str, request: m.Message, timeout_s: float
+    ) -> list[bytes]:
+        """Ask and wait: who is asked so is of the test bench, or the robot's own source."""
+        self._tap(self.tap)
+        try:
+            return self._bus.ask(channel, name, request, timeout_s)
+        finally:
+            self._tap(None)
 
     def request(self, channel: ch.Channel, name: str, request: m.Message) -> None:
         """Ask; nobody hears a question that is out of reach."""

@@ -13,7 +13,7 @@ from team.robot.node import RobotNode
 from team.shell import RECORDER, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, BusError, Sample
+from team.wire.bus import Bus, BusError, Sample, Tap
 from team.wire.codec import WireError, decoded
 
 SECOND_PATIENCE_S = 6.0
@@ -21,6 +21,8 @@ SECOND_PATIENCE_S = 6.0
 SECOND_PERIOD_S = 0.5
 CONFIRMED_S = 1.0
 """Between two questions at the source, in which incarnation its stream is."""
+LOG_LOOK_S = 2.0
+"""Between two looks at what the robot's own log lacks."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -46,6 +48,7 @@ class RobotShell:
         self.node = RobotNode(config, exchange)
         self._first_of: dict[int, Sample] = {}
         self._confirm_at = 0.0
+        self._log_due_s = 0.0
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
 
     def run_in(self, shell: Shell) -> None:
@@ -65,6 +68,7 @@ class RobotShell:
             self._catch_up()
         self._look_for_driver()
         self.shell.run(self._duty)
+        self._complete_log()
         _LOG.info("%d submaps from %d measurements", self.node.submaps, self.node.next_measurement)
         self._await_recorder()
         self.shell.end(self._final)
@@ -88,6 +92,32 @@ class RobotShell:
         """Ask the source for what is missing of the stream."""
         wanted = self.node.wanted()
         self._missing.look(() if wanted is None else (wanted,))
+        if time.monotonic() >= self._log_due_s:
+            self._log_due_s = time.monotonic() + LOG_LOOK_S
+            self._complete_log()
+
+    def _complete_log(self) -> None:
+        """Ask the source for what a death has cost the robot's own log.
+
+        What the robot lacks, too, it asks for itself, and the log has the answer.
+        """
+        tap: Tap | None = getattr(self.bus, "tap", None)
+        for incarnation, first, last in () if tap is None else tap.lost(self.node.robot):
+            here = incarnation == self.node.incarnation
+            used = min(last, self.node.next_measurement - 1) if here else last
+            if first <= used:
+                wanted = m.MeasurementsRequest(
+                    stamp_ns=0,
+                    robot=self.node.robot,
+                    incarnation=incarnation,
+                    first=first,
+                    last=used,
+                )
+                try:
+                    self.bus.ask(ch.MEASUREMENTS, self.node.robot, wanted, ASK_TIMEOUT_S)
+                except BusError as error:
+                    _LOG.warning("its own log lacks measurements %d to %d: %s", first, used, error)
+                    return
 
     def _look_for_driver(self) -> None:
         """Whether the robot's driver is there is known before anything else is heard."""

@@ -69,6 +69,19 @@ Answer = Callable[[bytes], Iterable[bytes]]
 
 
 @runtime_checkable
+class Tap(Protocol):
+    """What keeps all that a bus sends and receives, replies to its questions, too: an own log."""
+
+    def __call__(self, samples: list[Sample]) -> None:
+        """Keep these."""
+
+    def lost(self, robot: str) -> list[tuple[int, int, int]]:
+        """Measurements of a robot that are known of and not kept, as after a death: incarnation,
+        first number, last number.
+        """
+
+
+@runtime_checkable
 class Bus(Protocol):
     """What a shell needs of a bus."""
 

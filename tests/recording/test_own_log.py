@@ -1,12 +1,15 @@
 """A robot's own log and another's make the whole: what one has not heard the other has."""
 
+import threading
 from pathlib import Path
 
 from team.recording.merge import merge
 from team.recording.own_log import own_log
 from team.recording.reader import open_log
 from team.wire import channels as c
+from team.wire import messages as m
 from team.wire.bus import Outgoing
+from team.wire.codec import encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 from tests.support import odometry, received, submap
@@ -31,3 +34,33 @@ def test_what_a_bus_sends_and_receives_is_in_its_own_log_and_merged_there_once(
     assert found == [{submaps: 5, measurements: 5}, {submaps: 5}]
     merged = merge([open_log(path) for path in paths], tmp_path / "whole.mcap")
     assert merged == (10, 5)
+
+
+def test_what_a_robot_has_asked_for_is_in_its_own_log_and_what_a_death_cost_it_is_known(
+    tmp_path: Path,
+) -> None:
+    """Killed and started again, a robot had the measurements of its source, and its log had not."""
+    path = tmp_path / "a.mcap"
+    with router() as at, own_log(path, "t") as log, ZenohBus("t", at) as source:
+        source.answer(c.MEASUREMENTS, "alpha", lambda _: [encoded(odometry(i)) for i in (1, 2, 5)])
+        answering = threading.Event()
+        thread = threading.Thread(target=lambda: answers(source, answering))
+        thread.start()
+        with ZenohBus("t", at) as robot:
+            robot.tap = log
+            wanted = m.MeasurementsRequest(
+                stamp_ns=0, robot="alpha", incarnation=1, first=1, last=5
+            )
+            for _ in range(2):
+                assert len(robot.ask(c.MEASUREMENTS, "alpha", wanted, 10.0)) == 3
+        answering.set()
+        thread.join()
+        assert [(first, last) for _, first, last in log.lost("alpha")] == [(0, 0), (3, 4)]
+        assert log.lost("bravo") == []
+    assert {k: n for k, (n, _) in open_log(path).counts().items()} == {c.ODOMETRY.key("alpha"): 3}
+
+
+def answers(bus: ZenohBus, until: threading.Event) -> None:
+    """A node that does nothing but answer."""
+    while not until.is_set():
+        bus.receive(0.05)

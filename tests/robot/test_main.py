@@ -2,14 +2,18 @@
 
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
 import pytest
 
+from team.recording.own_log import own_log
 from team.robot.main import RobotShell
 from team.wire import channels as ch
-from team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing
-from team.wire.codec import encoded
+from team.wire import messages as m
+from team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing, Sample
+from team.wire.codec import decoded, encoded
+from tests.support import odometry
 from tests.teams import config, published, stream
 
 
@@ -42,7 +46,13 @@ class Source:
     def __init__(self, network: MemoryNetwork) -> None:
         self.bus = MemoryBus(network)
         self.start = published(stream("r1", 3))[0]
-        self.bus.answer(ch.MEASUREMENTS, "r1", lambda request: [encoded(self.start)])
+        self.asked: list[tuple[int, int, int]] = []
+        self.bus.answer(ch.MEASUREMENTS, "r1", self.answer)
+
+    def answer(self, request: bytes) -> list[bytes]:
+        wanted = decoded(request, m.MeasurementsRequest)
+        self.asked.append((wanted.incarnation, wanted.first, wanted.last))
+        return [encoded(self.start)]
 
     def begins(self, incarnation: int) -> None:
         said = msgspec.structs.replace(self.start, incarnation=incarnation)
@@ -74,6 +84,21 @@ def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone() -> None:
     assert shell.shell.boundary.refused == 1
     warnings = str(shell.shell.boundary.warnings)
     assert "of incarnation 4, of which its source knows nothing" in warnings
+
+
+def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path: Path) -> None:
+    network = MemoryNetwork()
+    source = Source(network)
+    bus = MemoryBus(network)
+    with own_log(tmp_path / "r1.mcap", "t") as log:
+        measured = msgspec.structs.replace(odometry(5, "r1"), incarnation=1)
+        later = Outgoing(ch.ODOMETRY, "r1", measured)
+        log([Sample(later.key, encoded(later.message), 0, 0, 0)])
+        bus.tap = log
+        shell = lived(network, bus, lambda: source.begins(1))
+    assert shell.node.next_measurement == 1
+    assert (1, 0, 0) in source.asked, "the robot has used it, its log has lost it"
+    assert not any(first > 0 for _, first, _ in source.asked), "it asks for these itself"
 
 
 def test_where_no_source_answers_the_message_itself_is_believed() -> None:

@@ -13,7 +13,7 @@ import logging
 import struct
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Self
 import zenoh
 from zenoh.handlers import Callback
 
-from team.wire.bus import Answer, BusError, Outgoing, Sample
-from team.wire.channels import ALIVE, TALLY, Channel, row_of
-from team.wire.codec import LARGEST_PAYLOAD, encoded
+from team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
+from team.wire.channels import ALIVE, REPLIES, TALLY, Channel, row_of
+from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.messages import Liveliness, Message, Tally
 from team.wire.zenoh.delivery import Publisher, declared, subscribe
 from team.wire.zenoh.queries import Queries, Question, Reply
@@ -80,7 +80,7 @@ class ZenohBus:
         self._published: dict[str, int] = {}
         self._newest_ns = 0
         self._since_ns = time.time_ns()
-        self.tap: Callable[[list[Sample]], None] | None = None
+        self.tap: Tap | None = None
         """Is handed what this bus publishes and receives."""
         self._closed = threading.Event()
         self._keys = keys
@@ -278,7 +278,12 @@ class ZenohBus:
         bus answers nobody meanwhile: two nodes must not ask one another at once.
         """
         self._check_open()
-        return self._queries.ask(channel, name, request, timeout_s)
+        payloads = self._queries.ask(channel, name, request, timeout_s)
+        if self.tap is not None and channel in REPLIES:
+            wall_ns = time.time_ns()
+            with suppress(WireError):  # whoever asked opens them, and says what is wrong
+                self.tap([replied(channel, name, payload, wall_ns) for payload in payloads])
+        return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
         """Ask without waiting: the replies come out of `receive`, as samples of their channels.
