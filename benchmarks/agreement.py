@@ -50,7 +50,7 @@ WAYS = ("with", "without", "dies")
 
 
 def scenario_of(case: str, utias: Path) -> Scenario:
-    """A case by its name; with `@100` behind it so many steps of its world or seconds of its set."""
+    """A case by its name; with `@100` behind it so many steps, or seconds of a data set."""
     case, _, length = case.partition("@")
     if length:
         whole = scenario_of(case, utias)
