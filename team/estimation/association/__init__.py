@@ -1,1 +1,3 @@
-"""Which detections of a window are of one landmark, from the window's own measurements alone."""
+"""Data association inside a window: decides which detections are of one landmark, from the
+window's own measurements alone.
+"""

@@ -1,7 +1,7 @@
 """The association of one closed window: track, smooth, associate again, merge, drop.
 
-No truth, no map and no other window goes in, so a submap's landmarks are its own measurements'
-alone. There is one association of a window: particles are not asked, and nothing is averaged.
+The association uses no map and no other window, so that submaps stay independent. A window has one
+association, which all its particles share.
 """
 
 from dataclasses import dataclass, replace
@@ -24,12 +24,13 @@ from team.estimation.association.tracking import Slip, slip_covariance, tracked
 
 @dataclass(frozen=True)
 class Associated:
-    """Which landmark each detection of a window is of.
+    """The landmark of each detection of a window.
 
-    landmark_of: by detection, in [0, L); NOBODY of what stays out. names: of each landmark, NOBODY
-    of those without; by name, then in the order in which the window saw them. counts: by how many
-    detections. seen: by which keyframes. slips: where the odometry was wrong.
-    clutter: of the detections that stay out, those whose place was looked at again in vain.
+    landmark_of: by detection, in [0, L); NOBODY for a detection that stays out. names: the identity
+    of each landmark, NOBODY where it has none; sorted by name, then in the order in which the
+    window saw them. counts: the number of detections of each landmark. seen: the keyframes that saw
+    it. slips: where the odometry was wrong. clutter: for each detection that stays out, whether its
+    place was observed again without finding it.
     """
 
     landmark_of: Int64[np.ndarray, " N"]
@@ -41,7 +42,7 @@ class Associated:
 
 
 def associated(scans: Scans, settings: Association) -> Associated:
-    """The window's one association; raises LinAlgError where the window has no solution."""
+    """Associate the detections of a window. Raises LinAlgError where the window has no solution."""
     first = tracked(scans, settings)
     scans = _with_slips(scans, first.slips)
     landmark_of, names = first.landmark_of, np.array(first.names, np.int64)
@@ -81,7 +82,7 @@ def _renumbered(
     names: Int64[np.ndarray, " before"],
     points: Float[np.ndarray, "before 2"],
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Landmarks that have a detection, by name, those without by their first detection."""
+    """Renumber the landmarks that have a detection: by name, then by their first detection."""
     kept, first = np.unique(landmark_of, return_index=True)
     kept, first = kept[kept != NOBODY], first[kept != NOBODY]
     unnamed = names[kept] == NOBODY
@@ -94,9 +95,9 @@ def _renumbered(
 def _again(
     scans: Scans, names: Int64[np.ndarray, " before"], now: Smoothed, settings: Association
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Every scan once more, from the smoothed path against the landmarks of the whole window.
+    """Associate every scan again, from the smoothed path against the landmarks of the whole window.
 
-    What matches none founds a landmark, for the scans that follow too.
+    A detection that matches none founds a landmark, also for the scans that follow.
     """
     k, n = len(now.poses), len(now.covariance)
     most = n + 2 * len(scans.points)
@@ -139,7 +140,7 @@ def _merged(
     now: Smoothed,
     settings: Association,
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Unnamed landmarks at one place that no scan saw together are one, the closest first."""
+    """Merge unnamed landmarks at one place that no scan saw together, the closest pair first."""
     count, first = len(names), 3 * len(now.poses)
     seen = _seen(scans, landmark_of, count)
     together = (seen.astype(np.int64) @ seen.T.astype(np.int64)) > 0
@@ -168,7 +169,9 @@ def _certain(
     now: Smoothed,
     settings: Association,
 ) -> Int64[np.ndarray, " N"]:
-    """The association without what may as well be of something else; names are believed."""
+    """Drop detections that may as well be of something else (`certain`); identities are always
+    accepted.
+    """
     sure = certainties(scans, landmark_of, now, settings) >= settings.certain
     return np.where(sure | (scans.names != NOBODY), landmark_of, NOBODY)
 
@@ -176,7 +179,7 @@ def _certain(
 def _confirmed(
     landmark_of: Int64[np.ndarray, " N"], names: Int64[np.ndarray, " L"], settings: Association
 ) -> Bool[np.ndarray, " L"]:
-    """Named landmarks, and those that were seen often enough."""
+    """Whether each landmark is accepted: it has a name or was seen often enough."""
     counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(names))
     return np.asarray((counts >= settings.least_seen) | (names != NOBODY))
 
@@ -188,11 +191,12 @@ def _looked_in_vain(
     now: Smoothed,
     settings: Association,
 ) -> Bool[np.ndarray, " N"]:
-    """Of what is not confirmed: where a landmark would have been seen more often.
+    """Of landmarks that are not confirmed, those that would have been seen more often if they were
+    real.
 
-    A place counts as looked at by a keyframe if it saw something at least as far off, and lies
-    between the outermost bearings of what it saw. Seen c times in v such looks, a landmark that is
-    detected with probability p would be seen so rarely in fewer than 1 of 20 cases.
+    A keyframe observes a place if it saw something at least as far off and the place lies between
+    the outermost bearings of what it saw. A landmark with detection probability p that was observed
+    v times is clutter if so few detections have a probability below 1/20.
     """
     clutter = np.zeros(len(landmark_of), np.bool_)
     scan_of = scans.keyframes

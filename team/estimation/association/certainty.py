@@ -1,4 +1,4 @@
-"""How certain it is that a detection is of its landmark, as a probability.
+"""The probability that a detection is of the landmark that it was associated with.
 
 In one scan each landmark gives one detection at the most and each detection is of one landmark, of
 one that is not known, or clutter. Of a landmark that is in view with probability v and detected
@@ -24,20 +24,21 @@ from team.estimation.association.scans import NOBODY, Scans
 from team.estimation.association.smoothing import Smoothed, predicted_by
 
 LEAST = 0.1
-"""What is seen at all is in view with this probability at least."""
+"""Least probability that something which was detected is in view."""
 WIDER, FARTHER = 0.5, 1.25
-"""A view goes on by so much [rad] beside the outermost bearing, and to so many times the median
-range at least: a robot that stands sees one landmark at one place, and looks at more."""
+"""The sector in view extends this far [rad] beyond the outermost bearing, and to this multiple
+of the median range at least: a robot that stands still sees a landmark at one place only, but
+more of its surroundings are in view."""
 ROUNDS = 30
 SETTLED = 1e-6
 
 
 @dataclass(frozen=True)
 class View:
-    """What a window's scans look at, from its own detections.
+    """The sector that a window's scans observe, estimated from its own detections.
 
-    density: detections of a scan per square metre of its view; area [m²]; looks: how many scans.
-    farthest [m]; least, most: bearings.
+    density: detections of a scan per square metre of the sector; area [m²]; looks: number of scans.
+    farthest [m]; least, most: bearings [rad].
     """
 
     density: float
@@ -50,7 +51,7 @@ class View:
     def holds(
         self, seen: Float[np.ndarray, "L 2"], spread: Float[np.ndarray, "L 2 2"]
     ) -> Float[np.ndarray, " L"]:
-        """The probability of each place, in the sensor's frame, to be in view."""
+        """Probability that each place, given in the sensor's frame, is in view."""
         ranges = np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-6)
         bearings = np.arctan2(seen[:, 1], seen[:, 0])
         along = seen / ranges[:, None]
@@ -65,8 +66,8 @@ class View:
 
 
 def view_of(scans: Scans) -> View:
-    """The sector that the window's detections fill, as far as it is not noise that widens it, and
-    how densely.
+    """The sector that the window's detections fill, without the widening by their noise, and the
+    density of detections in it.
     """
     ranges = np.hypot(scans.points[:, 0], scans.points[:, 1])
     bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
@@ -82,8 +83,8 @@ def view_of(scans: Scans) -> View:
 def certainties(
     scans: Scans, landmark_of: Int64[np.ndarray, " N"], now: Smoothed, settings: Association
 ) -> Float[np.ndarray, " N"]:
-    """Of each detection, the probability that it is of the landmark that it went to; of what went
-    to none, 0.
+    """Of each detection, the probability that it is of the landmark that it was associated with;
+    0 for a detection without a landmark.
     """
     view = view_of(scans)
     counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(now.landmarks))
@@ -113,7 +114,9 @@ def certainties(
 
 
 def marginals(weights: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:
-    """P(detection i is of landmark j) by the odds ψ_ij of each pair alone, each of both once."""
+    """P(detection i is of landmark j), from the odds ψ_ij of the pairs, each detection and each
+    landmark used at most once.
+    """
     messages = np.ones_like(weights)
     for _ in range(ROUNDS):
         of_landmark = (weights * messages).sum(axis=0) - weights * messages

@@ -1,4 +1,6 @@
-"""One scan against landmarks: the best pair first, each detection and each landmark once."""
+"""Matches one scan with landmarks: the best pair first, each detection and each landmark at most
+once.
+"""
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -20,10 +22,10 @@ def squared_distances(
 def best_pairs_first(
     squared: Float[np.ndarray, "n L"], costs: Float[np.ndarray, "n L"], gate: float
 ) -> Int64[np.ndarray, " n"]:
-    """The landmark of each detection, NOBODY where none is left within the gate.
+    """Assign a landmark to each detection; NOBODY where none is left within the gate.
 
-    Of all pairs within the gate that of the least cost is taken, then the next one whose detection
-    and whose landmark are free; equal costs by their order.
+    The pair with the least cost within the gate is taken, then the next one whose detection and
+    landmark are both free. Equal costs are taken in their order.
     """
     found = np.full(len(squared), NOBODY)
     rows, columns = np.nonzero(squared < gate)

@@ -1,4 +1,4 @@
-"""A window's detections as arrays, and the geometry of many poses and points at once."""
+"""A window's detections as arrays, and geometry on many poses and points at once."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 NOBODY = -1
-"""No name, no landmark."""
+"""Stands for no identity and for no landmark."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,9 @@ def points_of(
     bearings: Float[np.ndarray, " n"],
     variances: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Ranges and bearings with covariances (rr, rb, bb) as points with theirs, to first order."""
+    """Convert ranges and bearings with covariances (rr, rb, bb) to points with theirs, to first
+    order.
+    """
     c, s = np.cos(bearings), np.sin(bearings)
     J = np.stack((np.stack((c, -ranges * s), -1), np.stack((s, ranges * c), -1)), -2)
     R = variances[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -49,19 +51,19 @@ def points_of(
 
 
 def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
-    """The matrix that turns by this angle."""
+    """The rotation matrix of an angle."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s], [s, c]])
 
 
 def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
-    """The matrices that turn by each angle."""
+    """The rotation matrix of each angle."""
     c, s = np.cos(angles), np.sin(angles)
     return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)
 
 
 def path_of(motions: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-    """The poses that the motions lead to, from zero."""
+    """The poses that the motions lead to, from the zero pose."""
     headings = np.cumsum(motions[:, 2])
     before = np.concatenate(([0.0], headings[:-1]))
     steps = np.einsum("kij,kj->ki", rotations(before), motions[:, :2])

@@ -1,4 +1,4 @@
-"""A window's path and landmarks together, by Gauss-Newton, for a given association."""
+"""Estimates a window's path and landmarks jointly by Gauss-Newton, for a given association."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,8 @@ JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²]: noise of motion may be of rank 2 or none."""
 ITERATIONS = 6
 SETTLED = 1e-4
-"""A step whose largest entry [m, rad] is smaller changes no association."""
+"""The iteration ends at a step whose largest entry [m, rad] is smaller: it changes no
+association."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Smoothed:
 def predicted_by(
     now: Smoothed, k: int
 ) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
-    """Each landmark as pose k sees it, and the covariance of that."""
+    """The position of each landmark relative to pose k, and its covariance."""
     poses, count = len(now.poses), len(now.landmarks)
     return seen_with(
         now.poses[k], now.landmarks, now.covariance, slice(3 * k, 3 * k + 3), 3 * poses, count
@@ -55,8 +56,8 @@ def seen_with(
     first: int,
     count: int,
 ) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
-    """The same of a joint covariance in which the pose is `at`, and `count` landmarks from `first`
-    on.
+    """The same from a joint covariance in which the pose stands at `at` and `count` landmarks
+    from `first` on.
     """
     turn = rotation(pose[2])
     seen = (landmarks - pose[:2]) @ turn
@@ -151,7 +152,7 @@ def _directions(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 def _moved(
     poses: Float[np.ndarray, "K 3"], steps: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "K 3"]:
-    """The poses pose ∘ (forward, left, turn) of each; a step is Exp to first order."""
+    """The poses after a step (forward, left, turn) of each; Exp to first order."""
     xi = steps.reshape(-1, 3)
     went = np.einsum("kij,kj->ki", rotations(poses[:, 2]), xi[:, :2])
     return np.column_stack((poses[:, :2] + went, _directions(poses[:, 2] + xi[:, 2])))

@@ -1,8 +1,9 @@
 """The first pass over a window: an extended Kalman filter with the best pair first.
 
-Smith, Self and Cheeseman 1990, with detections as points. Odometry that slips is noticed: where few
-detections match although landmarks are about, and nearly all do if the robot has jumped (Ortín,
-Montiel 2001; one-point RANSAC), the motion is taken as that much more uncertain.
+Smith, Self and Cheeseman 1990, with detections as points. A slip of the odometry is detected where
+few detections match although there are landmarks nearby, and nearly all match if the robot is
+assumed to have jumped (one-point RANSAC; Ortín and Montiel 2001). The covariance of that motion is
+then enlarged by the jump.
 """
 
 from typing import NamedTuple
@@ -17,26 +18,28 @@ from team.estimation.association.scans import NOBODY, Scans, pose_jacobians, rot
 from team.estimation.geometry import adjoint, compose, inverse
 
 FEW = 0.5
-"""Of a scan's detections: fewer that match are few …"""
+"""A slip is suspected where a smaller share of a scan's detections matches …"""
 MOST = 0.7
-"""… and so many that match after one jump are no chance."""
+"""… and accepted where at least this share matches after one jump."""
 RARE = 1e-3
-"""A joint distance that right pairs exceed so rarely is a surprise."""
+"""Probability with which correct pairs exceed the limit of the joint distance."""
 SLIP_TURN = 0.1
-"""A robot that slips may turn by about this [rad]."""
+"""Standard deviation of the rotation of a slip [rad]."""
 SLIP_DETECTIONS = 3
-"""A slip is looked for from so many detections on."""
+"""Least number of detections in a scan for a slip to be looked for."""
 
 
 class Slip(NamedTuple):
-    """Up to this keyframe the odometry was wrong by about this (forward [m], left [m], turn)."""
+    """A slip of about this (forward [m], left [m], turn [rad]) in the odometry up to a keyframe."""
 
     keyframe: int
     by: Float[np.ndarray, "3"]
 
 
 class Tracked(NamedTuple):
-    """What the first pass found; the landmark of each detection, and where they are."""
+    """The result of the first pass: the landmark of each detection, and the landmarks'
+    positions.
+    """
 
     landmark_of: Int64[np.ndarray, " N"]
     names: list[int]
@@ -46,7 +49,7 @@ class Tracked(NamedTuple):
 
 
 class Tracker:
-    """The filter's state: the pose, the landmarks so far, and their joint covariance."""
+    """The state of the filter: the pose, the landmarks so far and their joint covariance."""
 
     def __init__(self, settings: Association, most: int) -> None:
         self._settings = settings
@@ -57,7 +60,7 @@ class Tracker:
 
     @property
     def landmarks(self) -> Float[np.ndarray, "L 2"]:
-        """Where they are, in the window's frame."""
+        """The landmarks' positions in the window's frame."""
         return self._points[: len(self.names)]
 
     @property
@@ -65,7 +68,7 @@ class Tracker:
         return 3 + 2 * len(self.names)
 
     def move(self, motion: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> None:
-        """The motion up to the next keyframe."""
+        """Predict the pose over the motion up to the next keyframe."""
         n = self._size
         Ad = adjoint(inverse(motion))
         self.pose = compose(self.pose, motion)
@@ -74,7 +77,7 @@ class Tracker:
         self._P[:3, :3] += covariance
 
     def predicted(self) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
-        """Each landmark as the robot would see it, and how sure that is."""
+        """Each landmark's position relative to the robot, and its covariance."""
         count = len(self.names)
         turn = rotation(self.pose[2])
         seen = (self.landmarks - self.pose[:2]) @ turn
@@ -87,7 +90,7 @@ class Tracker:
         return seen, S + turn.T @ own @ turn + mixed + mixed.transpose(0, 2, 1)
 
     def shift(self, by: Float[np.ndarray, "3"]) -> None:
-        """The robot has slipped by about this (forward, left, turn)."""
+        """Apply a slip of about this (forward, left, turn) to the pose, with its uncertainty."""
         self.pose = compose(self.pose, by)
         self._P[:3, :3] += slip_covariance(by)
 
@@ -97,7 +100,7 @@ class Tracker:
         points: Float[np.ndarray, "m 2"],
         covariances: Float[np.ndarray, "m 2 2"],
     ) -> None:
-        """These landmarks were seen there: one joint update."""
+        """Update the state jointly by the detections of these landmarks."""
         m, n = len(landmarks), self._size
         if not m:
             return
@@ -116,7 +119,7 @@ class Tracker:
     def _jacobian(
         self, landmarks: Int64[np.ndarray, " m"]
     ) -> tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "m 2"]]:
-        """∂h/∂state of these landmarks, and h."""
+        """∂h/∂state for these landmarks, and h."""
         m = len(landmarks)
         turn = rotation(self.pose[2])
         seen = (self.landmarks[landmarks] - self.pose[:2]) @ turn
@@ -129,7 +132,7 @@ class Tracker:
     def found(
         self, point: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"], name: int
     ) -> int:
-        """A landmark that was not known; its index."""
+        """Add a new landmark; returns its index."""
         index, n = len(self.names), self._size
         turn = rotation(self.pose[2])
         G = turn @ np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
@@ -147,7 +150,7 @@ class Tracker:
         covariances: Float[np.ndarray, "n 2 2"],
         names: Int64[np.ndarray, " n"],
     ) -> Int64[np.ndarray, " n"]:
-        """The landmark of each detection of a scan, NOBODY of those that match none."""
+        """The landmark of each detection of a scan; NOBODY for those that match none."""
         if not len(points) or not self.names:
             return np.full(len(points), NOBODY)
         seen, spread = self.predicted()
@@ -167,7 +170,9 @@ class Tracker:
         points: Float[np.ndarray, "m 2"],
         covariances: Float[np.ndarray, "m 2 2"],
     ) -> float:
-        """The joint squared Mahalanobis distance of these pairs, over what it should not exceed."""
+        """The joint squared Mahalanobis distance of these pairs, divided by the largest
+        plausible one.
+        """
         m, n = len(landmarks), self._size
         if not m:
             return 0.0
@@ -183,13 +188,12 @@ class Tracker:
         covariances: Float[np.ndarray, "n 2 2"],
         found: Int64[np.ndarray, " n"],
     ) -> Float[np.ndarray, "3"] | None:
-        """(forward, left, turn) of the one slip that explains most of a scan; None if none does.
-
-        It must explain more pairs than those `found` without it, and together they must fit better
-        by more than one pair that fits not at all.
+        """The slip (forward, left, turn) that explains most of a scan; None if none does.
 
         Each pair of a detection and a landmark near it proposes a slip, given that the pose may be
-        wrong by slip_m; the other pairs are counted given that one.
+        wrong by slip_m; the other pairs are counted under that proposal. A slip must explain more
+        pairs than those `found` without it, and must fit better by more than the cost of one pair
+        that does not fit.
         """
         gate, reach = self._settings.gate, self._settings.slip_m
         seen, spread = self.predicted()
@@ -232,13 +236,15 @@ class Tracker:
 
 
 def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Of a motion that slipped by about this (forward, left, turn): as large again."""
+    """The covariance of a motion with a slip of about this (forward, left, turn): the slip is
+    its standard deviation.
+    """
     metres, turn = max(float(np.hypot(*slip[:2])), 0.02), max(abs(float(slip[2])), 0.02)
     return np.diag([metres**2, metres**2, turn**2])
 
 
 def tracked(scans: Scans, settings: Association) -> Tracked:
-    """The first association of a window's detections, scan by scan."""
+    """Associate a window's detections scan by scan."""
     tracker = Tracker(settings, len(scans.points))
     landmark_of = np.full(len(scans.points), NOBODY)
     bounds = scans.bounds
@@ -272,7 +278,9 @@ def _looks_slipped(
     covariances: Float[np.ndarray, "n 2 2"],
     reach: float,
 ) -> bool:
-    """Whether few match, some miss a landmark nearby, or the pairs do not fit together."""
+    """Whether a slip is suspected: few detections match, some miss a landmark nearby, or the
+    pairs do not fit together.
+    """
     known = np.nonzero(found != NOBODY)[0]
     if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
         return False
@@ -287,7 +295,7 @@ def _missed_nearby(
     points: Float[np.ndarray, "n 2"],
     reach: float,
 ) -> bool:
-    """Whether a detection and a landmark that match nothing lie within reach of each other."""
+    """Whether an unmatched detection and an unmatched landmark lie within reach of each other."""
     seen, _ = tracker.predicted()
     free = np.ones(len(seen), np.bool_)
     free[found[found != NOBODY]] = False

@@ -1,1 +1,1 @@
-"""Hybrid-SLAM, the front end: measurements become independent submaps."""
+"""Hybrid-SLAM, the front end: turns measurements into independent submaps."""

@@ -1,4 +1,4 @@
-"""What a window becomes at its end: a submap with the names of its inputs."""
+"""The result of a window: a submap with the names of its inputs."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class ClosedWindow:
     window, keyframes_ns: its particles with their paths, and the keyframes' team times; None where
     the window had no solution. innovation: of the window's measurements that were predicted.
     gated: measurements that no others of the window confirmed, and that are not in the submap.
-    late: scans of the interval that are stamped behind the window's end; they are rejected.
+    late: scans that arrived in the window and are stamped behind its end; they are rejected.
     unconfirmed, clutter: scans without identities of which no detection is in the submap. became:
     what became of each detection; None where there was none. slips: motions that the odometry
     missed.

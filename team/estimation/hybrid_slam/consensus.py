@@ -1,12 +1,12 @@
-"""Which measurements of one window agree: a landmark is taken when others confirm it, an outlier
-is not.
+"""Decides which measurements of a window agree; measurements that no others confirm are outliers.
 
-A measurement is good with probability 1 − ε and has the sensor's noise, or is an outlier, uniform
-over what the sensor can read, density u. It is taken if (1 − ε) p(z | the other taken ones,
-odometry) is above ε u; and a landmark is, if all its taken measurements together speak for it with
-odds of EVIDENCE, against outliers and against being another landmark of the window under a wrong
-name. Only measurements of the window itself are asked: a map or an earlier window could lock the
-robot out of what is true, and would use measurements twice.
+A measurement is good with probability 1 − ε and has the sensor's noise, or it is an outlier,
+uniform over the sensor's range and field of view with density u. It is accepted if (1 − ε) p(z |
+the other accepted ones, odometry) > ε u. A landmark is accepted if its measurements together reach
+odds of EVIDENCE against being outliers and against being another landmark of the window under a
+wrong identity. Only measurements of the window itself are used: a gate by a map or an earlier
+window would keep rejecting correct measurements once that map is wrong, and would use measurements
+twice.
 """
 
 import math
@@ -23,9 +23,8 @@ from team.estimation.models import Increment, located, variances
 from team.estimation.scans import Own
 
 EVIDENCE = math.log(100.0)
-"""Log odds that a landmark's taken measurements must reach: they agree by chance once in a
-hundred.
-"""
+"""Log odds that a landmark's accepted measurements must reach; by chance they do so in one case
+of a hundred."""
 MOTION_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each motion's variances [m², m², rad²]: noise of rank 2 has no information."""
 ROUNDS = 5
@@ -35,8 +34,8 @@ Taken = Bool[np.ndarray, " N"]
 
 
 class _Measurements:
-    """The measurements of the keyframes that have some, by landmark slots, and the motions
-    between.
+    """The measurements of the keyframes that have some, by landmark slot, and the motions
+    between them.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class _Measurements:
         uniform = 1.0 / (reach * sensor.field_of_view)
         self.prior = math.log((1.0 - outlier_share) / outlier_share)
         self.odds = self.prior - math.log(uniform)
-        """Added to log p(z): the log odds that the measurement is good."""
+        """Added to log p(z): gives the log odds that the measurement is good."""
 
 
 def agreeing(
@@ -71,11 +70,11 @@ def agreeing(
     sensor: Sensor,
     outlier_share: float,
 ) -> Taken:
-    """Measurements that agree with others of their landmark under the odometry alone.
+    """The measurements that agree with others of their landmark under the odometry alone.
 
-    Of a landmark's measurements the one that the others support best places it, and they are taken
-    with it. motions[k] leads to keyframe k; measurements are calibrated, own the noises
-    that they claim; 0 < outlier_share < 1 is ε.
+    The measurement of a landmark that the others support best places it; it is accepted together
+    with those that support it. motions[k] leads to keyframe k; measurements are calibrated; own:
+    the noises that they claim; 0 < outlier_share < 1 is ε.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
@@ -92,12 +91,11 @@ def confirmed(
     sensor: Sensor,
     outlier_share: float,
 ) -> Taken:
-    """As `agreeing`, then by a smoother over the whole window until no measurement changes sides.
+    """As `agreeing`, then by a smoother over the whole window until the classification is stable.
 
-    The poses and landmarks of least squares over the odometry and the taken measurements are found,
-    and every measurement is judged by what the others predict of it. Where the smoother's equations
-    have no solution in these numbers (odometry and measurements of scales too far apart) it judges
-    nothing.
+    The smoother estimates poses and landmarks by least squares over the odometry and the accepted
+    measurements; then every measurement is compared with its prediction from the others. Where the
+    normal equations have no solution in floating point, nothing is rejected.
     """
     if not len(ids):
         return np.zeros(0, dtype=np.bool_)
@@ -137,7 +135,7 @@ def confirmed(
 def _between(
     motions: Sequence[Increment], seen: Sequence[int]
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
-    """The motions between the keyframes of `seen`; the one to the first of them is none."""
+    """The motions between the keyframes of `seen`; the first one gets the zero motion."""
     means, covariances = np.zeros((len(seen), 3)), np.zeros((len(seen), 3, 3))
     for k in range(1, len(seen)):
         motion = motions[seen[k - 1] + 1]
@@ -168,11 +166,11 @@ def _smoothed(
     metrics: Float[np.ndarray, "K 3 3"],
     taken: Taken,
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "L 2"], Float[np.ndarray, "n n"]] | None:
-    """Two Gauss-Newton steps and the covariance; a landmark without a taken measurement stays,
+    """Two Gauss-Newton steps and the covariance; a landmark without an accepted measurement stays
     unknown.
 
-    Such a landmark has a variance of the reach squared, about what is known of it. None where the
-    normal equations are not positive definite.
+    Such a landmark gets the squared reach of the sensor as its variance. None where the normal
+    equations are not positive definite.
     """
     unknown = np.bincount(window.slots[taken], minlength=window.landmarks) == 0
     free = 3 * (len(path) - 1) + np.flatnonzero(np.repeat(unknown, 2))
@@ -197,8 +195,8 @@ def _smoothed(
 def _judged(window: _Measurements, odds: Float[np.ndarray, " N"], before: Taken) -> Taken:
     """The measurements with odds above even, of landmarks whose measurements have enough evidence.
 
-    Each of k measurements is predicted by the k − 1 others, so their odds count (k − 1)/k times. A
-    landmark that had lost all its measurements stays out.
+    Each of k measurements is predicted by the k − 1 others, so their odds are weighted by (k −
+    1)/k. A landmark that has lost all its measurements stays out.
     """
     held = np.bincount(window.slots[before], minlength=window.landmarks)
     taken = (odds > 0.0) & (held[window.slots] > 0)
@@ -216,12 +214,11 @@ def _misread(
     logs: Float[np.ndarray, " N"],
     taken: Taken,
 ) -> Taken:
-    """Measurements of landmarks that may well be another one of the window, with as many
-    measurements.
+    """Measurements of landmarks that may be another landmark of the window under a wrong identity.
 
-    k measurements that agree may all be of landmark m, misread k times as l: probability of each
-    ε/(L − 1) p(z | m) for the L names in the window, against (1 − ε) p(z | l) of its own, the first
-    of which is uniform. Taken are odds of EVIDENCE for l.
+    If k measurements that agree are all of landmark m, read k times as l, each has the probability
+    ε/(L − 1) p(z | m) for the L identities in the window, against (1 − ε) p(z | l) of its own, the
+    first of which is uniform. They are accepted where the odds for l reach EVIDENCE.
     """
     count = np.bincount(window.slots[taken], minlength=window.landmarks)
     total = np.bincount(window.slots[taken], logs[taken], minlength=window.landmarks)

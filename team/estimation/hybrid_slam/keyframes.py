@@ -1,4 +1,6 @@
-"""From a stream of odometry intervals and observations to the keyframes that an estimator takes."""
+"""Turns a stream of odometry intervals and observations into the keyframes that an estimator
+takes.
+"""
 
 from bisect import insort
 from dataclasses import dataclass, field, replace
@@ -20,9 +22,10 @@ from team.estimation.scans import Own, calibrated, unclaimed
 from team.rejection import Rejection
 
 NOTHING = np.empty(0, np.uint32), np.empty(0), np.empty(0), unclaimed(0)
-"""Seen at a keyframe without measurements."""
+"""The measurements of a keyframe without any."""
 UNMEASURED = (1.0, 0.5)
-"""Where motion was not measured it is uncertain by as much as it is, and by this [m/s, rad/s]."""
+"""Least standard deviation [m/s, rad/s] of a motion that was not measured; otherwise it is as
+large as the motion itself."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Keyframe:
             object.__setattr__(self, "own", unclaimed(len(self.ids)))
 
     def only(self, taken: Bool[np.ndarray, " n"]) -> "Keyframe":
-        """The keyframe with those of its measurements."""
+        """The keyframe with only these of its measurements."""
         return replace(
             self,
             ids=self.ids[taken],
@@ -102,7 +105,7 @@ class Segmenter:
         self.now_ns: int | None = None
 
     def begin(self, stamp_ns: int) -> None:
-        """A stream or a window begins at this team time."""
+        """Begin a stream or a window at this team time."""
         self.now_ns = stamp_ns
         self._keyframe_start_ns = stamp_ns
         self._last = STANDING  # what a window says depends on its own measurements alone
@@ -117,7 +120,9 @@ class Segmenter:
         bearings: Float[np.ndarray, " n"],
         own: Own | None = None,
     ) -> Rejection | None:
-        """Keep a scan until the odometry covers its time; the reason if it is rejected instead."""
+        """Keep a scan until the odometry covers its time; returns the reason if it is rejected
+        instead.
+        """
         if self.now_ns is not None and stamp_ns < self.now_ns:
             return Rejection.OLDER
         mask = acceptable(self._sensor, ranges, bearings)
@@ -139,10 +144,11 @@ class Segmenter:
         *,
         measured: bool = True,
     ) -> list[Keyframe]:
-        """Integrate one odometry interval; the keyframes that lie in it, in order.
+        """Integrate one odometry interval; returns the keyframes in it, in order.
 
-        Where its motion was not measured (what came could not be) the last speeds go on, with
-        errors of their own size, UNMEASURED at least; a heading's stays within a turn.
+        Where its motion could not be measured, the last speeds are assumed, with standard
+        deviations as large as the motion, at least UNMEASURED, and below a full rotation in
+        heading.
         """
         over = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
         if measured:
@@ -176,9 +182,10 @@ class Segmenter:
         return keyframes
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
-        """A window ends here: its last keyframe if one is open, and the motion after it.
+        """Close the window here: returns its last keyframe, if one is open, and the motion after
+        it.
 
-        That motion's shift by an error of the scale of speed is `rest_forward`.
+        The shift of that motion by an error of the scale of speed is `rest_forward`.
         """
         self._settle()
         keyframes = [self._close_keyframe(stamp_ns)] if self._keyframe else []
@@ -189,21 +196,23 @@ class Segmenter:
         return keyframes, rest
 
     def leave(self) -> int:
-        """A window ends: drop the scans that are stamped behind it, and say how many there were.
+        """End the window: drop the scans that are stamped behind it; returns their number.
 
-        The window's interval of measurements holds them, so no later window may use them: one that
-        is computed again, by a robot that was started again, would not have them.
+        Their counters lie in the window's interval of measurements, so no later window may use
+        them: a robot that is started again behind this window would not have them.
         """
         left, self._waiting = len(self._waiting), []
         return left
 
     @property
     def uncovered(self) -> int:
-        """Scans that wait for odometry that covers their time."""
+        """Number of scans that wait for odometry to cover their time."""
         return len(self._waiting)
 
     def _nodes(self, until_ns: int, over: Interval) -> list[Keyframe]:
-        """The grid times up to until_ns; inter-robot measurements up to there find their node."""
+        """The grid times up to until_ns as keyframes; inter-robot measurements up to there reach
+        their node.
+        """
         keyframes = []
         grid = self._grid
         while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
@@ -213,7 +222,7 @@ class Segmenter:
         return keyframes
 
     def _go_to(self, stamp_ns: int, over: Interval) -> int:
-        """Integrate up to a stamp; what lies before the interval's start is at its start."""
+        """Integrate up to a stamp; a stamp before the interval's start is taken as its start."""
         at_ns = max(stamp_ns, self._here_ns)
         self._integrate(at_ns - self._here_ns, over.end_ns - at_ns, over)
         self._settle()
@@ -247,7 +256,9 @@ class Segmenter:
             self._since_look = self._since_look.then(step)
 
     def _is_plain(self, over: Interval) -> bool:
-        """Whether an interval's motion follows from its speeds, and nobody waits for it."""
+        """Whether an interval's motion follows from its speeds alone and no inter-robot
+        measurement waits for it.
+        """
         return (
             over.moved is None
             and self._unmeasured is None
@@ -256,7 +267,7 @@ class Segmenter:
         )
 
     def _settle(self) -> None:
-        """What has been driven since somebody asked is in the motions."""
+        """Bring the motions up to date with the intervals driven since the last call."""
         if not self._run:
             return
         if self._since_look is not None:
@@ -309,7 +320,7 @@ class Segmenter:
 
 
 def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most: int) -> Keyframe:
-    """The keyframe without the new landmarks that are too many for a submap; the nearest stay."""
+    """The keyframe without the new landmarks beyond a submap's limit; the nearest ones stay."""
     ids, ranges = keyframe.ids, keyframe.ranges
     if len(known) + len(ids) <= most:
         return keyframe
@@ -321,7 +332,7 @@ def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most:
 
 
 def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.ndarray, "3 3"]:
-    """Variance per second of a motion that nobody measured, such that errors of the speeds sum."""
+    """Variance per second of an unmeasured motion, such that errors of the speeds sum up."""
     way = max(abs(forward), UNMEASURED[0]) * duration_s
     turn = min(max(abs(yaw_rate), UNMEASURED[1]) * duration_s, np.pi)
     return np.diag([way * way, 0.01 * way * way, turn * turn]) / duration_s

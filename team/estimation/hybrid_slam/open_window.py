@@ -1,7 +1,7 @@
-"""The open window of a robot, total: a step that has no solution ends no run.
+"""The open window of a robot; a step without a solution does not end the run.
 
-Where the particles of a window have once had no solution, none of its measurements count: what is
-left of it is the motion that the odometry says.
+Once the particles of a window have had no solution, none of its measurements are used: its submap
+is the motion by odometry alone.
 """
 
 import math
@@ -25,10 +25,11 @@ from team.estimation.randomness import generator
 from team.estimation.submap import LocalMap
 
 DEPLETED = 10.0
-"""Effective particles: where fewer were left after a keyframe, their scatter says nothing. One of a
-thousand windows of `thesis`, whose submap is then far off and sure of itself (decision 0081)."""
+"""Effective number of particles; where fewer remain after a keyframe, their scatter is no
+estimate of the uncertainty. It happens in one of a thousand windows of `thesis`, whose submap is
+then far off and overconfident (decision 0081)."""
 AGAIN = 8
-"""So many times the particles take such a window again."""
+"""The window is computed again with this many times the particles."""
 
 
 class OpenWindow:
@@ -60,30 +61,34 @@ class OpenWindow:
 
     @property
     def gated(self) -> int:
-        """Measurements that no others of the window confirmed."""
+        """Number of measurements that no others of the window confirmed."""
         return self._gate.gated + self.settled.gated
 
     def advance(self, keyframe: Keyframe) -> None:
-        """Particles move and weigh, once more: those measurements count that others agree with."""
+        """Move and weigh the particles with the measurements that agree with others so far."""
         self._follow(keyframe.increment)
         self.last_keyframe_ns = keyframe.stamp_ns
         self._try(lambda: self._admit(keyframe))
 
     def confirm(self) -> None:
-        """Where there may be outliers, or there are detections without identities, the window once
-        more with what all of it confirms; where that depleted the particles, again with more
-        (where landmarks have names and errors are white: decision 0081).
+        """Compute the window again with the measurements that are confirmed by all of it.
+
+        Only where outliers are expected or there are detections without identities. Where that
+        depletes the particles, the window is computed with more of them (where landmarks have
+        identities and errors are white: decision 0081).
         """
         self._try(self._settle)
 
     def move(self, rest: Increment, forward: np.ndarray) -> None:
-        """The motion after the last keyframe; forward: its shift by an error of the speed."""
+        """Take the motion after the last keyframe; forward: its shift by an error of the scale
+        of speed.
+        """
         if rest.mean.any() or rest.covariance.any():
             self._follow(rest)
             self._try(lambda: self._go(rest, forward))
 
     def solved(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
-        """The Gaussian that a step makes of the window; None where there is none."""
+        """The Gaussian that `step` makes of the window; None where it has none."""
         if not self._solvable:
             return None
         try:
@@ -93,11 +98,11 @@ class OpenWindow:
             return None
 
     def is_sensible(self, submap: LocalMap | None) -> bool:
-        """Whether a submap is there and within the bounds."""
+        """Whether there is a submap and it lies within the bounds."""
         return submap is not None and submap_beyond(submap, self._config.bounds) is None
 
     def _follow(self, motion: Increment) -> None:
-        """The base moves as its sensor does."""
+        """The base's motion as the sensor's."""
         sensor = self._config.sensor
         if sensor.is_mounted:
             motion = of_base(motion, np.array(sensor.mount))
@@ -153,7 +158,7 @@ class OpenWindow:
         self.particles = windows.moved(self.particles, rest, self._generator, forward)
 
     def _try(self, step: Callable[[], None]) -> None:
-        """Take a step of the particles, unless one has failed."""
+        """Apply a step to the particles, unless one has failed before."""
         if self._solvable:
             try:
                 with np.errstate(all="ignore"):

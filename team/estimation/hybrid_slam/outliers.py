@@ -1,4 +1,4 @@
-"""The open window's measurements, and which of them the others confirm."""
+"""The gate against outliers: the open window's measurements, and which of them others confirm."""
 
 from collections.abc import Sequence
 
@@ -13,11 +13,11 @@ from team.estimation.scans import Own, together
 
 
 class OutlierGate:
-    """Lets measurements pass that agree with others of the same window; it forgets at its end.
+    """Accepts measurements that agree with others of the same window; keeps nothing beyond its end.
 
-    While the window is open a measurement passes if earlier ones (or some beside it) agree with it;
-    for the submap all are judged again with all others, since the first measurement of a landmark
-    is only confirmed by a later one.
+    While the window is open, a measurement is accepted if earlier ones, or others at the same time,
+    agree with it. For the submap all are compared with all others, since the first measurement of a
+    landmark can only be confirmed by a later one.
     """
 
     def __init__(self, sensor: Sensor, outlier_share: float) -> None:
@@ -28,16 +28,16 @@ class OutlierGate:
 
     @property
     def judges(self) -> bool:
-        """Whether there may be outliers; else all measurements pass."""
+        """Whether outliers are expected; otherwise all measurements are accepted."""
         return self._outlier_share > 0.0
 
     def begin(self) -> None:
-        """A window begins."""
+        """Begin a window."""
         self._keyframes = []
         self.gated = 0
 
     def admitted(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe with those of its measurements that agree with what was read up to it."""
+        """The keyframe with those of its measurements that agree with the ones up to it."""
         if not self.judges:
             return keyframe
         self._keyframes.append(keyframe)
@@ -47,8 +47,8 @@ class OutlierGate:
         return keyframe.only(taken[-len(keyframe.ids) :])
 
     def settled(self) -> Sequence[Keyframe]:
-        """All keyframes of the window with the measurements that are confirmed; counts the
-        others.
+        """All keyframes of the window with their confirmed measurements; counts the rejected
+        ones.
         """
         taken = confirmed(*self._all(), self._sensor, self._outlier_share)
         self.gated = int(np.count_nonzero(~taken))

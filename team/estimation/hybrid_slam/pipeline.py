@@ -45,7 +45,7 @@ class HybridSlam:
         self._begin_window(0, 0)
 
     def resume(self, closed: ClosedWindow) -> None:
-        """Go on behind a submap of an earlier life: the next window begins where it ended."""
+        """Continue behind an earlier submap: the next window begins where that one ended."""
         self._start_ns = closed.end_ns
         self._segmenter.begin(closed.end_ns)
         self._begin_window(closed.sequence + 1, closed.last_measurement + 1)
@@ -53,17 +53,17 @@ class HybridSlam:
     # A measurement comes in.
 
     def consumed(self, measurement: int) -> None:
-        """The measurement belongs to the open window (or was rejected while it was open)."""
+        """Note that the measurement belongs to the open window, even if it was rejected."""
         self._last_measurement = measurement
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan of landmarks; the reason if it is rejected."""
+        """Take a scan of landmarks; returns the reason if it is rejected."""
         reason = self._segmenter.observe(stamp_ns, *scan)
         self._scans += reason is None
         return reason
 
     def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
-        """Take inter-robot measurements; the reason if they are rejected."""
+        """Take inter-robot measurements; returns the reason if they are rejected."""
         if self._grid is None:
             return Rejection.NO_NODES
         if self._start_ns is None:
@@ -80,7 +80,7 @@ class HybridSlam:
         *,
         measured: bool = True,
     ) -> ClosedWindow | None:
-        """Take one odometry interval, the keyframes that lie in it, and the window that it ends."""
+        """Take one odometry interval; returns the window that it closes, if any."""
         if self._start_ns is None:
             self._start_ns = stamp_ns - duration_ns
             self._segmenter.begin(self._start_ns)
@@ -95,7 +95,9 @@ class HybridSlam:
         return None
 
     def finish(self) -> tuple[ClosedWindow | None, int]:
-        """The stream has ended: the last submap, and how many scans no odometry covered."""
+        """End the stream; returns the last submap, and the number of scans that no odometry
+        covered.
+        """
         uncovered, end_ns = self._segmenter.uncovered, self._segmenter.now_ns
         if self._start_ns is None or end_ns is None or end_ns <= self._start_ns:
             return None, uncovered
@@ -104,9 +106,9 @@ class HybridSlam:
     # The window closes.
 
     def _is_full(self, lasting_ns: int) -> bool:
-        """Whether the window is long enough to close; one of a standing robot goes on.
+        """Whether the window is long enough to close; the window of a standing robot stays open.
 
-        One that has seen half as many landmarks as a submap may hold closes at once.
+        A window with half as many landmarks as a submap may hold closes at once.
         """
         front, bounds = self._config.front_end, self._config.bounds
         if 2 * len(self.window.particles.ids) >= bounds.submap_landmarks:
@@ -115,7 +117,9 @@ class HybridSlam:
         return lasting_ns >= round(front.window_s * 1e9) and not stands
 
     def _close(self, start_ns: int, end_ns: int, late: int = 0) -> ClosedWindow:
-        """The open window as a submap; where it has no solution, the odometry's motion alone."""
+        """Close the open window; where it has no solution, its submap is the odometry's motion
+        alone.
+        """
         last, rest = self._segmenter.cut(end_ns)
         for keyframe in last:
             self._open.advance(keyframe)
@@ -170,11 +174,13 @@ class HybridSlam:
 
     @property
     def last_keyframe_ns(self) -> int | None:
-        """Of the open window."""
+        """Team time of the open window's last keyframe."""
         return self._open.last_keyframe_ns
 
     def running(self) -> LocalMap | None:
-        """The open window's Gaussian at its last keyframe, if it has one; no submap."""
+        """The Gaussian of the open window at its last keyframe, if there is one; it is not a
+        submap.
+        """
         if self.last_keyframe_ns is None:
             return None
         found = self._open.solved(lambda window: windows.gaussian(window, running=True))
@@ -182,11 +188,11 @@ class HybridSlam:
 
     @property
     def innovation(self) -> Innovation:
-        """Of every window of this incarnation, since this process consumes it."""
+        """The innovations of all windows of this incarnation that this process has computed."""
         return self._innovation.plus(self.window.innovation)
 
 
 def _submap(window: Window) -> LocalMap:
-    """Landmarks are solved again along the paths, then moments are matched."""
+    """Solve the landmarks again along the paths, then match moments."""
     landmarks = windows.landmarks_solved_again(window)
     return windows.moments_matched(window, landmarks)

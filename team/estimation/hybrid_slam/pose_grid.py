@@ -1,10 +1,10 @@
-"""The team's grid of times at which every robot has a pose node, and the inter-robot measurements
-at these nodes.
+"""The team's time grid, at which every robot has a pose node, and the inter-robot measurements at
+them.
 
-A robot does not know when it is seen, so all robots put nodes at the same times: the multiples of
-node_s. An inter-robot measurement belongs to the grid time nearest to it, if that lies in the open
-window and not too far away. The observer's odometry carries it there; the inter-robot measurements
-of one teammate at one node become one measurement.
+A robot does not know when it is observed, so all robots place nodes at the same times, the
+multiples of node_s. An inter-robot measurement belongs to the nearest grid time, if that lies in
+the open window and within sighting_s. The observer's odometry carries it to that node; several
+measurements of one teammate at one node are reduced to one.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ Looks = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 
 @dataclass(frozen=True, eq=False)
 class NodeSighting:
-    """One teammate seen from one pose node: range [m], bearing [rad], their covariance.
+    """One teammate observed from one pose node: range [m], bearing [rad] and their covariance.
 
     measurements: the counters of the sensor's messages that went into it, ascending.
     """
@@ -44,7 +44,7 @@ class NodeSighting:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """A teammate seen in message `counter`; `motion` of the observer since, until the node."""
+    """A teammate observed in message `counter`; `motion`: the observer's since, up to the node."""
 
     stamp_ns: int
     counter: int
@@ -55,8 +55,8 @@ class _Look:
 
 
 class PoseGrid:
-    """The grid times and the inter-robot measurements of the open window; the segmenter tells it of
-    the motion.
+    """The grid times of the open window and its inter-robot measurements; the segmenter reports
+    motion.
 
     since_node: the motion since the last pose node.
     """
@@ -74,20 +74,20 @@ class PoseGrid:
         self.since_node = Increment.identity()
 
     def begin(self, stamp_ns: int) -> None:
-        """A window begins; its nodes are the grid times within window_s from here."""
+        """Begin a window; its nodes are the grid times within window_s from here."""
         self._begin_ns = stamp_ns
         self._node_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
         self._last_ns = stamp_ns + self._window_ns
         self._uncovered, self._ahead, self._at_node = [], [], {}
 
     def go_on(self, stamp_ns: int) -> None:
-        """The window is open still: it may reach the next grid time after its planned end."""
+        """Extend a window that stays open to the next grid time after its planned end."""
         if stamp_ns >= self._begin_ns + self._window_ns:
             self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
 
     def observe(self, stamp_ns: int, counter: int, looks: Looks) -> Rejection | None:
-        """Keep inter-robot measurements until the odometry covers their time; the reason if all are
-        rejected.
+        """Keep inter-robot measurements until odometry covers their time; returns the reason if
+        all are rejected.
         """
         teammates, ranges, bearings = looks
         node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
@@ -109,16 +109,16 @@ class PoseGrid:
 
     @property
     def next_ns(self) -> int | None:
-        """Team time of the next node or inter-robot measurement, whichever comes first; None:
-        nothing is left.
-        """
+        """Team time of the next node or inter-robot measurement; None where there is none."""
         times = [look.stamp_ns for look in self._uncovered[:1]]
         if self._node_ns <= self._last_ns:
             times.append(self._node_ns)
         return min(times, default=None)
 
     def reach(self) -> bool:
-        """The observer is at `next_ns` now; True if that is a pose node (before what is seen)."""
+        """Note that the observer is at `next_ns`; True if that is a pose node (which comes
+        before measurements).
+        """
         is_node = self.next_ns == self._node_ns <= self._last_ns
         if not is_node:
             look = self._uncovered.pop(0)
@@ -136,16 +136,18 @@ class PoseGrid:
 
     @property
     def carries(self) -> bool:
-        """Whether what was seen waits for the motion up to its node."""
+        """Whether an inter-robot measurement waits for the motion up to its node."""
         return bool(self._ahead)
 
     def moved(self, step: Increment) -> None:
-        """The observer has moved."""
+        """Take the observer's motion."""
         self.since_node = self.since_node.then(step)
         self._ahead = [replace(each, motion=each.motion.then(step)) for each in self._ahead]
 
     def sightings(self) -> tuple[NodeSighting, ...]:
-        """What the window has seen, by node and teammate; what reached no node is not in it."""
+        """The window's inter-robot measurements, by node and teammate, without those that
+        reached no node.
+        """
         return tuple(
             NodeSighting(
                 node_ns,

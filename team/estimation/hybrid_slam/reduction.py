@@ -1,4 +1,4 @@
-"""Several scans of a moment reduced to one range and bearing for each landmark."""
+"""Reduces several scans of a moment to one range and bearing for each landmark."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from team.estimation.scans import SENSOR, Own, carried, mean_claim, together
 
 @dataclass(frozen=True)
 class Look:
-    """One scan, at at_ns (its stamp, or where the odometry begins that covers it).
+    """One scan at at_ns (its stamp, or the start of the odometry that covers it).
 
-    pose: where the robot was, since the keyframe's start. back: the same seen from the keyframe's
-    end; None: it is the keyframe itself. motion: since the look or the keyframe before.
+    pose: the robot's, since the keyframe's start. back: the same pose relative to the keyframe's
+    end; None: it is the keyframe itself. motion: since the scan or keyframe before.
     """
 
     stamp_ns: int
@@ -32,17 +32,19 @@ class Look:
 
     @property
     def is_unnamed(self) -> bool:
-        """Whether it has detections without identities; then it has no others."""
+        """Whether it has detections without identities; it has no others then."""
         return bool((self.ids >= UNNAMED).any())
 
 
 Measured = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
-"""Ids, ranges [m], bearings [rad] and what they claim."""
+"""Ids, ranges [m], bearings [rad] and the noises that they claim."""
 
 
 def reduced(looks: Sequence[Look], end: Float[np.ndarray, "3"]) -> Measured:
-    """By ascending id: the medians of range and bearing, moved by the odometry to the end, and the
-    mean of what they claim.
+    """Reduce scans to one measurement per landmark, by ascending id.
+
+    It is the median of range and bearing, moved by the odometry to the keyframe's end; its claimed
+    noise is the mean of theirs.
     """
     points: dict[int, list[tuple[float, float]]] = {}
     claims: dict[int, list[Own]] = {}
@@ -65,7 +67,7 @@ def reduced(looks: Sequence[Look], end: Float[np.ndarray, "3"]) -> Measured:
 def variances(
     ranges: Float[np.ndarray, " n"], own: Own, sensor: Sensor
 ) -> Float[np.ndarray, "n 3"]:
-    """(rr, rb, bb) of each measurement: what it claims itself, or the sensor's at its range."""
+    """(rr, rb, bb) of each measurement: as it claims, or the sensor's at its range."""
     of_sensor = np.column_stack(
         (
             sensor.range_sigma**2 + (sensor.range_sigma_per_m * ranges) ** 2,
@@ -80,6 +82,6 @@ def variances(
 
 
 def _median_direction(angles: list[float]) -> float:
-    """The median of directions, taken about the first of them."""
+    """The median of directions, relative to the first of them."""
     offsets = [geometry.wrapped(angle - angles[0]) for angle in angles]
     return geometry.wrapped(angles[0] + float(np.median(offsets)))

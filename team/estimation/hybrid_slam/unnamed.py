@@ -1,8 +1,8 @@
-"""An open window's detections without identities, and what they are at its end.
+"""An open window's detections without identities, and their association when it closes.
 
-While the window is open its pose follows the odometry and the landmarks with names alone. At its
-close the detections are associated once, and the particles take the window again with them. No
-particle has an association of its own: there is one, and nothing is averaged over many.
+While the window is open, its pose follows the odometry and the landmarks with identities alone. At
+its close the detections are associated once, for all particles, and the particles take the window
+again with them.
 """
 
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ from team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 
 @dataclass(frozen=True)
 class Settled:
-    """A window's keyframes with their associated detections, and what stayed out.
+    """A window's keyframes with their associated detections, and the detections that stay out.
 
     unconfirmed, clutter: scans of which no detection is in the submap. gated: detections that stay
-    out. slips: motions that the odometry missed. became: what became of each detection.
+    out. slips: motions that the odometry missed. became: the outcome of each detection.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -56,10 +56,10 @@ class Event(NamedTuple):
 def settled(
     keyframes: Sequence[Keyframe], settings: Association, sensor: Sensor, most: int
 ) -> Settled:
-    """The window with its detections associated; raises LinAlgError where it has no solution.
+    """Associate the window's detections. Raises LinAlgError where the window has no solution.
 
-    keyframes: with their measurements of landmarks with names, and the looks without. most:
-    landmarks of a submap; those that were seen most often stay.
+    keyframes: with their measurements of landmarks with identities, and the scans without. most:
+    number of landmarks of a submap; those that were seen most often stay.
     """
     events = events_of(keyframes)
     scans = scans_of(events, sensor)
@@ -88,9 +88,9 @@ def settled(
 
 
 def events_of(keyframes: Sequence[Keyframe]) -> list[Event]:
-    """The looks of a window and the ends of its keyframes, in order of time.
+    """The scans of a window and the ends of its keyframes, in order of time.
 
-    A keyframe that is itself a look, and has nothing beside it, is one event.
+    A keyframe that is itself a scan without identities, and nothing else, is one event.
     """
     events = []
     for k, each in enumerate(keyframes):
@@ -106,7 +106,7 @@ def _is_none(motion: Increment) -> bool:
 
 
 def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
-    """The window's measurements as the association takes them: points, with their noise."""
+    """The window's detections as points with their covariances, as the association takes them."""
     seen = [_seen_at(event) for event in events]
     counts = [len(ids) for ids, *_ in seen]
     ids = np.concatenate([ids for ids, *_ in seen]).astype(np.int64)
@@ -133,7 +133,7 @@ def _seen_at(event: Event) -> Measured:
 def _became(
     events: Sequence[Event], landmarks: Int64[np.ndarray, " n"], clutter: Bool[np.ndarray, " n"]
 ) -> Became:
-    """By the stamps of the scans and the detections' places in them."""
+    """The outcomes, by the stamps of the scans and the detections' places in them."""
     looks = [event.look for event in events if event.look is not None]
     return Became(
         stamps=np.array([each.stamp_ns for each in looks], np.int64),
@@ -145,7 +145,9 @@ def _became(
 
 
 def _silent(became: Became) -> tuple[int, int]:
-    """Scans none of whose detections is in the submap: how many, and of them those of clutter."""
+    """Numbers of scans without any detection in the submap: of all, and of those with clutter
+    only.
+    """
     scan = np.repeat(np.arange(len(became.counts)), became.counts)
     k = len(became.counts)
     used = np.bincount(scan[became.landmarks > 0], minlength=k)
@@ -160,8 +162,9 @@ def _keyframes(
     numbers: Int64[np.ndarray, " n"],
     slips: tuple[Slip, ...],
 ) -> tuple[Keyframe, ...]:
-    """The keyframes with their looks' landmarks under these numbers (0: it stays out), reduced to
-    one measurement of each; a motion that slipped is that much less sure.
+    """The keyframes with their scans' detections under these landmark numbers (0: left out).
+
+    Each keyframe gets one measurement per landmark; a motion that slipped gets a larger covariance.
     """
     looks: dict[int, list[Look]] = {}
     first = 0
@@ -184,7 +187,7 @@ def _keyframes(
 
 
 def _only(look: Look, numbers: Int64[np.ndarray, " n"]) -> Look:
-    """The detections of a look that have a number, under it."""
+    """The detections of a scan that have a number, under it."""
     kept = numbers > 0
     return replace(
         look,
@@ -196,7 +199,9 @@ def _only(look: Look, numbers: Int64[np.ndarray, " n"]) -> Look:
 
 
 def _measured(looks: Sequence[Look]) -> Measured:
-    """What a keyframe's looks see from its end; of one that is the keyframe, what it sees."""
+    """The detections of a keyframe's scans, relative to its end or, for a scan that is the
+    keyframe, as they are.
+    """
     if len(looks) == 1 and looks[0].back is None:
         (look,) = looks
         return look.ids, look.ranges, look.bearings, look.own
@@ -204,7 +209,7 @@ def _measured(looks: Sequence[Look]) -> Measured:
 
 
 def _with(keyframe: Keyframe, seen: Measured) -> Keyframe:
-    """The keyframe with more measurements."""
+    """The keyframe with further measurements."""
     ids, ranges, bearings, own = seen
     parts: list[tuple[int, Own]] = [(len(keyframe.ids), keyframe.own), (len(ids), own)]
     return replace(

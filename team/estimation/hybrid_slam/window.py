@@ -62,7 +62,9 @@ class Window:
 
 
 class ParticleLandmarks(NamedTuple):
-    """The landmarks of each of M particles by ascending id [m, m²]; covariances as (xx, xy, yy)."""
+    """The landmarks of each of M particles, by ascending id [m, m²]; covariances as (xx, xy,
+    yy).
+    """
 
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "M L 2"]
@@ -81,7 +83,7 @@ def noise_of(sensor: Sensor) -> Noise:
 
 
 def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
-    """A window at its start: every particle exactly at zero, no landmark, no measurement."""
+    """Open a window: every particle exactly at zero, without landmarks or measurements."""
     return Window(
         front_end=front_end,
         sensor=sensor,
@@ -156,7 +158,7 @@ def _with_motion(
 
 
 def marked(window: Window, stamp_ns: int) -> Window:
-    """The particles' poses of the last keyframe become a pose node at this team time."""
+    """Make the particles' poses at the last keyframe a pose node at this team time."""
     return replace(
         window,
         node_stamps=np.append(window.node_stamps, stamp_ns),
@@ -170,7 +172,7 @@ def moved(
     generator: np.random.Generator,
     forward: Float[np.ndarray, "3"] = STILL,
 ) -> Window:
-    """Motion without a keyframe, as from the last one to the window's end.
+    """Move the particles without a keyframe, as from the last one to the window's end.
 
     It never resamples: the weights of the last measurements stay as they are.
     """
@@ -179,7 +181,7 @@ def moved(
 
 
 def gaussian(window: Window, *, running: bool = False) -> LocalMap:
-    """The window so far as one Gaussian: `landmarks_solved_again`, then `moments_matched`.
+    """Make one Gaussian of the window so far: `landmarks_solved_again`, then `moments_matched`.
 
     Raises NotACovarianceError if P is not finite or not positive definite.
     """
@@ -187,14 +189,13 @@ def gaussian(window: Window, *, running: bool = False) -> LocalMap:
 
 
 def landmarks_solved_again(window: Window, *, running: bool = False) -> ParticleLandmarks:
-    """Each landmark of each particle over all the window's measurements, given the path.
+    """Solve each landmark of each particle over all the window's measurements, given the path.
 
     An EKF is linearised at the first, noisiest measurement, and that bias is common to many
-    submaps: `landmarks_along_paths` starts from it.
-    running: for a pose within the window, which is not fused. Where all of the sensor's errors are
-    white the landmarks are then those that the particles hold: to solve them again at every
-    keyframe moves that pose by a hundredth and costs a third of all. Of a landmark's constant error
-    the particles know nothing.
+    submaps: `landmarks_along_paths` starts from it. running: for a pose within the window, which is
+    not fused; where all of the sensor's errors are white, the landmarks are then those that the
+    particles hold, since solving them at every keyframe changes that pose by a hundredth of its
+    error and costs a third of the time. The particles do not model a landmark's constant error.
     """
     particles = window.particles
     order = np.argsort(particles.ids)
@@ -253,7 +254,9 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
 
 
 def of_base(window: Window) -> Window:
-    """The window's particles and paths as those of the base, in the frame of the base's start."""
+    """The window's particles and paths as those of the base, in the frame of the base's start
+    pose.
+    """
     if not window.sensor.is_mounted:
         return window
     mount, particles = np.array(window.sensor.mount), window.particles
@@ -267,7 +270,7 @@ def of_base(window: Window) -> Window:
 
 
 def motion_alone(motion: Increment) -> LocalMap:
-    """A window of which only the odometry counts, as a Gaussian in the window's frame."""
+    """The Gaussian of a window's odometry alone, in the window's frame."""
     G = tangent(motion.mean[2])
     covariance = G @ motion.covariance @ G.T + np.diag(POSE_JITTER)
     return LocalMap(np.empty(0, np.uint32), motion.mean, 0.5 * (covariance + covariance.T))

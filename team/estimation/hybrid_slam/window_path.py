@@ -1,7 +1,7 @@
-"""The path within a closed window, given where the window ends.
+"""The path within a closed window, given the pose at its end.
 
 A submap keeps the pose at its window's end. What the particles know of the poses before it is here
-as a linear Gaussian of that end, so that a map that moves the two ends of a window moves the path
+a linear Gaussian given that end, so a map that moves the two ends of a window moves the path
 between them, and the path has a covariance.
 """
 
@@ -59,7 +59,7 @@ def window_path(window: Window, keyframes_ns: Sequence[int]) -> WindowPath:
 
 @dataclass(frozen=True)
 class Ends:
-    """Where a window lies in the map: its start and its end with their joint 6 × 6 covariance."""
+    """The start and end pose of a window in the map, with their joint 6 × 6 covariance."""
 
     start: Pose
     end: Pose
