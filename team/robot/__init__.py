@@ -1,1 +1,1 @@
-"""The member of the team: its node (no I/O), its configuration and its shell."""
+"""A robot of the team: its node (no I/O), the parts of the node, and its process."""

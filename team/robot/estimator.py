@@ -1,4 +1,6 @@
-"""What a robot's estimator is to its node: one small interface, and what some can do beside it."""
+"""The interface between a robot's node and its estimator, and the further abilities that some
+have.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +35,7 @@ class InitialPose(NamedTuple):
 
 
 class KnownMap(NamedTuple):
-    """Landmarks that a robot is told: ids ascending, positions [m] in the team's frame."""
+    """Prior map of a localisation-only robot: ids ascending, positions [m] in the team's frame."""
 
     ids: UInt32[np.ndarray, " L"]
     landmarks: Float[np.ndarray, "L 2"]
@@ -51,7 +53,7 @@ class Cloud(NamedTuple):
 
 
 def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
-    """Every so many particles, in their order; origin: their frame's pose in the own map's."""
+    """Thin out the particles evenly; origin: the pose of their frame in the own map's frame."""
     every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
     logs = particles.log_weights[::every]
     weights = np.exp(logs - logs.max())
@@ -61,11 +63,11 @@ def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimates:
-    """What an odometry interval gave: a submap; the stamps of a new running pose and map.
+    """What an odometry interval led to: a submap, and the stamps of a new running pose and map.
 
-    cloud: the particles, where there are any. judged: how well an estimator without windows
-    predicted what it measured since it last said so, and when. became: what became of all its
-    detections without identities, from one without windows at the end of its stream.
+    cloud: the particles, where there are any. judged: the innovation of an estimator without
+    windows since it was last reported, and its time. became: the outcomes of all detections without
+    identities, from such an estimator at the end of its stream.
     """
 
     closed: ClosedWindow | None = None
@@ -81,10 +83,11 @@ NOTHING_NEW = Estimates()
 
 @runtime_checkable
 class RobotEstimator(Protocol):
-    """One incarnation of a robot's stream: measurements in, running poses and maps out.
+    """An estimator on one incarnation of a robot's stream: measurements in, running poses and maps
+    out.
 
-    sequence: by what its running poses and maps are named. used: the disposition of a measurement
-    that it takes. joint: whether its map has a joint covariance. innovation: of all that it
+    sequence: the number of its running poses and maps. used: the disposition of a measurement that
+    it takes. joint: whether its map has a joint covariance. innovation: of all measurements that it
     predicted.
     """
 
@@ -98,7 +101,7 @@ class RobotEstimator(Protocol):
     def innovation(self) -> Innovation: ...  # noqa: D102
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan of landmarks; the reason if it is rejected."""
+        """Take a scan of landmarks; returns the reason if it is rejected."""
 
     def drive(
         self,
@@ -110,10 +113,14 @@ class RobotEstimator(Protocol):
         *,
         measured: bool = True,
     ) -> Estimates:
-        """Take one odometry interval, or its time alone (not measured); what it gave."""
+        """Take one odometry interval, or only its duration (not measured); returns what it led
+        to.
+        """
 
     def finish(self) -> tuple[Estimates, int]:
-        """The stream has ended: what that gave, and how many scans no odometry covered."""
+        """End the stream; returns what that led to, and the number of scans that no odometry
+        covered.
+        """
 
     def own_pose(self) -> PoseGaussian:
         """The running pose from own measurements alone."""
@@ -124,16 +131,16 @@ class RobotEstimator(Protocol):
 
 @runtime_checkable
 class MakesSubmaps(Protocol):
-    """An estimator whose windows become submaps; it can be put back to its last one."""
+    """An estimator whose windows become submaps; it can be reset to its last submap."""
 
     def consumed(self, measurement: int) -> None:
-        """The measurement with this counter belongs to the open window."""
+        """Note that the measurement with this counter belongs to the open window."""
 
     def resume(self, closed: ClosedWindow) -> None:
-        """Go on behind a submap of an earlier life."""
+        """Continue behind a submap of an earlier process."""
 
     def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
-        """Take inter-robot measurements; the reason if they are rejected."""
+        """Take inter-robot measurements; returns the reason if they are rejected."""
 
     def open_window(self) -> LocalMap | None:
         """The Gaussian since the last submap, if there is a keyframe in it."""
@@ -151,7 +158,7 @@ class AbsorbsMaps(Protocol):
     """An estimator that takes the team's map back in (rules with feedback)."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
-        """The fused landmarks replace the own ones."""
+        """Replace the own landmarks by the fused ones."""
 
 
 Factory = Callable[[RobotConfig, int, InitialPose, KnownMap], RobotEstimator]
@@ -163,7 +170,7 @@ def estimator_of(
     initial: InitialPose = AT_ORIGIN,
     known: KnownMap = NOTHING_KNOWN,
 ) -> RobotEstimator:
-    """The estimator that the configuration names, at the beginning of an incarnation."""
+    """Make the estimator that the configuration names, at the beginning of an incarnation."""
     made: Factory = loaded(
         ESTIMATORS[config.estimator].made_by, f"the estimator {config.estimator}"
     )

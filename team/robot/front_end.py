@@ -1,7 +1,7 @@
 """The robot's estimator behind the bounds of its stream: measurements in, estimates out.
 
-A measurement within the bounds goes to the estimator; of one beyond them the reason is returned. An
-estimator of submaps can be put back to its last submap and the measurements of the open window.
+A measurement within the bounds goes to the estimator; for one beyond them the reason is returned.
+An estimator of submaps can be reset to its last submap and the measurements of the open window.
 """
 
 from typing import NamedTuple
@@ -32,21 +32,24 @@ from team.stream.judge import StreamJudge
 from team.wire import messages as m
 
 MOST_SET_ASIDE = 8
-"""Measurements of one window after which the estimator is not put back behind them any more."""
+"""After so many measurements of one window were set aside, the estimator is not reset for
+further ones."""
 
 
 class Driven(NamedTuple):
-    """What an odometry interval gave, and why its motion was rejected, if it was."""
+    """What an odometry interval led to, and why its motion was rejected, if it was."""
 
     estimates: Estimates
     rejected: Rejection | None
 
 
 class FrontEnd:
-    """One incarnation after the other: `begin`, then each measurement in its order.
+    """The estimators of one incarnation after the other: `begin`, then each measurement in its
+    order.
 
-    estimator: of this incarnation. submaps: of this incarnation, their landmarks with names. gated:
-    measurements that no others of their window confirmed. What is odd goes into `warnings`.
+    estimator: of this incarnation. submaps: of this incarnation, their landmarks with identities.
+    gated: number of measurements that no others of their window confirmed. warnings: what is
+    implausible, in words.
     """
 
     def __init__(self, config: RobotConfig, warnings: list[str]) -> None:
@@ -68,11 +71,11 @@ class FrontEnd:
 
     @property
     def waits(self) -> bool:
-        """Whether the map that it localises in has not been told yet."""
+        """Whether it waits for the map that it localises in."""
         return self._known is None
 
     def know(self, told: m.KnownMap) -> None:
-        """Take the map to localise in: the newer one by its stamp."""
+        """Take the map to localise in; of two the newer one by its stamp."""
         if self._known_ns is None or told.stamp_ns > self._known_ns:
             self._known_ns = told.stamp_ns
             self._known = self._sensible(KnownMap(*translate.landmarks_of(told)))
@@ -88,7 +91,7 @@ class FrontEnd:
     # An incarnation, its windows, and the way back.
 
     def begin(self, start: m.InitialPose) -> None:
-        """A new incarnation, from its initial pose."""
+        """Begin a new incarnation, from its initial pose."""
         self._judge = StreamJudge(self._config.bounds)
         self._begin_from(start)
         self._start, self._closed, self._window, self._aside = start, [], [], 0
@@ -113,7 +116,9 @@ class FrontEnd:
         self._windows = self.estimator if isinstance(self.estimator, MakesSubmaps) else None
 
     def resume(self, submap: m.Submap) -> None:
-        """Go on behind the next submap of an earlier life; ValueError where there are none."""
+        """Continue behind the next submap of an earlier process. Raises ValueError where there
+        are none.
+        """
         closed = ClosedWindow(
             sequence=submap.sequence,
             first_measurement=submap.first_measurement,
@@ -132,7 +137,7 @@ class FrontEnd:
         self._windows.resume(closed)
 
     def close(self, closed: ClosedWindow) -> None:
-        """The open window has become a submap: the next one begins."""
+        """Note that the open window has become a submap and the next one begins."""
         self._window, self._aside = [], 0
         self.gated += closed.gated
         self._close(
@@ -152,12 +157,14 @@ class FrontEnd:
         self._judge = StreamJudge(self._config.bounds, closed.end_ns)
 
     def keep(self, measurement: m.Measurement) -> None:
-        """The open window has the measurement: it comes again when the estimator is put back."""
+        """Keep a measurement of the open window: it is repeated if the estimator is reset."""
         if self._keeps_window:
             self._window.append(measurement)
 
     def put_back(self) -> None:
-        """Go back behind a measurement whose handling raised, as if it had never been there."""
+        """Reset the estimator to the state before a measurement whose handling raised an
+        exception.
+        """
         self._aside += 1
         if not self._keeps_window or self._start is None or self._aside > MOST_SET_ASIDE:
             return
@@ -178,7 +185,7 @@ class FrontEnd:
                     self._goes_in(measurement)
 
     def _goes_in(self, measurement: m.Measurement) -> None:
-        """The open window, if there is one, names the measurement among its inputs."""
+        """Note that the open window, if there is one, names the measurement among its inputs."""
         if self._windows is not None:
             self._windows.consumed(measurement.number)
 
@@ -189,7 +196,7 @@ class FrontEnd:
     # Measurements.
 
     def drive(self, measurement: m.AnyOdometry) -> Driven:
-        """Take one odometry interval, or its time alone where its motion is rejected."""
+        """Take one odometry interval, or only its duration where its motion is rejected."""
         self._goes_in(measurement)
         motion = translate.motion_of(measurement, self._config)
         rejected = self._judge.odometry(*motion)
@@ -198,7 +205,7 @@ class FrontEnd:
         return Driven(self.estimator.drive(*motion, measured=rejected is None), rejected)
 
     def observe(self, measurement: m.AnyScan | m.Detections) -> Rejection | None:
-        """Take a scan of landmarks; the reason if it is rejected."""
+        """Take a scan of landmarks; returns the reason if it is rejected."""
         self._goes_in(measurement)
         if isinstance(measurement, m.Detections) and not self._associates:
             return Rejection.NO_ASSOCIATION
@@ -212,7 +219,7 @@ class FrontEnd:
         return rejected
 
     def sight(self, measurement: m.Sightings) -> Rejection | None:
-        """Take inter-robot measurements; the reason if they are rejected."""
+        """Take inter-robot measurements; returns the reason if they are rejected."""
         self._goes_in(measurement)
         teammates, ranges, bearings = translate.detections_of(measurement)
         others = np.array([name != self._config.id for name in teammates], dtype=np.bool_)
@@ -230,5 +237,5 @@ class FrontEnd:
 
     @property
     def _associates(self) -> bool:
-        """Whether detections without identities are of use."""
+        """Whether the estimator takes detections without identities."""
         return isinstance(self.estimator, Associates) and self.estimator.associates

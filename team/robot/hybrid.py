@@ -1,9 +1,10 @@
-"""Hybrid-SLAM as a robot runs it: the front end's submaps, and the own whole map made of them.
+"""Hybrid-SLAM as a robot runs it: the front end's submaps, and the robot's own whole map made of
+them.
 
 The own map is what the robot knows by itself: its submaps joined one by one (Brooks & Bailey's back
-end). No submap depends on it. Landmarks without names are in none of it: which of them are one over
-several submaps the centre finds out, so meanwhile the pose follows odometry and landmarks with
-names.
+end). No submap depends on it. It has no landmarks without identities: the centre finds out which of
+them are one over several submaps, and until then the pose follows odometry and the landmarks with
+identities.
 """
 
 import numpy as np
@@ -33,7 +34,9 @@ from team.robot.estimator import (
 
 
 class HybridEstimator:
-    """One incarnation of a robot's stream, from its initial pose or from its last submap."""
+    """Hybrid-SLAM on one incarnation of a robot's stream, from its initial pose or its last
+    submap.
+    """
 
     used = "in a submap"
     joint = True
@@ -53,29 +56,31 @@ class HybridEstimator:
 
     @property
     def sequence(self) -> int:
-        """Of the window that is open."""
+        """The number of the open window."""
         return self._slam.sequence
 
     @property
     def innovation(self) -> Innovation:
-        """Of every window of this incarnation, since this process consumes it."""
+        """The innovations of all windows of this incarnation that this process has computed."""
         return self._slam.innovation
 
     def consumed(self, measurement: int) -> None:
-        """The measurement belongs to the open window (or was rejected while it was open)."""
+        """Note that the measurement belongs to the open window, even if it was rejected."""
         self._slam.consumed(measurement)
 
     def resume(self, closed: ClosedWindow) -> None:
-        """Go on behind a submap of an earlier life: the next window begins where it ended."""
+        """Continue behind a submap of an earlier process: the next window begins where that one
+        ended.
+        """
         self.whole, self._open = self._joined(closed.local.named), None
         self._slam.resume(closed)
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan of landmarks; the reason if it is rejected."""
+        """Take a scan of landmarks; returns the reason if it is rejected."""
         return self._slam.observe(stamp_ns, scan)
 
     def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
-        """Take inter-robot measurements; the reason if they are rejected."""
+        """Take inter-robot measurements; returns the reason if they are rejected."""
         return self._slam.sight(stamp_ns, measurement, looks)
 
     def drive(
@@ -88,7 +93,7 @@ class HybridEstimator:
         *,
         measured: bool = True,
     ) -> Estimates:
-        """Take one odometry interval; the submap that it closes, if it does."""
+        """Take one odometry interval; returns the submap that it closes, if any."""
         self._open, before_ns = None, self._slam.last_keyframe_ns
         interval = stamp_ns, duration_ns, forward, yaw_rate, moved
         closed = self._slam.drive(*interval, measured=measured)
@@ -98,26 +103,32 @@ class HybridEstimator:
         return Estimates(pose_ns=now_ns if now_ns != before_ns else None)
 
     def finish(self) -> tuple[Estimates, int]:
-        """The stream has ended: the last submap, and how many scans no odometry covered."""
+        """End the stream; returns the last submap, and the number of scans that no odometry
+        covered.
+        """
         self._open = None
         closed, uncovered = self._slam.finish()
         return Estimates() if closed is None else self._with_submap(closed), uncovered
 
     def _with_submap(self, closed: ClosedWindow) -> Estimates:
-        """The pose and the map are new with a submap."""
+        """Update pose and map by a submap."""
         begun_at = self.whole.mean[:3]
         cloud = None if closed.window is None else thinned(closed.window.particles, begun_at)
         self.whole = self._joined(closed.local.named)
         return Estimates(closed=closed, pose_ns=closed.end_ns, map_ns=closed.end_ns, cloud=cloud)
 
     def open_window(self) -> LocalMap | None:
-        """The open window's Gaussian at its last keyframe, if it has one; kept until it changes."""
+        """The Gaussian of the open window at its last keyframe, if there is one; kept until it
+        changes.
+        """
         if self._open is None:
             self._open = (self._slam.running(),)
         return self._open[0]
 
     def own_pose(self) -> PoseGaussian:
-        """The pose of the own whole map, times the open window; its motion if they contradict."""
+        """The pose by the own whole map and the open window, or by its motion alone if they
+        contradict.
+        """
         window = self.open_window()
         try:
             with np.errstate(all="ignore"):
@@ -131,11 +142,13 @@ class HybridEstimator:
         return LandmarkGaussian(whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:])
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
-        """The fused landmarks replace those of the own whole map; submaps never see it."""
+        """Replace the landmarks of the own whole map by the fused ones; submaps never see it."""
         self.whole = absorbed(self.whole, *landmarks)
 
     def _joined(self, local: LocalMap) -> WholeMap:
-        """The own map with a submap; of one that contradicts it beyond all numbers, its motion."""
+        """The own map joined with a submap, or with its motion alone if it contradicts the map
+        numerically.
+        """
         try:
             with np.errstate(all="ignore"):
                 after = joined(self.whole, local)

@@ -1,4 +1,6 @@
-"""The robot process: the node's shell, with recovery of what it missed and of an earlier life."""
+"""The robot's process: the node's shell, which recovers what it missed and continues an earlier
+process.
+"""
 
 import logging
 import threading
@@ -17,19 +19,19 @@ from team.wire.bus import Bus, BusError, Sample, Tap
 from team.wire.codec import WireError, decoded
 
 SECOND_PATIENCE_S = 6.0
-"""The token of a process that was cut off is there for the lease of its link: 5 s of silence."""
+"""Wait [s] for another process' token: that of a cut-off process lasts for its lease of 5 s."""
 SECOND_PERIOD_S = 0.5
 CONFIRMED_S = 1.0
-"""Between two questions at the source, in which incarnation its stream is."""
+"""Wait [s] between two questions to the source which incarnation its stream is in."""
 LOG_LOOK_S = 2.0
-"""Between two looks at what the robot's own log lacks."""
+"""Wait [s] between two checks for what the robot's own log lacks."""
 _LOG = logging.getLogger("teamslam")
 
 
 class RobotShell:
-    """A robot's process: subscribe, resume an earlier life if there was one, run.
+    """A robot's process: it subscribes, continues an earlier process if there was one, and runs.
 
-    `run` raises BusError when another process is this robot, and stays it for `patience_s`;
+    `run` raises BusError when another process runs this robot for `patience_s`;
     FaultyRunError, at its end, when messages were set aside.
     """
 
@@ -58,7 +60,7 @@ class RobotShell:
         self._missing = MissingMeasurements(shell)
 
     def run(self) -> None:
-        """Until the final map."""
+        """Run until the final map is there."""
         name = self.node.robot
         self._be_the_only_one()
         self._subscribe()
@@ -89,7 +91,7 @@ class RobotShell:
         self.look_for_gaps()
 
     def look_for_gaps(self) -> None:
-        """Ask the source for what is missing of the stream."""
+        """Ask the source for missing measurements of the stream."""
         wanted = self.node.wanted()
         self._missing.look(() if wanted is None else (wanted,))
         if time.monotonic() >= self._log_due_s:
@@ -120,14 +122,14 @@ class RobotShell:
                     return
 
     def _look_for_driver(self) -> None:
-        """Whether the robot's driver is there is known before anything else is heard."""
+        """Find out whether the robot's driver is present before any other message is handled."""
         driver = ch.source_node(self.node.robot)
         there = m.Liveliness(stamp_ns=0, node=driver, alive=self.bus.is_alive(driver))
         self.node.handle(there, 0)
         self.bus.watch_alive(driver)
 
     def _await_recorder(self) -> None:
-        """Stay until who records has every submap: it can ask nobody else for them."""
+        """Stay until the recorder has every submap: it can ask nobody else for them."""
         recorded: dict[int, int] = {}
 
         def take(samples: Sequence[Sample]) -> None:
@@ -144,7 +146,7 @@ class RobotShell:
         self.shell.wait_for_recorder(lambda: recorded.get(own[0], 0) < own[1], take)
 
     def _be_the_only_one(self) -> None:
-        """Return when no other process is this robot."""
+        """Wait until no other process runs this robot."""
         node = ch.robot_node(self.node.robot)
         deadline = time.monotonic() + self._patience_s
         while self.bus.is_alive(node):
@@ -155,7 +157,7 @@ class RobotShell:
                 )
 
     def _resume(self) -> bool:
-        """Take over the submaps of an earlier life that the centre has; False if there are none."""
+        """Take over the submaps of an earlier process from the centre; False if there are none."""
         wanted = m.SubmapsRequest(stamp_ns=0, robot=self.node.robot)
         try:
             replies = self.bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
@@ -180,7 +182,7 @@ class RobotShell:
         return True
 
     def _catch_up(self) -> None:
-        """Ask the source for everything since the last submap that it has published already."""
+        """Ask the source for everything that it has published since the last submap."""
         while True:
             first = self.node.next_measurement
             replies = self._missing.ask(
@@ -196,11 +198,10 @@ class RobotShell:
                 return
 
     def _believed(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples, less the beginnings of incarnations that the source knows nothing of.
+        """The samples without the initial poses of incarnations that the source does not confirm.
 
-        A robot that begins a new incarnation leaves the one before, so it takes nobody's word for
-        it but the source's own answer; where no source answers (a replayed log) there is only the
-        message itself.
+        A robot that begins a new incarnation leaves the one before, so it needs the source's own
+        answer. Where no source answers (a replayed log) the message alone counts.
         """
         passed = []
         for sample in samples:
@@ -222,7 +223,7 @@ class RobotShell:
         return passed
 
     def _incarnation_at_source(self) -> int | None:
-        """In which incarnation the stream is by its source's word; None: nobody answers."""
+        """The incarnation that the source says its stream is in; None where nobody answers."""
         request = m.MeasurementsRequest(
             stamp_ns=0, robot=self.node.robot, incarnation=0, first=0, last=0
         )
@@ -235,7 +236,7 @@ class RobotShell:
 
 
 def _beginning(sample: Sample, robot: str) -> int | None:
-    """The incarnation of the robot's stream that a sample begins; None: it is something else."""
+    """The incarnation of the robot's stream that a sample begins; None for other samples."""
     if sample.key != ch.START.key(robot):
         return None
     try:

@@ -1,4 +1,6 @@
-"""A robot's running map: for viewers, or exchanged where the rule fuses whole maps."""
+"""Publishes a robot's running map: for viewers, or in an exchange where the rule fuses whole
+maps.
+"""
 
 import numpy as np
 
@@ -14,11 +16,13 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 JOINT_LANDMARKS = 2000
-"""An own map of more landmarks carries their own covariances only: a message has 64 MiB at most."""
+"""An own map with more landmarks carries their 2 × 2 covariances only: a message has at most 64
+MiB."""
 
 
 class RunningMaps:
-    """When the own map goes out. last: the sequence of the last one that was exchanged; −1: none.
+    """Decides when the own map is published. last: the sequence of the last one that was exchanged;
+    −1: none.
 
     Under a rule on whole maps one goes out every `exchange_s`, with its joint covariance; under one
     with feedback the robot then waits for the answer (`Pace`).
@@ -34,11 +38,11 @@ class RunningMaps:
         self.last = -1
 
     def begin_incarnation(self) -> None:
-        """Its maps are numbered anew."""
+        """Begin an incarnation: its maps are numbered from 0."""
         self.last = -1
 
     def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
-        """A new running map is there: for viewers, or for an exchange that is due."""
+        """A new running map: publish it for viewers, or in an exchange that is due."""
         self._map_ns = stamp_ns
         if not self._exchanges:
             return [self._own_map(stamp_ns, front, writer)]
@@ -48,7 +52,7 @@ class RunningMaps:
         return self._exchange(stamp_ns, front, writer)
 
     def finish(self, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
-        """The stream has ended: the last map, if no exchange had it."""
+        """End the stream: publish the last map, unless an exchange had it."""
         if self._map_ns is None or not self._exchanges or self._map_ns == self._exchange_ns:
             return []
         return self._exchange(self._map_ns, front, writer)
@@ -76,7 +80,7 @@ class RunningMaps:
         )
 
     def absorb(self, fused: m.FusedMap, front: FrontEnd) -> None:
-        """The answer of an exchange: under a rule with feedback the own map takes it in."""
+        """Take the answer of an exchange: under a rule with feedback the own map absorbs it."""
         estimator: object = front.estimator
         if self._pace.answered(fused.exchange):
             if not isinstance(estimator, AbsorbsMaps):

@@ -40,17 +40,18 @@ from team.wire.bus import Outgoing
 from team.wire.codec import unsound
 
 AHEAD = 64
-"""Submaps of an earlier life that the centre may have taken since it was asked for them."""
+"""Number of submaps of an earlier process that the centre may have taken since it was asked for
+them."""
 
 Replaced = Callable[[ClosedWindow, m.Prior | None, Sequence[LocalMap]], ClosedWindow]
 """What is sent instead of a closed window, given the team's map and the submaps before it."""
 
 
 class RobotNode:
-    """One robot: `begin`, then `handle` for every message, until `finished`.
+    """The node of one robot: call `begin`, then `handle` for every message, until `finished`.
 
-    For who computes a log again: announced, the digest under which the configuration was announced;
-    poses, when and from which priors poses are said; replaced, what is sent instead of a window, to
+    For recomputing a log: announced, the digest under which the configuration was announced; poses,
+    when and from which priors poses are published; replaced, what is sent instead of a window, to
     show what that costs; on_window is given each window that closes.
     """
 
@@ -88,7 +89,7 @@ class RobotNode:
         self._stream_end = EndOfStream(config.id, self._inbox)
         self._front = FrontEnd(config, self.warnings)
         self.ledger = Ledger(self._front.estimator.used)
-        """Law 1's account of the incarnation that is being consumed."""
+        """The ledger of the incarnation that is being consumed."""
         self._outbox = Outbox(config.id, exchange)
         submaps = PAIRS[config.estimator, config.fusion] == "submap"
         self._pace = Pace(lockstep=config.fusion in FEEDBACK, credit=submaps)
@@ -125,12 +126,12 @@ class RobotNode:
 
     @property
     def submaps(self) -> int:
-        """How many submaps of this incarnation have been sent, in this life or an earlier one."""
+        """Number of submaps of this incarnation that were sent, also by an earlier process."""
         return len(self._front.submaps) - self._outbox.submaps
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """The channels to subscribe to whoever they name: orders, and teammates that meet."""
+        """Channels to subscribe to for all robots: orders, and teammates' encounters."""
         orders = (ch.ORDER, ch.WITHDRAWAL)
         return (*orders, ch.RENDEZVOUS) if self._outbox.buffers else orders
 
@@ -149,13 +150,13 @@ class RobotNode:
         )
 
     def begin(self) -> list[Outgoing]:
-        """What the node says first: its configuration."""
+        """The first messages of the node: its configuration."""
         return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
 
     def take_over(self, kept: Sequence[m.Message]) -> None:
-        """Go on where the centre's set of this robot ends: the latest incarnation comes first.
+        """Continue where the centre's set of this robot ends; the latest incarnation comes first.
 
-        What an earlier life has sent can be asked of this one, too.
+        The submaps of an earlier process can then be requested from this one, too.
         """
         start = kept[0]
         assert isinstance(start, m.InitialPose)
@@ -165,11 +166,13 @@ class RobotNode:
             self._outbox.keep(message)
 
     def answer_submaps(self, request: bytes) -> list[bytes]:
-        """The answer to `SubmapsRequest`: all that was sent, of an earlier life too."""
+        """The answer to `SubmapsRequest`: everything sent for fusion, also by an earlier
+        process.
+        """
         return self._outbox.answer(request)
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
-        """Go on after the last of this robot's own submaps, as an earlier life sent them.
+        """Continue after the last of this robot's own submaps, as an earlier process sent them.
 
         `submaps` are those of the latest incarnation, without a gap from sequence 0.
         """
@@ -184,7 +187,9 @@ class RobotNode:
         self._inbox.resume(last.incarnation, last.last_measurement + 1)
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message can not be true of this robot: another's, an absurd count, an early end."""
+        """Why a message can not be true of this robot: it is another's, its counts are absurd,
+        or its end is too early.
+        """
         refused = absurd(message)
         if refused is not None:
             return refused
@@ -202,7 +207,7 @@ class RobotNode:
         return None
 
     def status(self) -> m.Status:
-        """What the robot is doing, for people."""
+        """The robot's status, for people."""
         measurements, outliers = self._inbox.next_measurement, self.config.front_end.outlier_share
         nis = self._front.estimator.innovation
         figures = {
@@ -243,10 +248,10 @@ class RobotNode:
         return self._sound([*self._heard(message), *self._go_on()])
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Go on behind a measurement whose handling raised, as if it had never been there.
+        """Continue behind a measurement whose handling raised an exception, as if it had not come.
 
-        An estimator of submaps is put back: to its last submap, and the window's other
-        measurements. One that raises as it closes its last window says `Done` without it.
+        An estimator of submaps is reset to its last submap and the window's other measurements. One
+        that raises as it closes its last window ends with `Done` without it.
         """
         if self._taking is not None:
             self._taking = None
@@ -257,7 +262,7 @@ class RobotNode:
         return self._sound(self._go_on())
 
     def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """What every receiver takes; the rest is withheld and named."""
+        """The messages that every receiver accepts; others are withheld and named."""
         sound = []
         for each in out:
             why = unsound(each.message)
@@ -269,7 +274,9 @@ class RobotNode:
         return sound
 
     def _heard(self, message: m.Message) -> list[Outgoing]:
-        """What there is to say of a message at once, before measurements go on."""
+        """Handle a message at once; returns what to publish before further measurements are
+        taken.
+        """
         match message:
             case m.Measurement():
                 self._inbox.put(message)
@@ -294,7 +301,7 @@ class RobotNode:
         return []
 
     def _hear_of_the_end(self, message: m.Message) -> None:
-        """Who is there, and where the stream ends."""
+        """Handle presence, and where the stream ends."""
         match message:
             case m.Liveliness() if message.node == ch.source_node(self.robot):
                 self._stream_end.driver_is_there = message.alive
@@ -315,7 +322,7 @@ class RobotNode:
                 self.warnings.append(f"no use for a {type(message).__name__}")
 
     def _repeated(self, order: m.Withdrawal) -> list[Outgoing]:
-        """An order is repeated once, so that a centre that is started again hears of it."""
+        """Repeat an order once, so that a centre that is started again receives it."""
         if order.robot in self._withdrawn:
             return []
         self._withdrawn.add(order.robot)
@@ -331,7 +338,9 @@ class RobotNode:
     # The stream.
 
     def _go_on(self) -> list[Outgoing]:
-        """Take the measurements whose turn has come; what there is to say is kept until said."""
+        """Take the measurements whose turn has come; messages to publish are kept until they are
+        out.
+        """
         measurements = self._inbox.taken()
         while not self._blocked:
             measurement = next(measurements, None)
@@ -347,11 +356,11 @@ class RobotNode:
 
     @property
     def _blocked(self) -> bool:
-        """Waits for a map that it is to be told, or for the centre: its answer or its credit."""
+        """Whether the robot waits: for a prior map, for the centre's answer or for its credit."""
         return self._front.waits or self._pace.holds(self.submaps)
 
     def _credit(self) -> list[Outgoing]:
-        """A robot that waits for an exchange still reports what it has received."""
+        """Report the measurements received; a robot that waits for an exchange does so, too."""
         waits = self._pace.lockstep and self._blocked
         if waits and self._pace.owes(self._inbox.received, self._consumed):
             return [self._progress()]
@@ -388,7 +397,7 @@ class RobotNode:
         return out
 
     def _taken(self) -> None:
-        """The measurement in progress is accounted for, and in the open window."""
+        """Account for the measurement in progress and add it to the open window."""
         if self._taking is not None:
             if isinstance(self._taking, m.AnyOdometry):
                 self.ledger.count(self._rejected)
@@ -396,7 +405,7 @@ class RobotNode:
             self._taking = None
 
     def _said_of(self, estimates: Estimates) -> list[Outgoing]:
-        """What there is to say of what the estimator has given."""
+        """The messages for what the estimator has produced."""
         closed, writer = estimates.closed, self._writer
         if closed is not None:
             return [*writer.cloud(closed.end_ns, estimates.cloud), *self._send(closed)]
@@ -414,7 +423,7 @@ class RobotNode:
         return out + writer.association(sequence, self._now_ns, estimates.became)
 
     def _send(self, closed: ClosedWindow) -> list[Outgoing]:
-        """Send a submap; it is among what is to be said before anything else of it can raise."""
+        """Queue a submap for publication before anything else can raise an exception."""
         writer = self._writer
         if self._replaced is not None:
             prior = self._poses.prior_of(self._incarnation)
@@ -436,7 +445,9 @@ class RobotNode:
         ]
 
     def _release(self, seen: tuple[str, ...]) -> list[Outgoing]:
-        """Send what is buffered for an encounter; `seen`: who is to do so too."""
+        """Release the submaps buffered for an encounter; `seen`: the teammates that are to do
+        so, too.
+        """
         released = self._outbox.release(seen, self._now_ns, self._incarnation)
         return [*released, self._progress()] if released else []
 
@@ -475,7 +486,7 @@ class RobotNode:
         self._passed_ns = start.stamp_ns - 1
 
     def _leave_incarnation(self) -> list[Outgoing]:
-        """A later incarnation begins: close what is open of this one, if there is one."""
+        """Close the current incarnation, if there is one, because a later one begins."""
         if not self._consumed:
             return []
         self._passed_ns = self._now_ns
@@ -497,7 +508,9 @@ class RobotNode:
         return out
 
     def _finish(self) -> list[Outgoing]:
-        """The last incarnation's `Done` goes first: with it the centre may conclude."""
+        """Finish: the last incarnation's `Done` goes first, since with it the centre may
+        conclude.
+        """
         self._done = True
         self._passed_ns = self._now_ns
         out = self._close_incarnation()

@@ -1,9 +1,9 @@
-"""What a robot sends for fusion, on its way: buffered until an encounter, and kept for who asks.
+"""What a robot sends for fusion: buffered until an encounter, and kept for later requests.
 
 Under `rendezvous` closed submaps are buffered until the robot encounters a teammate (Xu, 5.1;
-Downs, 4.3). Of the two only the one that sees knows of it: it says so, and both release what they
-have buffered. This changes when a submap is sent, never what is in it: the final map is that of a
-continuous exchange.
+Downs, 4.3). Only the observing robot of the two notices the encounter: it announces it, and both
+release their buffered submaps. This changes when a submap is sent, never its content: the final map
+is that of a continuous exchange.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from team.wire.codec import decoded, encoded
 class Outbox:
     """Initial poses, submaps and inter-robot factors of one robot, in their order.
 
-    buffers: whether anything waits for an encounter at all.
+    buffers: whether submaps wait for an encounter.
     """
 
     def __init__(self, robot: str, exchange: Exchange) -> None:
@@ -36,16 +36,16 @@ class Outbox:
 
     @property
     def submaps(self) -> int:
-        """How many submaps are buffered."""
+        """Number of buffered submaps."""
         return len(self._submaps)
 
     @property
     def since_ns(self) -> int | None:
-        """When the window of the oldest one began; None: nothing is buffered."""
+        """Start of the oldest buffered window; None where nothing is buffered."""
         return next((submap.start_ns for submap in self._submaps), None)
 
     def put(self, out: list[Outgoing]) -> list[Outgoing]:
-        """A window's messages; what of it goes out now."""
+        """Take a window's messages; returns those that go out now."""
         if self.buffers:
             self._buffered += out
             self._greeted.clear()
@@ -54,9 +54,9 @@ class Outbox:
         return out
 
     def release(self, seen: tuple[str, ...], now_ns: int, incarnation: int) -> list[Outgoing]:
-        """An encounter, or the end: what is buffered goes out, behind an announcement.
+        """Release the buffered messages behind an announcement, at an encounter or at the end.
 
-        seen: the teammates that are to release theirs, too. Nothing where nobody would hear news.
+        seen: the teammates that are to release theirs, too. Nothing where no message would be new.
         """
         submaps = self._submaps
         if not self.buffers or not (submaps or set(seen) - self._greeted):
@@ -75,7 +75,7 @@ class Outbox:
         return [Outgoing(ch.RENDEZVOUS, self._robot, announced), *released]
 
     def keep(self, message: m.Message) -> None:
-        """Something for fusion that is sent otherwise, or was in an earlier life."""
+        """Keep a message for fusion that is sent otherwise, or was sent by an earlier process."""
         self._sent.take(message)
 
     def _note(self, out: Sequence[Outgoing]) -> None:
@@ -83,7 +83,9 @@ class Outbox:
             self._sent.take(each.message)
 
     def answer(self, request: bytes) -> list[bytes]:
-        """The answer to `SubmapsRequest`: all that was sent, of an earlier life too."""
+        """The answer to `SubmapsRequest`: everything sent for fusion, also by an earlier
+        process.
+        """
         wanted = decoded(request, m.SubmapsRequest)
         if wanted.robot != self._robot:
             return []

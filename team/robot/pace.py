@@ -1,16 +1,18 @@
-"""How far a robot may go without the centre: lockstep, credit, and what it reports of itself."""
+"""Limits how far a robot runs ahead of the centre: lockstep and credit; and when it reports
+progress.
+"""
 
 from dataclasses import dataclass
 
 CREDIT_SUBMAPS = 4
-"""A robot is at most this many submaps ahead of a living centre."""
+"""A robot is at most this many submaps ahead of a centre that is present."""
 PROGRESS_MEASUREMENTS = 64
 """A robot reports its progress at least once per this many measurements."""
 
 
 @dataclass
 class Pace:
-    """What a robot has sent, what the centre has answered, and what of it holds the robot up.
+    """What a robot has sent and the centre has answered, and whether the robot must wait.
 
     lockstep: each map that is exchanged is answered before the robot goes on (rules with feedback).
     credit: the submaps that are sent are acknowledged. exchange: the last round that was answered;
@@ -29,14 +31,16 @@ class Pace:
     unreported: int = 0
 
     def begin_incarnation(self) -> None:
-        """Submaps and measurements are counted anew; rounds are the team's and go on."""
+        """Begin an incarnation: submaps and measurements are counted from 0; rounds go on, they
+        are the team's.
+        """
         self.acknowledged = self.credited = 0
 
     def holds(self, submaps: int) -> bool:
         """Whether a robot that has sent so many submaps waits for the centre.
 
-        A centre that was never heard of gives no credit, but may still answer: lockstep does not
-        depend on whose token arrives first.
+        A centre that was never present gives no credit, but may still answer: lockstep does not
+        depend on the order in which tokens arrive.
         """
         if self.lockstep:
             return self.awaited > self.exchange and self.centre_alive is not False
@@ -46,21 +50,21 @@ class Pace:
         return submaps - self.acknowledged > CREDIT_SUBMAPS
 
     def answered(self, exchange: int) -> bool:
-        """Take the answer of a round; whether it is news."""
+        """Take the answer of a round; returns whether it is new."""
         if not self.lockstep or exchange <= self.exchange:
             return False
         self.exchange = exchange
         return True
 
     def sent_map(self) -> None:
-        """A map was sent for the next round."""
+        """Note that a map was sent for the next round."""
         self.awaited = self.exchange + 1
 
     def owes(self, received: int, consumed: int) -> bool:
-        """Whether a robot in lockstep must report what it has received, not what it has used.
+        """Whether a robot in lockstep must report the measurements received, not those used.
 
-        Else the world would wait for it, and with the world whoever it waits for: a teammate that
-        needs more measurements for its map, or the end.
+        Otherwise the world would wait for it, and with the world a teammate that needs more
+        measurements for its map, or the end.
         """
         if received - max(self.credited, consumed) < PROGRESS_MEASUREMENTS:
             return False
@@ -68,6 +72,6 @@ class Pace:
         return True
 
     def counted(self) -> bool:
-        """One more measurement was used; whether it is time to report."""
+        """Count a used measurement; returns whether progress is to be reported."""
         self.unreported += 1
         return self.unreported >= PROGRESS_MEASUREMENTS

@@ -1,4 +1,4 @@
-"""A robot's running poses: from its own measurements, and given the team's map."""
+"""Publishes a robot's running poses: by its own measurements, and given the team's map."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from team.wire.newer import is_newer_prior
 
 
 class RunningPoses:
-    """What the robot says of where it is, every `pose_s`.
+    """Publishes poses every `pose_s`.
 
     sigma_m: standard deviation of the last pose in the team's frame; 0 before there is one.
     """
@@ -32,7 +32,7 @@ class RunningPoses:
         self.sigma_m = 0.0
 
     def take(self, prior: m.Prior) -> None:
-        """The team's map, as far as the robot needs it; the newest one counts."""
+        """Take a prior from the team's map; the newest one is used."""
         if not is_newer_prior(prior, self._prior):
             return
         whole = translate.prior_of(prior).whole
@@ -44,21 +44,21 @@ class RunningPoses:
 
     @property
     def has_prior(self) -> bool:
-        """Whether the team's map has been heard."""
+        """Whether a prior has arrived."""
         return self._prior is not None
 
     def prior_of(self, incarnation: int) -> m.Prior | None:
-        """The team's map with a pose of this incarnation."""
+        """The prior with a pose of this incarnation; None where there is none."""
         prior = self._prior
         return prior if prior is not None and prior.incarnation == incarnation else None
 
     def begin_incarnation(self, incarnation: int) -> None:
-        """A prior of an earlier incarnation is of no use any more."""
+        """Begin an incarnation: a prior of an earlier one is of no further use."""
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
 
     def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
-        """A new pose is known: what is said of it, if that is due."""
+        """A new pose: the messages to publish, if they are due."""
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
         self._posed_ns = stamp_ns
@@ -71,7 +71,7 @@ class RunningPoses:
         front: FrontEnd,
         writer: MessageWriter,
     ) -> list[Outgoing]:
-        """The own pose, and given a prior the pose in the team's map."""
+        """The message of the own pose and, given a prior, of the pose in the team's map."""
         sequence = front.estimator.sequence
         own = front.estimator.own_pose()
         out = [writer.pose(ch.OWN_POSE, stamp_ns, sequence, translate.NO_MAP, own)]

@@ -1,4 +1,4 @@
-"""What a robot has sent for fusion, in this life or an earlier one: whoever lacks it may ask."""
+"""Keeps what a robot has sent for fusion, also in an earlier process, for whoever requests it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from team.wire import messages as m
 
 @dataclass
 class Sent:
-    """Initial poses, submaps and inter-robot factors by incarnation.
+    """The initial poses, submaps and inter-robot factors that were sent, by incarnation.
 
     A resumed robot's publisher has only what this process published; this has what it took over,
     too, so that a centre that is started again can be given everything.
@@ -19,7 +19,7 @@ class Sent:
     factors: dict[int, dict[tuple[int, int, str], m.SightingFactor]] = field(default_factory=dict)
 
     def take(self, message: m.Message) -> None:
-        """Keep what is for fusion."""
+        """Keep a message for fusion."""
         match message:
             case m.InitialPose():
                 self.starts[message.incarnation] = message
@@ -32,7 +32,9 @@ class Sent:
                 pass
 
     def wanted(self, wanted: m.SubmapsRequest) -> Iterator[m.Message]:
-        """The answer: of each incarnation its start, then factors and submaps by sequence."""
+        """Answer a request: of each incarnation its initial pose, then factors and submaps by
+        sequence.
+        """
         for incarnation in sorted(self.starts) if wanted.incarnation == 0 else [wanted.incarnation]:
             first = wanted.first if wanted.incarnation else 0
             if incarnation in self.starts:

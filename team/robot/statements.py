@@ -1,4 +1,4 @@
-"""What a robot says of what its estimator has found: values to messages on their channels."""
+"""Turns what a robot's estimator has found into messages on their channels."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -22,7 +22,7 @@ from team.wire.bus import Outgoing
 
 @dataclass(frozen=True)
 class MessageWriter:
-    """One incarnation of a robot's stream under an announced configuration (by its digest)."""
+    """Writes the messages of one incarnation under an announced configuration (its digest)."""
 
     robot: str
     incarnation: int
@@ -44,7 +44,7 @@ class MessageWriter:
         return Outgoing(ch.SUBMAP, self.robot, message)
 
     def association(self, sequence: int, stamp_ns: int, became: Became | None) -> list[Outgoing]:
-        """What became of the window's detections without identities, if it had any."""
+        """The outcomes of the window's detections without identities, if it had any."""
         if became is None:
             return []
         message = translate.association_message(
@@ -53,7 +53,7 @@ class MessageWriter:
         return [Outgoing(ch.ASSOCIATION, self.robot, message)]
 
     def sighting(self, closed: ClosedWindow, each: NodeSighting) -> Outgoing:
-        """A teammate seen from a pose node of the window."""
+        """The inter-robot measurement from a pose node of the window."""
         sighting = Sighting(
             self.robot,
             self.incarnation,
@@ -75,7 +75,7 @@ class MessageWriter:
         return [Outgoing(ch.PARTICLES, self.robot, message)]
 
     def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
-        """How well the measurements of a window, or since the last of these, were predicted."""
+        """The innovations of a window's measurements, or of those since the last such message."""
         message = m.Innovation(
             stamp_ns=stamp_ns,
             robot=self.robot,
@@ -96,7 +96,7 @@ class MessageWriter:
     ) -> Outgoing:
         """The running map, with the joint covariance or with each landmark's own.
 
-        What rounding has spoilt is left out.
+        Landmarks whose covariance rounding has spoilt are left out.
         """
         joint = kind == "joint"
         message = m.MapEstimate(

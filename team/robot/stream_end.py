@@ -1,4 +1,4 @@
-"""Where a robot's stream ends, by whoever knows: its world, its driver, or an operator."""
+"""Where a robot's stream ends, as its world, its driver or an operator says."""
 
 from team.stream.inbox import Inbox
 from team.wire import messages as m
@@ -6,7 +6,7 @@ from team.wire.newer import later_end, later_head
 
 
 class EndOfStream:
-    """Of one robot. A world ends a stream by `End`, a driver by its `StreamHead`."""
+    """The end of one robot's stream. A world ends it by `End`, a driver by its `StreamHead`."""
 
     def __init__(self, robot: str, inbox: Inbox) -> None:
         self._robot = robot
@@ -19,12 +19,12 @@ class EndOfStream:
 
     @property
     def reached(self) -> bool:
-        """Whether every measurement up to the last one has had its turn."""
+        """Whether every measurement up to the last one has been consumed."""
         return self._last is not None and self._inbox.complete(self._last)
 
     @property
     def waits_for_driver(self) -> bool:
-        """Its measurements come from a driver, and that is not there to be asked."""
+        """Whether measurements must come from a driver that is not present."""
         return self._head is not None and self.driver_is_there is False
 
     def missing(self) -> tuple[int, int, int] | None:
@@ -32,7 +32,7 @@ class EndOfStream:
         return None if self.waits_for_driver else self._inbox.missing(self._known())
 
     def _known(self) -> m.StreamEnd | None:
-        """The stream's last counter that anybody has told, whether it has ended or not."""
+        """The stream's last announced counter, whether it has ended or not."""
         head = self._head
         if self._last is not None or head is None:
             return self._last
@@ -41,7 +41,7 @@ class EndOfStream:
         )
 
     def refusal(self, message: m.End | m.StreamHead) -> str | None:
-        """Why this can not be true of the stream, in words."""
+        """Why an announced end can not be true of the stream, in words."""
         if isinstance(message, m.End):
             return self._inbox.contradicts(message, self._robot)
         if message.robot != self._robot:
@@ -50,15 +50,15 @@ class EndOfStream:
         return self._inbox.contradicts(_end_at(message), self._robot) if ended else None
 
     def take(self, end: m.End) -> None:
-        """A world's end; one that does not know of this robot ends it where it is."""
+        """Take a world's end; one that does not name this robot ends its stream where it is."""
         self._world_end = end = later_end(end, self._world_end)
         mine = [stream for stream in end.streams if stream.robot == self._robot]
         self._last = mine[0] if mine else self._at(0)
 
     def take_head(self, head: m.StreamHead) -> m.StreamHead:
-        """How far the driver is; the newest that it has said.
+        """Take the newest head of the driver.
 
-        Its stream ends when it says so, unless a later incarnation begins after that.
+        The stream ends when the head says so, unless a later incarnation begins after that.
         """
         self._head = head = later_head(head, self._head)
         if head.state == "ended":
@@ -68,7 +68,7 @@ class EndOfStream:
         return head
 
     def end_without_driver(self) -> None:
-        """A live team is to end and the driver is not there: the stream ends where it has come."""
+        """End the stream where it is: a live team is to end and the driver is not present."""
         if self.is_ordered and self._last is None and not self.driver_is_there:
             self._last = self._at(self._inbox.received)
 
@@ -79,7 +79,7 @@ class EndOfStream:
 
 
 def _end_at(head: m.StreamHead) -> m.End:
-    """The end of one robot's stream, as a world would say it."""
+    """The end of one robot's stream as a world would announce it."""
     last = m.StreamEnd(
         robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
     )

@@ -1,4 +1,4 @@
-"""The robot's map given the team's: kept between its poses, made anew with each prior."""
+"""The robot's map given the team's: kept between poses, computed anew with each prior."""
 
 from collections.abc import Sequence
 
@@ -18,10 +18,11 @@ from team.wire import messages as m
 
 
 class TeamMap:
-    """A pure function of the last prior and the robot's submaps, computed when they change.
+    """The joint map of the last prior and the robot's later submaps; recomputed when they change.
 
-    known, refused: of the newest submap's and the open window's landmarks, how many the rest has,
-    and contradicts. doubt: what speaks against the last pose, in words; empty: nothing.
+    known, refused: of the landmarks of the newest submap and the open window, the numbers that the
+    rest of the map has and contradicts. doubt: a warning about the last pose, in words; empty where
+    there is none.
     """
 
     def __init__(self) -> None:
@@ -34,9 +35,10 @@ class TeamMap:
         self.doubt = ""
 
     def pose(self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None) -> Posed:
-        """The robot's pose in the team's frame; `window`: the one in progress, if it has begun.
+        """The robot's pose in the team's frame; `window`: the open one, if it has begun.
 
-        Its covariance is that of the arc on which a robot lies whose heading is known badly.
+        A robot whose heading is badly known lies on an arc; its pose gets the covariance of that
+        arc.
         """
         given = self.given(prior, submaps)
         open_window = None if window is None else self._shared.taken(window.named)
@@ -60,12 +62,11 @@ class TeamMap:
         return ""
 
     def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
-        """The prior times those of the incarnation's submaps that are not in it.
+        """Join the prior with those of the incarnation's submaps that it does not contain.
 
-        Their landmarks without names are known to themselves alone before the team's fold has taken
-        them (the prior's own are not compared with them), so they say nothing here.
-        The prior may have more of them than a robot that has come back. That a prior and submaps
-        have no solution is found once, not at every keyframe, and raised again.
+        Landmarks without identities are left out: the robot can not compare them before the team's
+        fold has. The prior may contain more submaps than a robot that has come back. If prior and
+        submaps have no joint solution, that is found once and raised again at every keyframe.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             told = translate.prior_of(prior)

@@ -1,4 +1,4 @@
-"""What a robot says in words of what it finds odd."""
+"""A robot's warnings, in words."""
 
 import numpy as np
 
@@ -6,16 +6,16 @@ from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.submap import Slipped
 
 UNEXPECTED = 3.0
-"""NIS per degree of freedom above which measurements are not what the models say: 1 is right, and
+"""NIS per degree of freedom above which measurements contradict the models: 1 is right, and
 5 % of outliers give 3 with a coarse sensor, a hundred with an accurate one."""
 UNEXPECTED_DOF = 60
-"""… judged from so many degrees of freedom on."""
+"""… computed from this many degrees of freedom at least."""
 
 
 def unexpected(nis: Innovation, outliers: float) -> tuple[str, ...]:
     """Warns that measurements lie far from their predictions, and says what to configure then.
 
-    outliers: the share of measurements that the robot is configured to take for wrong.
+    outliers: the configured share of outliers.
     """
     ratio = nis.per_dof
     if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
@@ -33,7 +33,7 @@ def unexpected(nis: Innovation, outliers: float) -> tuple[str, ...]:
 
 
 def slipped(slip: Slipped) -> str:
-    """A slip of the odometry in words."""
+    """Describes a slip of the odometry."""
     metres, turn = float(np.hypot(*slip.by[:2])), float(np.degrees(slip.by[2]))
     return (
         f"the odometry slipped by {metres:.2f} m, {turn:.0f}° before {slip.stamp_ns * 1e-9:.2f} s"
@@ -41,7 +41,7 @@ def slipped(slip: Slipped) -> str:
 
 
 def driver_away(last: int) -> str:
-    """A live robot waits for measurements; `last`: the counter of the last one that came."""
+    """Warns that a live robot waits for measurements; `last`: the counter of the last one."""
     return (
         f"its driver is away after measurement {last}: start it again, or end the team by "
         "`teamslam end`"

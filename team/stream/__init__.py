@@ -1,1 +1,1 @@
-"""A robot's measurements on their way to an estimator: in their order, cut into keyframes."""
+"""Puts a robot's measurements in order and checks them, before they go to an estimator."""

@@ -1,4 +1,4 @@
-"""The measurements of one robot, put in the order of its measurement counter."""
+"""Puts the measurements of one robot in the order of its measurement counter."""
 
 from collections.abc import Iterator
 
@@ -6,7 +6,7 @@ from team.door import another_time
 from team.wire.messages import End, InitialPose, Measurement, StreamEnd
 
 NEAR_LIVES = 16
-"""A stream begins a new life when it is asked for what it has lost: seldom, one by one."""
+"""Incarnations beyond the current one that are accepted: they begin one by one, and seldom."""
 
 
 class Inbox:
@@ -25,8 +25,8 @@ class Inbox:
         self._began_ns: int | None = None
 
     def resume(self, incarnation: int, next_measurement: int) -> None:
-        """Everything before `next_measurement` of `incarnation` has been consumed in an earlier
-        life.
+        """Note that an earlier process has consumed everything before `next_measurement` of
+        `incarnation`.
         """
         self.incarnation = incarnation
         self.next_measurement = next_measurement
@@ -49,9 +49,9 @@ class Inbox:
             self._waiting[measurement.number] = measurement
 
     def refusal(self, measurement: Measurement) -> str | None:
-        """Why a measurement can not be of this stream, in words; None: it can.
+        """Why a measurement can not be of this stream, in words; None if it can.
 
-        A stream's incarnations follow one another, and its stamps its initial pose's.
+        Incarnations follow one another, and stamps do not precede the initial pose's.
         """
         if self.next_measurement and measurement.incarnation > self.incarnation + NEAR_LIVES:
             return (
@@ -62,7 +62,7 @@ class Inbox:
         return None
 
     def contradicts(self, end: End, robot: str) -> str | None:
-        """Why this can not be the end of the robot's stream, in words."""
+        """Why an announced end can not be the end of the robot's stream, in words."""
         ends = {
             stream.incarnation: stream.measurements
             for stream in end.streams
@@ -79,7 +79,7 @@ class Inbox:
         return None
 
     def taken(self) -> Iterator[Measurement]:
-        """The measurements whose turn has come, one by one."""
+        """Yield the measurements whose turn has come, one by one."""
         while True:
             measurement = self._waiting.pop(self.next_measurement, None)
             if measurement is not None:
@@ -96,7 +96,9 @@ class Inbox:
             self._forget(following)
 
     def _forget(self, incarnation: int) -> None:
-        """Nothing of this incarnation or an earlier one can become its turn any more."""
+        """Drop measurements of this incarnation and of earlier ones that can not have their turn
+        any more.
+        """
         self._received = 0
         self._later = {
             e: measurements for e, measurements in self._later.items() if e > incarnation
@@ -114,10 +116,9 @@ class Inbox:
 
     @property
     def gap(self) -> tuple[int, int, int] | None:
-        """Incarnation, first and last measurement that are missing before the earliest one that
-        waits.
+        """Incarnation, first and last measurement of the gap before the earliest waiting one.
 
-        Of a later incarnation that is its beginning, when nothing else of this one is here.
+        Where only a later incarnation has arrived, the gap is at its beginning.
         """
         if self._waiting:
             first = min(self._waiting)
@@ -133,14 +134,14 @@ class Inbox:
         return (following, 0, first - 1) if first else None
 
     def complete(self, end: StreamEnd) -> bool:
-        """Whether every measurement up to the stream's last one has had its turn."""
+        """Whether every measurement up to the stream's last one has been consumed."""
         return end.measurements == 0 or (
             self.incarnation == end.incarnation and self.next_measurement >= end.measurements
         )
 
     def missing(self, end: StreamEnd | None) -> tuple[int, int, int] | None:
-        """Incarnation, first and last measurement to ask the source for: a gap, or all up to the
-        end.
+        """Incarnation, first and last measurement to ask the source for: a gap, or everything up
+        to the end.
         """
         gap = self.gap
         last = None if end is None else (end.incarnation, end.measurements)
@@ -153,5 +154,5 @@ class Inbox:
 
     @property
     def waiting(self) -> int:
-        """How many measurements wait for their turn."""
+        """Number of measurements that wait for their turn."""
         return len(self._waiting) + sum(len(r) for r in self._later.values())

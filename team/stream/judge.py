@@ -1,4 +1,4 @@
-"""Whether a stream's measurements are physically sensible, one after the other."""
+"""Checks whether a stream's measurements are physically sensible, one after the other."""
 
 import math
 
@@ -12,10 +12,10 @@ from team.rejection import Rejection
 
 
 class StreamJudge:
-    """Of one incarnation of a sensor stream; it remembers how far the odometry has come.
+    """Checks one incarnation of a sensor stream; it remembers the time of the last odometry.
 
     A stamp that lies `jump_s` ahead of the odometry is refused, and so is the odometry itself,
-    until the next interval confirms that the clock has truly jumped.
+    until the next interval confirms that the clock has really jumped.
     """
 
     def __init__(self, bounds: Bounds, now_ns: int | None = None) -> None:
@@ -32,7 +32,9 @@ class StreamJudge:
         yaw_rate: float,
         moved: Moved | None = None,
     ) -> Rejection | None:
-        """Why an interval is refused: by `Rejection.SPEED` its motion alone, else all of it."""
+        """Why an interval is refused: for `Rejection.SPEED` only its motion, otherwise all of
+        it.
+        """
         if duration_ns == 0:
             return Rejection.NO_TIME
         if self._now_ns is not None:
@@ -57,7 +59,7 @@ class StreamJudge:
         return None if sensible else Rejection.SPEED
 
     def time(self, stamp_ns: int) -> Rejection | None:
-        """Why what was seen at this time is refused."""
+        """Why a measurement at this time is refused."""
         ahead_ns = 0 if self._now_ns is None else stamp_ns - self._now_ns
         return Rejection.TIME if ahead_ns > self._jump_ns else None
 

@@ -194,8 +194,8 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
     An EKF is linearised at the first, noisiest measurement, and that bias is common to many
     submaps: `landmarks_along_paths` starts from it. running: for a pose within the window, which is
     not fused; where all of the sensor's errors are white, the landmarks are then those that the
-    particles hold, since solving them at every keyframe changes that pose by a hundredth of its
-    error and costs a third of the time. The particles do not model a landmark's constant error.
+    particles hold, since solving them at every keyframe moves that pose by a
+    hundredth and costs a third of the time. The particles do not model a landmark's constant error.
     """
     particles = window.particles
     order = np.argsort(particles.ids)
