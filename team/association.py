@@ -12,22 +12,22 @@ Few = Annotated[int, Meta(ge=1, le=1000)]
 
 
 class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When landmarks without names count as one; lengths in metres.
+    """Thresholds by which landmarks without identities are merged; lengths in metres.
 
     gate: χ² (2 numbers) beyond which two are not one. slack: what two submaps' places of one
     landmark differ by beside their covariance. density: λ, landmarks to be expected per square
     metre. llr_tight, llr_loose: the log-likelihood ratio that a pair needs where the standard
     deviation of its difference is below `tight`, and elsewhere. odds: how much more it needs than
     its best rival. near: up to this standard deviation old landmarks are candidates without a
-    closure. same: two landmarks nearer than this may be one that was split.
-    recent: so many last submaps of a robot are followed by tracking, and are the patch for which a
-    closure is searched. absent: what a landmark costs that one side has and the other, which looked
-    there, has not: −ln of how rarely that is. closure_pairs, closure_llr, margin, ratio: what a
-    closure needs: pairs, evidence (the sum of their log-likelihood ratios less what is absent), how
-    much more and how many times the evidence of the best other alignment. island_pairs, island_llr:
-    the same between robots with unknown initial poses. context: landmarks of both outside the
-    matched place, as a part of the pairs, without which it is not known whether the place is unlike
-    any other. share: of the landmarks of either side near the matched places (of the side that has
+    closure. same: two landmarks nearer than this may be one that was split. recent: so many last
+    submaps of a robot are followed by tracking, and are the patch for which a closure is searched.
+    absent: the cost of a landmark that one side has and the other, which observed its place, has
+    not: −ln of the probability of that. closure_pairs, closure_llr, margin, ratio: what a closure
+    needs: pairs, evidence (the sum of their log-likelihood ratios less what is absent), how much
+    more and how many times the evidence of the best other alignment. island_pairs, island_llr: the
+    same between robots with unknown initial poses. context: least number of landmarks of both sides
+    outside the matched place, relative to the pairs; with fewer it is unknown whether the place is
+    unique. share: of the landmarks of either side near the matched places (of the side that has
     fewer), how many are matched. A closure whose share falls below undone_below within `audited`
     ticks is undone.
     """
@@ -58,7 +58,7 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 DEFAULT_PROFILE = AssociationProfile()
 
 SCALE_M = 0.03
-"""What the sensor of the default profile mismeasures a landmark by, at the far end of its view."""
+"""The sensor error [m] of the default profile at the far end of its view."""
 
 
 def profile_for(sensor: Sensor, farthest_m: float) -> AssociationProfile:

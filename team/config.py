@@ -1,4 +1,4 @@
-"""What a robot is told before it starts: its models, its estimator and its rule.
+"""The configuration of a robot: its models, its estimator and its fusion rule.
 
 The fields are SI; angles in radians unless the name says `_deg`. Noise of motion is a density, so
 it does not depend on the rate of the odometry: a standard deviation per square root of a second, of
@@ -18,12 +18,12 @@ Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 
 UNNAMED = 2**31
-"""Landmark numbers below this are names, as of a barcode. From here on they are given by whoever
-associates: in a submap 2³¹ + a local index, in the team's map 2³¹ | a name of its first member.
-"""
+"""Landmark numbers below this are identities, as of a barcode. From here on they are assigned by
+data association: in a submap 2³¹ + a local index, in the team's map 2³¹ | a number of its first
+member."""
 Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
 Exchange = Literal["continuous", "rendezvous"]
-"""When robots send: each submap as it is closed, or what they hold when one sees another."""
+"""When robots send: each submap as it is closed, or all buffered ones at an encounter."""
 if TYPE_CHECKING:
     Estimator = str
     FusionRule = str
@@ -50,26 +50,25 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     "velocity" (Ma & Ma eq. 1-4) drives the arc of constant (forward, yaw_rate);
     "differential-drive" (Downs eq. 2.3-2.4) drives that arc on two wheels wheel_base apart;
     "ackermann" drives it as a car, whose axles are wheel_base apart and whose base is the middle of
-    the rear one: of a wheel's speed u and the steering angle s + steering_offset it makes
-    forward = u/(1 - tan(s)·wheel_offset/wheel_base) and yaw_rate = forward·tan(s)/wheel_base, where
-    the wheel whose speed is logged lies wheel_offset [m] left of the middle.
-    Odometry that tells a motion on SE(2) instead is an arc with a part to the left, of any kind; if
-    it claims a covariance, that counts, covariance_factor times, and not the noises below.
-    forward [m], turn [rad], final_turn [rad] (a rotation after the motion) and lateral [m] are the
-    independent noises. forward_scale and yaw_scale multiply the logged values first.
-    alphas: Ma & Ma's α₁ … α₆, in addition: at speed v and yaw rate ω, forward has the variance
-    (α₁v² + α₂ω²)·alpha_interval_s·t, turn that with α₃ and α₄, final_turn that with α₅ and α₆:
-    theirs for t = alpha_interval_s, and a density like all noise of motion.
-    left_wheel, right_wheel [m/√m], in addition: the variance of a wheel's way is noise² |way|, and
-    the two make one error of (forward, turn), correlated where the wheels differ.
-    turn_drag [m]: a base whose outer wheel is no faster than the logged speed loses
-    turn_drag·|yaw rate| of it in a turn, at most all. veer [rad/m]: it turns so much on each metre.
+    the rear one: of a wheel's speed u and the steering angle s + steering_offset it makes forward =
+    u/(1 - tan(s)·wheel_offset/wheel_base) and yaw_rate = forward·tan(s)/wheel_base, where the wheel
+    whose speed is logged lies wheel_offset [m] left of the middle. Odometry that gives a motion on
+    SE(2) instead is an arc with a part to the left, of any kind; a covariance that comes with it is
+    taken times covariance_factor and replaces the noises below. forward [m], turn [rad], final_turn
+    [rad] (a rotation after the motion) and lateral [m] are the independent noises. forward_scale
+    and yaw_scale multiply the logged values first. alphas: Ma & Ma's α₁ … α₆, in addition: at speed
+    v and yaw rate ω, forward has the variance (α₁v² + α₂ω²)·alpha_interval_s·t, turn that with α₃
+    and α₄, final_turn that with α₅ and α₆: theirs for t = alpha_interval_s, and a density like all
+    noise of motion. left_wheel, right_wheel [m/√m], in addition: the variance of a wheel's way is
+    noise² |way|, and the two make one error of (forward, turn), correlated where the wheels differ.
+    turn_drag [m]: a base whose outer wheel is no faster than the logged speed loses turn_drag·|yaw
+    rate| of it in a turn, at most all. veer [rad/m]: rotation of the base on each metre driven.
     shares: forward and lateral [m/m] and heading [rad/m], in addition: errors that are a share of
     the way and stay so for shares_interval_s: the variance is (share·v)²·shares_interval_s·t.
-    slow_scale: a base that creeps faster than it is told to has this scale, not forward_scale,
-    where the logged speed is below slow_below [m/s].
-    calibrated_speed: the logged speeds [m/s] from which forward_scale was learnt; where the robot
-    is slower or faster the scale has an error of its own (the bias "forward_scale").
+    slow_scale: at low speed, where the logged speed is below slow_below [m/s], this scale replaces
+    forward_scale. calibrated_speed: the logged speeds [m/s] from which forward_scale was learnt;
+    where the robot is slower or faster the scale has an error of its own (the bias
+    "forward_scale").
     """
 
     kind: Literal["turn-then-drive", "velocity", "differential-drive", "ackermann"] = "velocity"
@@ -127,13 +126,13 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def slips(self) -> bool:
-        """Whether it has noise behind the motion that odometry measures."""
+        """Whether it has noise beside the motion that odometry measures."""
         final = any((self.alphas or ())[4:]) or any((self.shares or ())[1:2])
         return final or self.final_turn != MotionNoise() or self.lateral != MotionNoise()
 
 
 class Lens(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a raw bearing b [rad] reads too much: linear·b + square·b² + cubic·b³ [rad]."""
+    """The error of a raw bearing b [rad]: linear·b + square·b² + cubic·b³ [rad]."""
 
     linear: float = 0.0
     square: float = 0.0
@@ -141,29 +140,29 @@ class Lens(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def is_ideal(self) -> bool:
-        """Whether bearings are what they read."""
+        """Whether raw bearings have no such error."""
         return self == Lens()
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A range-bearing sensor: true range = (measurement − range_offset)/range_scale.
 
-    range_is_depth: what is read is the distance along the optical axis, as by a camera that tells
-    it from an object's height in the image: true range = (measured − range_offset)/(range_scale ·
-    cos β), where the raw bearing is optical_axis + β. Measurements with |β| above 80° are rejected.
-    bearing_lens: what bearings read too much beside bearing_offset, as through a camera's lens.
-    Range sigma at a predicted range r is hypot(range_sigma, range_sigma_per_m · r); the predicted
-    range is used, not the measured one (else maps shrink: Peelle's puzzle).
+    range_is_depth: the measured range is the distance along the optical axis, as of a camera that
+    infers it from an object's height in the image: true range = (measured −
+    range_offset)/(range_scale · cos β), where the raw bearing is optical_axis + β. Measurements
+    with |β| above 80° are rejected. bearing_lens: error of bearings beside bearing_offset, as by a
+    camera's lens. Range sigma at a predicted range r is hypot(range_sigma, range_sigma_per_m · r);
+    the predicted range is used, not the measured one (else maps shrink: Peelle's puzzle).
     Measurements outside [min_range, max_range] or more than field_of_view/2 from the axis are
     rejected. range_white and bearing_white are the shares of the two variances that are independent
     from measurement to measurement; the rest is one error per landmark, constant within a window (a
     camera that mismeasures a marker does so again a moment later). In a simulated world the rest is
     a first-order Gauss-Markov process for each landmark (and each teammate), whose correlation
-    falls to 1/e in range_correlation_s or bearing_correlation_s.
-    mount: the sensor's pose (x [m], y [m], theta [rad]) on the robot's base; what it measures is
-    relative to it. covariance_factor: what covariances that come with measurements are taken times.
-    A teammate's marker reads marker_range_offset [m] too long after this calibration, and lies
-    marker_sigma [m] from the pose that its robot tracks.
+    falls to 1/e in range_correlation_s or bearing_correlation_s. mount: the sensor's pose (x [m], y
+    [m], theta [rad]) on the robot's base; what it measures is relative to it. covariance_factor:
+    factor on covariances that come with measurements. The range to a teammate's marker is
+    marker_range_offset [m] too long after this calibration, and the marker lies marker_sigma [m]
+    from the pose that its robot tracks.
     """
 
     range_sigma: Positive = 0.1
@@ -189,23 +188,22 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def is_mounted(self) -> bool:
-        """Whether it is elsewhere than at its base's pose."""
+        """Whether the sensor has a pose of its own on the base."""
         return any(self.mount)
 
 
 class Association(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a window finds out which detections without identities are of one landmark.
+    """Parameters of the association of detections without identities inside a window.
 
     gate: the largest squared Mahalanobis distance of a detection from its landmark, χ² of two
-    degrees of freedom (13.8: one in a thousand of the right ones is beyond).
-    variance_factor: detections' covariances are taken times this while associating; below 1 where
-    the noise that estimation needs is systematic, and neighbours would be taken for one.
-    least_seen: a landmark that fewer detections of the window support stays out.
-    slack_m: two landmarks that no scan saw together are one if they are within the gate with this
-    much slack. slip_m: the largest jump of the odometry that is looked for; 0: none.
-    detection_probability: of a landmark in view; what was seen too rarely for it is clutter.
-    certain: a detection that is of its landmark with a smaller probability stays out
-    (`team.estimation.association.certainty`).
+    degrees of freedom (13.8: one in a thousand of the right ones is beyond). variance_factor:
+    factor on detections' covariances during association; below 1 where the noise for estimation
+    includes systematic errors, so that neighbours would be merged. least_seen: a landmark that
+    fewer detections of the window support stays out. slack_m: two landmarks that no scan saw
+    together are one if they are within the gate with this much slack. slip_m: the largest jump of
+    the odometry that is looked for; 0: none. detection_probability: of a landmark in view; what was
+    seen too rarely for it is clutter. certain: a detection that is of its landmark with a smaller
+    probability stays out (`team.estimation.association.certainty`).
     """
 
     gate: Positive = 13.8
@@ -221,14 +219,14 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The particle front end of one window and the rule that closes the window.
 
     window_s: a window closes with the first odometry interval that ends this long after its start.
-    window_m: a window in which the odometry drove less than this goes on, up to standing_s: what a
-    robot sees from one place it sees with one error, which is counted once for each window.
-    keyframe_s: measurements within this time are reduced to one per landmark (median, moved with
-    the odometry to the keyframe's end); 0 takes every observation message as a keyframe of its own.
-    node_s: each submap carries the robot's poses at the multiples of this team time that lie in its
-    window, so that inter-robot measurements are factors between poses; 0: none,
-    inter-robot measurements unused. sighting_s: an inter-robot measurement is used if such a time
-    is no farther from it than this. teammate_speed: how fast a teammate may move in between [m/s].
+    window_m: a window in which the odometry drove less than this stays open, up to standing_s:
+    measurements from one place share one error, which is counted once for each window. keyframe_s:
+    measurements within this time are reduced to one per landmark (median, moved with the odometry
+    to the keyframe's end); 0 takes every observation message as a keyframe of its own. node_s: each
+    submap carries the robot's poses at the multiples of this team time that lie in its window, so
+    that inter-robot measurements are factors between poses; 0: there are none, and inter-robot
+    measurements are not used. sighting_s: an inter-robot measurement is used if such a time is no
+    farther from it than this. teammate_speed: how fast a teammate may move in between [m/s].
     outlier_share: the share of measurements that may have nothing to do with their landmark; above
     0 a window takes only measurements that others of it confirm
     (`team.estimation.hybrid_slam.consensus`). biases: the errors shared by all of the robot's
@@ -255,7 +253,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is physically sensible: what lies beyond is refused, with its reason, before it is used.
+    """Bounds of what is physically sensible; values beyond them are refused with the reason.
 
     coordinate_m: of a pose or a landmark in the team's frame. extent_m: of what one submap holds,
     from its start, and of one range. speed_m_s, yaw_rate_rad_s, interval_s: of one odometry
@@ -284,9 +282,9 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     exchange_s: under a rule with feedback, the least team time between two exchanges of maps (at
     window ends; for `hybrid-thesis` at keyframes). pose_s: the least team time between two running
-    poses. clock_offset_s: what the odometry's clock stamps t happened at t + clock_offset_s of team
-    time, which is the sensor's clock; the robot corrects it before it uses a stamp. bounds: what
-    lies beyond them is rejected.
+    poses. clock_offset_s: odometry stamped t belongs to t + clock_offset_s of team time, the
+    sensor's clock; the robot corrects the stamp before it uses it. bounds: measurements beyond them
+    are rejected.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]

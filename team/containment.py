@@ -1,9 +1,10 @@
-"""The one boundary around the handling of a message: what raises there is set aside and named.
+"""The fault boundary around a node: a message whose handling raises an exception is set aside and
+named.
 
 Every shell, a team in memory and a rerun hand messages to their nodes through it, so what a node
 makes of a log does not depend on who runs it. A message that raised is recorded as `Fault`,
 counted, and not handled again when it is delivered once more; the node goes on with what its
-`set_aside` says. What is not an `Exception` (an interrupt, an exit) ends the process as ever.
+`set_aside` returns. What is not an `Exception` (an interrupt, an exit) ends the process.
 """
 
 import hashlib
@@ -22,7 +23,7 @@ from team.wire.codec import WireError, decoded, encoded
 
 M = TypeVar("M", bound=m.Message)
 MOST_ANSWERS = 1000
-"""Attempts of a node to go on behind one message, when it raises at that again and again."""
+"""Most attempts of a node to continue behind one message, where it raises again and again."""
 KEPT_TEXT = 1000
 """Characters of an exception's text, or of a key, that are kept."""
 _OURS = ("team.", "central.", "sim.")
@@ -31,7 +32,7 @@ _LOG = logging.getLogger("teamslam")
 
 @runtime_checkable
 class Handler(Protocol):
-    """What a message is handed to."""
+    """Anything that handles messages."""
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message."""
@@ -39,7 +40,7 @@ class Handler(Protocol):
 
 @runtime_checkable
 class TakesSamples(Protocol):
-    """A handler that needs the very bytes of a message, too: it may hand them on."""
+    """A handler that also needs the encoded bytes of a message, as it may forward them."""
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
         """Take one message, as `handle`."""
@@ -47,27 +48,28 @@ class TakesSamples(Protocol):
 
 @runtime_checkable
 class Guarded(Protocol):
-    """A handler that knows what can not be true of its team."""
+    """A handler that knows which messages can not be true of its team."""
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why it does not take a message, in words; None: it takes it."""
+        """Why it does not take a message, in words; None where it does."""
 
 
 @runtime_checkable
 class Recovers(Protocol):
-    """A handler that says how it goes on behind a message that raised."""
+    """A handler that can continue behind a message whose handling raised."""
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """What it says in place of its answer: what others wait for, and what was said before."""
+        """The messages in place of its answer: those that others wait for, and those prepared
+        before.
+        """
 
 
 @dataclass
 class Boundary:
-    """Hands messages to one node and keeps what was refused at the door and what raised.
+    """Hands messages to one node; counts the messages refused on arrival and those that raised.
 
-    name: the node. faults: handlings that raised. refused: messages that were no sound ones.
-    last, last_refused: the newest of each, in words. aside: what is not handled again, by key and
-    payload.
+    name: the node. faults: handlings that raised. refused: invalid messages. last, last_refused:
+    the newest of each, in words. aside: messages that are not handled again, by key and payload.
     """
 
     name: str
@@ -78,7 +80,7 @@ class Boundary:
     aside: set[tuple[str, bytes]] = field(default_factory=set)
 
     def take(self, node: Handler, sample: Sample) -> list[Outgoing]:
-        """Decode a sample at the door and hand it to the node; its answer."""
+        """Decode a sample, hand the message to the node and return its answer."""
         message = self.let_in(sample, lambda: opened(sample)[2])
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
@@ -95,7 +97,7 @@ class Boundary:
         return self.hand(node, message, reply_sample(m.tag_of(type(message)), encoded(message)))
 
     def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
-        """The sound message of a sample, else what there is to say: nothing, or a fault."""
+        """The valid message of a sample; otherwise what to publish: nothing, or a fault."""
         try:
             return open_()
         except WireError as error:
@@ -105,7 +107,9 @@ class Boundary:
         return []
 
     def hand(self, node: Handler, message: m.Message, sample: Sample) -> list[Outgoing]:
-        """Hand a message to the node; its answer, or the fault and how the node goes on."""
+        """Hand a message to the node; returns its answer, or the fault and what the node
+        continues with.
+        """
         if self.aside and _name(sample) in self.aside:
             return []
         tag = m.tag_of(type(message))
@@ -128,13 +132,13 @@ class Boundary:
         return out
 
     def refuse(self, sample: Sample, why: str) -> None:
-        """Count and log a message that is not taken."""
+        """Count and log a message that is refused."""
         self.refused += 1
         self.last_refused = f"{_cut(sample.key, 80)}: {_cut(why, 200)}"
         _LOG.warning("%s: dropped %s", self.name, self.last_refused)
 
     def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
-        """Count and log a fault; its message."""
+        """Count and log a fault; returns its message."""
         self.faults += 1
         place = place_of(error.__traceback__)
         text = _cut(str(error), KEPT_TEXT)
@@ -162,7 +166,7 @@ class Boundary:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was dropped and set aside, in words, for a status."""
+        """What was refused and set aside, in words, for a status."""
         dropped = f"{self.refused} dropped at the door, the last: {self.last_refused}"
         raised = f"{self.faults} set aside after a fault, the last: {self.last}"
         return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
@@ -184,7 +188,7 @@ def reply_sample(key: str, payload: bytes) -> Sample:
 
 
 def reply_of(payload: bytes, expected: type[M]) -> M:
-    """The message of a reply; WireError if it is no sound one, or of another kind."""
+    """The message of a reply; raises WireError if it is invalid or of another kind."""
     message: m.Message = decoded(payload)
     if not isinstance(message, expected):
         wanted = expected.__name__

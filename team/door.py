@@ -1,9 +1,9 @@
-"""What a node refuses of messages that are sound in themselves: what can not be true of this team.
+"""Refuses messages that are valid in themselves and can not be true of this team.
 
-A stranger, or a robot that is broken, may name robots that nobody knows, lives and counters that
-nobody could have reached, stamps that are years away. A node says so by `refusal`, the boundary
-(`team.containment`) counts it and names the reason in the node's status; the recorder keeps it all.
-Every bound is far beyond what a team does, so that no order of arrival lets a true message fail.
+A stranger, or a broken robot, may name unknown robots, incarnations and counters that can not be
+reached, stamps that are years away. A node gives the reason by `refusal`; the boundary
+(`team.containment`) counts it and names it in the node's status; the recorder keeps everything.
+Every bound is far beyond what a team does, so that no order of arrival makes a true message fail.
 """
 
 from collections.abc import Iterable, Iterator
@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator
 from team.wire import messages as m
 
 MOST_LIVES = 1_000
-"""Incarnations of a stream: each begins because its source has lost what it was asked for."""
+"""Most incarnations of a stream; each begins because the source has lost requested measurements."""
 MOST_COUNT = 2**40
-"""Of anything that is counted one by one; at 100 Hz that takes 348 years."""
+"""Largest value of any counter; at 100 Hz it is reached after 348 years."""
 EARLY_NS = 86_400 * 10**9
 LATE_NS = 400 * EARLY_NS
 """A stream's messages lie within a day before and 400 days after its initial pose's stamp."""
@@ -21,11 +21,11 @@ OF_ROBOTS = (
     m.Measurement, m.Submap, m.SightingFactor, m.MapEstimate, m.Progress, m.Done, m.Rendezvous,
     m.Innovation, m.Association, m.StreamHead,
 )  # fmt: skip
-"""Messages about a stream: they carry its robot and its incarnation."""
+"""Messages about a stream: they have its robot and its incarnation."""
 
 
 class Door:
-    """Knows who is in the team, and when each stream began by its source's word."""
+    """Knows the team's robots, and when each stream began according to its source."""
 
     def __init__(self, robots: Iterable[str]) -> None:
         self._robots = frozenset(robots)
@@ -36,7 +36,7 @@ class Door:
         self._robots |= {robot}
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why the message can not be true of this team, in words; None: it can."""
+        """Why the message can not be true of this team, in words; None if it can."""
         strangers = sorted(set(_robots(message)) - self._robots)
         if strangers:
             return f"of {', '.join(strangers)}, not in this team"
@@ -53,7 +53,7 @@ class Door:
 
 
 def another_time(stamp_ns: int, began_ns: int) -> str | None:
-    """Why a stamp can not be of a stream that began then, in words."""
+    """Why a stamp can not be of a stream that began at this time, in words."""
     after_ns = stamp_ns - began_ns
     if -EARLY_NS <= after_ns <= LATE_NS:
         return None
@@ -61,7 +61,7 @@ def another_time(stamp_ns: int, began_ns: int) -> str | None:
 
 
 def absurd(message: m.Message) -> str | None:
-    """Why nobody could have counted so far, in words."""
+    """Why a count is absurd, in words."""
     for incarnation in _lives(message):
         if incarnation > MOST_LIVES:
             return f"of incarnation {incarnation}; no stream has more than {MOST_LIVES}"
@@ -72,7 +72,7 @@ def absurd(message: m.Message) -> str | None:
 
 
 def _robots(message: m.Message) -> Iterator[str]:
-    """The robots that a message speaks of as of the team's."""
+    """The robots that a message names as the team's."""
     match message:
         case m.SightingFactor():
             yield from (message.robot, message.teammate)

@@ -1,7 +1,7 @@
-"""The estimators for programs of others: values in, values out, no process and no network.
+"""The estimators as a library: values in, values out, no process and no network.
 
-`from team import …` gives everything that is named here. These names and their meaning stay: what
-is removed or changed is announced in the changelog one version before.
+`from team import …` gives every name listed here. Names and meanings are stable: a removal or
+change is announced in the changelog one version before.
 
 All poses are (x [m], y [m], theta [rad]), theta counter-clockwise in (−π, π]. Landmarks are points
 with numbers, measured by range [m] and bearing [rad].

@@ -1,4 +1,4 @@
-"""Measurements that a node lacks are asked for at their source."""
+"""Requests the measurements that a node lacks from their source."""
 
 import logging
 import time
@@ -10,21 +10,23 @@ from team.wire import messages as m
 from team.wire.bus import BusError
 
 PATIENCE_S = 0.5
-"""What is on its way needs no question: a gap has this long to close."""
+"""A gap has this long [s] to close before it is asked for."""
 ASK_TIMEOUT_S = 10.0
 """A source that does not answer within this time is asked again later."""
 _LOG = logging.getLogger("teamslam")
 
 
 class MissingMeasurements:
-    """Of one node, whose shell takes the answers: `look` often."""
+    """Requests missing measurements for one node, whose shell takes the answers; call `look`
+    often.
+    """
 
     def __init__(self, shell: Shell) -> None:
         self._shell = shell
         self._since_s: float | None = None
 
     def look(self, wanted: Sequence[m.MeasurementsRequest]) -> None:
-        """Ask for what is wanted, once something has been for PATIENCE_S."""
+        """Send the requests, once any has been open for PATIENCE_S."""
         now_s = time.monotonic()
         if not wanted:
             self._since_s = None
@@ -42,7 +44,9 @@ class MissingMeasurements:
                 self.ask(each)
 
     def ask(self, wanted: m.MeasurementsRequest) -> int:
-        """Ask now; how many measurements came, which the node has taken."""
+        """Send one request now; returns the number of measurements that came, which the node has
+        taken.
+        """
         try:
             replies = self._shell.bus.ask(ch.MEASUREMENTS, wanted.robot, wanted, ASK_TIMEOUT_S)
         except BusError as error:

@@ -1,7 +1,7 @@
-"""The estimators and the fusion rules that there are: one row for each, and which may feed which.
+"""The table of estimators and fusion rules, one row each, and which estimator may feed which rule.
 
-A row names its class as `package.module:name`, found by `team.registry` when it is chosen: so what
-is there for comparison can be left out of an installation.
+A row names its class as `package.module:name`, found by `team.registry` when it is chosen, so the
+methods for comparison can be left out of an installation.
 """
 
 from collections.abc import Mapping
@@ -9,14 +9,14 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 Channel = Literal["submap", "own/map", "measurements"]
-"""What a rule's map rests on. submap: independent, each measurement once. own/map: whole maps.
-measurements: the sensor channels; what the robots run is then for their own poses."""
+"""The inputs of a rule. submap: independent submaps, each measurement used once. own/map: whole
+maps. measurements: the sensor channels; the robots' estimators are then for their own poses."""
 
 
 class EstimatorRow(NamedTuple):
     """made_by: a `team.robot.estimator.Factory`. feeds: rules, beside those that name it.
 
-    needs_map: it is told the landmarks.
+    needs_map: it is given a prior map.
     """
 
     made_by: str
@@ -80,13 +80,13 @@ PAIRS: Mapping[tuple[str, str], Channel] = MappingProxyType(
         if estimator in RULES[rule].takes or rule in row.feeds
     }
 )
-"""(estimator, rule) → what the centre subscribes to. Any other pair has no meaning: only `hybrid`
-makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis, and who
-only localises himself has no map to fuse."""
+"""(estimator, rule) → what the centre subscribes to. Any other pair has no meaning: only
+`hybrid` makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis,
+and a robot that only localises has no map to fuse."""
 FEEDBACK = frozenset(rule for rule, row in RULES.items() if row.feedback)
 """The rules whose map the robots absorb again, in lockstep."""
 NEEDS_MAP = frozenset(name for name, row in ESTIMATORS.items() if row.needs_map)
-"""The estimators that are told the landmarks."""
+"""The estimators that are given a prior map."""
 
 
 def rules_for(estimator: str) -> list[str]:

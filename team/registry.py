@@ -1,4 +1,6 @@
-"""Finds by name what a table only names: the one way to what can be left out of an installation."""
+"""Finds classes by the name that a table gives them, so that modules can be left out of an
+installation.
+"""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -6,11 +8,11 @@ from typing import Any
 
 
 class NotInstalledError(Exception):
-    """A method's module is not there: this installation goes without what is for comparison."""
+    """A method's module is missing: this installation goes without the methods for comparison."""
 
 
 def is_installed(place: str) -> bool:
-    """Whether the module of `package.module:name` is there; nothing of it is imported."""
+    """Whether the module of `package.module:name` is installed; nothing is imported."""
     module = place.partition(":")[0]
     package, _, _ = module.rpartition(".")
     try:
@@ -20,14 +22,16 @@ def is_installed(place: str) -> bool:
 
 
 def absence(place: str, what: str) -> str | None:
-    """Why `what` can not be had, in words; None if it is installed."""
+    """Why `what` is not available, in words; None if it is installed."""
     if is_installed(place):
         return None
     return f"{what} is not installed: {place.partition(':')[0]} is not here"
 
 
 def loaded(place: str, what: str) -> Any:
-    """The `name` of `package.module:name`; raises NotInstalledError that says `what` lacks."""
+    """The `name` of `package.module:name`. Raises NotInstalledError, which says that `what` is
+    missing.
+    """
     module, _, name = place.partition(":")
     absent = absence(place, what)
     if absent is not None:

@@ -1,21 +1,22 @@
-"""Why a measurement is in no submap and in no inter-robot factor: every reason that there is."""
+"""All reasons for which a measurement is in no submap and in no inter-robot factor."""
 
 from enum import StrEnum
 
 
 class Rejection(StrEnum):
-    """A reason, as the robot's ledger, its last word and `teamslam verify-ledger` spell it.
+    """A reason for rejection, as the robot's ledger, its `Done` and `teamslam verify-ledger` spell
+    it.
 
-    A robot's ledger counts `disposition` of each; the rest of its measurements were used.
+    The ledger counts by `disposition`; all other measurements were used.
     """
 
     OLDER = "older than the odometry"
     NOT_COVERED = "no odometry covers it"
     NO_TIME = "odometry over no time"
     SPEED = "odometry beyond the bounds"
-    """Of odometry: its time is believed, its motion is not."""
+    """Of odometry: its time is used, its motion is not."""
     STEERING = "steering without a car's motion model"
-    """Of odometry: as SPEED; the robot's motion.kind is not "ackermann"."""
+    """Of odometry: as SPEED; steering needs motion.kind = "ackermann"."""
     TIME = "a time beyond the bounds"
     RANGE = "a range beyond the bounds"
     SENSOR_LIMITS = "outside the sensor's limits"
@@ -28,17 +29,17 @@ class Rejection(StrEnum):
     NO_TEAMMATES = "sightings are not used by this estimator"
     NO_NODES = "sightings need pose nodes, and front_end.node_s is 0"
     NO_NODE = "no pose node near it"
-    """Of an inter-robot measurement: no pose of the submap is near its time."""
+    """Of an inter-robot measurement: no pose node is near its time."""
     LATE = "counted in a window that ends before its stamp"
     UNSOLVED = "its window has no solution"
-    """Of the window the odometry's motion alone is in the submap."""
+    """Of a window without a solution: its submap has the odometry's motion alone."""
     SET_ASIDE = "its handling raised"
 
     @property
     def disposition(self) -> str:
-        """What the ledger counts it as."""
+        """The disposition under which the ledger counts it."""
         return f"rejected: {self.value}"
 
 
 UNMEASURED = frozenset({None, Rejection.SPEED, Rejection.STEERING})
-"""Of odometry whose time counts, whether or not its motion does."""
+"""Of odometry whose time is used, whether or not its motion is."""

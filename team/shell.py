@@ -1,4 +1,6 @@
-"""The shell of a node: it owns the bus, the clock and the signals; the node owns the answers."""
+"""The shell of a node: it owns the bus, the clock and the signals; the node computes the
+answers.
+"""
 
 import ctypes
 import logging
@@ -23,18 +25,20 @@ from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FusedMap, Liveliness, Message, Status, tag_of
 
 STATUS_S = 0.5
-"""Wall time between two statuses of a node."""
+"""Wall time [s] between two statuses of a node."""
 REMIND_S = 10.0
-"""Wall time between two lines of a node that waits."""
+"""Wall time [s] between two log lines of a node that waits."""
 WAIT_S = 0.05
-"""How long a shell waits for input before it looks at its other duties."""
+"""Time [s] that a shell waits for input before it turns to its other duties."""
 RECORDER_S = 30.0
-"""A process leaves this long after its end, though the recorder still lacks something of it."""
+"""A process leaves this long [s] after its end, even if the recorder still lacks some of its
+messages."""
 BACK_S = 1.5
-"""A recorder that is back fetches from the publishers' caches what it has missed."""
+"""Time [s] that a recorder which has come back needs to fetch missed messages from the
+publishers' caches."""
 RECORDER = "recorder"
 PARENT = "TEAMSLAM_PARENT"
-"""Environment variable: the process without which this one must not live."""
+"""Environment variable: the process whose end ends this one."""
 LAST_S = 20
 """A process that was told to stop is ended by SIGALRM after this many seconds."""
 T = TypeVar("T")
@@ -45,18 +49,18 @@ _PR_SET_PDEATHSIG = 1
 
 @runtime_checkable
 class Node(Protocol):
-    """What a shell runs: messages and time in, messages out."""
+    """The interface of a node to its shell: messages and time in, messages out."""
 
     finished: bool
 
     def begin(self) -> list[Outgoing]:
-        """What the node says first."""
+        """The first messages of the node."""
 
     def handle(self, message: Message, now_ns: int) -> list[Outgoing]:
         """Take one message."""
 
     def status(self) -> Status:
-        """What the node is doing, for people."""
+        """The node's status, for people."""
 
 
 class FaultyRunError(RuntimeError):
@@ -76,8 +80,8 @@ def judge(boundary: Boundary, final: FusedMap | None) -> None:
 class Shell:
     """Runs one node on one bus.
 
-    What fails at the door is counted, logged with its reason, and dropped; what raises behind it is
-    set aside (`team.containment`), and the node goes on.
+    A message that is refused is counted, logged with its reason, and dropped; one whose handling
+    raises is set aside (`team.containment`), and the node goes on.
     """
 
     def __init__(self, bus: Bus, node: Node, name: str, stop: threading.Event) -> None:
@@ -91,7 +95,7 @@ class Shell:
         self.boundary = Boundary(name)
         self.notes: Callable[[], tuple[str, ...]] = tuple
         self.believed: Callable[[Sequence[Sample]], Sequence[Sample]] = lambda samples: samples
-        """What of the samples of a turn the process lets come to its node's door."""
+        """Selects the samples of a turn that reach the node."""
         self.the_end = TheEnd(bus, name)
         self._recorder_is_there: bool | None = None
         self._recorder_since = 0.0
@@ -103,14 +107,17 @@ class Shell:
         self._stale = False
 
     def refresh_by(self, refresh: Callable[[], list[Outgoing]], share: float) -> None:
-        """What to say when something has come and nothing more waits: `share` of the time at most.
+        """Sets what to publish when input has arrived and no more waits, for at most `share` of the
+        time.
 
-        So what is worth most while it is new does not wait for when it would be due.
+        So a result that is worth most while it is fresh does not wait until it would be due.
         """
         self._refresh, self._spare_time = refresh, SpareTime(share)
 
     def receive(self) -> list[Sample]:
-        """What has come within WAIT_S; when nothing more has, what there is to refresh is said."""
+        """The samples that arrive within WAIT_S; once no more wait, publishes what there is to
+        refresh.
+        """
         refreshes = self._stale and self._refresh is not None
         wait_s = min(WAIT_S, self._spare_time.wait_s) if refreshes else WAIT_S
         samples = self.bus.receive(wait_s)
@@ -128,7 +135,9 @@ class Shell:
         return samples
 
     def begin(self) -> None:
-        """Say what the node says first and declare it alive; its subscriptions are made before."""
+        """Publish the node's first messages and declare it alive; its subscriptions exist
+        before.
+        """
         self.publish(self.node.begin())
         self.bus.declare_alive(self._name)
         self._begun = True
@@ -136,13 +145,14 @@ class Shell:
 
     @property
     def going(self) -> bool:
-        """Until the node has finished or the process was told to stop."""
+        """True until the node has finished or the process was told to stop."""
         return not (self.node.finished or self._stop.is_set())
 
     def publish(self, out: Iterable[Outgoing]) -> None:
-        """Publish what a node returned, in its order; what can not be published is a fault.
+        """Publish what a node returned, in its order; a message that can not be published is a
+        fault.
 
-        A question is asked; its replies come as other samples do.
+        Requests are sent as queries; their replies arrive like other samples.
         """
         for outgoing in out:
             try:
@@ -158,7 +168,9 @@ class Shell:
                     self.publish([fault])
 
     def take(self, samples: Iterable[Sample]) -> None:
-        """Decode at the door, hand to the node, publish its answer; a long queue is no silence."""
+        """Decode samples, hand them to the node and publish its answers; status goes on during a
+        long queue.
+        """
         for sample in samples:
             self._note_recorder(sample)
             self.publish(self.boundary.take(self.node, sample))
@@ -168,13 +180,13 @@ class Shell:
     def take_replies(
         self, channel: Channel, name: str, replies: Iterable[bytes], expected: type[Message]
     ) -> None:
-        """As `take`, of the replies to a question, each of which must be of the expected kind."""
+        """As `take`, for the replies to a query, each of which must be of the expected kind."""
         for reply in replies:
             key = channel.key(name)
             self.publish(self.boundary.take_reply(self.node, key, reply, expected))
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer queries; an answer that raises is a fault, of which the asker is told."""
+        """Answer queries; an answer that raises is a fault, of which the asker is informed."""
 
         def contained(request: bytes) -> list[bytes]:
             try:
@@ -189,9 +201,9 @@ class Shell:
         self.bus.answer(channel, name, contained)
 
     def contained(self, what: str, duty: Callable[[], T]) -> T | None:
-        """Do what no message asked for; None, and a fault, if it raises.
+        """Do work that no message asked for; None, and a fault, if it raises.
 
-        BusError passes: without a bus there is nothing to go on with.
+        BusError passes: without a bus the process can not go on.
         """
         try:
             return duty()
@@ -206,7 +218,7 @@ class Shell:
         self.take(self.the_end.missed())
 
     def note(self, samples: Iterable[Sample]) -> None:
-        """Note who records, where nothing else of what arrives matters any more."""
+        """Note which recorder is present, at a time when nothing else that arrives matters."""
         for sample in samples:
             self._note_recorder(sample)
 
@@ -219,10 +231,11 @@ class Shell:
                 self._recorder_is_there = there
 
     def wait_for_recorder(self, lacks: Callable[[], bool], take: Take | None = None) -> None:
-        """Stay, at most RECORDER_S, while a recorder that was there is away or lacks something.
+        """Stay, at most RECORDER_S, while a recorder of the run is absent or lacks messages.
 
-        What a process has published it alone can give again. lacks: whether it does by its own
-        word. take: takes what arrives meanwhile; without it nothing but the recorder matters.
+        Only the publisher can repeat its messages. lacks: whether the recorder says that it lacks
+        some. take: handles what arrives meanwhile; without it only the recorder's messages are
+        read.
         """
         deadline = time.monotonic() + RECORDER_S
         while self._recorder_is_there is not None and not self._stop.is_set():
@@ -238,7 +251,7 @@ class Shell:
             _LOG.warning("the recorder lacks something of this process")
 
     def sample_of(self, out: Outgoing) -> Sample:
-        """A message to this node itself, as if it had come over the bus."""
+        """A message to this node itself, as a sample from the bus."""
         return Sample(out.key, encoded(out.message), out.message.stamp_ns, time.time_ns(), 0)
 
     def end(self, final: FusedMap | None) -> None:
@@ -282,7 +295,7 @@ class Shell:
         self.bus.publish(Outgoing(STATUS, self._name, status))
 
     def run(self, duty: Callable[[], None] = lambda: None) -> None:
-        """Turn after turn until the end: input, the node's answers, `duty`, status."""
+        """Run turn after turn until the end: input, the node's answers, `duty`, status."""
         self.begin()
         while self.going:
             self.take(self.believed(self.receive()))
@@ -294,10 +307,10 @@ class Shell:
 
 @contextmanager
 def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
-    """What every process of a team does: stop at SIGTERM and SIGINT, end when its parent dies.
+    """Run a process of a team: it stops at SIGTERM and SIGINT and ends when its parent dies.
 
-    One that was told to stop has not done its work, so it ends with status 128 + the signal's
-    number; one that is `endless` works until it is told to stop, and ends with 0.
+    A process that was told to stop before its work was done ends with status 128 + the signal's
+    number; an `endless` one works until it is told to stop, and ends with 0.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
     stop = threading.Event()
@@ -322,9 +335,9 @@ def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
 
 
 def _tie_to(parent: int, stop: threading.Event) -> None:
-    """Stop when the parent is gone: at once where the kernel tells (Linux), else by looking.
+    """Stop when the parent is gone: at once where the kernel reports it (Linux), else by polling.
 
-    Whoever has not stopped by itself two seconds later is ended.
+    A process that has not stopped by itself two seconds later is ended.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -1,16 +1,17 @@
-"""When a node may do what can wait: when nothing else waits, and for no more than its share."""
+"""Schedules a node's deferrable work: when nothing else waits, and for a limited share of the
+time.
+"""
 
 import time
 
 FAILED_S = 10.0
-"""Work that raised is tried again after this time."""
+"""Work that raised an exception is tried again after this time [s]."""
 
 
 class SpareTime:
-    """Decides by the wall clock when the next piece of such work may begin.
+    """Decides by the wall clock when the next piece of deferrable work may begin.
 
-    share: of the time, at the most. took_s: how long the last piece that did something took; None:
-    there was none yet.
+    share: of the time, at most. took_s: duration of the last useful piece; None before the first.
     """
 
     def __init__(self, share: float) -> None:
@@ -20,16 +21,18 @@ class SpareTime:
 
     @property
     def wait_s(self) -> float:
-        """Until it may begin; 0: now."""
+        """Time until the next piece may begin [s]; 0: now."""
         return max(0.0, self._next - time.monotonic())
 
     def note(self, began: float, *, useful: bool) -> None:
-        """A piece that began then (`time.monotonic`) is done; one with no result costs nothing."""
+        """Note that a piece that began at this `time.monotonic` is done; a useless one costs
+        nothing.
+        """
         now = time.monotonic()
         if useful:
             self.took_s = now - began
             self._next = now + self._rest * self.took_s
 
     def failed(self) -> None:
-        """A piece raised."""
+        """Note that a piece raised an exception."""
         self._next = time.monotonic() + FAILED_S

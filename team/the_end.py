@@ -1,4 +1,4 @@
-"""The end of a team as a fact: the router keeps the final map for whoever was away at the end."""
+"""The end of a team: the router keeps the final map for processes that were absent at the end."""
 
 import logging
 import os
@@ -10,10 +10,11 @@ from team.wire.codec import WireError, decoded
 from team.wire.messages import FinalMapReply, FinalMapRequest, FusedMap
 
 FINAL_S = 3.0
-"""The router is asked so often for a final map that was missed."""
+"""Time [s] between two queries to the router for a missed final map."""
 FINAL_ASK_S = 2.0
 SINCE = "TEAMSLAM_SINCE"
-"""Environment variable: when this process's run began [ns, wall clock], if not with itself."""
+"""Environment variable: start of this process' run [ns, wall clock], where that is earlier than
+the process."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -21,7 +22,7 @@ _STARTED = time.monotonic()
 
 
 def _forked() -> None:
-    """The life of a process that was forked begins with the fork."""
+    """Set the start of a forked process to the fork."""
     global _STARTED
     _STARTED = time.monotonic()
 
@@ -30,12 +31,12 @@ os.register_at_fork(after_in_child=_forked)
 
 
 class TheEnd:
-    """Whether a team that this process knows has ended: the router keeps the final map.
+    """Finds out from the router whether the team of this process has ended.
 
-    A process that starts again, or that was stopped or cut off while the centre left, learns of it
-    so. A map that is older than the process is another run's, unless whoever started it says that
-    the run began earlier (SINCE), or the router knows an earlier process of this node that was in
-    that run and never said a last word.
+    A process that starts again, or that was stopped or cut off while the centre left, learns of the
+    end in this way. A map that is older than the process is another run's, unless whoever started
+    it says that the run began earlier (SINCE), or the router knows an earlier process of this node
+    that was in that run and ended without a `Tally`.
     """
 
     def __init__(self, bus: Bus, node: str = "") -> None:

@@ -1,1 +1,3 @@
-"""The team's set as every peer keeps it: what is in it, what to ask of whom, and its file."""
+"""The team's set of members as every peer keeps it: what it holds, what peers request, and its
+file.
+"""

@@ -1,4 +1,4 @@
-"""What one peer asks of another, given the other's summary, and what it answers."""
+"""The requests of one peer to another, given the other's summary, and their answers."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
@@ -9,24 +9,25 @@ from team.peers.replica import MOST_SEQUENCES, Replica, intervals
 from team.wire import messages as m
 
 MOST_WANTED = 64
-"""Intervals in one question."""
+"""Most intervals in one request."""
 MOST_ASKED = 512
-"""Submaps in one question."""
+"""Most submaps in one request."""
 ANSWER_BYTES = 1 * 2**20
-"""Of members in one answer at the most, but for one that is larger itself; who lacks more asks
-again."""
+"""Most bytes of members in one answer, except for a single member that is larger; the rest takes
+a further request."""
 BATCH_BYTES = 64 * 2**10
-"""Of members in one message of an answer."""
+"""Bytes of members in one message of an answer."""
 
 
 def wanted(
     replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
 ) -> m.MembersRequest | None:
-    """What the summary's node has and this replica lacks; None: nothing.
+    """The request for what the summary's node has and this replica lacks; None where that is
+    nothing.
 
-    not_now: (stream, sequence) that somebody has been asked for a moment ago. A stream of which
-    both have the same sequences by different digests is asked for whole: someone contradicts
-    himself, and the smaller of two members is everybody's.
+    not_now: (stream, sequence) that were requested from another peer a moment ago. A stream of
+    which both have the same sequences with different digests is requested whole: its robot has
+    contradicted itself, and all peers keep the smaller of two members.
     """
     if summary.digest == replica.digest:
         return None
@@ -77,7 +78,7 @@ def wanted(
 
 
 def named(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
-    """What a question names, as `not_now` of `wanted` takes it."""
+    """The (stream, sequence) of a request, as `not_now` takes them."""
     for each in request.wanted:
         stream = each.robot, each.incarnation
         yield stream, -2
@@ -88,7 +89,9 @@ def named(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
 
 
 def _contradicts(replica: Replica, holding: m.Holding) -> bool:
-    """Whether a node's same sequences of a stream are others than the replica's."""
+    """Whether a node's members of a stream differ from the replica's although their sequences
+    are equal.
+    """
     stream = holding.robot, holding.incarnation
     mine = replica.announced_of(stream)
     same = mine is not None and (mine.start, mine.sequences) == (holding.start, holding.sequences)
@@ -96,15 +99,15 @@ def _contradicts(replica: Replica, holding: m.Holding) -> bool:
 
 
 Sign = Callable[[Member], bytes]
-"""A member's signature by who said it; empty where it has none."""
+"""A member's signature by its author; empty where it has none."""
 
 
 def answered(
     replica: Replica, request: m.MembersRequest, node: str, sign: Sign | None = None
 ) -> list[m.Members]:
-    """The members that are asked for and here, by portions; the statements first.
+    """The requested members that are here, in portions; the statements first.
 
-    sign: where there are keys; what has no signature yet is not given.
+    sign: where there are keys; members without a signature yet are left out.
     """
     batches: list[list[Member]] = [[]]
     total = size = 0

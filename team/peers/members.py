@@ -1,8 +1,8 @@
-"""A member of the team's set: the very bytes of who first said it, and its name in the set.
+"""A member of the team's set: the original bytes of a message and its name in the set.
 
-What a map rests on: initial poses, submaps with the inter-robot measurements from them, orders
-(withdrawals, robots that are given up), verdicts on identities and last words. That a peer has
-concluded is one on which no map rests.
+Members are the inputs of a map: initial poses, submaps with the inter-robot measurements from them,
+orders (withdrawals, robots that are given up), verdicts on identities and `Done`. `Concluded` is a
+member, too, and no input.
 """
 
 import hashlib
@@ -20,12 +20,12 @@ STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.CONCLUDED, ch.CER
 CHANNELS = (*STREAMED, *STATED)
 """The channels whose messages are members."""
 LARGEST_MEMBER = 4 * 2**20
-"""Bytes of one member at most: a submap of a thousand landmarks has two million."""
+"""Most bytes of one member; a submap of a thousand landmarks has two million."""
 
 
 @dataclass(frozen=True)
 class Member:
-    """One member; `signature` is by who said it, empty where the team has no keys."""
+    """One member; `signature` is its author's, empty where the team has no keys."""
 
     key: str
     payload: bytes
@@ -34,18 +34,18 @@ class Member:
 
     @cached_property
     def hash(self) -> bytes:
-        """32 bytes that name the member by its key and its bytes."""
+        """32 bytes that identify the member by its key and its bytes."""
         named = len(self.key).to_bytes(2, "little") + self.key.encode() + self.payload
         return hashlib.blake2b(named, digest_size=32).digest()
 
     @property
     def size(self) -> int:
-        """Bytes that it takes on the way and on disk, but for a few."""
+        """Approximate size on the wire and on disk [bytes]."""
         return len(self.key) + len(self.payload) + len(self.signature)
 
 
 def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
-    """The member in a payload, checked at the door; raises WireError, ValueError."""
+    """Decode and check a member. Raises WireError or ValueError."""
     if len(payload) > LARGEST_MEMBER:
         raise ValueError(f"too large: {len(payload)} bytes, {LARGEST_MEMBER} at most")
     channel, _, message = opened(Sample(key, payload, 0, 0, -1))
@@ -55,14 +55,14 @@ def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
 
 
 def about(message: m.Message) -> str:
-    """The robot that a member is about: whose share of the set it belongs to."""
+    """The robot that a member is about, to whose share of the set it belongs."""
     if isinstance(message, m.GivenUp):
         return ch.robot_of(message.node) or ""
     return str(getattr(message, "robot", ""))
 
 
 def said_by(key: str) -> str:
-    """The node that says what is on a member's key, as certificates name it: `robot-r1`."""
+    """The node that publishes a member's key, as certificates name it: `robot-r1`."""
     first, _, rest = key.partition("/")
     name = rest.partition("/")[0]
     return f"{first}-{name}" if first in ("robot", "source") else first

@@ -1,8 +1,8 @@
 """A peer's part in spreading the set: members in, members out; no I/O, no clock.
 
-It says what it has (`SetSummary`), soon after that has changed and to whoever turns up; asks who
-says more for what it lacks; and answers. Members come from whoever has them, so news travels over
-third robots. What it has taken it hands on in an order in which a fold can take it: of each stream
+It publishes a summary of its set (`SetSummary`) when that has changed or a node appears, requests
+members that others have and it lacks, and answers requests. Any node may give a member, so members
+travel over third robots. They are passed to the fold in an order that it accepts: of each stream
 the initial pose, then the submaps without a gap.
 """
 
@@ -20,25 +20,25 @@ from team.wire.bus import Outgoing, Sample
 from team.wire.codec import WireError, decoded, encoded
 
 SUMMARY_S = 1.0
-"""Between two summaries at the least."""
+"""Least time [s] between two summaries."""
 LAST_S = 0.2
-"""… once all have concluded: they leave soon, and are to know that they agree."""
+"""… once all have concluded: peers leave soon, and need to know that their maps agree."""
 REPEAT_S = 10.0
-"""… and at the most: who has turned up unnoticed learns of what is here."""
+"""… and the longest: a node that has appeared unnoticed learns what is here."""
 PATIENCE_S = 3.0
-"""What somebody was asked for is asked of another one after so long."""
+"""A request without an answer goes to another node after this time [s]."""
 FRESH_S = 25.0
-"""A summary that is older says nothing of who is in reach."""
+"""A summary older than this [s] does not show that its node is in reach."""
 
 
 GIVEN_BYTES = 8 * 2**20
-"""Of members that one node is given within a second, at the most; all together GIVEN_TO_ALL."""
+"""Most bytes of members given to one node within a second; to all nodes together GIVEN_TO_ALL."""
 GIVEN_TO_ALL = 32 * 2**20
 
 
 class Given:
-    """What was given within the current second, to each node and to all: questions without end
-    cost no more than that.
+    """Bytes given within the current second, to each node and to all, which limits the cost of
+    endless requests.
     """
 
     def __init__(self) -> None:
@@ -52,24 +52,24 @@ class Given:
         return self._bytes.get(node, 0) < GIVEN_BYTES and sum(self._bytes.values()) < GIVEN_TO_ALL
 
     def note(self, node: str, size: int) -> None:
-        """It was given so many bytes."""
+        """Count bytes given to a node."""
         self._bytes[node] = self._bytes.get(node, 0) + size
 
 
 @dataclass
 class Carried:
-    """What has come over one node: members that were news, and bytes, news or not."""
+    """Traffic from one node: members that were new, and bytes, new or not."""
 
     members: int = 0
     bytes: int = 0
 
 
 class PeerNode:
-    """One node's copy of the set, and its talk with others about it.
+    """One node's copy of the set, and its exchange with other nodes.
 
-    proofs: checks members that come over third nodes; None: there are no keys, and everyone is
-    believed. unsaved: what was news since somebody has last cleared it. carried: by the node
-    over which it came. refused: how many members were not kept; last_refused: why.
+    proofs: checks members that come over third nodes; None: there are no keys, and every node is
+    believed. unsaved: new members since it was last cleared. carried: traffic by node. refused: how
+    many members were not kept; last_refused: why.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
@@ -102,7 +102,7 @@ class PeerNode:
     # Members.
 
     def take(self, member: Member, carrier: str) -> bool:
-        """Take a member that came over a node; whether it was news."""
+        """Take a member that came from a node; returns whether it is new."""
         over = self.carried[carrier]
         over.bytes += member.size
         try:
@@ -122,7 +122,7 @@ class PeerNode:
         return True
 
     def take_sample(self, sample: Sample, carrier: str) -> bool:
-        """As `take`, of a sample on a member's key."""
+        """As `take`, for a sample on a member's key."""
         try:
             return self.take(member_of(sample.key, sample.payload), carrier)
         except (WireError, ValueError) as error:
@@ -130,7 +130,7 @@ class PeerNode:
             return False
 
     def take_carried(self, carried: m.Members) -> list[Member]:
-        """Take what another node carries; the members that were news."""
+        """Take the members that another node carries; returns the new ones."""
         new_messages = []
         for key, payload, signature in zip(
             carried.keys, carried.payloads, carried.signatures, strict=True
@@ -153,7 +153,7 @@ class PeerNode:
         self.last_refused = why
 
     def new_messages(self) -> Iterator[m.Message]:
-        """What a fold can take now and has not yet been handed, in order."""
+        """The messages that a fold can take now and has not yet been given, in order."""
         for stream, share in sorted(self.replica.streams.items()):
             fed = self._fed.get(stream, -1)
             if share.start is None or fed >= share.count:
@@ -167,7 +167,7 @@ class PeerNode:
         yield from told
 
     def again(self) -> None:
-        """Hand everything on once more: a fold begins anew."""
+        """Give everything to the fold again, which begins anew."""
         self.rebuild = False
         self._fed.clear()
         self._new_messages = [
@@ -179,7 +179,9 @@ class PeerNode:
     # Talk.
 
     def hear(self, summary: m.SetSummary) -> list[Outgoing]:
-        """Take another's summary: ask for what it has more, and let it know of what is here."""
+        """Take another node's summary: request what it has more, and publish a summary where it
+        lacks members.
+        """
         if summary.node == self.node:
             return []
         if summary.node not in self._known:
@@ -191,11 +193,11 @@ class PeerNode:
         return self._ask(summary)
 
     def greet(self) -> None:
-        """Somebody is there who may lack something: say soon what is here."""
+        """Publish a summary soon, for a node that has appeared."""
         self._answer_s = self._now_s if self._answer_s is None else self._answer_s
 
     def tick(self, now_s: float) -> list[Outgoing]:
-        """What there is to say by now: a summary that is due, questions that were not answered."""
+        """The messages that are due: a summary, and requests that were not answered."""
         self._now_s = now_s
         self._forget_questions()
         out: list[Outgoing] = []
@@ -216,7 +218,7 @@ class PeerNode:
         return out
 
     def _forget_questions(self) -> None:
-        """Who has not given what it says to have is asked after the others the next time."""
+        """Let requests expire; nodes that did not give what they have are asked last."""
         over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
         for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:
             self._failures[node] = self._failures.get(node, 0) + 1
@@ -226,7 +228,7 @@ class PeerNode:
         return sequence >= 0 and sequence not in self.replica.share_of(stream).complete
 
     def more_of(self, node: str) -> list[Outgoing]:
-        """A node has answered: ask for the rest of what it has."""
+        """Request the rest from a node that has answered."""
         heard = self._heard.get(node)
         return [] if heard is None else self._ask(heard[1])
 
@@ -261,6 +263,6 @@ class PeerNode:
 
     @property
     def agrees(self) -> dict[str, bool]:
-        """Of each node whose summary has been heard, whether its set is this one."""
+        """For each node with a summary, whether its set equals this one."""
         digest = self.replica.digest
         return {n: s.digest == digest for n, (_, s) in sorted(self._heard.items())}

@@ -1,9 +1,9 @@
-"""Whether a member that a third node carries was said by whom it is about.
+"""Checks by signatures that a member carried by a third node is its author's.
 
 Every robot states its certificate, itself a member, and signs each of its members on a key of its
-own (`robot/r1/signature`), for whoever carries them. An operator does not stay: it signs its orders
-(`operator/signature/r1`) with its certificate in front, so that whoever was out of reach believes
-who carries them.
+own (`robot/r1/signature`), for whoever carries them. An operator leaves at once: it signs its
+orders (`operator/signature/r1`) with its certificate in front, so that robots out of its reach can
+check them.
 """
 
 from typing import Protocol, runtime_checkable
@@ -13,10 +13,10 @@ from team.peers.replica import Replica
 from team.wire import messages as m
 
 MOST_SIGNATURES = 250_000
-"""Kept of one node at the most; a robot has one for each of its members."""
+"""Most signatures kept of one node; a robot has one for each of its members."""
 OPERATOR = "operator"
 ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
-"""What an operator says."""
+"""The messages of operators that are members."""
 
 
 @runtime_checkable
@@ -26,7 +26,7 @@ class Signs(Protocol):
     certificate: bytes
 
     def sign(self, named: bytes) -> bytes:
-        """The signature of what the bytes name."""
+        """The signature of these bytes."""
 
     def refusal(self, node: str, certificate: bytes) -> str | None:
         """Why a certificate is not the node's."""
@@ -36,7 +36,7 @@ class Signs(Protocol):
 
 
 class Proofs:
-    """The signatures that one peer has, and what it believes by them."""
+    """The signatures that one peer has; by them it decides which members it believes."""
 
     def __init__(self, robot: str, signer: Signs) -> None:
         self._robot = robot
@@ -48,7 +48,7 @@ class Proofs:
         return m.Certificate(stamp_ns=0, robot=self._robot, certificate=self._signer.certificate)
 
     def signed(self, member: Member) -> m.Signature:
-        """The robot's signature of a member of its own, to be said behind it."""
+        """The message with the robot's signature of its own member, to be published after it."""
         signature = self.of(member)
         return m.Signature(
             stamp_ns=member.message.stamp_ns,
@@ -58,14 +58,16 @@ class Proofs:
         )
 
     def hear(self, said: m.Signature, publisher: str) -> None:
-        """Keep a signature that a robot, or an operator, says on its own key: of its own only."""
+        """Keep a signature that a robot or an operator publishes on its own key, of its own
+        members only.
+        """
         kept = self._signatures.setdefault(publisher, {})
         if len(kept) < MOST_SIGNATURES and (publisher == OPERATOR or publisher == said.robot):
             kept[said.member] = said.signature
 
     def of(self, member: Member) -> bytes:
-        """A member's signature; empty where there is none yet, and of a certificate: the authority
-        has signed that.
+        """A member's signature; empty where there is none yet, and for a certificate, which the
+        authority has signed.
         """
         if isinstance(member.message, m.Certificate):
             return b""
@@ -77,7 +79,7 @@ class Proofs:
         return found
 
     def refusal(self, member: Member, replica: Replica) -> str | None:
-        """Why a carried member is not to be believed, in words; None: it is."""
+        """Why a carried member is not believed, in words; None where it is."""
         robot, message = about(member.message), member.message
         if isinstance(message, m.Certificate):
             return self._signer.refusal(f"robot-{robot}", message.certificate)
@@ -109,7 +111,7 @@ class Proofs:
 
 
 def signed_by(member: Member) -> str:
-    """Whose signature proves a member: the robot that it is about, or `operator`."""
+    """The node whose signature proves a member: its robot, or `operator`."""
     return OPERATOR if isinstance(member.message, ORDERS) else about(member.message)
 
 

@@ -1,8 +1,9 @@
-"""The team's set as one peer has it: grow-only, equal whatever the order in which members came.
+"""One peer's copy of the team's set: grow-only, independent of the order in which members arrive.
 
 Members of one name that differ (a robot that contradicts itself) are decided by their bytes: the
-smaller hash stays, so that all peers agree. What may be kept is bounded: known robots, incarnations
-and sequences that can be, and a share of bytes for each robot, so that none fills another's disk.
+smaller hash stays, so that all peers agree. The set is bounded: it takes known robots and possible
+incarnations and sequences only, and limits the bytes of each robot, so that none fills another's
+disk.
 """
 
 import hashlib
@@ -15,19 +16,19 @@ from team.peers.members import Member, Stream, about
 from team.wire import messages as m
 
 MOST_SEQUENCES = 200_000
-"""Submaps of one incarnation at the most."""
+"""Most submaps of one incarnation."""
 MOST_STREAMS = 64
-"""Incarnations of one robot that are kept at the most."""
+"""Most incarnations of one robot."""
 MOST_STATEMENTS = 2 * MOST_STREAMS + 8
-"""Orders and last words about one robot at the most."""
+"""Most orders and `Done` messages about one robot."""
 MOST_VERDICTS = 4096
-"""Verdicts on landmarks of one robot, and withdrawals of verdicts, at the most."""
+"""Most verdicts on landmarks of one robot, and withdrawals of verdicts."""
 SHARE = 256 * 2**20
-"""Bytes about one robot at the most: 8 h of a submap of 4 kB every half second."""
+"""Most bytes about one robot: 8 h of a submap of 4 kB every half second."""
 MOST_INTERVALS = 64
-"""Intervals of one stream that a summary names: what lies behind is named when gaps have closed."""
+"""Most intervals of one stream in a summary; those behind follow once gaps have closed."""
 MOST_LOOKS = 1024
-"""Inter-robot measurements from one submap at the most."""
+"""Most inter-robot measurements from one submap."""
 _WORD = 2**256
 K = TypeVar("K")
 
@@ -37,15 +38,15 @@ Look = tuple[int, str]
 
 
 class RefusedError(ValueError):
-    """A member that is not kept; the text says which bound it breaks."""
+    """A member is not kept; the text names the bound that it breaks."""
 
 
 @dataclass
 class StreamShare:
-    """What is here of one incarnation.
+    """The members of one incarnation that are here.
 
     complete: sequences whose submap is here with all inter-robot measurements from it; count: how
-    many of them from 0 on without a gap; beyond: the others. sum: of the complete ones' hashes,
+    many of them from 0 on without a gap; beyond: the others. sum: sum of the complete ones' hashes,
     modulo 2²⁵⁶.
     """
 
@@ -59,9 +60,9 @@ class StreamShare:
     newest_ns: int = 0
 
     def parcel(self, sequence: int) -> list[Member]:
-        """A complete submap behind the inter-robot measurements from it, in canonical order.
+        """A complete submap after the inter-robot measurements from it, in canonical order.
 
-        Of more than the submap says, the first ones.
+        If there are more of these than the submap says, the first ones.
         """
         submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
         assert isinstance(submap.message, m.Submap)
@@ -84,7 +85,7 @@ class StreamShare:
                 self.count += 1
 
     def forget(self, sequence: int) -> None:
-        """A member of a submap is about to be replaced."""
+        """Remove a member of a submap from the counts, since it will be replaced."""
         if sequence in self.complete:
             self.complete.discard(sequence)
             self.sum = (self.sum - _sum(self.parcel(sequence))) % _WORD
@@ -95,16 +96,18 @@ class StreamShare:
 
 
 class Have(NamedTuple):
-    """How much of a robot is here: submaps, and the end of the newest [ns of team time]."""
+    """How much of a robot is here: number of submaps, and the end of the newest [ns of team
+    time].
+    """
 
     submaps: int
     newest_ns: int
 
 
 class Replica:
-    """One peer's copy of the set of a team with the given robots.
+    """The set of a team with the given robots, as one peer has it.
 
-    replacements: how often a robot contradicted itself in what had been handed on.
+    replacements: how often a robot contradicted a member that had been passed to the fold.
     """
 
     def __init__(self, robots: Iterable[str], share: int = SHARE) -> None:
@@ -119,7 +122,9 @@ class Replica:
         self._told: _Announced | None = None
 
     def add(self, member: Member) -> Outcome:
-        """Take a member; RefusedError where it can not be of this team or there is no room."""
+        """Take a member. Raises RefusedError where it can not be of this team or exceeds a
+        bound.
+        """
         message = member.message
         robot = about(message)
         if robot not in self._bytes:
@@ -197,7 +202,7 @@ class Replica:
     # What is here.
 
     def share_of(self, stream: Stream) -> StreamShare:
-        """What is here of a stream; empty where nothing is."""
+        """The members of a stream that are here; empty where there are none."""
         return self.streams.get(stream) or StreamShare()
 
     def have(self, robot: str) -> Have:
@@ -208,12 +213,12 @@ class Replica:
 
     @property
     def submaps(self) -> int:
-        """How many complete submaps are here."""
+        """Number of complete submaps that are here."""
         return sum(len(share.complete) for share in self.streams.values())
 
     @property
     def concluded(self) -> dict[str, m.Concluded]:
-        """The peers whose final map is out, by robot, each by its own word."""
+        """The peers whose final map is out, by robot, as each has announced it."""
         found = {}
         for robot, statements in self.statements.items():
             member = statements.get(("concluded", 0))
@@ -222,7 +227,7 @@ class Replica:
         return found
 
     def members(self) -> Iterator[Member]:
-        """Every member in canonical order, such that a fold can take them one by one."""
+        """Every member, in an order in which a fold can take them one by one."""
         for stream in sorted(self.streams):
             share = self.streams[stream]
             if share.start is not None:
@@ -238,7 +243,7 @@ class Replica:
     # What others are told.
 
     def holding(self, stream: Stream) -> m.Holding | None:
-        """What is here of a stream; None: nothing that others could ask for."""
+        """What is here of a stream, for a summary; None where nothing can be requested."""
         share = self.share_of(stream)
         if share.start is None and not share.complete:
             return None
@@ -252,7 +257,7 @@ class Replica:
         )
 
     def _held(self, stream: Stream) -> m.Holding | None:
-        """As `holding`, kept until something of the stream comes."""
+        """As `holding`, cached until a member of the stream arrives."""
         held = self._holdings.get(stream) or self.holding(stream)
         if held is not None:
             self._holdings[stream] = held
@@ -268,11 +273,11 @@ class Replica:
 
     @property
     def digest(self) -> bytes:
-        """Of all that others are told of: equal digests are equal sets."""
+        """Digest of the summary: equal digests mean equal sets."""
         return self._telling.digest
 
     def summary(self, node: str, serial: int, stamp_ns: int) -> m.SetSummary:
-        """What is here, in so few bytes that it can be told again and again."""
+        """A summary of the set, small enough to be published again and again."""
         told = self._telling
         return m.SetSummary(
             stamp_ns=stamp_ns,
@@ -284,11 +289,11 @@ class Replica:
         )
 
     def announced_of(self, stream: Stream) -> m.Holding | None:
-        """What others are told of a stream."""
+        """A stream's holding in the summary."""
         return self._telling.holdings.get(stream)
 
     def stated_of(self, robot: str) -> m.Statements | None:
-        """What others are told of the statements about a robot."""
+        """The summary of the statements about a robot."""
         return self._telling.statements.get(robot)
 
     @property
@@ -311,7 +316,7 @@ class Replica:
 
 
 class _Announced(NamedTuple):
-    """What a summary says, kept until something comes."""
+    """The contents of a summary, cached until a member arrives."""
 
     digest: bytes
     holdings: dict[Stream, m.Holding]
@@ -319,7 +324,7 @@ class _Announced(NamedTuple):
 
 
 def _stated(message: m.Message) -> tuple[str, int]:
-    """A statement's name among those about its robot."""
+    """The name of a statement among those about its robot."""
     match message:
         case m.Done():
             return "done", message.incarnation
@@ -339,7 +344,9 @@ def _stated(message: m.Message) -> tuple[str, int]:
 
 
 def _rank(member: Member) -> tuple[int, bytes]:
-    """Of two statements of one name the greater stays: a later conclusion, else by the bytes."""
+    """Order of two statements of one name; the greater stays: a later conclusion, else by the
+    bytes.
+    """
     serial = member.message.serial if isinstance(member.message, m.Concluded) else 0
     return serial, bytes(255 - byte for byte in member.hash)
 
@@ -347,7 +354,7 @@ def _rank(member: Member) -> tuple[int, bytes]:
 def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
     """First, last, first, last, … of the closed intervals; `count`: those from 0 on without a gap.
 
-    Of more than MOST_INTERVALS the first ones.
+    At most MOST_INTERVALS, the first ones.
     """
     ends: list[int] = [0, count - 1] if count else []
     for each in sorted(s for s in sequences if s >= count):

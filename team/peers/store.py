@@ -1,10 +1,10 @@
-"""A peer's set on disk: an append-only file, from which a robot that was started again goes on.
+"""A peer's set on disk: an append-only file, from which a robot continues after a restart.
 
 After eight bytes that say what it is come records: length and CRC-32 of the body, four bytes each,
-little-endian; the body is a MessagePack array [key, payload, signature]. A record that a death tore
-is cut off when the file is opened again: its member comes from others, or is computed once more. A
-record is in the hands of the operating system when `append` returns: a process that is killed
-loses nothing, a computer without power the last seconds.
+little-endian; the body is a MessagePack array [key, payload, signature]. A record that a crash has
+truncated is cut off when the file is opened again: its member comes from other peers, or is
+computed again. A record is in the hands of the operating system when `append` returns: a process
+that is killed loses nothing, a computer without power the last seconds.
 """
 
 import struct
@@ -26,13 +26,13 @@ class StoreError(RuntimeError):
 
 
 def record_of(member: Member) -> bytes:
-    """A member as the file has it."""
+    """The record of a member."""
     body: bytes = msgpack.packb([member.key, member.payload, member.signature], use_bin_type=True)
     return _HEAD.pack(len(body), zlib.crc32(body)) + body
 
 
 def records_in(content: bytes) -> Iterator[tuple[int, Member]]:
-    """The whole members of a file, each with where its record ends; stops at what is torn."""
+    """The complete members of a file, each with the end of its record; stops at a truncated one."""
     at = len(MAGIC)
     while at + _HEAD.size <= len(content):
         length, crc = _HEAD.unpack_from(content, at)
@@ -48,7 +48,7 @@ def records_in(content: bytes) -> Iterator[tuple[int, Member]]:
 
 
 class Store:
-    """The file of one peer; `kept` is what was there when it was opened. Raises StoreError."""
+    """The file of one peer; `kept`: the members in it when it was opened. Raises StoreError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -69,7 +69,7 @@ class Store:
             raise StoreError(f"{path} can not be written: {error}") from error
 
     def append(self, members: Iterable[Member]) -> None:
-        """Keep members; raises StoreError."""
+        """Append members. Raises StoreError."""
         records = b"".join(record_of(member) for member in members)
         if records:
             try:
@@ -78,5 +78,5 @@ class Store:
                 raise StoreError(f"{self.path} can not be written: {error}") from error
 
     def close(self) -> None:
-        """Nothing more is kept."""
+        """Close the file."""
         self._file.close()
