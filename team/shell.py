@@ -90,7 +90,7 @@ class Shell:
         self._name = name
         self._stop = stop
         self._status_due = 0.0
-        self._begun = False
+        self._is_running = False
         self._remind_due = time.monotonic() + REMIND_S
         self.boundary = Boundary(name)
         self.notes: Callable[[], tuple[str, ...]] = tuple
@@ -140,7 +140,7 @@ class Shell:
         """
         self.publish(self.node.begin())
         self.bus.declare_alive(self._name)
-        self._begun = True
+        self._is_running = True
         self.report()
 
     @property
@@ -174,7 +174,7 @@ class Shell:
         for sample in samples:
             self._note_recorder(sample)
             self.publish(self.boundary.take(self.node, sample))
-            if self._begun:
+            if self._is_running:
                 self.report()
 
     def take_replies(

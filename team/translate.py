@@ -233,7 +233,7 @@ def association_message(
 def sighting_message(
     sighting: Sighting, config: bytes, measurements: tuple[int, ...]
 ) -> m.SightingFactor:
-    """A sighting with the names of its inputs."""
+    """An inter-robot factor with the names of its inputs."""
     return m.SightingFactor(
         stamp_ns=sighting.stamp_ns,
         robot=sighting.robot,
@@ -249,7 +249,7 @@ def sighting_message(
 
 
 def sighting_of(message: m.SightingFactor) -> Sighting:
-    """A sighting message as the join takes it."""
+    """An inter-robot factor message as the join takes it."""
     return Sighting(
         message.robot,
         message.incarnation,

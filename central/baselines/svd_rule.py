@@ -157,7 +157,7 @@ class SvdJoinRule(SubmapRule):
             if not refused:
                 local = translate.local_map_of(submap).without_nodes.without_biases
                 why = submap_beyond(local, self.config.bounds)
-                after = _stepped(state, stream[0], local) if why is None else None
+                after = _joined_with(state, stream[0], local) if why is None else None
                 if after is None:
                     words = why or "with it the map has no solution"
                     refused = f"submap {submap.sequence} of {named(stream)} refused: {words}"
@@ -168,7 +168,7 @@ class SvdJoinRule(SubmapRule):
         return _Joined(len(chain), solution, digest, refused)
 
 
-def _stepped(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
+def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
     """The map with one more submap; None where it has no solution or no covariance."""
     try:
         with np.errstate(all="ignore"):

@@ -62,7 +62,7 @@ class Recorder:
         self._closed = False
         try:
             self._file: IO[bytes] = self.path.open("xb")
-            self._writer = _begun(self._file, {**metadata, "team": team})
+            self._writer = _opened_writer(self._file, {**metadata, "team": team})
         except FileExistsError:
             raise RecorderError(f"{self.path} exists: choose another name or remove it") from None
         except OSError as error:
@@ -181,7 +181,7 @@ class Recorder:
         return self._writer.register_channel(self._prefix + key, said.encoding, number)
 
 
-def _begun(file: IO[bytes], metadata: dict[str, str]) -> Writer:
+def _opened_writer(file: IO[bytes], metadata: dict[str, str]) -> Writer:
     """A writer that has written its head and the metadata, so that a killed log has them."""
     writer = Writer(file)
     try:

@@ -112,8 +112,8 @@ class HybridEstimator:
 
     def _with_submap(self, closed: ClosedWindow) -> Estimates:
         """Update pose and map by a submap."""
-        begun_at = self.whole.mean[:3]
-        cloud = None if closed.window is None else thinned(closed.window.particles, begun_at)
+        origin = self.whole.mean[:3]
+        cloud = None if closed.window is None else thinned(closed.window.particles, origin)
         self.whole = self._joined(closed.local.named)
         return Estimates(closed=closed, pose_ns=closed.end_ns, map_ns=closed.end_ns, cloud=cloud)
 

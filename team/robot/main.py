@@ -213,8 +213,8 @@ class RobotShell:
         if self._first_of and time.monotonic() >= self._confirm_at:
             self._confirm_at = time.monotonic() + CONFIRMED_S
             last = self._incarnation_at_source()
-            begun, self._first_of = self._first_of, {}
-            for incarnation, sample in sorted(begun.items()):
+            first_of, self._first_of = self._first_of, {}
+            for incarnation, sample in sorted(first_of.items()):
                 if last is None or incarnation <= last:
                     passed.append(sample)
                 else:

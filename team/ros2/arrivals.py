@@ -92,5 +92,5 @@ class Backlog:
     @property
     def oldest_s(self) -> float:
         """How long the oldest message has waited [s]; 0 where none does."""
-        begun = [queue[0].at_s for queue in self.waiting.values() if queue]
-        return time.monotonic() - min(begun) if begun else 0.0
+        arrived = [queue[0].at_s for queue in self.waiting.values() if queue]
+        return time.monotonic() - min(arrived) if arrived else 0.0

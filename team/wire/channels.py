@@ -186,9 +186,9 @@ TALLY = Channel(name="tally", template="{node}/tally", message=m.Tally, rate="on
 MEASUREMENTS = Channel(name="readings", template="source/{robot}/readings", message=m.MeasurementsRequest, rate="query", delivery="stream", recorded=False,
                    recomputable=False, meaning="a query; the replies are the measurements")  # fmt: skip
 SUBMAPS = Channel(name="submaps", template="central/submaps", message=m.SubmapsRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
-                  meaning="a query; the replies are the starts, submaps and sightings in the centre's set")  # fmt: skip
+                  meaning="a query; the replies are the initial poses, submaps and inter-robot factors in the centre's set")  # fmt: skip
 SENT = Channel(name="sent", template="robot/{robot}/submaps", message=m.SubmapsRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
-               meaning="a query; the replies are the starts, submaps and sightings that the robot has sent")  # fmt: skip
+               meaning="a query; the replies are the initial poses, submaps and inter-robot factors that the robot has sent")  # fmt: skip
 
 FINAL_KEPT = Channel(name="final_kept", template="router/final", message=m.FinalMapRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                      meaning="a query; the reply is the final map, when the centre has left, too")  # fmt: skip

@@ -140,7 +140,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
     )
     starts = [landmark_starts(chains, poses, run.map) for poses in fillings]
     if noise == "profile":
-        descend = _stepped
+        descend = _after_step
         sigmas = run.scenario.central.bias_sigma
         graph = profile_graph(gtsam, chains, fillings[0], starts[0], robust_c, sigmas)
     else:
@@ -249,7 +249,7 @@ def _newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
     return step, float(np.sqrt(max(2.0 * gain, 0.0)))
 
 
-def _stepped(gtsam: Any, graph: Any, initial: Any) -> Any:
+def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
     """Gauss-Newton; a step that does not lower the cost is halved.
 
     For factors in Python: GTSAM's Levenberg-Marquardt takes five times as long for one iteration.

@@ -64,7 +64,7 @@ __all__ = [
 ]
 
 PATIENCE = 1.1
-"""What was searched in vain is searched again when there are so many times the submaps."""
+"""A failed search is repeated once the number of submaps has grown by this factor."""
 
 
 class NotCanonicalError(ValueError):

@@ -180,17 +180,17 @@ class RunningEstimator:
         own: np.ndarray,
     ) -> None:
         step = increment, ids, ranges, bearings, own
-        after = self._stepped(step)
+        after = self._after(step)
         if after is None:  # what was seen leads nowhere: the motion alone
             self.unsolved += bool(len(ids))
-            after = self._stepped((increment, ids[:0], ranges[:0], bearings[:0], own[:0]))
+            after = self._after((increment, ids[:0], ranges[:0], bearings[:0], own[:0]))
         if after is not None:
             self._state, judged = after
             self._unsaid = self._unsaid.plus(judged)
         self.sequence += 1
         self.last_keyframe_ns = stamp_ns
 
-    def _stepped(self, step: Step) -> tuple[Any, Innovation] | None:
+    def _after(self, step: Step) -> tuple[Any, Innovation] | None:
         """The state after a step, and how well its measurements were predicted; None: there is
         none.
 

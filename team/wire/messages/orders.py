@@ -22,10 +22,10 @@ class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
 
 
 class WithdrawalHeard(Message, frozen=True, kw_only=True, tag="withdrawal_heard/1"):
-    """A robot has heard that the team goes on without `withdrawn`, and keeps the order for a centre
-    that is started again. Hearsay, which a centre weighs (`central.withdrawal_witnesses`).
+    """A robot repeats an order to withdraw `withdrawn`, for a centre that is started again.
 
-    robot: who says so. by, reason: as the order had them.
+    The centre believes it only from enough robots (`central.withdrawal_witnesses`). robot: the one
+    that repeats it. by, reason: as in the order.
     """
 
     robot: Name
