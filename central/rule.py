@@ -124,10 +124,10 @@ class FusionRule(ABC):
         return []
 
     def kept(self, robot: str) -> Sequence[m.Message]:
-        """What the robot's next life takes over; nothing: it begins its stream again.
+        """What the robot's next process takes over; nothing: it begins its stream again.
 
-        Of each incarnation, the latest first: its start, the submaps without a gap, their
-        sightings.
+        Of each incarnation, the latest first: its initial pose, the submaps without a gap and the
+        inter-robot factors from them.
         """
         return ()
 

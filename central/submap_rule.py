@@ -179,8 +179,9 @@ class SubmapRule(FusionRule):
         return self.count((done.robot, done.incarnation)) >= done.submaps
 
     def kept(self, robot: str) -> list[m.Message]:
-        """Of each incarnation of one robot, the latest first: start, submaps without a gap,
-        sightings.
+        """What the robot's next process takes over, of each incarnation, the latest first.
+
+        It is the initial pose, the submaps without a gap and the inter-robot factors from them.
         """
         found: list[m.Message] = []
         for stream in sorted((s for s in self.members.streams if s[0] == robot), reverse=True):

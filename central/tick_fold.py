@@ -74,7 +74,7 @@ def join_settings(config: CentralConfig) -> JoinSettings:
 
 @dataclass
 class Checkpoint:
-    """The fold after a tick; tried: its submaps when suspects were last tried in vain.
+    """The fold after a tick; tried: its number of submaps when no suspect was last found.
 
     number: of the ticks that were taken, this one included.
     """

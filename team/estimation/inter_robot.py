@@ -50,7 +50,7 @@ class Sighting:
 
     @cached_property
     def information(self) -> Float[np.ndarray, "2 2"]:
-        """The inverse covariance. Raises NotACovarianceError that names the sighting."""
+        """The inverse covariance. Raises NotACovarianceError that names the measurement."""
         what = f"a sighting of {self.teammate} by {named(self.stream)}"
         return information(self.covariance, what)
 

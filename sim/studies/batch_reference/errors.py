@@ -212,7 +212,7 @@ def _base_key(chain: Chain, number: int, pose: int) -> int:
 
 
 def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
-    """(chain, pose) of the bases' poses that are states of their own: at times of sightings."""
+    """(chain, pose) of the base's poses that are states: those at inter-robot measurements."""
     times = {sighting.stamp_ns for chain in chains for sighting in chain.sightings}
     return [
         (c, i)

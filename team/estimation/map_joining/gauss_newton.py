@@ -191,7 +191,7 @@ class Island(least_squares.Point):
 
     @cached_property
     def sighting_chi2(self) -> Float[np.ndarray, " S"]:
-        """rᵀR⁻¹r of each sighting."""
+        """rᵀR⁻¹r of each inter-robot measurement."""
         return sightings.sighting_costs(self.state, self.graph.offset, self.graph.sighting_factors)
 
     @property

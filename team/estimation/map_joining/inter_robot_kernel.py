@@ -59,7 +59,7 @@ def sighting_residual(
 
 @compiled
 def sighting_costs(state: Values, offset: Indices, sightings: Sightings) -> Values:
-    """χ² = rᵀR⁻¹r of each sighting."""
+    """χ² = rᵀR⁻¹r of each inter-robot measurement."""
     result = np.empty(len(sightings.nodes))
     for f in range(len(result)):
         a, b = offset[sightings.nodes[f, 0]], offset[sightings.nodes[f, 1]]
@@ -97,7 +97,7 @@ def add_sightings(
     entry: Indices,
     value_start: Indices,
 ) -> None:
-    """Add Σ w JᵀR⁻¹J on the pattern and Σ w JᵀR⁻¹r; scale: the robust c of each sighting."""
+    """Add Σ w JᵀR⁻¹J on the pattern and Σ w JᵀR⁻¹r; scale: each one's robust c."""
     pair = sightings.first_pair
     for f in range(len(sightings.nodes)):
         nodes = sightings.nodes[f]

@@ -306,7 +306,7 @@ def _own_marginal(
 
 
 def _sightings(island: Island) -> list[tuple[str, float, float]]:
-    """(observer, w χ², dof) of the sightings."""
+    """(observer, w χ², dof) of the inter-robot measurements."""
     graph, weight = island.graph, island.sighting_weight
     explained = explained_by_sightings(
         island.state,

@@ -117,7 +117,7 @@ class Recovery:
         return found
 
     def overdue(self, now_s: float) -> list[Sample]:
-        """Ask for what has been missing for a while, without waiting; what waited in vain."""
+        """Request what has been missing for a while; returns samples that no longer wait for it."""
         if now_s < self._look_due or not self._incomplete:
             return []
         self._look_due = now_s + _LOOK_S
