@@ -30,7 +30,8 @@ HOPELESS = 100.0
 class Tie(NamedTuple):
     """A point: its node in the main island and in the other one; how it is seen, if it is.
 
-    seen: the sighting. from_main: its observer is in the main island, so there the node is his.
+    seen: the inter-robot measurement. from_main: its observer is in the main island, whose node is
+    then the observer's.
     """
 
     main: int
