@@ -15,7 +15,7 @@ def calibrate(
     source: Annotated[
         list[Path],
         typer.Argument(
-            help="Data sets (folders, UTIAS zips) or logs (.mcap), learnt from together."
+            help="Data sets (folders, UTIAS zips), logs (.mcap), ROS 2 bags; learnt from together."
         ),
     ],
     output: Annotated[
@@ -40,6 +40,7 @@ def calibrate(
     from sim.calibration.figures import CalibrationError
     from sim.calibration.scenario import scenario_toml
     from sim.calibration.source import measurements_of
+    from sim.cli.importing import readable
     from sim.cli.options import scenario_of, warn_of_holes
     from team.recording.reader import open_log
 
@@ -48,9 +49,10 @@ def calibrate(
     read = []
     for path in source:
         typer.echo(f"reading {path}", err=True)
-        if path.suffix == ".mcap":
-            warn_of_holes(open_log(path))
-        read.append((path.name, *measurements_of(path)))
+        with readable(path) as found_at:
+            if found_at.suffix == ".mcap":
+                warn_of_holes(open_log(found_at))
+            read.append((path.name, *measurements_of(found_at)))
     start = read[0][2] if scenario is None else scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
     try:

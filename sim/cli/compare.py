@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from central.desk.pictures.style import Form
-from sim.cli.options import WRONG_USE, fail
+from sim.cli.options import WRONG_USE, fail, warn_of_holes
 
 app = typer.Typer()
 FEWEST = 2
@@ -41,7 +41,9 @@ def compare(
         name = path.name if path.is_dir() else path.stem if path.stem != "log" else path.parent.name
         while name in evaluated:
             name += "'"
-        evaluated[name] = evaluate(open_log(log).samples())
+        opened = open_log(log)
+        warn_of_holes(opened)
+        evaluated[name] = evaluate(opened.samples())
     table = Table(box=box.SIMPLE)
     table.add_column("", no_wrap=True)
     for name in evaluated:

@@ -1,6 +1,8 @@
 """The command `teamslam import`."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +11,9 @@ import typer
 from sim.cli.options import WRONG_USE, counted, fail, parsed_start
 
 app = typer.Typer()
+ROS2_PROFILE = b"ros2"
+HEAD = 64
+"""Bytes in which an MCAP file names its profile."""
 
 
 @app.command(name="import")
@@ -88,6 +93,31 @@ def imported_into(path: Path, folder: Path) -> Path:
         typer.echo(note, err=True)
     typer.echo(f"imported {path} into {folder}", err=True)
     return folder
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[Path]:
+    """A ROS 2 bag as the data set that it is imported into meanwhile; anything else as it is."""
+    from tempfile import TemporaryDirectory
+
+    if not (path.suffix == ".db3" or (path / "metadata.yaml").is_file() or _is_ros2_mcap(path)):
+        yield path
+        return
+    from sim.importing.source import Request, imported
+
+    with TemporaryDirectory() as place:
+        folder = Path(place) / path.stem
+        for note in imported(Request(sources=[path]), folder).said:
+            typer.echo(note, err=True)
+        yield folder
+
+
+def _is_ros2_mcap(path: Path) -> bool:
+    """Whether it is an MCAP file that says that ROS 2 wrote it."""
+    if path.suffix != ".mcap" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return ROS2_PROFILE in file.read(HEAD)
 
 
 def _as_read(folder: Path) -> list[str]:

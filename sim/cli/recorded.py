@@ -19,6 +19,7 @@ from sim.cli.options import (
     parsed_speed,
     refuse_existing,
     refuse_open_door,
+    warn_of_holes,
 )
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ def replay(
             fail("--keys is for a router that is there: give --connect", WRONG_USE)
         refuse_open_door(listen, keys=False, insecure=insecure)
     opened = open_log(log)
+    warn_of_holes(opened)
     hub = router(listen) if connect is None else nullcontext(connect)
     with (
         process("replay") as stop,

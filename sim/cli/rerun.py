@@ -33,7 +33,7 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures
 
 @app.command()
 def rerun(
-    log: Annotated[Path, typer.Argument(help="An MCAP log of a team, or a data set.")],
+    log: Annotated[Path, typer.Argument(help="An MCAP log of a team, a data set or a ROS 2 bag.")],
     verify: Annotated[
         bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
     ] = False,
@@ -170,11 +170,13 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
         same_final_map,
     )
     from central.desk.verification.recorded import RerunError
+    from sim.cli.importing import readable
     from sim.recorded.changed_run import changed_run
     from sim.recorded.data_set import DataSetRun, log_or_run
     from team.recording.reader import Log
 
-    log = log_or_run(path)
+    with readable(path) as source:
+        log = log_or_run(source)
     if isinstance(log, Log):
         warn_of_holes(log)
     recorded = evaluate(log.samples())

@@ -22,6 +22,8 @@ from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from sim.scenarios.toml import folder_scenario
 from sim.world.streams import StartPose, WorldStreams
+from team.recording.check import holes
+from team.recording.reader import open_log
 from team.ros2.bags import BagError, is_bag
 from team.ros2.topics import TopicsError, load_topics
 
@@ -169,7 +171,8 @@ def is_own_log(path: Path) -> bool:
 
 
 def _log(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:
-    return *measurements_in(path), []
+    lacks = [f"{path} is not whole, {finding}" for finding in holes(open_log(path))]
+    return *measurements_in(path), lacks
 
 
 def _data_set(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sim.cli.options import FAILED, fail
+from sim.cli.options import FAILED, fail, warn_of_holes
 
 Noise = Annotated[
     Literal["white", "profile"],
@@ -15,7 +15,7 @@ Noise = Annotated[
         "the scenario's errors that persist, biases, and inter-robot measurements."
     ),
 ]
-Source = Annotated[Path, typer.Argument(help="An MCAP log of a team, or a data set.")]
+Source = Annotated[Path, typer.Argument(help="An MCAP log of a team, a data set or a ROS 2 bag.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures.")]
 app = typer.Typer()
 
@@ -31,21 +31,27 @@ def batch_reference(
     ] = None,
 ) -> None:
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
+    from sim.cli.importing import readable
     from sim.recorded.data_set import log_or_run
     from sim.studies.batch_reference.g2o import g2o_lines
     from sim.studies.batch_reference.measurements import BatchReferenceError
     from sim.studies.batch_reference.reference import batch_map
+    from team.recording.reader import Log
 
+    with readable(log) as source:
+        run = log_or_run(source)
+    if isinstance(run, Log):
+        warn_of_holes(run)
     if g2o is not None:
         try:
-            lines = list(g2o_lines(log_or_run(log).samples()))
+            lines = list(g2o_lines(run.samples()))
         except BatchReferenceError as error:
             fail(str(error), FAILED)
         g2o.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
         typer.echo(f"wrote {g2o}: {len(lines)} lines")
         return
     try:
-        result = batch_map(log_or_run(log).samples(), noise)
+        result = batch_map(run.samples(), noise)
     except BatchReferenceError as error:
         fail(str(error), FAILED)
     figures = result.to_json()

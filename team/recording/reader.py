@@ -174,7 +174,8 @@ def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
     raise LogError(
         path,
         "an MCAP file of another program, or cut off at its very beginning",
-        f"a log of ours begins with metadata {METADATA!r}",
+        f"a log of ours begins with metadata {METADATA!r}; `teamslam import` makes a data set of a "
+        "ROS 2 bag",
     )
 
 

@@ -201,7 +201,10 @@ def test_the_program_itself_ends_with_2_and_one_line(tmp_path: Path) -> None:
     [
         ("verify-ledger",),
         ("rerun", "--verify"),
+        ("rerun",),
         ("calibrate",),
+        ("batch-reference",),
+        ("compare", "hole.mcap"),
         ("log", "export", "--output", "tables"),
         ("report", "--output", "report"),
     ],

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from sim.cli.importing import readable
 from sim.cli.main import app
 from sim.datasets.folder_writer import write_folder
 from sim.datasets.tables import DatasetError
@@ -302,3 +303,19 @@ def test_wrong_use_is_said(tmp_path: Path) -> None:
         result = run(*arguments)
         assert result.exit_code == 2 or isinstance(result.exception, DatasetError)
         assert words in result.output + str(result.exception)
+
+
+@pytest.mark.parametrize("db3", [False, True])
+def test_commands_on_data_sets_read_a_bag_as_what_it_is_imported_into(
+    tmp_path: Path, db3: bool
+) -> None:
+    bag = ros.write_bag(tmp_path / "bag", drive(), db3=db3)
+    for path in (bag, next(bag.glob("*.db3" if db3 else "*.mcap"))):
+        with readable(path) as folder:
+            (stream,) = read(folder).streams
+            assert stream.intervals.end_ns.tolist() == [S, 2 * S]
+        assert not folder.exists()
+    (tmp_path / "own.mcap").write_bytes(b"\x89MCAP0\r\n teamslam")
+    for path in (tmp_path / "own.mcap", tmp_path, tmp_path / "none.mcap"):
+        with readable(path) as same:
+            assert same == path
