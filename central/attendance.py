@@ -14,8 +14,8 @@ Dealt = Callable[[m.Done], bool]
 class Attendance:
     """What the centre knows of one robot.
 
-    began: the latest incarnation that has begun; 0: none. head: its driver's last word, of a live
-    team. driver: whether its driver is there; None: nobody has said.
+    began: the latest incarnation that has begun; 0: none. head: the newest head of its driver, in a
+    live team. driver: whether its driver is present; None: unknown.
     """
 
     alive: bool = False
@@ -29,12 +29,12 @@ class Attendance:
 
     @property
     def lost(self) -> bool:
-        """It was there and is not any more."""
+        """True once the robot was present and is not any more."""
         return self.seen and not self.alive
 
     @property
     def stream_end(self) -> m.StreamEnd | None:
-        """Where its driver has ended the stream, unless it has begun anew since."""
+        """Where its driver has ended the stream, unless a later incarnation has begun."""
         head = self.head
         if head is None or head.state != "ended" or head.incarnation < self.began:
             return None
@@ -44,7 +44,9 @@ class Attendance:
 
     @property
     def has_all(self) -> bool:
-        """The robot is done with all that its driver has numbered, and the driver left nothing."""
+        """True once the robot has consumed all that its driver has numbered and the stream is
+        not open.
+        """
         head, done = self.head, self.done
         if head is None or done is None or head.state == "open":
             return False
@@ -72,15 +74,15 @@ class TeamAttendance:
 
     @classmethod
     def of(cls, robots: Sequence[str]) -> "TeamAttendance":
-        """A team of which nobody has been heard of."""
+        """The attendance of a team at its start."""
         return cls({robot: Attendance() for robot in sorted(robots)})
 
     def admit(self, robot: str) -> None:
-        """From now on the robot is in the team."""
+        """Add a robot to the team."""
         self.robots = dict(sorted({**self.robots, robot: Attendance()}.items()))
 
     def take(self, message: m.Message) -> None:
-        """Note what a message says of its sender; of strangers nothing."""
+        """Take what a message says of its sender; messages of strangers are ignored."""
         match message:
             case m.Submap() | m.MapEstimate():
                 self.now_ns = max(self.now_ns, message.stamp_ns)
@@ -139,14 +141,17 @@ class TeamAttendance:
 
     @property
     def is_live(self) -> bool:
-        """The robots are measured by drivers, each with its own end, and by no world."""
+        """True where drivers, each with its own end, publish the measurements, and no world
+        does.
+        """
         return self.ordered or any(robot.head is not None for robot in self.robots.values())
 
     @property
     def end(self) -> m.End | None:
-        """The last counters of all streams: a world's, or those of every driver; None: not yet.
+        """The last counters of all streams, from a world or from every driver; None while one is
+        open.
 
-        Where a live team was told to end, a robot whose driver is away ends where it is done.
+        Where a live team was ordered to end, a robot whose driver is absent ends where it is done.
         """
         if self.world_end is not None or not self.is_live:
             return self.world_end
@@ -165,11 +170,11 @@ class TeamAttendance:
         return m.End(stamp_ns=self.now_ns, streams=tuple(streams))
 
     def _never_measured(self, name: str) -> bool:
-        """A live team was told to end before this robot had begun: there is nothing to wait for."""
+        """True where a live team was ordered to end before this robot had begun."""
         return self.ordered and not self.robots[name].began
 
     def whole(self, name: str, dealt: Dealt) -> bool:
-        """The robot is done, and all of it is here."""
+        """True once the robot is done and everything of it is here."""
         done = self.robots[name].done
         return (
             done is not None and self._is_last_incarnation(name, done.incarnation) and dealt(done)
@@ -192,9 +197,10 @@ class TeamAttendance:
         return None
 
     def settled(self, name: str, dealt: Dealt) -> bool:
-        """Nobody waits for the robot: all of it is here, or it is given up or withdrawn and gone.
+        """True once nobody waits for the robot: all of it is here, or it is given up, or withdrawn
+        and gone.
 
-        That it is lost is no reason: it may come back, and the map is not to depend on when.
+        A lost robot is waited for: it may come back, and the map must not depend on when.
         """
         robot = self.robots[name]
         gone = name in self.withdrawn and not robot.alive
@@ -202,13 +208,13 @@ class TeamAttendance:
 
     @property
     def given_up(self) -> list[str]:
-        """The robots that nobody waits for by an order."""
+        """The robots that are given up by an order."""
         return [robot for robot, attendance in self.robots.items() if attendance.given_up]
 
     def missing(self, dealt: Dealt) -> list[str]:
-        """The robots that the team was to have and whose streams are not wholly here.
+        """The robots of the team whose streams are not complete here.
 
-        Of a live team that was told to end, those whose drivers may have had more.
+        In a live team that was ordered to end, those whose drivers may have had more.
         """
         return [
             name
@@ -219,7 +225,7 @@ class TeamAttendance:
         ]
 
     def awaited(self, dealt: Dealt) -> list[str]:
-        """The robots that are not there, were or not, and that are waited for."""
+        """The robots that are absent and waited for."""
         return [r for r, a in self.robots.items() if not (a.alive or self.settled(r, dealt))]
 
     def _is_last_incarnation(self, name: str, incarnation: int) -> bool:
@@ -230,16 +236,16 @@ class TeamAttendance:
         return not ends or incarnation >= ends[0].incarnation
 
     def concluded(self, dealt: Dealt) -> bool:
-        """The world has ended and no robot is waited for."""
+        """True once the streams have ended and no robot is waited for."""
         return self.end is not None and all(self.settled(r, dealt) for r in self.robots)
 
     def takes_part(self, name: str) -> bool:
-        """Whether the robot may still send a map; one that is lost may come back."""
+        """Whether the robot may still send a map; a lost one may come back."""
         robot = self.robots[name]
         return robot.done is None and not robot.given_up
 
     def watermark_ns(self, dealt: Dealt, count: Callable[[tuple[str, int]], int]) -> float:
-        """The least progress of the live robots: no submap that ends before it can still come.
+        """The least progress of the live robots: every submap that ends before it has arrived.
 
         count: how many submaps of a stream have been dealt with.
         """
@@ -254,9 +260,10 @@ class TeamAttendance:
         return least
 
     def _is_away(self, robot: Attendance) -> bool:
-        """Of a live team: it has not begun, or its driver is not there, so nothing waits for it.
+        """In a live team: True for a robot that has not begun or whose driver is absent; nothing
+        waits for it.
 
-        What it sends when it comes rolls the fold back.
+        What it sends later rolls the fold back.
         """
         if not self.is_live:
             return False

@@ -1,4 +1,4 @@
-"""What the central computer is told before it starts."""
+"""The configuration of the central computer."""
 
 from typing import Annotated
 
@@ -10,10 +10,10 @@ from team.config import Bounds, FusionRule, NonNegative, Positive
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How large the errors are that all submaps of a robot share, before they are estimated.
+    """Prior standard deviations of the errors that all submaps of a robot share.
 
-    bearing [rad]; range_offset [m]; range_scale, forward_scale: shares of the range and of the way
-    driven.
+    bearing [rad]; range_offset [m]; range_scale, forward_scale: shares of the range and of the
+    distance driven.
     """
 
     bearing: Positive = 0.01
@@ -23,11 +23,12 @@ class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How large the errors are that all robots share, beside each robot's own; 0: there are none.
+    """Prior standard deviations of the errors that all robots share, beside each robot's own; 0:
+    none.
 
-    What was calibrated for robots of a kind is off by one amount for all of them. marker: the share
-    of the range by which a landmark's marker, each by itself, reads too far for whoever sees it,
-    since it hangs higher or is larger than the others; for landmarks with names.
+    An error of a common calibration is the same for all robots of a kind. marker: for landmarks
+    with identities, a share of the range by which a landmark's marker appears too far to every
+    robot, since it hangs higher or differs in size.
     """
 
     bearing: NonNegative = 0.0
@@ -38,32 +39,28 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The rule and its figures.
+    """The fusion rule and its parameters.
 
     fusion: `join` keeps a set of submaps and joins them by least squares; `team.pairs` says what
     the others consume. Under rules with feedback the robots absorb the map again: their covariance
-    counts measurements more than once, save that of `covariance-intersection`.
-    tick_s: the fold takes the submaps of this much team time at once.
-    broadcast_s: at least this much team time lies between two broadcasts of the fused map.
-    robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2)
-    of each measurement (a range and a bearing); absent: plain squares.
-    landmark_submaps: a landmark enters the map once so many submaps have it and are believed; above
-    1 where measurements may have nothing to do with what is there.
-    covariance_factor: the submaps' covariances are multiplied by it; 1 for a sensor whose errors
-    are independent from measurement to measurement.
-    normal_scale: what the covariance scale of the monitor is where the covariances are right. 1
-    where the errors of windows are independent; less where part of them lasts for longer than a
-    window, since what two windows have in common does not set them apart.
-    particles: of `joint-fastslam`.
-    bias_sigma: of the errors that robots send their submaps' sensitivities for.
-    common_bias_sigma: of what all robots have in common of them, in addition.
-    joined_ranges: the errors of ranges are proportional to the range, and a submap's landmarks
-    count with what they are at the range of the joined map: at the measured one, what came out
-    short weighs more and the map shrinks.
-    withdraw_above: a robot of whose submaps the half and more cost above this per degree of freedom
-    is withdrawn if the rest of the team agrees without it; absent: by an operator only.
-    bounds: submaps, inter-robot measurements and initial poses beyond them are refused.
-    association: when landmarks without names count as one: a profile for each kind of sensor.
+    counts measurements more than once, save that of `covariance-intersection`. tick_s: the fold
+    takes the submaps of this much team time at once. broadcast_s: at least this much team time lies
+    between two broadcasts of the fused map. robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of
+    each submap, under `batch` on sqrt(chi2) of each measurement (a range and a bearing); absent:
+    plain squares. landmark_submaps: a landmark enters the map once so many consistent submaps have
+    it; above 1 where outliers are expected. covariance_factor: the submaps' covariances are
+    multiplied by it; 1 for a sensor whose errors are independent from measurement to measurement.
+    normal_scale: the monitor's covariance scale where the covariances are right. 1 where the errors
+    of windows are independent; less where part of them lasts longer than a window, since a common
+    error of two windows does not show in their difference. particles: of `joint-fastslam`.
+    bias_sigma: of the errors that robots send their submaps' sensitivities for. common_bias_sigma:
+    of the part of these errors that all robots share, in addition. joined_ranges: for errors
+    proportional to the range, a submap's landmarks are weighted by the range in the joined map:
+    weighted by the measured range, short measurements weigh more and the map shrinks.
+    withdraw_above: a robot is withdrawn if the median cost of its submaps per degree of freedom is
+    above this and the rest of the team agrees without it; absent: by an operator only. bounds:
+    submaps, inter-robot measurements and initial poses beyond them are refused. association:
+    thresholds for merging landmarks without identities: a profile for each kind of sensor.
     """
 
     fusion: FusionRule = "join"

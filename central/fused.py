@@ -1,4 +1,4 @@
-"""The message of a fused map, as the rules that do not join submaps say it."""
+"""The message of a fused map, for rules that do not join submaps."""
 
 import msgspec
 
@@ -10,9 +10,9 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import unsound
 
 START_POSES = "start poses"
-"""The frame of a map that lies in the frame in which the robots were told their start poses."""
+"""The frame of a map that lies in the frame of the given initial poses."""
 JOINT_LANDMARKS = 2000
-"""With more landmarks than this a map carries their own covariances only."""
+"""A map with more landmarks carries their 2 × 2 covariances only."""
 
 
 def fused_message(
@@ -57,13 +57,15 @@ def fused_message(
 
 
 def version_entry(stream: tuple[str, int], sequence: int) -> m.VersionEntry:
-    """The entry of a version vector that says: all of (robot, incarnation) up to `sequence`."""
+    """The entry of a version vector for all submaps of (robot, incarnation) up to `sequence`."""
     robot, incarnation = stream
     return m.VersionEntry(robot=robot, incarnation=incarnation, sequence=sequence)
 
 
 def receivable(fused: m.FusedMap) -> m.FusedMap:
-    """The map as every receiver takes it; what it has to leave out for that stands in `reasons`."""
+    """The map as every receiver accepts it; the reasons for what is left out are added to
+    `reasons`.
+    """
     if unsound(fused) is None:
         return fused
     said = []

@@ -1,7 +1,7 @@
-"""The set of a centre on disk: what robots and operators have sent for it, as they sent it.
+"""A centre's set on disk: the messages of robots and operators for it, as they were sent.
 
-The file is a peer's (`team.peers.store`). A centre that was killed takes it up and goes on: nothing
-of it has to be sent again, and the same set has the same map.
+The file is a peer's (`team.peers.store`). A centre that was killed reads it and continues: nothing
+of it has to be sent again, and the same set gives the same map.
 """
 
 import logging
@@ -20,7 +20,7 @@ _LOG = logging.getLogger("teamslam")
 
 
 class KeptSet:
-    """Keeps each member once; raises StoreError where the file can not be used."""
+    """Keeps each member once. Raises StoreError where the file can not be used."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -29,13 +29,13 @@ class KeptSet:
         self._known = {member.hash for member in self._found}
 
     def samples(self) -> list[Sample]:
-        """What was kept, as if it were heard now."""
+        """The members in the file, as samples that arrive now."""
         now_ns, found = time.time_ns(), self._found
         self._found = []
         return [_as_heard(member, now_ns) for member in found]
 
     def note(self, samples: Iterable[Sample]) -> None:
-        """Keep what is sound and new of what has come."""
+        """Keep the valid and new members among these samples."""
         if self._store is None:
             return
         news = []
@@ -57,7 +57,7 @@ class KeptSet:
             self.close()
 
     def close(self) -> None:
-        """The file is complete; nothing more is kept."""
+        """Close the file."""
         if self._store is not None:
             self._store.close()
             self._store = None

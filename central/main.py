@@ -1,4 +1,4 @@
-"""The central process: the node's shell; it holds back the news that a robot is lost."""
+"""The central process: the node's shell, which delays the message that a robot is lost."""
 
 import logging
 import threading
@@ -19,22 +19,24 @@ from team.wire.codec import WireError
 from team.wire.patience import Patience
 
 LOST_S = 3.0
-"""A robot whose token went for so long holds up no broadcast; the final map still waits for it."""
+"""Time [s] after which a lost robot delays no broadcast any more; the final map still waits for
+it."""
 FRESH_SHARE = 1.0 / 3.0
-"""Of the time, for maps that are not due: so one waits for two solutions at the most."""
+"""Share of the time for maps that are not due, so that a due map waits for two solutions at
+most."""
 FAREWELL_S = 10.0
-"""The centre leaves after the others, at most this long after its final map."""
+"""The centre leaves after the others, at most this long [s] after its final map."""
 ORDERS_S = 30.0
-"""Between two questions to the router for an operator's orders."""
+"""Time [s] between two queries to the router for an operator's orders."""
 _LOG = logging.getLogger("teamslam")
 
 
 class CentralShell:
-    """The centre's process: subscribe, answer for its set, run, leave last.
+    """The centre's process: it subscribes, answers requests for its set, runs, and leaves last.
 
-    patience_s: a robot that is lost for so long is given up; None: nobody is, unless by an order.
-    admit: robots that are not named are taken into the team. store: the file that keeps what the
-    robots and operators have sent for the set; a centre that is started again goes on from it.
+    patience_s: a robot that is lost for this long is given up; None: only by an order. admit:
+    robots that the scenario does not name may join. store: the file of the set, from which a centre
+    that is started again continues.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class CentralShell:
         self._orders_due = 0.0
 
     def run(self) -> None:
-        """Until the final map is out and the others have gone."""
+        """Run until the final map is out and the others have left."""
         for channel in self.node.listens:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
@@ -100,7 +102,7 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        """Take what an earlier life has kept; nobody has to send it again."""
+        """Take the set that an earlier process has kept, so that nobody has to send it again."""
         if self._kept is None or not self._shell.going:
             return
         kept = self._kept.samples()
@@ -109,7 +111,7 @@ class CentralShell:
             _LOG.info("%d members of the set are kept in %s", len(kept), self._kept.path)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples, less the news of lost robots: they may come back within LOST_S."""
+        """The samples without the tokens of lost robots that may still come back within LOST_S."""
         now = time.monotonic()
         passed = []
         for sample in samples:
@@ -140,7 +142,7 @@ class CentralShell:
         return [node for node, since in self._since.items() if now - since >= for_s]
 
     def _give_up(self) -> None:
-        """Give up who has been lost for longer than an operator's patience, if there is one."""
+        """Give up robots that have been lost for longer than patience_s."""
         for node in [] if self._patience_s is None else self._away(self._patience_s):
             del self._since[node]
             why = f"lost for {self._patience_s:g} s, the centre's --patience"
@@ -151,7 +153,7 @@ class CentralShell:
             self._shell.take([self._shell.sample_of(order)])
 
     def _awaited(self) -> tuple[str, ...]:
-        """Whom the final map waits for although they are not there, and what to do."""
+        """The absent robots that the final map waits for, and what to do."""
         now, said = time.monotonic(), []
         for robot in self.node.awaited:
             since = self._since.get(ch.robot_node(robot))
@@ -168,8 +170,10 @@ class CentralShell:
         return tuple(said)
 
     def _hear_orders(self) -> None:
-        """Ask the router for the operator's orders now and then: who gave them does not stay, and
-        this process may have been cut off, or another one, when they were given.
+        """Ask the router now and then for the operator's orders.
+
+        The operator's command ends at once, and this process may have been cut off when it gave the
+        order.
         """
         now = time.monotonic()
         if now >= self._orders_due:
@@ -177,9 +181,10 @@ class CentralShell:
             self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
 
     def _gather(self) -> None:
-        """Ask robots for what they have sent and the centre lacks; those that appear, for all.
+        """Request submaps that robots have sent and the centre lacks; from robots that appear, all
+        of them.
 
-        What a resumed robot took over from an earlier life is in no publisher's cache.
+        What a resumed robot took over from an earlier process is in no publisher's cache.
         """
         robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
         for robot in sorted(robots.intersection(self.node.robots) - self._greeted):
@@ -194,7 +199,9 @@ class CentralShell:
             self._bus.request(ch.SENT, stream[0], wanted[stream])
 
     def _leave_last(self) -> None:
-        """Robots and world leave at the final map; whoever missed it may still ask for it."""
+        """Wait until robots and world have left at the final map, since one that missed it may
+        ask for it.
+        """
         deadline = time.monotonic() + FAREWELL_S
         while not self._stop.is_set() and time.monotonic() < deadline:
             self._shell.note(self._patient(self._bus.receive(WAIT_S)))

@@ -1,4 +1,4 @@
-"""The members of a fold by ticks of team time: messages as they came, made ready when asked for.
+"""The members of a fold by ticks of team time: encoded messages, decoded on demand.
 
 A contribution (a submap as the join takes it) is several times as large as its message and can be
 made again from it; it is kept as long as some fold has it.
@@ -34,7 +34,7 @@ class Members:
         self._named: dict[tuple[bytes, ...], tuple[float, translate.Digest]] = {}
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
-        """File a submap, with what `digest` names besides; its tick."""
+        """File a submap, with what else `digest` names; returns its tick."""
         key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
         tick = self.tick_of(submap.stamp_ns)
         if tick not in self._ticks:
@@ -49,11 +49,11 @@ class Members:
         return tick
 
     def tick_of(self, end_ns: int) -> int:
-        """The tick of a submap that ends then."""
+        """The tick of a submap that ends at this time."""
         return (end_ns - 1) // self.tick_ns
 
     def behind(self, after: float, last: float = math.inf) -> list[int]:
-        """The ticks with members behind this one, up to the last, ascending."""
+        """The ticks with members after this one, up to the last, ascending."""
         found = []
         for tick in reversed(self._order):
             if tick <= after:
@@ -63,7 +63,7 @@ class Members:
         return found[::-1]
 
     def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
-        """The submaps of a tick in canonical order, less those of robots that are gone."""
+        """The submaps of a tick in canonical order, without those of withdrawn robots."""
         return sorted(key for key in self._ticks[tick] if key[1] not in gone)
 
     def contribution(self, key: Key) -> Contribution:
@@ -79,7 +79,7 @@ class Members:
         return self._sightings.get(key, ())
 
     def concerns(self, tick: int, robot: str) -> bool:
-        """Whether a tick has something by a robot or of it."""
+        """Whether a tick has a submap of a robot or an inter-robot measurement of it."""
         return any(
             key[1] == robot or any(each.teammate == robot for each in self.sightings(key))
             for key in self._ticks[tick]
@@ -90,7 +90,7 @@ class Members:
     ) -> bytes:
         """The digest of these parts and of the members up to a tick, in canonical order.
 
-        That of the ticks up to `closed` is kept, by what stands before them.
+        The digest of the ticks up to `closed` is cached, by the parts in front of them.
         """
         until, digest = self._named.pop(before, (math.inf, translate.Digest()))
         if until > closed:

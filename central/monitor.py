@@ -1,12 +1,12 @@
-"""The consistency monitor: what the submaps say of the robots' covariances, without any truth.
+"""The consistency monitor: tests the robots' covariances by their submaps, without the truth.
 
-Two figures, both 1 where every covariance is true. The joint cost per degree of freedom is what is
+Two figures, both 1 where every covariance is right. The joint cost per degree of freedom is what is
 minimised; it is sharp (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but a
-robust loss bounds it, since it takes whatever is large for an outlier. The covariance scale is what
-the submaps' unweighted χ² says by its median: no loss bounds it, the outliers of a minority do not
-move it, and it tells covariances that are too large as well. docs/decisions/0033 has how it is
-distributed. With few degrees of freedom both scatter, so a level counts only where chance would
-not reach it once in a thousand as well.
+robust loss bounds it, since it down-weights large terms as outliers. The covariance scale is the
+median of the submaps' unweighted χ² relative to its expectation: no loss bounds it, a minority of
+outliers does not change it, and it also shows covariances that are too large. docs/decisions/0033
+has how it is distributed. With few degrees of freedom both scatter, so a warning needs a level that
+chance alone reaches less than once in a thousand.
 """
 
 import math
@@ -24,7 +24,7 @@ from team.estimation.map_joining.marginals import Agreement, BiasEstimate
 WARN = 1.1
 FAIL = 1.3
 SCALE_WARN = math.sqrt(2.0)
-"""Beyond this, and below its inverse, the team's covariance scale is told: half way to 2."""
+"""The team's covariance scale is reported beyond this, and below its inverse."""
 ROBOT_WARN = 1.5
 """… and a robot's: one of five sound ones of the real sets reads 1.4."""
 QUANTILE = 0.999
@@ -33,7 +33,7 @@ MISCALIBRATED = 0.015
 SIGMAS = 3.0
 SCALE_SIGMAS = 3.3
 NAMED = 3
-"""Submaps that are named at the most, the worst first."""
+"""Most submaps that are named, the worst first."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ NOTHING = Finding({}, ())
 
 
 def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
-    """What the team's own data say against the models of all robots together, in words.
+    """Where the team's data contradict the models of all robots together, in words.
 
     The size of a map comes from the odometry and from the ranges. Where they contradict each other
     the robots' range scales, each of which is held near its model's, move in the same direction:
@@ -80,7 +80,9 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
 
 
 def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
-    """The mean of one bias over the robots, where it is too large to be that of single robots."""
+    """The mean of one bias over the robots, where it is too large to be an error of single
+    robots.
+    """
     known = np.array([(value, sigma) for _, bias, value, sigma in biases if bias == name])
     if not len(known):
         return None
@@ -93,7 +95,7 @@ def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
 def finding(agreement: Agreement, normal: float = 1.0) -> Finding:
     """The team's and every robot's figures, and who is out of bounds.
 
-    normal: what the covariance scale is where the covariances are right; it is told in units of it.
+    normal: the covariance scale where the covariances are right; the scale is given relative to it.
     """
     figures = {}
     warnings = []
@@ -127,7 +129,7 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
 
 
 def _misscaled(scales: Mapping[str, Scale]) -> list[str]:
-    """Whose covariances are far too small or too large, in words: the team's, or single robots'."""
+    """The team, or single robots, whose covariances are far too small or too large, in words."""
     robots = {who: each for who, each in scales.items() if who}
     said = {who: words for who, each in robots.items() if (words := _misscale(each, ROBOT_WARN))}
     team = _misscale(scales[""], SCALE_WARN) if "" in scales else ""
@@ -137,7 +139,7 @@ def _misscaled(scales: Mapping[str, Scale]) -> list[str]:
 
 
 def _misscale(scale: Scale, limit: float) -> str:
-    """What is wrong beyond the limit, and beyond chance; empty where nothing is."""
+    """What is wrong beyond the limit and beyond chance, in words; empty where nothing is."""
     value = scale.value
     if value <= 0.0:
         return ""
@@ -158,7 +160,7 @@ def _level(chi2: float, dof: float) -> str | None:
 
 
 def _worst(agreement: Agreement) -> list[str]:
-    """The submaps that the rest of the map contradicts, beyond what so many would by chance."""
+    """The submaps that the rest of the map contradicts, beyond what chance explains."""
     quantile = 1.0 - (1.0 - QUANTILE) / max(len(agreement.submaps), 1)
     wrong = [
         (each.chi2 / each.dof, each)

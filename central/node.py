@@ -1,7 +1,7 @@
 """The centre's node: messages in, messages out; no I/O, no clock.
 
-It listens to what its rule consumes (submaps, own maps or raw measurements), to progress and
-liveliness, and to nothing that holds the fused map.
+It subscribes to the inputs of its rule (submaps, own maps or raw measurements), to progress and
+liveliness, and to nothing that contains the fused map.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -21,14 +21,14 @@ from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
 
 MOST_ROBOTS = 100
-"""A team has at most so many, admitted ones among them."""
+"""Most robots of a team, admitted ones included."""
 
 
 class CentralNode:
-    """One centre for the robots of a team: `begin`, then `handle`, until `finished`.
+    """The node of the centre: call `begin`, then `handle` for every message, until `finished`.
 
-    announcement: its configuration, by the digest of which its maps name it. admit: a robot that
-    nobody has named is taken into the team when it, or its driver, comes.
+    announcement: its configuration, which its maps name by the digest. admit: a robot that the
+    scenario does not name joins the team when it, or its driver, appears.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class CentralNode:
 
     @property
     def warnings(self) -> list[str]:
-        """What went wrong, in words, the newest last."""
+        """Warnings in words, the newest last."""
         return self._rule.warnings
 
     def begin(self) -> list[Outgoing]:
-        """What the node says first: its configuration."""
+        """The first messages of the node: its configuration."""
         return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement)]
 
     def refusal(self, message: m.Message) -> str | None:
@@ -76,7 +76,7 @@ class CentralNode:
         return refused
 
     def _admit(self, message: m.Message) -> None:
-        """A robot that announces itself, or whose driver begins its stream, joins the team."""
+        """Admit a robot that announces itself, or whose driver begins its stream."""
         robot = message.robot if isinstance(message, m.InitialPose) else None
         if isinstance(message, m.Configuration):
             robot = ch.robot_of(message.node)
@@ -101,10 +101,10 @@ class CentralNode:
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Go on behind a message whose handling raised: who waits for its credit gets it.
+        """Continue behind a message whose handling raised an exception: its sender gets the credit.
 
-        One that the rule could not take counts as refused. Where the final map can not be computed,
-        the newest map that could is the final one, provisional and with the reason.
+        A submap that the rule could not take counts as refused. Where the final map can not be
+        computed, the newest earlier map becomes the final one, provisional and with the reason.
         """
         out, self._credit = self._credit, []
         if out is None:
@@ -114,24 +114,24 @@ class CentralNode:
         return out + (self._advance() if self._is_over else [])
 
     def _take_final(self, final: m.FusedMap) -> list[Outgoing]:
-        """An earlier life of this centre has concluded already."""
+        """Take the final map that an earlier process of this centre has published."""
         if final.final and not self.finished:
             self.finished, self.final = True, final
         return []
 
     @property
     def robots(self) -> Collection[str]:
-        """Who is in the team."""
+        """The robots of the team."""
         return self._attendance.robots.keys()
 
     @property
     def awaited(self) -> list[str]:
-        """The robots that are not there and that the final map waits for."""
+        """The absent robots that the final map waits for."""
         return [] if self.finished else self._attendance.awaited(self._rule.dealt)
 
     @property
     def ends(self) -> bool:
-        """Whether all streams have ended, by the word of the world or of their drivers."""
+        """Whether all streams have ended, as the world or their drivers have announced."""
         return self._attendance.end is not None
 
     def _advance(self) -> list[Outgoing]:
@@ -148,12 +148,14 @@ class CentralNode:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of all that is here, if the last one lacks something; for when there is time."""
+        """A map of everything that is here, if the last one lacks something; called in spare
+        time.
+        """
         return [] if self.finished else self._counted(self._rule.refresh(self._attendance))
 
     @property
     def _is_over(self) -> bool:
-        """The streams have ended, and nobody and nothing of them is waited for."""
+        """Whether the streams have ended and nothing of them is waited for."""
         end = self._attendance.end
         over = end is not None and self._attendance.concluded(self._rule.dealt)
         return over and end is not None and self._rule.complete(end)
@@ -197,11 +199,11 @@ class CentralNode:
         return [encoded(message) for message in kept]
 
     def lacking(self) -> list[m.SubmapsRequest]:
-        """What robots have sent by their own word and is not here: to be asked of them."""
+        """What robots say that they have sent and is not here, to be requested from them."""
         return [] if self.finished else self._rule.lacking(self._attendance)
 
     def status(self) -> m.Status:
-        """What the centre is doing, for people."""
+        """The centre's status, for people."""
         figures = {
             "broadcasts": float(self._broadcasts),
             "submaps": float(self._rule.submaps),

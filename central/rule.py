@@ -1,7 +1,7 @@
-"""What a fusion rule is: a pure function from what the team has sent to its fused map.
+"""The interface of fusion rules: a pure function from what the team has sent to its fused map.
 
-`fuse` is that function. The centre's node decides when it is asked: `take` files what comes,
-`advance` gives the maps that are due, `conclude` the final one. A rerun asks `fuse` for each
+`fuse` is that function. The centre's node decides when it is called: `take` files a message,
+`advance` returns the maps that are due, `conclude` the final one. A rerun asks `fuse` for each
 recorded map with the inputs that the map names, and has to get the same bytes.
 """
 
@@ -21,18 +21,18 @@ from team.wire.bus import Outgoing
 Stream = tuple[str, int]
 """(robot, incarnation)."""
 Tail = Literal["final", "closed", "provisional"]
-"""Which map it is: the last one; one that holds all submaps up to a time; one ahead of that."""
+"""The kind of a map: the last one; one with all submaps up to a time; one beyond that."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """What one map rests on.
+    """The inputs of one map.
 
     starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
-    by (robot, incarnation, sequence) of their submap. maps: the robots' own. withdrawals: whom the
-    team goes on without, by robot. verdicts: an operator's on unnamed landmarks. heard: raw
-    measurements, the robots' models and the end of the streams, for rules that take these.
-    exchange: the round, of rules in lockstep.
+    by (robot, incarnation, sequence) of their submap. maps: the robots' own. withdrawals: orders by
+    withdrawn robot. verdicts: an operator's on unnamed landmarks. heard: raw measurements, the
+    robots' models and the end of the streams, for rules that take these. exchange: the round, of
+    rules in lockstep.
     """
 
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
@@ -49,11 +49,11 @@ class Inputs:
 
 
 class FusionRule(ABC):
-    """Messages of the robots in, the team's maps out; the node keeps the roll.
+    """A fusion rule: messages of the robots in, the team's maps out; the node keeps the attendance.
 
-    listens: the channels whose messages it takes. unnamed: fields of its maps that rest on what it
-    knew beyond the inputs that a map names. landmarks: in its newest map. warnings: what went
-    wrong, the newest last.
+    listens: the channels whose messages it takes. unnamed: fields of its maps that depend on more
+    than the inputs that a map names. landmarks: in its newest map. warnings: in words, the newest
+    last.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]]
@@ -68,40 +68,42 @@ class FusionRule(ABC):
         self.warnings: list[str] = []
 
     def admit(self, robot: str) -> None:
-        """From now on the robot is in the team."""
+        """Add a robot to the team."""
         self.team = tuple(sorted({*self.team, robot}))
 
     @abstractmethod
     def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
-        """The map of these inputs, and what goes out with it; inputs that grow are cheap."""
+        """The map of these inputs, and the messages that go out with it; growing inputs are
+        cheap.
+        """
 
     @abstractmethod
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take one message; the credit that it gives."""
+        """Take one message; returns the credit that it gives."""
 
     @abstractmethod
     def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """The maps that are due."""
 
     def refresh(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """The newest map at once, whether or not one is due, if it has more than the last one."""
+        """The newest map at once, whether or not it is due, if it has more than the last one."""
         return []
 
     @abstractmethod
     def conclude(self, now_ns: int) -> list[Outgoing]:
-        """The last messages, the final map behind all others."""
+        """The last messages, the final map after all others."""
 
     def dealt(self, done: m.Done) -> bool:
         """True once all messages announced in the robot's `Done` have arrived."""
         return True
 
     def complete(self, end: m.End) -> bool:
-        """Whether everything of the streams that it needs itself is here."""
+        """Whether the streams that the rule itself consumes are complete here."""
         return True
 
     @property
     def submaps(self) -> int:
-        """How many submaps it has dealt with."""
+        """Number of submaps that were dealt with."""
         return 0
 
     @property
@@ -111,16 +113,16 @@ class FusionRule(ABC):
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What a reader of the map must know."""
+        """Warnings for readers of the map."""
         return ()
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
-        """The robots that the team goes on without."""
+        """The withdrawn robots."""
         return ()
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
-        """A message whose handling raised counts as refused; the credit that this gives."""
+        """Count a message whose handling raised as refused; returns the credit that this gives."""
         return []
 
     def kept(self, robot: str) -> Sequence[m.Message]:
@@ -132,7 +134,7 @@ class FusionRule(ABC):
         return ()
 
     def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
-        """What robots say that they have sent, and what is not here."""
+        """What robots say that they have sent and is not here."""
         return []
 
     def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:

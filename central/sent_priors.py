@@ -1,8 +1,8 @@
-"""Which priors a robot needs: those that say something that it can not know by itself.
+"""Decides which priors a robot needs: those with information that it can not have by itself.
 
-A robot joins its last prior with its own submaps since, so a new prior is worth its bytes only for
-what teammates have said, or for landmarks that it comes near to. Priors are nearly all that the
-centre sends; in a map that stands still most of them say nothing new.
+A robot joins its last prior with its own later submaps, so a new prior is worth its bytes only for
+information from teammates, or for landmarks that it comes near to. Priors are most of the centre's
+traffic; in a map that does not change, most of them contain nothing new.
 """
 
 from dataclasses import dataclass, replace
@@ -14,20 +14,20 @@ from team.estimation.contribution import Stream
 from team.estimation.map_joining.marginals import LandmarkBlocks
 
 EVERY = 8
-"""Of so many broadcasts one brings a prior at least: a robot has no more submaps of its own to
-join, and who has missed one does not wait for long."""
+"""One of so many broadcasts brings a prior at least, which bounds the robot's own submaps to
+join and the wait of a robot that has missed one."""
 NEEDED = 12
-"""The landmarks nearest to a robot, which it will see next."""
+"""Number of landmarks nearest to a robot, which it will see next."""
 MOVED = 0.1
-"""Root of the mean square of how far they moved, in standard deviations."""
+"""Least root mean square of the landmarks' movements for a new prior, in standard deviations."""
 SURER = 0.8
-"""… or their variance has become this part of what it was."""
+"""… or their variance has fallen to this share."""
 
 
 @dataclass(frozen=True)
 class _Sent:
-    """The map that a robot was told of, and its nearest landmarks that it was told; since:
-    broadcasts since then.
+    """The map of a robot's last prior and the landmarks in it; since: the number of broadcasts
+    since.
     """
 
     blocks: LandmarkBlocks
@@ -36,7 +36,7 @@ class _Sent:
 
 
 class SentPriors:
-    """What each stream was told last. A function of the broadcasts before, not of the set."""
+    """The last prior of each stream; a function of the broadcasts before, not of the set."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -45,7 +45,7 @@ class SentPriors:
     def is_worth(
         self, stream: Stream, pose: Float[np.ndarray, "3"], blocks: LandmarkBlocks
     ) -> bool:
-        """Whether a prior at this pose in this map is to be sent; it counts as told then."""
+        """Whether to send a prior at this pose in this map; if so, it is noted as sent."""
         offsets = blocks.means - pose[:2]
         nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
         old = self._sent.get(stream)

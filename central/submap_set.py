@@ -1,8 +1,8 @@
 """The set of submaps: a union, so duplicates and any order of arrival change nothing.
 
 A submap is complete when the inter-robot measurements from it, of which it says how many there are,
-are here too. Admission is the ledger's gate: a submap whose measurements overlap another's, or that
-says something else under a name that is taken, is refused with its reason.
+are here too. Admission enforces law 1: a submap whose measurements overlap another's, or that
+differs from one with the same name, is refused with the reason.
 """
 
 from collections.abc import Mapping
@@ -19,9 +19,8 @@ class SubmapSet:
     """Submaps by stream and sequence, as they came; inter-robot measurements by stream, sequence,
     what and when.
 
-    used: the inter-robot measurement that each measurement of a stream went into, by (measurement,
-    teammate). chains: of each stream, as far as `chain` has found it; what is in a set stays there,
-    so it only grows.
+    used: the inter-robot factor of each measurement of a stream, by (measurement, teammate).
+    chains: the submaps of each stream without a gap, cached; they only grow.
     """
 
     streams: dict[Stream, dict[int, Submap]] = field(default_factory=dict)
@@ -32,7 +31,8 @@ class SubmapSet:
     chains: dict[Stream, list[Submap]] = field(default_factory=dict)
 
     def admit(self, submap: Submap) -> str | None:
-        """Take a submap; the reason if it is refused. One that is in the set already is accepted.
+        """Take a submap; returns the reason if it is refused. A submap of the set is accepted
+        again.
 
         The nearest ones in sequence bound the measurements: law 1 says that each is used once.
         """
@@ -64,8 +64,8 @@ class SubmapSet:
         return None
 
     def admit_sighting(self, sighting: SightingFactor) -> str | None:
-        """Take an inter-robot measurement; the reason if it is refused. Law 1: each look is used
-        once.
+        """Take an inter-robot factor; returns the reason if it is refused: law 1, each
+        measurement once.
         """
         stream, teammate = (sighting.robot, sighting.incarnation), sighting.teammate
         from_submap = self.seen.setdefault(stream, {}).setdefault(sighting.sequence, {})
@@ -95,7 +95,7 @@ class SubmapSet:
         return list(self._chain(stream))
 
     def count(self, stream: Stream) -> int:
-        """How many submaps from sequence 0 on are there without a gap."""
+        """Number of submaps from sequence 0 on without a gap."""
         return len(self._chain(stream))
 
     def _chain(self, stream: Stream) -> list[Submap]:
@@ -108,7 +108,7 @@ class SubmapSet:
         return chain
 
     def missing(self) -> tuple[VersionEntry, ...]:
-        """Of every stream that holds more than its chain, the submap that this waits for."""
+        """The missing submap that each stream with later ones waits for."""
         gaps = []
         for (robot, incarnation), found in sorted(self.streams.items()):
             first = self.count((robot, incarnation))

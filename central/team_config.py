@@ -1,4 +1,4 @@
-"""What a team is told before it starts: its robots, its centre, and what they have in common."""
+"""The configuration of a team: its robots, its centre, and what they have in common."""
 
 from typing import Annotated
 
@@ -13,11 +13,11 @@ KeyChunk = Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{1,64}$")]
 
 
 class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """A team without its world: every robot and the centre carry the seed, estimator and rule.
+    """A scenario without its world: every robot and the centre have the seed, estimator and rule.
 
     name: of the scenario. team: the chunk of the keys `team/<team>/…` that keeps two teams on one
-    network apart. exchange: with "rendezvous" a robot sends its submaps only when it sees a
-    teammate or is seen. peers: every robot keeps the team's set and folds it by itself
+    network apart. exchange: with "rendezvous" a robot sends its submaps only when it observes a
+    teammate or is observed. peers: every robot keeps the team's set and folds it by itself
     (docs/without_a_centre.md). centre: whether there is a central computer; without one, robots are
     peers. Fields that only a world has are ignored when one is decoded.
     """

@@ -1,10 +1,10 @@
-"""Which robot contradicts the rest beyond doubt, so that the team goes on without it.
+"""Finds the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
 A robot's disagreement is the median over its submaps of χ²/dof at the joint estimate: near or below
-1 for a robot whose covariances are true, whatever a few of its submaps say. One robot that is wrong
-bends the map and makes others disagree too, so it is found by leaving out: it goes only if without
-it the rest agree among themselves; and with one other robot left only if it contradicts itself when
-it is alone, since two that disagree do not say which of them is wrong.
+1 for a robot whose covariances are right, whatever a few of its submaps are. One wrong robot
+distorts the map and makes others disagree, too. So it is found by leaving out: a robot is withdrawn
+only if the rest agree without it; where only one other robot is left, only if it contradicts itself
+when alone, since of two that disagree either may be wrong.
 """
 
 from collections.abc import Callable, Collection
@@ -13,11 +13,11 @@ from statistics import median
 from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
-"""A robot is judged by so many submaps or more."""
+"""Least number of submaps of a robot for it to be judged."""
 AGREEING = 0.5
-"""The rest agree if nobody's disagreement is above this part of the limit."""
+"""The rest agree if no disagreement is above this share of the limit."""
 TRIED = 3
-"""Robots that are left out for a trial at the most, the most suspect first."""
+"""Most robots that are left out for a trial, the most suspect first."""
 
 Without = Callable[[Collection[str]], Agreement | None]
 """The agreement of the team without some robots; None: nothing is left."""
@@ -40,7 +40,7 @@ def suspects(agreement: Agreement, limit: float) -> list[str]:
 
 
 def convicted(agreement: Agreement, limit: float, without: Without) -> tuple[str, str] | None:
-    """The robot that is wrong beyond doubt and why, in words; None if there is no such."""
+    """The robot that is wrong beyond chance, and why, in words; None if there is none."""
     found = disagreement(agreement)
     verdicts = []
     for robot in suspects(agreement, limit)[:TRIED]:

@@ -1,11 +1,11 @@
-"""What a centre that is started again believes of withdrawals that robots say they have heard.
+"""Decides which withdrawals a centre that is started again believes, from what robots report.
 
-An order lives in the cache of who gave it: an operator's command ends at once, and a centre that
-died has lost its own. The robots repeat what they heard, each under its own key, and one that lies
-must not be able to withdraw a teammate. So an order is believed from the robot that it withdraws,
-or from two others at the least, if they are more than half of all others. Hence, where only one
-other robot is left to say it (a team of two whose withdrawn robot has gone), the operator has to
-repeat the order: what is not believed is named.
+An order is in the cache of its author: an operator's command ends at once, and a centre that died
+has lost its own orders. The robots repeat the orders that they have received, each under its own
+key, and a lying robot must not be able to withdraw a teammate. So an order is believed from the
+withdrawn robot itself, or from two other robots at least that are more than half of all others.
+Where only one other robot is left (a team of two whose withdrawn robot has gone), the operator has
+to repeat the order; orders that are not believed are named.
 """
 
 from collections.abc import Sequence
@@ -13,22 +13,24 @@ from collections.abc import Sequence
 from team.wire import messages as m
 
 LEAST_WITNESSES = 2
-"""Robots that say the same of another one: nobody withdraws a teammate alone."""
+"""Least number of other robots that report an order: no robot withdraws a teammate alone."""
 
 
 class WithdrawalWitnesses:
-    """Who has said what about whose withdrawal."""
+    """The reports of robots about each withdrawal."""
 
     def __init__(self, robots: Sequence[str]) -> None:
         self._robots = frozenset(robots)
         self._said: dict[str, dict[str, m.WithdrawalHeard]] = {}
 
     def admit(self, robot: str) -> None:
-        """From now on the robot is in the team."""
+        """Add a robot to the team."""
         self._robots |= {robot}
 
     def take(self, heard: m.WithdrawalHeard) -> m.Withdrawal | None:
-        """The order, once it is to be believed; strangers are not listened to."""
+        """Take a report; returns the order once it is believed. Reports of strangers are
+        ignored.
+        """
         if not {heard.robot, heard.withdrawn} <= self._robots:
             return None
         self._said.setdefault(heard.withdrawn, {})[heard.robot] = heard
@@ -46,7 +48,9 @@ class WithdrawalWitnesses:
         )
 
     def unconfirmed(self, withdrawn: Sequence[str]) -> tuple[str, ...]:
-        """What is not believed and not known otherwise, in words, with the remedy."""
+        """The reported orders that are not believed and not known otherwise, in words, with the
+        remedy.
+        """
         return tuple(
             f"{', '.join(sorted(said))} heard that {robot} is withdrawn, too few to be believed: "
             f"if it is, order it again by `teamslam withdraw {robot}`"

@@ -2,8 +2,9 @@
 maps.
 
 A submap names its interval of measurements, a map its version vector. Which measurements of an
-interval a robot rejected, and why, its node says when it consumes the recorded measurements again.
-Of measurements behind a robot's last submap those that it had consumed are open, the others lost.
+interval a robot rejected, and why, is found by its node, which consumes the recorded measurements
+again. Of measurements behind a robot's last submap those that it had consumed are open, the others
+lost.
 """
 
 from collections import Counter
@@ -21,15 +22,16 @@ IN_SUBMAP = "in a submap"
 OPEN = "open"
 LOST = "lost"
 MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
-"""Measurements that are missing need memory too: so many, or so many times those that are there."""
+"""Limits on missing measurements, which need memory, too: this many, or this many times those
+that are there."""
 SubmapName = tuple[str, int, int]
 """(robot, incarnation, sequence)."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What became of one measurement; `submap`: the sequence of the submap whose interval holds
-    it.
+    """The disposition of one measurement; `submap`: the sequence of the submap whose interval
+    holds it.
     """
 
     disposition: str
@@ -38,7 +40,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Ledger:
-    """Every measurement's entry by stream and counter, every submap's maps, and what is wrong.
+    """Every measurement's entry by stream and counter, every submap's maps, and the violations.
 
     maps: the digests of the maps that used a submap, in the order of the log. withdrawn: the robots
     that the last map goes without; what is in their submaps is in no map any more.
@@ -51,7 +53,7 @@ class Ledger:
 
     @property
     def measurements(self) -> int:
-        """The measurements of all robots."""
+        """Number of measurements of all robots."""
         return sum(len(entries) for entries in self.entries.values())
 
     def totals(self, robot: str | None = None) -> dict[str, int]:
@@ -104,7 +106,7 @@ class Ledger:
 
 
 def ledger(log: Recorded) -> Ledger:
-    """The ledger of a log; raises RerunError where a robot's configuration is missing."""
+    """Compute the ledger of a log. Raises RerunError where a robot's configuration is missing."""
     offenders = [f"{_named(r)} is in the log twice, and not the same" for r in log.contradicted]
     streams = sorted(log.measurements.keys() | log.submaps().keys())
     entries = {}
@@ -117,7 +119,7 @@ def ledger(log: Recorded) -> Ledger:
 
 
 def _withdrawn(log: Recorded) -> tuple[str, ...]:
-    """By the last map's word."""
+    """The robots withdrawn in the last map."""
     last = next(iter(reversed((*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)))), None)
     return last.withdrawn if isinstance(last, m.FusedMap) else ()
 
@@ -130,7 +132,7 @@ def _named(measurement: m.Measurement) -> str:
 
 
 def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
-    """The stream's submaps by sequence, each once; which of them contradict one another."""
+    """The stream's submaps by sequence, each once, and those that contradict one another."""
     robot, incarnation = stream
     found: dict[int, m.Submap] = {}
     wrong = []
@@ -146,7 +148,7 @@ def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]
 def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
-    """The entry of every measurement that there is or should be; the offenders among them."""
+    """The entry of every measurement that is there or should be, and the violations among them."""
     robot, incarnation = stream
     measurements = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
@@ -188,10 +190,9 @@ def _entries(
 
 
 def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -> Iterator[str]:
-    """Where a robot's last word on an incarnation differs from what the log gives.
+    """Where a robot's `Done` differs from the ledger of the log.
 
-    A robot that was resumed counts all measurements before as in submaps, so its sum only can
-    differ.
+    A resumed robot counts all earlier measurements as in submaps, so only its sum can differ.
     """
     for done in log.of(ch.ROBOT_DONE):
         if not isinstance(done, m.Done) or (done.robot, done.incarnation) != stream:
@@ -212,7 +213,7 @@ def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -
 
 
 def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
-    """Which maps used each submap; which use one that is not there, or one twice."""
+    """The maps that used each submap, and those that use a missing one, or one twice."""
     users: dict[SubmapName, list[str]] = {
         (s.robot, s.incarnation, s.sequence): []
         for s in log.of(ch.SUBMAP)

@@ -1,4 +1,4 @@
-"""Smoothed paths at the rate of keyframes: from a log's final map and its measurements.
+"""Computes smoothed paths at the rate of keyframes, from a log's final map and its measurements.
 
 The final map has each robot's poses at the ends of its submaps. Between them the robot's windows
 are computed again from the recorded measurements, and each window's path is placed between its two
@@ -39,7 +39,7 @@ class SmoothedPath:
 def smoothed_paths(
     found: Recorded, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, SmoothedPath]:
-    """The path of every robot that is in the final map; `progress` hears each robot's name."""
+    """The path of every robot in the final map; `progress` is called with each robot's name."""
     last: dict[tuple[str, int], m.Trajectory] = {}
     for message in found.of(ch.TRAJECTORY):
         if isinstance(message, m.Trajectory):

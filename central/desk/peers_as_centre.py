@@ -1,8 +1,8 @@
-"""A team without a centre as its desk looks at it: what peers say of the team's map, as a centre's.
+"""Presents a team without a centre to the desk: peers' messages about the map, as a centre's.
 
-The running maps are those of one peer, the first that speaks; the final one is anybody's, since
-they are the same; a prior and a smoothed path are their own robot's. While a centre speaks for
-itself nobody speaks in its place; when it has gone, a peer does.
+The running maps are those of one peer, the first that publishes one; the final map is any peer's,
+since all are equal; a prior and a smoothed path are their own robot's. While there is a centre, its
+own messages are used; when it has gone, a peer's.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,21 +25,22 @@ _AS = {
     ch.TEAM_TRAJECTORY.name: ch.TRAJECTORY,
 }
 LISTENS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY)
-"""The channels that are heard so."""
+"""The peers' channels that are presented in this way."""
 _FOLD = "fold."
 _LAST = (ch.TEAM_FINAL, ch.TEAM_TRAJECTORY)
-"""What counts for the team unless a centre has said it: one that comes back late may lack some."""
+"""Messages that count for the team unless a centre has published them; one that comes back late
+may not."""
 
 
 class PeersAsCentre:
-    """Gives samples a centre's key, one after the other."""
+    """Renames samples of peers to a centre's keys, one after the other."""
 
     def __init__(self) -> None:
         self._centre = self._concluded = False
         self._robot: str | None = None
 
     def of(self, sample: Sample) -> Sample | None:
-        """The sample as a centre would have said it; None: nothing of the kind."""
+        """The sample as a centre would have published it; None where it has no counterpart."""
         if sample.key in _CENTRE:
             self._centre = True
             self._concluded = self._concluded or sample.key == ch.FINAL_MAP.key()
@@ -70,7 +71,7 @@ class PeersAsCentre:
         return replace(sample, payload=encoded(said))
 
     def _status(self, sample: Sample, node: str) -> Sample | None:
-        """What the voice says of its fold, as a centre's status."""
+        """The status of the peer's fold as a centre's status."""
         if self._robot is None or node != ch.robot_node(self._robot):
             return None
         try:
@@ -96,7 +97,7 @@ def _is_alive(token: Sample) -> bool:
 
 
 def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:
-    """The samples, and behind each what it says in a centre's place."""
+    """The samples, each followed by its counterpart in a centre's name."""
     for sample in samples:
         yield sample
         said = centre.of(sample)

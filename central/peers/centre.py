@@ -1,7 +1,7 @@
-"""A centre among peers: one that has no estimator, and keeps and folds the set as they do.
+"""A centre among peers: it has no estimator, and keeps and folds the team's set as they do.
 
-It may come when it likes, go, and come back: nobody waits for it, and what it lacks it asks of
-whoever has it. What it says are a centre's maps; peers do not need them.
+It may join, leave and come back at any time: nobody waits for it, and it requests what it lacks
+from any peer. It publishes a centre's maps; peers do not need them.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from team.wire.bus import Outgoing
 
 
 class PeerCentre(Peer):
-    """The centre's peer: `begin`, then `handle_sample` and `tick`, until `finished`."""
+    """The centre's peer: call `begin`, then `handle_sample` and `tick`, until `finished`."""
 
     def __init__(
         self, central: CentralConfig, robots: Sequence[str], signer: Signs | None = None
@@ -26,7 +26,7 @@ class PeerCentre(Peer):
         super().__init__(CENTRE, central, robots, proofs=proofs)
 
     def begin(self) -> list[Outgoing]:
-        """What it says first: its configuration."""
+        """The first messages: its configuration."""
         return self.fold.centre.begin()
 
     def _of_fold(self, said: Sequence[Outgoing]) -> list[Outgoing]:
@@ -34,7 +34,7 @@ class PeerCentre(Peer):
         return [each for each in said if each.channel is not ch.CENTRAL_PROGRESS]
 
     def status(self) -> m.Status:
-        """A centre's status with how much of the set is here."""
+        """A centre's status, with how much of the set is here."""
         own = self.fold.centre.status()
         faults = (*self.boundary.warnings, *self.fold.boundary.warnings)
         figures = {**own.figures, **self.set_figures()}

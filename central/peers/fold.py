@@ -1,8 +1,8 @@
 """A peer's own fold: the centre's node, fed from the peer's set instead of from the network.
 
-So its maps are the centre's, byte for byte, wherever the set is the same. A set that has changed
-in what was folded already (somebody contradicted himself), or that grows behind the final map, is
-folded anew.
+So its maps are the centre's, byte for byte, wherever the set is the same. The fold begins anew
+where a folded member changes (a robot has contradicted itself), or where the set grows after the
+final map.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from team.wire.codec import encoded
 from team.wire.newer import further, later_end, later_head
 
 FoldWhen = Literal["always", "request", "end"]
-"""When a peer folds: as the set grows; when asked to, and when all is there; or only then."""
+"""When a peer folds: as the set grows; on request and once the set is complete; or only then."""
 
 
 class PeerFold:
@@ -64,7 +64,7 @@ class PeerFold:
             self._give(said)
 
     def note(self, message: m.Message) -> list[Outgoing]:
-        """Take what is no member: progress, liveliness, the end of the streams."""
+        """Take a message that is no member: progress, liveliness, the end of the streams."""
         refused = self.centre.refusal(message)
         if refused is None and not self._kept(message):
             return []
@@ -73,7 +73,9 @@ class PeerFold:
         return [*self._give(message), *self.grow()]
 
     def _kept(self, message: m.Message) -> bool:
-        """Keep for a fold that begins anew what no later word takes back; whether it is of use."""
+        """Keep a message for a fold that begins anew, unless a later one replaces it; returns
+        whether it was of use.
+        """
         match message:
             case m.End():
                 self._end = later_end(message, self._end)
@@ -94,7 +96,9 @@ class PeerFold:
         return True
 
     def _end_by_others(self) -> list[Outgoing]:
-        """Who missed the word that all streams have ended knows it from others' conclusions."""
+        """Infer from other peers' conclusions that all streams have ended, where the message was
+        missed.
+        """
         stated = self._peer.replica.statements
         here = [r for r in stated if not {("given_up", 0), ("withdrawal", 0)} & stated[r].keys()]
         if self._end is not None or not here:
@@ -113,7 +117,7 @@ class PeerFold:
         return self._give(self._end)
 
     def grow(self) -> list[Outgoing]:
-        """Fold what the set has more; what there is to say of it."""
+        """Fold the new members of the set; returns the messages to publish."""
         if self._waits:
             if not self._whole:
                 return []
@@ -132,7 +136,7 @@ class PeerFold:
         return out
 
     def ask(self) -> list[Outgoing]:
-        """Fold what is here now, whatever was waited for; what there is to say of it."""
+        """Fold what is here now, without waiting; returns the messages to publish."""
         if self._when == "end" and self._waits:
             return []
         waits, self._waits = self._waits, False
@@ -141,7 +145,7 @@ class PeerFold:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of all that is here, if the last one lacks something."""
+        """A map of everything that is here, if the last one lacks something."""
         return [] if self._waits else self.centre.refresh()
 
     def _give(self, message: m.Message) -> list[Outgoing]:
@@ -154,7 +158,7 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        """Everything that anyone has said he has sent is here, as far as is known."""
+        """Whether everything that any node has announced is here."""
         if self._end is None:
             return False
         replica = self._peer.replica
@@ -170,7 +174,7 @@ class PeerFold:
         return True
 
     def conclusion(self, robot: str) -> m.Concluded | None:
-        """What a robot's peer says of its final map."""
+        """The `Concluded` message of a robot's peer about its final map."""
         final = self.final
         if final is None:
             return None

@@ -1,1 +1,1 @@
-"""What a run was worth, from its log alone."""
+"""Evaluates a run from its log alone."""

@@ -1,8 +1,8 @@
-"""How landmarks without names were told apart, scored by labels that no estimator has seen.
+"""Scores data association by labels that no estimator has seen.
 
-A landmark's label is that of the majority of its *labelled* detections; what nobody has labelled
-says nothing for or against. Pairs are counted by detections: two of one label in one landmark are a
-right pair, two of one label in two landmarks a missed one, two of two labels in one a wrong one.
+A landmark's label is that of the majority of its *labelled* detections; unlabelled detections do
+not count. Pairs are counted by detections: two of one label in one landmark are a right pair, two
+of one label in two landmarks a missed one, two of two labels in one a wrong one.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,13 +34,13 @@ class Pairs:
 
     @property
     def precision(self) -> float | None:
-        """Of the pairs that were said to be one, those that are."""
+        """Of the pairs that were associated, the share that is right."""
         said = self.right + self.wrong
         return self.right / said if said else None
 
     @property
     def recall(self) -> float | None:
-        """Of the pairs that are one, those that were said to be."""
+        """Of the pairs of one label, the share that was associated."""
         real = self.right + self.missed
         return self.right / real if real else None
 
@@ -58,7 +58,7 @@ class Pairs:
 
 @dataclass(frozen=True, kw_only=True)
 class AssociationResult:
-    """All of a run: between all its detections, inside windows, and of the map.
+    """The scores of a run: between all its detections, inside windows, and of the map.
 
     label_of: of each of the map's unnamed landmarks, its label; UNKNOWN where nobody knows.
     duplicates: landmarks beyond the first of a label; confirmed: among those of two submaps or
@@ -82,7 +82,7 @@ class AssociationResult:
 
 
 def association_result(log: Collected) -> AssociationResult | None:
-    """The scores of a run; None where nothing was told without an identity, or nobody labelled."""
+    """The scores of a run; None where all detections had identities, or none was labelled."""
     labels = _labels(log)
     if not labels:
         return None
@@ -147,7 +147,7 @@ def association_json(result: AssociationResult) -> dict[str, object]:
 
 
 def _robots(log: Collected, channel: ch.Channel) -> list[str]:
-    """Of whom there is something on a channel."""
+    """The robots with messages on a channel."""
     return sorted(name for key in log.kept if (name := channel.owner(key)) is not None)
 
 

@@ -32,7 +32,7 @@ SMALL_TURN = 1e-6
 class PoseErrors:
     """Estimate − truth of the K poses that have truth, in (x [m], y [m], theta [rad]).
 
-    sigmas: what the estimator says of each. nees: eᵀ P⁻¹ e, 3 degrees of freedom each.
+    sigmas: the estimator's standard deviations. nees: eᵀ P⁻¹ e, 3 degrees of freedom each.
     motion_nees: the same of the rigid motion of the frame that carries the estimate to the truth.
     """
 

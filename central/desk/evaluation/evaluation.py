@@ -1,4 +1,4 @@
-"""What a run was worth: every figure from the samples of its log alone, against the truth in it.
+"""Evaluates a run: every figure from the samples of its log alone, against the truth in it.
 
 A figure that can not be computed (no truth, no such message) is None. Errors are in metres and
 radians; NEES is per degree of freedom, 1 where the covariance is right.
@@ -59,8 +59,8 @@ class MapResult:
 
     truth: the true positions, rows without truth zero; known: which rows have it. errors: of those.
     payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
-    covariance_scale: how many times the submaps' covariances ought to be taken; None: not known.
-    withdrawn: the robots that the map goes without. lost: those that are not wholly in it.
+    covariance_scale: the factor by which the submaps' covariances should be multiplied; None:
+    unknown. withdrawn: robots left out of the map. lost: robots that are not completely in it.
     gospa: of all landmarks against all true ones, after truth_from_map; None without it.
     """
 
@@ -86,10 +86,10 @@ class MapResult:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotResult:
-    """One robot: its stream, what became of it, and its poses against the truth.
+    """One robot: its measurements, their dispositions, and its poses against the truth.
 
-    smoothed: the final map's poses at the ends of the submaps. online: what the robot said when it
-    was there, given the team's map (`online_channel`: "team/pose"), or from its own measurements
+    smoothed: the final map's poses at the ends of the submaps. online: the poses that the robot
+    published, given the team's map (`online_channel`: "team/pose"), or by its own measurements
     alone where it never had that. aligned_rmse_m: of the smoothed positions after the rigid motion
     that aligns the map (`alignment`: "map"), or else their own ("trajectory");
     online_aligned_rmse_m: of the online ones after the map's. own_map: of the robot's last own map,
@@ -121,11 +121,11 @@ class RobotResult:
 class Evaluation:
     """A run: its scenario (None: the log does not say), its map, its robots and its traffic.
 
-    true_landmarks: all of them, seen or not. notes: what the world had to say of its data, and what
-    each node set aside. faults: how many messages were.
-    unsound: samples that are no sound message. arbitrary_frame: no robot knew its initial pose, so
-    the map's frame is not the truth's, and only aligned errors mean something. decisions: closures
-    and merges by landmarks without names, as the final map says.
+    true_landmarks: all of them, measured or not. notes: the world's remarks on its data, and
+    messages set aside. faults: number of messages set aside. unsound: number of invalid samples.
+    arbitrary_frame: no robot knew its initial pose, so the map's frame is not the truth's, and only
+    aligned errors mean something. decisions: closures and merges by landmarks without identities,
+    from the final map.
     """
 
     scenario: TeamConfig | None
@@ -146,7 +146,7 @@ class Evaluation:
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
-    """The figures of one run, from its log's samples in the order of the log."""
+    """Compute the figures of one run, from its log's samples in the order of the log."""
     log = collected(samples)
     scenario = _scenario(log)
     truth = log.sound(log.last(ch.TRUTH_LANDMARKS))
@@ -208,13 +208,13 @@ def _is_arbitrary(log: Collected) -> bool:
 
 
 def _lost(fused: MapResult | None) -> list[str]:
-    """Of whom the final map has not all that it was to have."""
+    """The robots of which the final map lacks submaps."""
     lost = () if fused is None else fused.lost
     return [f"the final map is provisional: {robot} lost, and not wholly in it" for robot in lost]
 
 
 def _never_came(log: Collected) -> list[str]:
-    """Whose driver lacks messages that its robot had published, by the driver's last status."""
+    """The robots whose driver lacks messages that were published, by the driver's last status."""
     said = []
     for robot in log.robots:
         status = log.sound(log.latest.get(ch.STATUS.key(ch.source_node(robot))))
@@ -229,7 +229,7 @@ def _never_came(log: Collected) -> list[str]:
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
-    """What each node set aside, and the first that raised, in words."""
+    """What each node set aside, and the first exception, in words."""
     by_node: dict[str, list[m.Fault]] = {}
     for fault in faults:
         by_node.setdefault(fault.node, []).append(fault)
@@ -241,7 +241,7 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
 
 
 def _by_robot(log: Collected, name: str) -> dict[str, float]:
-    """The centre's last word on each robot's figure of this name."""
+    """The last values of the centre's figure of this name, by robot."""
     status = log.sound(log.latest.get(ch.STATUS.key("central")))
     if not isinstance(status, m.Status):
         return {}
@@ -249,7 +249,7 @@ def _by_robot(log: Collected, name: str) -> dict[str, float]:
 
 
 def with_holes(evaluation: Evaluation, log: Log) -> Evaluation:
-    """The evaluation with a note for everything that its log lacks."""
+    """The evaluation with a note for every gap of its log."""
     lost = tuple(f"the log is not whole, {finding}" for finding in holes(log))
     return replace(evaluation, notes=(*evaluation.notes, *lost))
 
@@ -352,7 +352,7 @@ def _scenario(log: Collected) -> TeamConfig | None:
 
 
 def _uplink(team: TeamConfig) -> tuple[ch.Channel, ...] | None:
-    """The channels that the team's rule consumes; None for a pair that no team can have."""
+    """The channels that the team's rule consumes; None for an impossible pair."""
     named = PAIRS.get((team.estimator, team.fusion))
     return None if named is None else UPLINK[named]
 

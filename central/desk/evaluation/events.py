@@ -1,4 +1,6 @@
-"""What happens to a team, in words: who joined, was lost, was refused, and what nodes warn of."""
+"""Detects the events of a team, in words: robots that join, are lost or refused, and nodes'
+warnings.
+"""
 
 import re
 from dataclasses import dataclass, field
@@ -21,7 +23,7 @@ Kind = Literal[
     "done",
 ]
 MOST = 2000
-"""Events of a run that are kept; a node that warns anew every second says no more by then."""
+"""Most events of a run; a node with a new warning every second stays below it."""
 FIRST = 1
 """The incarnation with which every stream begins."""
 _NUMBER = re.compile(r"\d+\.\d+")
@@ -31,12 +33,12 @@ _AWAITED = (
     "no measurements of this team yet",
     "no measurements of this team yet",
 )
-"""Nobody is there at once: that is no event."""
+"""States of a node at its start, which are no events."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened: team time [ns], of which kind, to which node, in words."""
+    """An event: team time [ns], kind, node, and a description."""
 
     stamp_ns: int
     kind: Kind
@@ -51,7 +53,7 @@ class Event:
 
 @dataclass
 class EventDetector:
-    """Turns the messages of a run, in their order, into events; each is told once."""
+    """Turns the messages of a run, in their order, into events, each once."""
 
     _alive: dict[str, bool] = field(default_factory=dict)
     _incarnations: dict[str, int] = field(default_factory=dict)
@@ -112,7 +114,7 @@ class EventDetector:
         return [Event(now_ns, "lost", node, f"{name} was lost")]
 
     def _configured(self, message: m.Configuration, now_ns: int) -> list[Event]:
-        """A robot announces its configuration once per life of its process."""
+        """A robot's announced configuration, once per process."""
         if self._alive.get(message.node) is not False or not message.node.startswith("robot/"):
             return []
         name = message.node.removeprefix("robot/")
@@ -127,7 +129,7 @@ class EventDetector:
         return [Event(now_ns, "restarted", robot_node(start.robot), text)]
 
     def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
-        """What a map says of who is in it, where that changes."""
+        """Changes in the robots that a map contains."""
         members = {member.robot for member in fused.members}
         events = [
             Event(now_ns, "map", robot_node(robot), f"{robot} is in the team's map")
@@ -156,7 +158,7 @@ class EventDetector:
         return events
 
     def _decisions(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
-        """Closures and merges by maps that are accepted or undone, once each; not what waits."""
+        """Closures and merges that are accepted or undone, each once; not the waiting ones."""
         events = []
         for each in fused.decisions:
             name = (each.stamp_ns, each.kind, each.about)
@@ -168,7 +170,7 @@ class EventDetector:
         return events
 
     def _status(self, status: m.Status, now_ns: int) -> list[Event]:
-        """A warning once, whatever the decimals in it; that someone is awaited is none."""
+        """A warning, once whatever its decimals; that a node is awaited is no event."""
         events = []
         refused = int(status.figures.get("refused", 0.0))
         if refused > self._refused and status.node == "central":
@@ -200,5 +202,5 @@ def decision_words(decision: m.AssociationDecision) -> str:
 
 
 def without_decimals(text: str) -> str:
-    """The text without its decimals: the same finding with other figures is nothing new."""
+    """The text without decimals: the same finding with other figures is no new event."""
     return _NUMBER.sub("#", text)

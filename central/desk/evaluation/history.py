@@ -1,7 +1,7 @@
 """A run over its team time: consistency, traffic, latency and events, from one pass over its log.
 
-`evaluation` says what a run was worth in the end; this is how it came to that. Nothing is kept of a
-message but the numbers that are shown: some tens of bytes a message.
+`evaluation` has the figures at the end, this module their history. Of each message only the plotted
+numbers are kept, some tens of bytes.
 """
 
 from array import array
@@ -68,7 +68,7 @@ class Latencies:
 
 @dataclass(frozen=True)
 class Traffic:
-    """One key's messages: team time [ns] and payload bytes of each."""
+    """The messages of one key: team time [ns] and payload bytes of each."""
 
     stamps_ns: Int64[np.ndarray, " n"]
     sizes: Int64[np.ndarray, " n"]
@@ -76,11 +76,11 @@ class Traffic:
 
 @dataclass(frozen=True, kw_only=True)
 class History:
-    """What happened in a run, by team time.
+    """The history of a run, by team time.
 
-    start_ns, end_ns: the span of the measurements, of everything where there are none. map_nees: of
-    every fused map, NEES per dof of its landmarks in their own blocks; empty without truth.
-    map_cost: of every fused map; robot_cost: as the centre's status gave it.
+    start_ns, end_ns: the span of the measurements, or of everything where there are none. map_nees:
+    of every fused map, NEES per dof of its landmarks in their own blocks; empty without truth.
+    map_cost: of every fused map; robot_cost: from the centre's status.
     """
 
     start_ns: int
@@ -143,7 +143,7 @@ class _Clocks:
 
 @dataclass
 class _Submap:
-    """A submap that no map has used yet: who waits for it."""
+    """A submap that no map has used yet, with the clocks of its measurements."""
 
     end_ns: int
     first_measurement: int
@@ -178,7 +178,7 @@ class _Gathering:
         self.hear(sample, channel)
 
     def hear(self, sample: Sample, channel: ch.Channel | None) -> None:
-        """What is said in a message, whatever it takes to carry it."""
+        """Take what a message contains, whatever its channel."""
         if channel not in _LOOKED_AT:
             return
         try:
@@ -271,7 +271,7 @@ def history(samples: Iterable[Sample]) -> History:
 
 
 def _innovations(of: list[m.Innovation]) -> Innovations:
-    """By window, each once: a robot that was resumed says some of them again."""
+    """The innovations by window, each once: a resumed robot repeats some of them."""
     once = {(each.incarnation, each.sequence): each for each in of}
     kept = [once[name] for name in sorted(once)]
     return Innovations(

@@ -1,7 +1,7 @@
 """One pass over a log's samples: what an evaluation needs of them, and no more.
 
 Most of a log is sensor measurements; of those only the head (robot, incarnation, measurement) is
-decoded, to be counted. Everything else that matters goes through the one door, `opened`.
+decoded, to be counted. All other messages are decoded and checked by `opened`.
 """
 
 from collections import defaultdict
@@ -82,7 +82,7 @@ class Measurements:
 
 @dataclass
 class Collected:
-    """What a log holds, by channel and robot; `kept` still as payloads, decoded when asked for.
+    """The contents of a log, by channel and robot; `kept` as payloads that are decoded on demand.
 
     first_ns: the wall clock of the first sample that has one. unsound: samples
     that are no sound message of their channel; they count as traffic only.
@@ -119,13 +119,13 @@ class Collected:
         return found
 
     def faults(self) -> list[m.Fault]:
-        """What any node set aside, in the order of the nodes."""
+        """The faults of all nodes, in the order of the nodes."""
         keys = sorted(key for key in self.kept if ch.FAULT.owner(key) is not None)
         found = (self.sound(sample) for key in keys for sample in self.kept[key])
         return [fault for fault in found if isinstance(fault, m.Fault)]
 
     def sound(self, sample: Sample | None) -> m.Message | None:
-        """The sample's message; None, and counted, if it is not sound."""
+        """The sample's message; None, and counted as unsound, if it is invalid."""
         if sample is None:
             return None
         try:
@@ -135,7 +135,7 @@ class Collected:
             return None
 
     def take(self, sample: Sample, channel: str, robot: str) -> None:
-        """Count one sample and keep of it what its channel (by name) asks for."""
+        """Count a sample, and keep what its channel asks for."""
         if self.first_ns is None and sample.wall_ns:
             self.first_ns = sample.wall_ns
         traffic = self.traffic[sample.key]
@@ -149,7 +149,9 @@ class Collected:
             self._keep(sample, channel)
 
     def keep(self, sample: Sample) -> None:
-        """Keep what somebody said for the centre; the traffic is his."""
+        """Keep a message that a peer has published in the centre's place; the traffic is the
+        peer's.
+        """
         found = channel_of(sample.key)
         if found is not None:
             self._keep(sample, found[0].name)
@@ -172,7 +174,7 @@ class Collected:
 
 
 def collected(samples: Iterable[Sample]) -> Collected:
-    """What the samples of a log hold."""
+    """Collect the contents of a log from its samples."""
     found = Collected()
     centre = PeersAsCentre()
     channels: dict[str, tuple[str, str]] = {}

@@ -1,4 +1,4 @@
-"""What a log says of peers: each one's final map, when it was there, and what the set has cost."""
+"""The peers of a log: each one's final map, when it was there, and the traffic of the set."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,12 +12,12 @@ _OF, _OVER, _OVER_BYTES = "set_submaps.", "set_over.", "set_over_bytes."
 
 @dataclass(frozen=True, kw_only=True)
 class PeerResult:
-    """One peer's end, by its own word.
+    """The conclusion of one peer, as it has announced it.
 
     complete_at_s: wall time from the log's beginning to its final map. uplink, downlink: bytes of
-    the set's talk that it said, each once, and heard. have: submaps of each robot. over: members
-    that were news, by the node over which they came. agrees: other peers whose last summary was of
-    the same set.
+    the set's messages that it published, each once, and received. have: submaps of each robot.
+    over: new members, by the node over which they came. agrees: other peers whose last summary was
+    of the same set.
     """
 
     final_map_sha256: str | None
@@ -31,7 +31,7 @@ class PeerResult:
 
 
 def peer_results(log: Collected) -> dict[str, PeerResult]:
-    """Of every robot that says anything of a set."""
+    """The result of every robot that has a copy of the set."""
     found = {}
     for robot in log.robots:
         status = log.sound(log.latest.get(ch.STATUS.key(ch.robot_node(robot))))

@@ -1,4 +1,4 @@
-"""One robot in a log: its poses and its truth, and what became of its measurements."""
+"""One robot in a log: its poses, its truth, and the dispositions of its measurements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,11 +32,11 @@ class RobotLog:
 
 @dataclass(frozen=True)
 class Consumption:
-    """Measurements on the robot's sensor channels, and what the robot says became of them.
+    """Measurements on the robot's sensor channels, and their dispositions by the robot.
 
-    steps: odometry intervals. published: distinct measurements. consumed, ledger: the robot's last
-    word, None and empty where it never said that it was done. each_once: no measurement lies in two
-    submaps, and the ledger adds up to what was consumed.
+    steps: odometry intervals. published: distinct measurements. consumed, ledger: from the robot's
+    `Done`; None and empty without one. each_once: no measurement lies in two submaps, and the
+    ledger adds up to what was consumed.
     """
 
     steps: int
@@ -76,7 +76,7 @@ def robot_log(log: Collected, robot: str) -> RobotLog:
 
 
 def consumption(log: Collected, robot: str) -> Consumption:
-    """What became of one robot's measurements."""
+    """The measurements of one robot and their dispositions."""
     dones = {d.incarnation: d for d in log.messages(ch.ROBOT_DONE, robot) if isinstance(d, m.Done)}
     submaps = {
         (s.incarnation, s.sequence): s

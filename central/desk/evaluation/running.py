@@ -1,4 +1,4 @@
-"""Errors of running estimates against the truth, as soon as the truth is there."""
+"""Computes errors of running estimates against the truth as soon as that arrives."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -23,9 +23,9 @@ from team.wire.arrays import floats, stamps
 SPACING_NS = 100_000_000
 """Of the estimates that are compared."""
 WAITING = 4_096
-"""Poses of a robot that wait for their truth, at the most; the oldest are given up first."""
+"""Most poses of a robot that wait for their truth; the oldest are dropped first."""
 BATCHES = 20_000
-"""Batches of a robot's truth that are kept, the newest."""
+"""Most batches of a robot's truth that are kept, the newest."""
 
 
 class MapFit(NamedTuple):
@@ -39,7 +39,7 @@ class MapFit(NamedTuple):
 
     @property
     def landmarks(self) -> int:
-        """How many have truth."""
+        """Number of landmarks with truth."""
         return len(self.nees)
 
     @property
@@ -57,11 +57,11 @@ class TrueLandmarks:
 
     @classmethod
     def of(cls, message: m.TruthLandmarks) -> "TrueLandmarks":
-        """The landmarks that a world tells its evaluators."""
+        """The landmarks that a world publishes for evaluators."""
         return cls(*translate.landmarks_of(message))
 
     def known(self, ids: UInt32[np.ndarray, " L"]) -> Bool[np.ndarray, " L"]:
-        """Of which landmarks the truth is known."""
+        """Whether the truth of each landmark is known."""
         return np.isin(ids, self.ids)
 
     def at(self, ids: UInt32[np.ndarray, " L"]) -> Float[np.ndarray, "L 2"]:
@@ -90,7 +90,7 @@ class NeesTally:
     inside: int = 0
 
     def take(self, nees: Float[np.ndarray, " n"], dof: int) -> None:
-        """So many more, each of `dof` degrees of freedom."""
+        """Add squared errors, each of `dof` degrees of freedom."""
         self.nees_per_dof += float(nees.sum()) / dof
         self.count += len(nees)
         self.inside += int(np.count_nonzero(nees <= chi2_quantile(BAND, dof)))
@@ -141,7 +141,7 @@ class RunningErrors:
         self._poses.append((message.stamp_ns, pose, P))
 
     def known(self) -> PoseErrors | None:
-        """The errors of the poses that the truth has reached since the last time."""
+        """The errors of the poses that the truth has reached since the last call."""
         until = int(self._truth[-1].stamps_ns[-1]) if self._truth else None
         due = []
         while until is not None and self._poses and self._poses[0][0] <= until:
