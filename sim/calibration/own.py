@@ -28,6 +28,8 @@ LEAST_ROBOTS = 3
 LEAST_LANDMARKS = 4
 """Of fewer it is not known how far they differ."""
 BEYOND_DOUBT = 0.99
+COMMON_DOF = 2
+"""What robots have in common counts as seen in so many worlds more, as large as one's own."""
 BIAS_OF = {
     "bearing_offset": "bearing",
     "range_offset": "range_offset",
@@ -37,7 +39,9 @@ BIAS_OF = {
 
 
 class Own(NamedTuple):
-    """robots: figures of each robot's sensor, empty where all are alike; strays: s of each bias."""
+    """robots: figures of each robot's sensor, empty where all are alike; strays: s of each bias,
+    and σ of the range scale that all have in common.
+    """
 
     robots: Mapping[str, tuple[Figure, ...]]
     strays: tuple[Figure, ...]
@@ -49,12 +53,14 @@ NOTHING_OF_ITS_OWN = Own({}, ())
 def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
     """Each robot's own constants by the worlds (or by stretches of time where there are few)."""
     found: dict[str, list[Mapping[str, float]]] = {}
+    worlds: dict[str, list[str]] = {}
     for group in groups_of(data):
         try:
             values = constants(group, depth=depth).figures
         except CalibrationError:
             continue
         found.setdefault(group[0].robot, []).append(values)
+        worlds.setdefault(group[0].robot, []).append(group[0].name.rpartition(" ")[0])
     found = {robot: each for robot, each in sorted(found.items()) if len(each) > 1}
     if len(found) < LEAST_ROBOTS:
         return NOTHING_OF_ITS_OWN
@@ -77,6 +83,8 @@ def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
         if name in BIAS_OF:
             error = stray / np.sqrt(2.0 * dof[1])
             strays.append(Figure(f"bias_sigma.{BIAS_OF[name]}", stray, error, UNITS[name]))
+        if name == "range_scale":
+            strays.append(_in_common(parts, [worlds[robot] for robot in found], stray))
     if not differ:
         return NOTHING_OF_ITS_OWN
     return Own({robot: tuple(each) for robot, each in robots.items()}, tuple(strays))
@@ -86,6 +94,26 @@ def _within(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
     """The spread of a robot's values about their mean, by the median of |v − v̄| √(n/(n − 1))."""
     off = [np.abs(part - part.mean()) * np.sqrt(len(part) / (len(part) - 1)) for part in parts]
     return MAD_TO_SIGMA * float(np.median(np.concatenate(off)))
+
+
+def _in_common(
+    parts: Sequence[Float[np.ndarray, " n"]], worlds: Sequence[Sequence[str]], stray: float
+) -> Figure:
+    """How far the range scale of all robots strays together from one world to the next.
+
+    parts: each robot's values, in the worlds of these names.
+    """
+    off: dict[str, list[float]] = {}
+    for part, names in zip(parts, worlds, strict=True):
+        each_world = sorted({*names})
+        of = [part[[name == world for name in names]].mean() for world in each_world]
+        for world, value in zip(each_world, of - np.mean(of), strict=True):
+            off.setdefault(world, []).append(float(value))
+    together = np.array([np.median(each) for _, each in sorted(off.items())])
+    squares = float(np.sum((together - together.mean()) ** 2))
+    dof = COMMON_DOF + len(together) - 1
+    sigma = float(np.sqrt((COMMON_DOF * stray**2 + squares) / dof * (1.0 + 1.0 / len(together))))
+    return Figure("common_bias_sigma.range_scale", sigma, sigma / np.sqrt(2.0 * dof), "")
 
 
 def marker_spread(data: Sequence[Reference], *, depth: bool) -> Figure | None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.estimation.compiled import compiled
+from team.estimation.geometry import wrapped
 from team.estimation.map_joining.submap_factor import (
     biased_normal,
     poses_of,
@@ -19,6 +20,9 @@ Values = Float[np.ndarray, " _"]
 LARGEST_RATIO = 1.25
 """Of a landmark's distance in the joined map to the measured one, or its inverse: what differs by
 more is an outlier, whose covariance is not to grow with it."""
+LARGEST_TURN_RAD = 0.2
+"""Of a landmark's direction in the joined map to the measured one: more is an outlier's."""
+NO_POWER = -1
 
 
 class Factors(NamedTuple):
@@ -28,8 +32,8 @@ class Factors(NamedTuple):
     pose nodes by stamp, landmarks by id, biases. mean, information (P⁻¹, row-major) and sensitivity
     (a row per bias) lie likewise from mean_start, information_start and sensitivity_start on.
     block: each landmark's own covariance (xx, xy, yy), those of submap f from block_start[f] on.
-    of_range: of each row of the sensitivities, those of submap f from row_start[f] on, whether it
-    is by the scale of the ranges.
+    range_power: of each row of the sensitivities, those of submap f from row_start[f] on, the power
+    of a landmark's range with which it moves that landmark, along or across; NO_POWER: neither.
     """
 
     member: Indices
@@ -42,7 +46,7 @@ class Factors(NamedTuple):
     sensitivity_start: Indices
     block: Float[np.ndarray, "B 3"]
     block_start: Indices
-    of_range: Bool[np.ndarray, " R"]
+    range_power: Indices
     row_start: Indices
 
 
@@ -123,16 +127,25 @@ def _places(offset: Indices, nodes: Indices) -> Indices:
 
 
 @compiled
+def _turn_and_stretch(values: Values, i: int, j: int, c: float, s: float, stretch: float) -> None:
+    """In place: the two numbers at i and j are a point, which is turned and made longer."""
+    x, y = values[i], values[j]
+    values[i], values[j] = stretch * (c * x - s * y), stretch * (s * x + c * y)
+
+
+@compiled
 def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Factors:
     """The submaps as if their noise had been taken at the ranges of the joined map.
 
     Where the error of a range is proportional to the range, q is the distance that the state gives
     a landmark from where its submap saw it (the middle of the submap's poses), over the one that
-    the submap measured. Its errors are taken times q, P' = T P T with T = diag(1, …, q, q, …), and
-    so is its derivative by the scale of the ranges. At the measured distance d(1 + e) what came out
-    short weighs more, by (1 + e)⁻² (Peelle's puzzle), and in a scale b that is a state the noise e
-    meets itself: E[S e] = −d² σ². Both make maps smaller, the second by more the more submaps
-    there are.
+    the submap measured, and φ the angle between the two. Its errors are turned with it and taken
+    times q, P' = T P Tᵀ with T = blkdiag(1, …, q R(φ), …), and its derivatives by the sensor's
+    errors are those at the place that the map gives it: S' = qᵏ R(φ) S with k = 0 of an offset of
+    ranges, 1 of their scale. At the measured distance d(1 + e) what came out short weighs more, by
+    (1 + e)⁻² (Peelle's puzzle), and in a scale b that is a state the noise, e along and ε across,
+    meets itself: a map and all ranges that are smaller by s have χ² smaller by 2 s for each number
+    that was measured. Both make maps smaller, the second by more the more submaps there are.
     """
     information, block = factors.information.copy(), factors.block.copy()
     columns = factors.sensitivity.copy()
@@ -151,19 +164,32 @@ def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Fact
         first = factors.row_start[f]
         for landmark in range(landmarks):
             row, node = 3 * poses + 2 * landmark, at[1 + poses + landmark]
-            own = math.hypot(mean[row] - x, mean[row + 1] - y)
-            joined = math.hypot(state[node] - x_map, state[node + 1] - y_map)
+            own_x, own_y = mean[row] - x, mean[row + 1] - y
+            dx, dy = state[node] - x_map, state[node + 1] - y_map
+            own, joined = math.hypot(own_x, own_y), math.hypot(dx, dy)
             if not (own > 0.0 and joined > 0.0):
                 continue
             q = min(max(joined / own, 1.0 / LARGEST_RATIO), LARGEST_RATIO)
-            block[factors.block_start[f] + landmark] *= q * q
-            for i in range(row, row + 2):
-                for j in range(n):
-                    metric[i * n + j] /= q
-                    metric[j * n + i] /= q
-                for b in range(factors.row_start[f + 1] - first):
-                    if factors.of_range[first + b]:
-                        columns[factors.sensitivity_start[f] + b * n + i] *= q
+            turn = wrapped(math.atan2(dy, dx) - math.atan2(own_y, own_x) - state[at[0] + 2])
+            turn = min(max(turn, -LARGEST_TURN_RAD), LARGEST_TURN_RAD)
+            c, s = math.cos(turn), math.sin(turn)
+            xx, xy, yy = block[factors.block_start[f] + landmark]
+            across = 2.0 * c * s * xy
+            block[factors.block_start[f] + landmark, 0] = q * q * (c * c * xx + s * s * yy - across)
+            block[factors.block_start[f] + landmark, 1] = (
+                q * q * (c * s * (xx - yy) + (c * c - s * s) * xy)
+            )
+            block[factors.block_start[f] + landmark, 2] = q * q * (s * s * xx + c * c * yy + across)
+            i, j = row * n, (row + 1) * n
+            for k in range(n):
+                _turn_and_stretch(metric, i + k, j + k, c, s, 1.0 / q)
+            for k in range(n):
+                _turn_and_stretch(metric, k * n + row, k * n + row + 1, c, s, 1.0 / q)
+            for b in range(factors.row_start[f + 1] - first):
+                if factors.range_power[first + b] == NO_POWER:
+                    continue
+                i = factors.sensitivity_start[f] + b * n + row
+                _turn_and_stretch(columns, i, i + 1, c, s, q ** factors.range_power[first + b])
     return Factors(
         factors.member,
         factors.member_start,
@@ -175,7 +201,7 @@ def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Fact
         factors.sensitivity_start,
         block,
         factors.block_start,
-        factors.of_range,
+        factors.range_power,
         factors.row_start,
     )
 

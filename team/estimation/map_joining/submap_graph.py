@@ -20,7 +20,7 @@ from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import Sighting
 from team.estimation.map_joining.condensed_factor import Condensed
 from team.estimation.map_joining.inter_robot_kernel import Sightings
-from team.estimation.map_joining.joining_kernel import Factors, block_pattern
+from team.estimation.map_joining.joining_kernel import NO_POWER, Factors, block_pattern
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
 
@@ -35,6 +35,12 @@ CommonError = Bias | int
 reads too far for everyone."""
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
+
+
+RANGE_POWER: Mapping[Bias, int] = MappingProxyType(
+    {"bearing": 1, "range_offset": 0, "range_scale": 1, "forward_scale": NO_POWER}
+)
+"""With which power of a landmark's range each bias moves it."""
 
 
 class Prior(NamedTuple):
@@ -151,9 +157,8 @@ class Graph:
             sensitivity_start=_starts([each.sensitivity.size for each in self.submaps]),
             block=np.concatenate([np.zeros((0, 3)), *(each.blocks for each in submaps)]),
             block_start=_starts([len(each.local.ids) for each in submaps]),
-            of_range=np.array(
-                [_scaling(b) == "range_scale" for each in self.submaps for b in each.biases],
-                np.bool_,
+            range_power=np.array(
+                [RANGE_POWER[_scaling(b)] for each in self.submaps for b in each.biases], np.int64
             ),
             row_start=_starts([len(each.biases) for each in self.submaps]),
         )
@@ -206,10 +211,10 @@ class Graph:
 
     @cached_property
     def of_bias(self) -> Bool[np.ndarray, " priors"]:
-        """Which priors are of a bias of sensors, not of a pose or a landmark's marker."""
-        markers = {node for error, node in self.common.items() if isinstance(error, int)}
+        """Which priors are of one robot's bias, not of a pose or of what the team has in common."""
+        common = set(self.common.values())
         return np.array(
-            [len(each.mean) == 1 and each.node not in markers for each in self.priors], np.bool_
+            [len(each.mean) == 1 and each.node not in common for each in self.priors], np.bool_
         )
 
     @cached_property

@@ -79,7 +79,9 @@ def test_each_cameras_own_constants_come_out_where_they_differ() -> None:
         assert found["optical_axis"].value == pytest.approx(axis, abs=0.003)
     assert {figure.name for figure in own.strays} == {
         "bias_sigma.bearing", "bias_sigma.range_offset", "bias_sigma.range_scale",
+        "common_bias_sigma.range_scale",
     }  # fmt: skip
+    assert max(f.value for f in own.strays if f.name.endswith("range_scale")) < 0.003
 
 
 def test_cameras_that_are_alike_have_nothing_of_their_own() -> None:
@@ -93,6 +95,18 @@ def test_a_camera_that_was_changed_between_worlds_does_not_widen_what_all_have()
     data[-1] = replace(looking("r4", 2, (1.08, 0.0, 0.0)), name="2 r4")
     after = {figure.name: figure.value for figure in own_constants(data, depth=True).strays}
     assert after["bias_sigma.range_scale"] < 3.0 * before["bias_sigma.range_scale"] + 1e-3
+
+
+def test_how_far_all_range_scales_stray_together_is_learnt_from_world_to_world() -> None:
+    read = [
+        looking(robot, world, (scale + by, *rest))
+        for world, by in ((1, 0.02), (2, -0.02))
+        for robot, (scale, *rest) in CAMERAS.items()
+    ]
+    found = {figure.name: figure.value for figure in own_constants(read, depth=True).strays}
+    own = found["bias_sigma.range_scale"]
+    together = np.sqrt((2.0 * own**2 + 2.0 * 0.02**2) / 3.0 * 1.5)
+    assert found["common_bias_sigma.range_scale"] == pytest.approx(together, rel=0.1)
 
 
 @pytest.mark.parametrize("depth", [True, False])
