@@ -1,4 +1,4 @@
-"""The command that learns the models' figures from measurements: calibrate."""
+"""The command `teamslam calibrate`: learns the parameters of the models from measurements."""
 
 from pathlib import Path
 from typing import Annotated

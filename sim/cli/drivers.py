@@ -14,9 +14,9 @@ app = typer.Typer()
 _LOG = logging.getLogger("teamslam")
 WAIT_S = 0.2
 LAST_S = 0.2
-"""At the end, what is on its way comes within this."""
+"""At the end, messages on their way arrive within this time [s]."""
 AT_ONCE = 500
-"""Measurements that are handed over before the next look at what has come."""
+"""Measurements handed over before the next check of what has arrived."""
 
 
 @app.command()

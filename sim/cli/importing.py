@@ -79,12 +79,12 @@ def import_(
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a data set is to be imported before a team can run on it: a ROS 2 bag or a log."""
+    """Whether a data set must be imported before a team can run on it: a ROS 2 bag or a log."""
     return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
 def imported_into(path: Path, folder: Path) -> Path:
-    """The folder with what was imported from a bag or a log; what became of it is said."""
+    """Import a bag or a log; returns the folder, and prints what was imported."""
     from sim.importing.source import Request, imported
 
     if folder.exists() and any(folder.iterdir()):
@@ -97,7 +97,9 @@ def imported_into(path: Path, folder: Path) -> Path:
 
 @contextmanager
 def readable(path: Path) -> Iterator[Path]:
-    """A ROS 2 bag as the data set that it is imported into meanwhile; anything else as it is."""
+    """Import a ROS 2 bag into a temporary data set and return that; anything else is returned as
+    it is.
+    """
     from tempfile import TemporaryDirectory
 
     if not (path.suffix == ".db3" or (path / "metadata.yaml").is_file() or _is_ros2_mcap(path)):
@@ -113,7 +115,7 @@ def readable(path: Path) -> Iterator[Path]:
 
 
 def _is_ros2_mcap(path: Path) -> bool:
-    """Whether it is an MCAP file that says that ROS 2 wrote it."""
+    """Whether it is an MCAP file written by ROS 2."""
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with path.open("rb") as file:
@@ -121,7 +123,7 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 
 def _as_read(folder: Path) -> list[str]:
-    """What there is of each robot, and what its tables say that can not be used."""
+    """What there is of each robot, and what its tables have that can not be used."""
     from sim.scenarios.scenario import load, with_options
     from sim.scenarios.source import scenario_beside, streams_of
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from sim.launch.plan import Plan
 
 COMPILING_S = 3.0
-"""Between two lines on kernels that are being compiled."""
+"""Time [s] between two lines about kernels that are being compiled."""
 app = typer.Typer()
 
 
@@ -176,7 +176,7 @@ def launch(
 
 
 def _launched(plan: "Plan") -> "Outcome":
-    """Start the template first: it imports while this process does."""
+    """Start the template first: it imports modules while this process does."""
     from sim.launch.processes import Starter
 
     scenario = plan.scenario
@@ -198,7 +198,7 @@ def _launched(plan: "Plan") -> "Outcome":
 
 
 def _keep_showing(url: str, log: Path) -> None:
-    """The page stays until somebody ends the command."""
+    """Keep the page until the user ends the command."""
     from team.shell import process
 
     typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
@@ -207,7 +207,7 @@ def _keep_showing(url: str, log: Path) -> None:
 
 
 def _check_world(scenario: Scenario) -> None:
-    """A data set that can not be read is found before any process starts."""
+    """Check the data set before any process starts."""
     from sim.scenarios.source import streams_of
     from sim.world.config import FolderWorld, UtiasWorld
 
@@ -216,7 +216,7 @@ def _check_world(scenario: Scenario) -> None:
 
 
 def _check_writable(path: Path) -> None:
-    """A result that can not be written is found before the run, not after it."""
+    """Check before the run that the result can be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("a").close()
@@ -235,7 +235,7 @@ def _new_folder(name: str) -> Path:
 
 
 def _keep_earlier(log: Path) -> None:
-    """A log is never overwritten: an earlier one of the same name steps aside."""
+    """Rename an earlier log of the same name, so that none is overwritten."""
     if log.exists() and not log.is_file():
         fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
@@ -247,14 +247,16 @@ def _keep_earlier(log: Path) -> None:
 
 
 class _Compiling:
-    """Tells how far the kernels are, which are compiled once per machine."""
+    """Reports the compilation of kernels, which happens once per machine."""
 
     def __init__(self) -> None:
         self._began = time.monotonic()
         self._due = self._began + COMPILING_S
 
     def tell(self, done: int, of: int) -> None:
-        """Now and then: how many kernels of about how many are compiled, and how long it takes."""
+        """Print now and then how many kernels of about how many are compiled, and how long it
+        takes.
+        """
         now = time.monotonic()
         if now >= self._due:
             self._due = now + COMPILING_S
@@ -264,7 +266,9 @@ class _Compiling:
 
 
 def _compile(scenario: Scenario) -> None:
-    """Where there is no template to do it: the processes would all compile the same."""
+    """Compile the kernels here where no template does: otherwise every process would compile the
+    same.
+    """
     from sim.launch.warm_up import warm_up
     from team.estimation.compiling import compilations
 
@@ -275,7 +279,7 @@ def _compile(scenario: Scenario) -> None:
 def _conclude(
     scenario: Scenario, outcome: "Outcome", json_file: Path | None, *, report: bool
 ) -> None:
-    """Evaluate the log, print the result, write the report; end with 1 if anything failed."""
+    """Evaluate the log, print the result and write the report; ends with 1 if anything failed."""
     from rich.console import Console
 
     from central.desk.evaluation.evaluation import evaluate, to_json, with_holes

@@ -1,4 +1,4 @@
-"""`teamslam log`: look into a log, check it, repair it, part it, put logs together, export them."""
+"""`teamslam log`: inspect a log, check it, repair it, cut it, merge logs, export them."""
 
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -37,7 +37,7 @@ app.command()(repair)
 
 
 class Format(StrEnum):
-    """What a log is exported as."""
+    """The format that a log is exported in."""
 
     CSV = "csv"
     PARQUET = "parquet"
@@ -199,7 +199,7 @@ def export(
 
 
 def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Exported]":
-    """What writes the tables; ends the command where it is not installed."""
+    """The exporter of tables; ends the command where it is not installed."""
     from team.recording.csv_tables import export_csv
     from team.recording.parquet_tables import export_parquet
 
@@ -211,7 +211,7 @@ def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Expo
 
 
 def _channels(names: str | None) -> "list[Channel] | None":
-    """The channels by name; ends the command at a name that is none."""
+    """The channels by name; ends the command at an unknown name."""
     if names is None:
         return None
     from team.wire.channels import CHANNELS
@@ -225,7 +225,7 @@ def _channels(names: str | None) -> "list[Channel] | None":
 
 
 def _line(text: str) -> str:
-    """A text of a file that is not trusted, as one line that can not steer a terminal."""
+    """A text of an untrusted file as one line without control characters for a terminal."""
     return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
 
 

@@ -60,7 +60,7 @@ def command() -> Callable[[], None]:
 
 
 def main() -> None:
-    """Run a command; what a user did wrong ends with 2, what failed with 1, without a traceback."""
+    """Run a command; wrong use ends with 2, a failed run with 1, both without a traceback."""
     try:
         command()()
     except Exception as error:
@@ -73,9 +73,9 @@ def main() -> None:
 
 
 def _told(error: Exception) -> tuple[int, str] | None:
-    """The exit status for an error that was foreseen and what to say of it; None: it was not.
+    """The exit status and the text for an expected error; None for any other.
 
-    What may be raised is imported when it has been: a router needs no SciPy.
+    Modules of exceptions are imported only where they were raised: a router needs no SciPy.
     """
     from sim.datasets.tables import DatasetError
     from sim.scenarios.checks import ScenarioError

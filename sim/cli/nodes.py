@@ -65,7 +65,7 @@ def router(
 ) -> None:
     """The team's Zenoh router: every other process is its client. Runs until it is stopped.
 
-    With --keys it lets in who has a certificate, and each may say only what is its own.
+    With --keys it admits nodes with a certificate, each of which may publish on its own keys only.
     """
     from team.keys.roster import load_roster
     from team.shell import process
@@ -154,8 +154,8 @@ def robot(
 ) -> None:
     """A robot: runs its estimator on its sensor stream and publishes submaps, maps and poses.
 
-    Started again after a crash it resumes after its last submap. With --peers it keeps the whole
-    team's submaps and is its own centre.
+    Started again after a crash, it continues after its last submap. With --peers it keeps the whole
+    team's submaps and computes the team's map itself.
     """
     from contextlib import nullcontext
 
@@ -253,7 +253,7 @@ def central(
 ) -> None:
     """The central computer: fuses the robots' maps and broadcasts the fused map back.
 
-    With --peers it is one more peer, which may come and go as it likes.
+    With --peers it is one more peer, which may join and leave at any time.
     """
     from team.peers.store import StoreError
     from team.shell import process
@@ -316,8 +316,8 @@ def record(
 ) -> None:
     """The recorder: every message of the team to one MCAP file, until the team has left.
 
-    Started again while the team still runs it goes on in a further part, and asks for what it has
-    missed; at the end the parts are joined.
+    Started again while the team runs, it writes a further part and requests what it has missed; at
+    the end the parts are joined.
     """
     from sim.scenarios.scenario import dumps
     from team.recording.parts import check_continues, join, next_part
@@ -382,7 +382,7 @@ def record(
 
 
 def _lost_in(parts: Sequence[Path]) -> tuple[str, ...]:
-    """The robots that the final map in a log lacks, if there is one."""
+    """The robots that are missing in the final map of a log, if it has one."""
     from team.recording.reader import LogError, open_log
     from team.wire.channels import FINAL_MAP, TEAM_FINAL
     from team.wire.codec import WireError, decoded
@@ -439,9 +439,9 @@ def withdraw(
         float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
     ] = 60.0,
 ) -> None:
-    """Let a running team go on without a robot: its map is that of a team that never had it.
+    """Withdraw a robot from a running team: the map becomes that of a team that never had it.
 
-    The order is recorded, and there is no way back.
+    The order is recorded and can not be undone.
     """
     from sim.launch.withdraw import WithdrawError
     from sim.launch.withdraw import withdraw as order
@@ -477,8 +477,8 @@ def verdict(
 ) -> None:
     """Tell a running team that two landmarks without names are one, or that they are two.
 
-    The page names them where one clicks on a landmark. The verdict is recorded and stays, until it
-    is withdrawn.
+    The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
+    until it is withdrawn.
     """
     from sim.launch.verdict import judge, local_landmark
     from sim.launch.withdraw import WithdrawError
@@ -519,11 +519,11 @@ def end(
         float, typer.Option(help="Seconds to wait for the centre to follow.", min=0.0)
     ] = 60.0,
 ) -> None:
-    """End a live team: every driver ends its stream, and the centre says the final map.
+    """End a live team: every driver ends its stream, and the centre publishes the final map.
 
-    With --without: let a running team end without a robot that is lost. What has come of it stays
-    in the map, which names it as lost and is provisional, and every process ends with 1. The router
-    keeps that order for a centre that is started again, until the run is over.
+    With --without: end a running team without a lost robot. Its submaps so far stay in the map,
+    which names it as lost and is provisional, and every process ends with status 1. The router
+    keeps the order until the run is over, for a centre that is started again.
     """
     from sim.launch.withdraw import WithdrawError, end_team, give_up
 

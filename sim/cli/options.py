@@ -1,4 +1,4 @@
-"""What the commands have in common: options, their parsing, and errors with their exit status."""
+"""The options that commands share, their parsing, and errors with their exit status."""
 
 import logging
 import math
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from team.wire.zenoh.bus import ZenohBus
 
 MOST_HOLES = 5
-"""Findings of what a log lacks that a command names; `teamslam log check` names all."""
+"""Most findings about gaps of a log that a command prints; `teamslam log check` prints all."""
 WRONG_USE = 2
 FAILED = 1
 
 
 def _either(names: object) -> str:
-    """The values of a Literal as a sentence: `a, b or c.`"""
+    """The values of a Literal as text: `a, b or c.`"""
     *first, last = get_args(names)
     return f"{', '.join(first)} or {last}."
 
@@ -50,7 +50,7 @@ ASSUMED = (
     "metre and by 6° after a radian, ranges by 5 cm and 2 %, bearings by 1.7°. `teamslam calibrate "
     "FOLDER -o FOLDER/scenario.toml` learns your robots' own from the data"
 )
-"""What the built-in scenario for recorded data says of robots that nobody knows."""
+"""Remarks on the built-in scenario for recorded data of unknown robots."""
 LOOPBACK = "tcp/127.0.0.1:7447"
 ANY_PORT = "tcp/127.0.0.1:0"
 Seed = Annotated[
@@ -92,7 +92,7 @@ SpeedText = Annotated[
 
 
 def check_pieces(scenario: Scenario) -> None:
-    """Only the log of a data set of one robot can be cut into several."""
+    """Check that only the log of a data set of one robot is cut into several."""
     if not isinstance(scenario.world, UnlabelledWorld):
         fail(
             "--pieces cuts the log of a data set of one robot with detections.csv: give it with "
@@ -102,7 +102,7 @@ def check_pieces(scenario: Scenario) -> None:
 
 
 def connected(team: str, connect: str, keys: Path | None, node: str) -> "ZenohBus":
-    """A bus of the team at the router's endpoint; with keys over TLS, by the node's certificate."""
+    """A bus of the team at the router's endpoint; with keys by TLS, with the node's certificate."""
     from team.wire.zenoh.bus import ZenohBus
 
     own = None if keys is None else own_keys(keys, node, team)
@@ -110,7 +110,7 @@ def connected(team: str, connect: str, keys: Path | None, node: str) -> "ZenohBu
 
 
 def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
-    """The node's certificate and key, checked; what will soon be wrong with them is logged."""
+    """The node's certificate and key, checked; warns of what will soon expire."""
     from team.keys.credentials import credentials_of
 
     own = credentials_of(folder, node, team)
@@ -120,12 +120,12 @@ def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
 
 
 def over_tls(endpoint: str) -> str:
-    """The same place by TLS, where none was chosen."""
+    """The same endpoint by TLS, unless the user has chosen one."""
     return endpoint.replace("tcp/", "tls/", 1) if endpoint in (LOOPBACK, ANY_PORT) else endpoint
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only this machine can reach an endpoint, as far as its address tells."""
+    """Whether an endpoint can be reached from this machine only, judged by its address."""
     protocol, _, address = endpoint.partition("/")
     if protocol.startswith("unix"):
         return True
@@ -137,7 +137,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
-    """End with an error where strangers could reach a router that lets everyone in."""
+    """End with an error where strangers could reach a router that admits everyone."""
     if "/" not in listen:
         fail(f"can not listen at {listen}: not an endpoint, as tcp/HOST:PORT", WRONG_USE)
     if not (keys or insecure or is_loopback(listen)):
@@ -155,13 +155,13 @@ def fail(message: str, status: int) -> NoReturn:
 
 
 def refuse_existing(path: Path) -> None:
-    """End with an error where there is something already."""
+    """End with an error where the file or folder exists already."""
     if path.exists():
         fail(f"{path} exists: choose another name or remove it", WRONG_USE)
 
 
 def warn_of_holes(log: "Log") -> None:
-    """Say what a log lacks, on stderr: whatever is made of it lacks that, too."""
+    """Warn on stderr of what a log lacks, since results made of it lack it, too."""
     from team.recording.check import holes
 
     found = holes(log)
@@ -203,7 +203,7 @@ def parsed_start(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def scenario_for(dataset: Path) -> str:
-    """The scenario of a data set for which none was given; what it is is said."""
+    """The scenario for a data set without one; prints which it is."""
     from sim.scenarios.source import scenario_beside
 
     name = scenario_beside(dataset)
@@ -215,7 +215,7 @@ def scenario_for(dataset: Path) -> str:
 
 
 def scenario_of(name: str) -> Scenario:
-    """The scenario by name, from TOML, or from the JSON that launch hands to its processes."""
+    """The scenario by name, from a TOML file, or from the JSON that launch gives its processes."""
     path = Path(name)
     if path.suffix == ".json" and path.is_file():
         try:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from team.recording.reader import Log
 
 LONG_BYTES = 5_000_000
-"""A report of a log of this size takes a while, and says so."""
+"""A report of a log from this size on takes a while, and says so."""
 app = typer.Typer()
 
 
@@ -149,7 +149,7 @@ def report(
 
 
 def _check_folder(path: Path) -> None:
-    """A folder that can not be made is found before the work, not after it."""
+    """Check before the work that the folder can be made."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -157,7 +157,7 @@ def _check_folder(path: Path) -> None:
 
 
 def _ledger(log: "Log") -> "tuple[Ledger | None, str]":
-    """The ledger of a log; without one, why."""
+    """The ledger of a log, or the reason why there is none."""
     from central.desk.ledger import ledger
     from central.desk.verification.recorded import RerunError, recorded
 

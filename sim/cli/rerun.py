@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 OFFENDERS = 20
-"""Offenders that are printed; the JSON file has all."""
+"""Most violations that are printed; the JSON file has all."""
 
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
 
@@ -79,9 +79,9 @@ def rerun(
     """Compute a log again: to verify it, or under other conditions to compare.
 
     With --verify every message is computed again from the inputs that it names. Otherwise the
-    recorded measurements run once more through the same nodes, with the changes asked for; without
-    any change, as they would have run with every message arriving at once. Of a data set the run
-    that is compared with is computed, too: no process is started.
+    recorded measurements go through the same nodes again, with the given changes; without a change,
+    as if every message arrived at once. For a data set, the run to compare with is computed, too.
+    No process is started.
     """
     changes = Changes(
         without=tuple(without or ()),

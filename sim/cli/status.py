@@ -1,4 +1,4 @@
-"""`teamslam status`: who of a running team is there."""
+"""`teamslam status`: the nodes of a running team."""
 
 import json
 import re
@@ -20,7 +20,7 @@ def status(
     seconds: Annotated[float, typer.Option(help="How long to look.", min=0.5)] = 3.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write it as JSON, too.")] = None,
 ) -> None:
-    """Who of a running team is there, rates, clocks, who waits for whom, and what to do."""
+    """Show the nodes of a running team: rates, clocks, which waits for which, and what to do."""
     from rich.console import Console
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""The commands of `sim/studies`, which an installation may lack: they are found by name."""
+"""The commands of `sim/studies`, which an installation may lack; they are found by name."""
 
 from importlib import import_module
 
@@ -12,7 +12,9 @@ COMMANDS = ("experiment", "batch-reference", "limit")
 
 
 def add_studies(app: typer.Typer) -> None:
-    """Register the commands of the studies; where there are none, each says so and exits with 2."""
+    """Register the commands of the studies; where these are missing, each command says so and
+    exits with 2.
+    """
     try:
         studies = import_module(f"{STUDIES}.commands")
     except ModuleNotFoundError as error:

@@ -44,7 +44,7 @@ app = typer.Typer()
 def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
     """Publish what Foxglove, Lichtblick and Rerun draw, once a second of team time.
 
-    The recorder stores it beside the team's own messages. Ends after the final map.
+    The recorder stores it beside the team's own messages. It ends after the final map.
     """
     from central.desk.view.viewer import run_viewer
     from team.shell import process
@@ -78,10 +78,10 @@ def view(
         Path | None, typer.Option(help="Write a Foxglove layout for this team's log, and end.")
     ] = None,
 ) -> None:
-    """Look at a log, or at a run by the log that is recorded of it, on a page in a browser.
+    """Show a log, or a running team by its log, on a page in a browser.
 
     The map with its uncertainty, robots, paths, errors within their bounds, consistency, traffic
-    and events; nothing is fetched from elsewhere. Foxglove and Lichtblick can connect, too. Ends
+    and events; nothing is loaded from elsewhere. Foxglove and Lichtblick can connect, too. It ends
     with Ctrl-C.
     """
     from team.recording.reader import open_log
@@ -107,7 +107,7 @@ def view(
 def shown_on_page(
     log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
 ) -> Iterator["Shown"]:
-    """Serve a log, say where, and open the page if that is wished or natural."""
+    """Serve a log, print where, and open the page if that is requested or there is a display."""
     from central.desk.view.session import session
 
     with session(log, host, port, foxglove_port, growing=growing) as shown:
@@ -121,7 +121,9 @@ def shown_on_page(
 
 
 def _has_display() -> bool:
-    """Whether a browser would be seen; without one, text browsers would take the terminal."""
+    """Whether a browser would be visible; without a display, text browsers would take the
+    terminal.
+    """
     windows = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
     return bool(windows) and sys.stdout.isatty()
 

@@ -1,1 +1,1 @@
-"""A whole team in one process, and what its messages meet on their way."""
+"""A whole team in one process, and simulated links for its messages."""

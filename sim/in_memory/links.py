@@ -1,4 +1,4 @@
-"""What becomes of messages on their way, in team time: delay, loss, partitions, a centre that dies.
+"""Simulated links, in team time: delay, loss, partitions, a centre that dies.
 
 Nothing is lost for good: delivery `all` sends a lost submap again. So under the rule `join` none of
 this can change the final map (law 2), only what the team knows meanwhile.
@@ -15,15 +15,17 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
 
 RESEND_NS = 1_000_000_000
-"""A lost submap is missed and sent again after this time, as often as it takes."""
+"""A lost submap is sent again after this time, as often as needed."""
 PATIENCE_NS = 3_000_000_000
-"""The centre believes after this time that a robot is gone."""
+"""The centre takes a robot for lost after this time."""
 _FROM_ROBOTS = (ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
 _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 
 class Link:
-    """Holds what reaches a node until it arrives; at equal times news of others come first."""
+    """Holds the messages for a node until they arrive; at equal times the presence of others
+    comes first.
+    """
 
     def __init__(self, arrival_ns: Callable[[Sample, int], int] | None = None) -> None:
         self._arrival_ns = arrival_ns
@@ -31,12 +33,12 @@ class Link:
         self._sent = 0
 
     def say(self, at_ns: int, message: m.Liveliness) -> None:
-        """The node notices at this time that another one went or came back."""
+        """Let the node notice at this time that another one left or came back."""
         sample = Sample(ch.ALIVE.key(message.node), encoded(message), 0, 0, 0)
         self._hold(at_ns, sample, sent=False)
 
     def arrived(self, samples: Sequence[Sample], now_ns: int) -> list[Sample]:
-        """What is there by now, given what has been sent since the last time."""
+        """The messages that have arrived by now, given what was sent since the last call."""
         if self._arrival_ns is None:
             return list(samples)
         for sample in samples:
@@ -52,7 +54,7 @@ class Link:
 
     @property
     def next_ns(self) -> int | None:
-        """When the next message arrives that is on its way."""
+        """Arrival time of the next message that is on its way."""
         return self._held[0][0] if self._held else None
 
 
@@ -85,7 +87,7 @@ class Conditions:
 
     @property
     def centre_back_ns(self) -> int:
-        """When there is a centre again."""
+        """Time at which there is a centre again."""
         return 0 if self.down_ns is None else self.down_ns[1]
 
     def to_centre(self, robots: Sequence[str]) -> Link:

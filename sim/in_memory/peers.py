@@ -26,7 +26,7 @@ from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
 
 AFTER_S = 3600.0
-"""Team time behind the end of the streams after which peers that lack something give in."""
+"""Team time after the streams' end at which peers that lack something give up."""
 Make = Callable[[Scenario, RobotConfig], PeerRobot]
 
 
@@ -68,12 +68,12 @@ class PeerTeam:
         self._latest: dict[str, tuple[ch.Channel, Sample]] = {}
 
     def seat(self, config: RobotConfig) -> None:
-        """Put a robot there that knows nothing yet: at the start, or after a death."""
+        """Add a robot without any knowledge: at the start, or after a death."""
         node = self._make(self.scenario, config)
         self.seats[config.id] = _Seat(node, Boundary(node.name))
 
     def seat_centre(self, restored: Iterable[Member] = ()) -> None:
-        """A centre comes, with what it has kept on disk: one more peer."""
+        """Add a centre, with the set that it has kept on disk: one more peer."""
         names = [each.id for each in self.scenario.robots]
         seat = _Seat(PeerCentre(self.scenario.central, names), Boundary(CENTRE))
         seat.node.keep(restored)
@@ -82,7 +82,7 @@ class PeerTeam:
         self._catch_up(CENTRE, seat)
 
     def leave(self, name: str) -> list[Member]:
-        """A robot or the centre dies; what it had kept."""
+        """Remove a robot or the centre; returns what it had kept."""
         seat = self.seats.pop(name)
         for other in self.seats.values():
             other.reached.discard(name)
@@ -150,7 +150,7 @@ class PeerTeam:
         self._catch_up(config.id, seat)
 
     def hear(self, name: str, sample: Sample) -> None:
-        """One robot alone hears what an operator says."""
+        """Give an operator's message to one robot alone."""
         seat = self.seats[name]
         self._say(name, seat.boundary.take(seat.node, sample))
 
@@ -171,7 +171,9 @@ class PeerTeam:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
     def _catch_up(self, robot: str, seat: _Seat) -> None:
-        """Who comes gets the latest of what the world has said once: that streams have ended."""
+        """Give a node that joins the last of the world's messages, such as the end of the
+        streams.
+        """
         for channel, sample in self._latest.values():
             if channel in _listened(seat.node):
                 self._say(robot, seat.boundary.take(seat.node, sample))
@@ -223,7 +225,7 @@ class PeerTeam:
             self._say(to, seat.boundary.take(seat.node, sample))
 
     def _see(self) -> None:
-        """Tell everyone who has come into reach and who has left it."""
+        """Tell every node which others have come into reach or left it."""
         for robot, seat in self.seats.items():
             for other in self.seats:
                 if other == robot:
@@ -238,7 +240,9 @@ class PeerTeam:
 
     @property
     def _agree(self) -> bool:
-        """All have a final map of one set and know that of each other; nothing is on its way."""
+        """Whether all have a final map of one set and know that of each other, and nothing is on
+        its way.
+        """
         finals = [seat.node.final for seat in self.seats.values()]
         if len(self.seats) < len(self.scenario.robots):
             return False

@@ -20,13 +20,13 @@ from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 
 ROUND_S = 1.0
-"""Team time of which everybody gets the measurements before the next: as in real time, no robot is
-windows ahead of the news of its teammates."""
+"""Team time of one round: every robot gets its measurements before the next round, so that none
+is windows ahead of its teammates' messages, as in real time."""
 
 
 @runtime_checkable
 class World(Protocol):
-    """Whatever publishes the measurements: a scenario's world, or a log's."""
+    """A publisher of measurements: a scenario's world, or a log's."""
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
@@ -34,10 +34,10 @@ class World(Protocol):
 
     @property
     def now_ns(self) -> int:
-        """Team time: the stamp that it has published up to."""
+        """Team time: the stamp up to which it has published."""
 
     def begin(self) -> list[Outgoing]:
-        """What it says first."""
+        """Its first messages."""
 
     def publish(self, clock_s: float) -> list[Outgoing]:
         """The next measurements; nothing when it waits or has ended."""

@@ -1,1 +1,1 @@
-"""A radio at each robot's door: what would not have reached it is dropped there."""
+"""A simulated radio at each robot's bus, which drops messages from out of reach."""

@@ -1,1 +1,1 @@
-"""Scenarios: what a user writes, what processes hand on, and the streams that come of it."""
+"""Scenarios: what a user writes, its resolved form for processes, and the streams of its world."""

@@ -1,4 +1,4 @@
-"""Say what is wrong with a scenario in its own words: the field's path, what is known, a remedy."""
+"""Checks scenarios: errors name the field's path, what is known there, and a remedy."""
 
 import difflib
 import math
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import msgspec
 
 SAID_ONCE = ("seed", "estimator", "fusion")
-"""Fields of robots and centre that the scenario says once, at its top, for all of them."""
+"""Fields of robots and centre that the scenario has once, at its top, for all of them."""
 
 _IN_WORDS = {
     "^[a-z][a-z0-9_]{0,31}$": "a small letter, then small letters, digits and _ (32 at most)",
@@ -75,5 +75,5 @@ def _is_struct(declared: Any) -> bool:
 
 
 def _here(name: str, at: str) -> bool:
-    """The fields that are said once are known at the top only."""
+    """The known fields; those that the scenario has once are known at the top only."""
     return not at or name not in SAID_ONCE

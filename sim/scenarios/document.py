@@ -1,4 +1,4 @@
-"""A user's TOML document → the plain fields of a resolved scenario.
+"""Converts a user's TOML document to the plain fields of a resolved scenario.
 
 base = "thesis"            # optional: a built-in scenario that this file changes
 name, team, seed, estimator, fusion, exchange, peers, centre
@@ -26,7 +26,7 @@ from team.config import RobotConfig
 MAX_ROBOTS = 100
 UTIAS_ROBOTS = 5
 ANY_ROBOT = "any_robot"
-"""Whose models are those of each robot of a data set that is not known yet."""
+"""The robot whose models are those of each robot of a data set that is not known yet."""
 
 Fields = dict[str, Any]
 

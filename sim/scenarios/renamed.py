@@ -1,4 +1,4 @@
-"""Fields of a scenario that had another name once: logs of that time are still read."""
+"""Former names of a scenario's fields, with which logs of that time are still read."""
 
 from typing import Any
 

@@ -41,7 +41,7 @@ __all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads
            "scenario_warnings", "with_options"]  # fmt: skip
 
 FAR_M = 10.0
-"""The end of a sensor's view where nothing says it."""
+"""The end of a sensor's range where nothing gives it."""
 WORLDS: dict[str, type[World]] = {
     "simulated": SimulatedWorld,
     "utias": UtiasWorld,
@@ -52,7 +52,7 @@ WORLDS: dict[str, type[World]] = {
 
 
 class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A resolved scenario: what the team is told, its world, and what peers reach each other by."""
+    """A resolved scenario: the team's configuration, its world, and the radio between peers."""
 
     world: World
     radio: Radio = Radio()
@@ -194,7 +194,9 @@ def loads(text: str) -> Scenario:
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
-    """What is valid, but hardly meant, in words: a simulated robot whose odometry has no noise."""
+    """Warns of settings that are valid and probably a mistake: a simulated robot without
+    odometry noise.
+    """
     if not isinstance(scenario.world, SimulatedWorld):
         return []
     return [
@@ -282,7 +284,7 @@ def _filled(scenario: Scenario) -> Scenario:
 
 
 def _check_way_points(robots: int, world: SimulatedWorld) -> None:
-    """Robots without a path of their own go from one random way-point to the next, for ever."""
+    """Check that robots without a path of their own drive between random way-points for ever."""
     width = world.size_m if world.radius_m is None else 2.0 * world.radius_m
     endless = robots > len(world.paths) and not world.way_point_count
     if endless and world.way_point_tolerance_m > 0.5 * width:

@@ -90,7 +90,9 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
 
 
 def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
-    """Whether the robots are told the landmarks; raises ScenarioError where nobody knows them."""
+    """Whether the robots are given the landmarks. Raises ScenarioError where these are not
+    known.
+    """
     needed = scenario.estimator in NEEDS_MAP
     if needed and streams.landmarks is None:
         raise ScenarioError(
@@ -101,7 +103,7 @@ def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
 
 
 def noise_seed(scenario: Scenario) -> int:
-    """What the world's random numbers are keyed by: the scenario's name and its seed.
+    """The key of the world's random numbers, from the scenario's name and its seed.
 
     So two scenarios share no noise: what holds over the seeds of one and of the other are two
     findings, not one finding twice. It is a positive integer of 63 bits.
