@@ -45,7 +45,8 @@ def driver(
         ),
     ] = None,
     latency: Annotated[
-        float, typer.Option(help="What is seen may come so much later than odometry [s].", min=0.0)
+        float,
+        typer.Option(help="Seconds by which landmarks may arrive later than odometry.", min=0.0),
     ] = 0.2,
 ) -> None:
     """Drive a robot of a live team by its ROS 2 topics, with no ROS here; Ctrl-C ends its stream.

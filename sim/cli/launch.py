@@ -77,7 +77,7 @@ def launch(
     ] = ANY_PORT,
     keys: Keys = None,
     insecure: Annotated[
-        bool, typer.Option(help="Without keys, let in whoever reaches the router.")
+        bool, typer.Option(help="Without keys, admit everyone who reaches the router.")
     ] = False,
     report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
     views: Annotated[
@@ -86,8 +86,8 @@ def launch(
     end_silent: Annotated[
         float | None,
         typer.Option(
-            help="End a process that has said nothing for so many seconds, so that it is started "
-            "again; default: name it only.",
+            help="End a process that is silent for this many seconds, so that it is started "
+            "again; default: only name it.",
             min=10.0,
         ),
     ] = None,
@@ -99,7 +99,7 @@ def launch(
         float | None,
         typer.Option(
             "--comm-range",
-            help="Peers reach each other within so many metres of true distance.",
+            help="Peers reach each other within this true distance in metres.",
             metavar="M",
             min=0.001,
         ),

@@ -134,7 +134,9 @@ def robot(
     fusion: FusionOption = None,
     log: Annotated[
         Path | None,
-        typer.Option(help="Its own log: what it sends and receives; `teamslam log merge` joins."),
+        typer.Option(
+            help="Its own log: what it sends and receives; `teamslam log merge` joins such logs."
+        ),
     ] = None,
     peers: Peers = False,
     kept: Annotated[
@@ -232,8 +234,8 @@ def central(
     patience: Annotated[
         float | None,
         typer.Option(
-            help="Give a robot up that is lost for so many seconds; default: wait for it, and say "
-            "so. A final map without it is provisional.",
+            help="Give up a robot that has been lost for this many seconds; default: wait for "
+            "it. A final map without it is provisional.",
             min=0.0,
         ),
     ] = None,
@@ -246,7 +248,8 @@ def central(
         Path | None,
         typer.Option(
             "--set",
-            help="The file that keeps the team's set: started again, it goes on from there.",
+            help="The file that keeps the team's set; a centre that is started again continues "
+            "from it.",
             metavar="FILE",
         ),
     ] = None,
@@ -469,10 +472,10 @@ def verdict(
     keys: Keys = None,
     reason: Annotated[str, typer.Option(help="Why, for the log.")] = "seen by an operator",
     withdraw: Annotated[
-        bool, typer.Option("--withdraw", help="This verdict holds no more, and for good.")
+        bool, typer.Option("--withdraw", help="Withdraw this verdict, for good.")
     ] = False,
     patience: Annotated[
-        float, typer.Option(help="Seconds to wait for a map that rests on it.", min=0.0)
+        float, typer.Option(help="Seconds to wait for a map that takes it into account.", min=0.0)
     ] = 60.0,
 ) -> None:
     """Tell a running team that two landmarks without names are one, or that they are two.
@@ -510,7 +513,7 @@ def verdict(
 def end(
     team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
     without: Annotated[
-        str | None, typer.Option(help="The robot that nobody is to wait for any more.")
+        str | None, typer.Option(help="A lost robot, for which the team no longer waits.")
     ] = None,
     connect: Connect = LOOPBACK,
     keys: Keys = None,

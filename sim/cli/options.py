@@ -73,7 +73,7 @@ Pieces = Annotated[
 IdentitiesOption = Annotated[
     str | None,
     typer.Option(
-        help="hidden: landmarks have no names, of any world or data set; or known.",
+        help="hidden: run any world or data set as if its landmarks had no names; or known.",
         metavar="WHICH",
     ),
 ]
@@ -87,7 +87,9 @@ Dataset = Annotated[
 ]
 SpeedText = Annotated[
     str,
-    typer.Option(help="Multiple of real time, or max: as fast as everyone keeps up.", metavar="X"),
+    typer.Option(
+        help="Multiple of real time, or max: as fast as the measurements are taken.", metavar="X"
+    ),
 ]
 
 

@@ -38,7 +38,7 @@ def rerun(
         bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
     ] = False,
     without: Annotated[
-        list[str] | None, typer.Option(help="A robot that was not there; repeatable.")
+        list[str] | None, typer.Option(help="A robot to leave out; repeatable.")
     ] = None,
     fusion: FusionOption = None,
     estimator: EstimatorOption = None,
@@ -59,10 +59,17 @@ def rerun(
     ] = None,
     partition: Annotated[
         list[str] | None,
-        typer.Option(help="Robots without the centre, as r1,r2:100-200.", metavar="ROBOTS:SPAN"),
+        typer.Option(
+            help="Robots cut off from the centre, and when, as r1,r2:100-200.",
+            metavar="ROBOTS:SPAN",
+        ),
     ] = None,
     unsafe_feedback: Annotated[
-        bool, typer.Option("--unsafe-feedback", help="Robots send what they took from the team.")
+        bool,
+        typer.Option(
+            "--unsafe-feedback",
+            help="Robots send the team's map back as their own: law 1 broken, for comparison.",
+        ),
     ] = False,
     noise: Annotated[
         list[str] | None,

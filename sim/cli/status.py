@@ -17,7 +17,9 @@ def status(
     team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
     connect: Connect = LOOPBACK,
     keys: Keys = None,
-    seconds: Annotated[float, typer.Option(help="How long to look.", min=0.5)] = 3.0,
+    seconds: Annotated[
+        float, typer.Option(help="Seconds for which the team is observed.", min=0.5)
+    ] = 3.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write it as JSON, too.")] = None,
 ) -> None:
     """Show the nodes of a running team: rates, clocks, which waits for which, and what to do."""
