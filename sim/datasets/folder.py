@@ -107,6 +107,10 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     )
 
 
+LONG_STEP_S = 5.0
+"""Odometry that is told so seldom has times in other units, or is of little use."""
+
+
 @dataclass(frozen=True)
 class RobotRows:
     """One robot's tables in order of time; looked: when it looked and saw nothing; unnamed: its
@@ -163,6 +167,12 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
     driven = None
     if len(intervals.end_ns):
         driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
+        step_s = 1e-9 * float(np.median(intervals.duration_ns))
+        if step_s > LONG_STEP_S:
+            notes.append(
+                f"most rows of its odometry are {step_s:,.0f} s apart: times are in seconds; a map "
+                "of columns makes them of others (scale = 1e-3)"
+            )
     else:
         notes.append("no odometry: only what it saw is given")
     seen, looked, said = rows.measurements_of(observed, "measurement", None, driven)

@@ -22,6 +22,20 @@ def kind_of(path: str | Path) -> Kind:
     except DatasetError as error:
         if not Path(path).exists() or UTIAS_MARKER not in str(error):
             raise
+        inner = _with_tables_within(Path(path))
+        if inner is not None:
+            raise DatasetError(
+                f"{path}: the data set is in its folder {inner}: give that"
+            ) from None
         raise DatasetError(
-            f"{error}; or {folder_files.EXPECTED.removeprefix('expected ')}"
+            f"{path}: no data set in it; {folder_files.EXPECTED}; or "
+            f"{tables.EXPECTED.removeprefix('expected ')}"
         ) from None
+
+
+def _with_tables_within(place: Path) -> Path | None:
+    """The first folder within that is a data set of tables."""
+    if not place.is_dir():
+        return None
+    inner = (each for each in sorted(place.iterdir()) if each.is_dir())
+    return next((each for each in inner if folder_files.has_tables(each)), None)

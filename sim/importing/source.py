@@ -29,6 +29,7 @@ from team.ros2.topics import TopicsError, load_topics
 
 TEAM_PROFILE = b"teamslam"
 HEAD = 64
+MEASURED = ("odometry", "observations", "sightings")
 
 
 @dataclass(frozen=True)
@@ -206,6 +207,12 @@ def _written(
     tables: Sequence[RobotTables], said: list[str], request: Request, folder: Path
 ) -> Report:
     by_name = {each.robot: each for each in tables}
+    if not any(kind in each.rows for each in tables for kind in MEASURED):
+        raise DatasetError(
+            f"{request.sources[0]}: neither odometry nor observations in it; give a folder with "
+            "them, or with one folder for each robot, or say by --columns (of bags: --ros2) which "
+            "are what"
+        )
     for name, (x, y, theta, *sigmas) in request.starts.items():
         by_name[_started(name, by_name)].start((x, y, theta), sigmas)
     if request.truth is not None:

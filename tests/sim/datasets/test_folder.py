@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from sim.cli.main import app
 from sim.datasets.folder import folder
 from sim.datasets.folder_writer import seconds, write_folder
+from sim.datasets.kinds import kind_of
 from sim.datasets.tables import DatasetError
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load, with_options
@@ -393,3 +394,27 @@ def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path: Path) -> 
     assert "teamslam calibrate" in result.output
     assert isinstance(result.exception, DatasetError)
     assert "line 5, column t_s: 'x' is not a time" in str(result.exception)
+
+
+def test_times_in_other_units_are_noted(tmp_path: Path) -> None:
+    rows = "".join(f"{1000 * k},1,0\n" for k in range(9))
+    odometry = "t_s,forward_m_s,yaw_rate_rad_s\n" + rows
+    notes = only(data_set(tmp_path, odometry=odometry, observations=SEEN)).notes
+    assert "most rows of its odometry are 1,000 s apart" in " ".join(notes)
+
+
+def test_a_folder_around_the_data_set_is_named(tmp_path: Path) -> None:
+    data_set(tmp_path / "inner", odometry=SPEEDS, observations=SEEN)
+    with pytest.raises(DatasetError, match="the data set is in its folder .*inner: give that"):
+        kind_of(tmp_path)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(DatasetError, match="none: no data set in it; expected a folder with a sub"):
+        kind_of(tmp_path / "none")
+
+
+def test_import_of_a_folder_without_measurements_makes_none(tmp_path: Path) -> None:
+    data_set(tmp_path / "a", landmarks="landmark,x_m,y_m\n1,2,3\n")
+    done = CliRunner().invoke(app, ["import", str(tmp_path / "a"), "-o", str(tmp_path / "b")])
+    assert isinstance(done.exception, DatasetError)
+    assert "neither odometry nor observations" in str(done.exception)
+    assert not (tmp_path / "b").exists()
