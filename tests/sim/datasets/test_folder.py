@@ -405,7 +405,7 @@ def test_times_in_other_units_are_noted(tmp_path: Path) -> None:
 
 def test_a_folder_around_the_data_set_is_named(tmp_path: Path) -> None:
     data_set(tmp_path / "inner", odometry=SPEEDS, observations=SEEN)
-    with pytest.raises(DatasetError, match="the data set is in its folder .*inner: give that"):
+    with pytest.raises(DatasetError, match=r"the data set is in its folder .*inner: give that"):
         kind_of(tmp_path)
     (tmp_path / "none").mkdir()
     with pytest.raises(DatasetError, match="none: no data set in it; expected a folder with a sub"):
