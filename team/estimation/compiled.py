@@ -6,18 +6,21 @@ bits on the same platform fingerprint. There are no parallel sections for the sa
 A kernel's machine code holds that of the kernels that it calls. Numba takes a cached one for fresh
 while the kernel's own file is unchanged, so after a change elsewhere it would go on with the old
 code; and it writes its index before the code, so another process could load what an older program
-left under the same name. Here the files of the cache are named by all sources that a kernel may
-call: docs/decisions/0029.
+left under the same name. Here the files of the cache are named by a digest of the kernel's byte
+code, of the constants that it names and of the kernels that it calls: docs/decisions/0029.
 """
 
+import dis
 import hashlib
 import inspect
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
+from types import CodeType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 from team.estimation.compiled_once import compile_once
 from team.sources import sources_of
@@ -34,24 +37,107 @@ def compiled(function: F) -> F:
     kernel = inspect.unwrap(function)
     dispatcher: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel)
     if dispatcher is not kernel:  # with NUMBA_DISABLE_JIT it is the function itself
-        cache, program = dispatcher._cache, program_of(kernel.__module__)
-        _name_cache(cache, program)
-        name = f"{cache._impl.filename_base}-{program}.lock"
-        compile_once(dispatcher, Path(cache._cache_path) / name)
+        compile_once(dispatcher, lambda: _cache_of_its_own(dispatcher))
     return cast(F, dispatcher)
 
 
+def _cache_of_its_own(dispatcher: Any) -> Path:
+    """Let a kernel's cached code be that of its program only; the file that locks it.
+
+    When it is called first: then all that it names is there. Its line is no part of the name.
+    """
+    cache, program = dispatcher._cache, program_of(dispatcher.py_func)
+    line = f"-{dispatcher.py_func.__code__.co_firstlineno}."
+    name = f"{cache._impl.filename_base.replace(line, '.', 1)}-{program}"
+    cache._cache_file = type(cache._cache_file)(cache._cache_path, name, program)
+    return Path(cache._cache_path) / f"{name}.lock"
+
+
+@cache
+def program_of(kernel: Callable[..., object]) -> str:
+    """Digest of a kernel's byte code, and of all that its names may mean: kernels and constants.
+
+    What is neither, such as a class, stands for every source that the kernel's module imports.
+    """
+    digest = hashlib.blake2b(digest_size=8)
+    _add_code(digest, kernel.__code__, kernel.__doc__)
+    digest.update(repr((kernel.__defaults__, kernel.__kwdefaults__)).encode())
+    for chain in sorted(_globals(kernel.__code__)):
+        _add_meant(digest, kernel, chain)
+    if kernel.__closure__:
+        digest.update(_sources(kernel.__module__))
+    return digest.hexdigest()
+
+
+def _add_code(digest: hashlib.blake2b, code: CodeType, doc: str | None) -> None:
+    digest.update(repr((code.co_varnames, code.co_names, code.co_freevars)).encode())
+    digest.update(code.co_code)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            _add_code(digest, constant, None)
+        elif isinstance(constant, frozenset):  # in no order
+            digest.update(repr(sorted(map(repr, constant))).encode())
+        elif constant is not doc:
+            digest.update(repr(constant).encode())
+
+
+def _globals(code: CodeType) -> set[tuple[str, ...]]:
+    """The global names that a function loads, each with the attributes that it asks of it."""
+    chains: list[tuple[str, ...]] = []
+    at_global = False
+    for step in dis.get_instructions(code):
+        if step.opname == "LOAD_GLOBAL":
+            chains.append((step.argval,))
+            at_global = True
+        elif at_global and step.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            chains[-1] = (*chains[-1], step.argval)
+        elif step.opname != "CACHE":
+            at_global = False
+    inside = [_globals(each) for each in code.co_consts if isinstance(each, CodeType)]
+    return set(chains).union(*inside)
+
+
+def _add_meant(
+    digest: hashlib.blake2b, kernel: Callable[..., object], chain: tuple[str, ...]
+) -> None:
+    """What a name of a kernel means."""
+    name, *attributes = chain
+    if name not in kernel.__globals__:  # of the language
+        return
+    value = kernel.__globals__[name]
+    for attribute in attributes:
+        if isinstance(value, ModuleType) and _is_ours(value.__name__):
+            value = getattr(value, attribute)
+    digest.update(".".join(chain).encode())
+    function = getattr(value, "py_func", None)
+    if function is not None:
+        digest.update(program_of(function).encode())
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
+    elif _is_plain(value):
+        digest.update(repr(value).encode())
+    elif _is_ours(str(getattr(value, "__module__", None) or getattr(value, "__name__", ""))):
+        digest.update(_sources(kernel.__module__))
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, bool | int | float | complex | str | bytes)
+
+
+def _is_ours(module: str) -> bool:
+    return module.partition(".")[0] not in _OTHERS
+
+
+_OTHERS = frozenset(("numpy", "math", "builtins", "numba", "typing", "jaxtyping"))
+
+
 @lru_cache
-def program_of(module: str) -> str:
+def _sources(module: str) -> bytes:
     """Digest of a module and of every module of ours that it imports, near or far."""
     digest = hashlib.blake2b(digest_size=8)
     package = (module.partition(".")[0],)
     for name, source in sorted(sources_of(module, package, places=False).items()):
         digest.update(f"{name}\n".encode() + source)
-    return digest.hexdigest()
-
-
-def _name_cache(cache: Any, program: str) -> None:
-    """Let a kernel's cached code be that of this program only."""
-    name = f"{cache._impl.filename_base}-{program}"
-    cache._cache_file = type(cache._cache_file)(cache._cache_path, name, program)
+    return digest.digest()

@@ -7,7 +7,7 @@ with two cores that is all that the second core then does.
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,23 +22,25 @@ PATIENCE_S = 60.0
 _POLL_S = 0.02
 
 
-def compile_once(dispatcher: Any, lock: Path) -> None:
+def compile_once(dispatcher: Any, lock_of: Callable[[], Path]) -> None:
     """Let `dispatcher` compile only while no other process compiles the same kernel.
 
-    lock: a file beside its machine code. Numba looks there again
-    once the lock is held. Kernels call each other without cycles, so processes that hold one and
-    wait for another do not wait in a circle; threads of a process take Numba's own lock first.
+    lock_of: the file to lock, beside its machine code; asked at the first call. Numba looks there
+    again once the lock is held. Kernels call each other without cycles, so processes that hold
+    one and wait for another do not wait in a circle; threads take Numba's own lock first.
     """
     compile_here = dispatcher.compile
     held = False
+    lock: Path | None = None
 
     def compile_(signature: Any) -> Any:
-        nonlocal held
+        nonlocal held, lock
         with global_compiler_lock:
             if held:  # one of its forms within another
                 return compile_here(signature)
             held = True
             try:
+                lock = lock_of() if lock is None else lock
                 with alone(lock, PATIENCE_S):
                     return compile_here(signature)
             finally:

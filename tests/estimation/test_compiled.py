@@ -1,5 +1,6 @@
 """A kernel's cached machine code is that of its sources, near and far."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from team.estimation.compiled import compiled, program_of
+from team.estimation.compiled import _sources, compiled, program_of
 
 INNER = """
 from team.estimation.compiled import compiled
@@ -72,14 +73,82 @@ def test_a_kernel_is_compiled_once_and_anew_when_what_it_calls_has_changed(packa
     assert computed(package.parent) == [(21.0, 1)], "the old program's code is still its own"
 
 
+FAR = """
+from typing import NamedTuple
+LIMIT = 1.0
+class Pair(NamedTuple):
+    a: int
+    b: int
+"""
+REACHES = '''
+import math
+from team.estimation.compiled import compiled
+from kernels import inner as module
+from kernels.far import LIMIT, Pair
+from kernels.inner import inner
+from kernels.tables import UNUSED
+
+@compiled
+def through_a_name(x):
+    return inner(x) + math.sin(x)
+
+@compiled
+def through_a_module(x):
+    return module.inner(x)
+
+@compiled
+def constant(x):
+    """What it does."""
+    return x < LIMIT
+
+@compiled
+def of_a_class(x):
+    return Pair(x, x)[0]
+
+@compiled
+def alone(x):
+    return [y * y for y in range(x)]
+'''
+
+
 def test_the_program_of_a_kernel_is_what_it_can_reach(
     package: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(package.parent)
-    before = program_of("kernels.outer")
-    program_of.cache_clear()
-    assert program_of("kernels.outer") == before
-    assert program_of("kernels.inner") != before
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    sources = {
+        "inner": INNER.format("2.0"),
+        "far": FAR,
+        "tables": "UNUSED = 1\n",
+        "reaches": REACHES,
+    }
+    kernels = ("through_a_name", "through_a_module", "constant", "of_a_class", "alone")
+
+    def programs(**changed: str) -> dict[str, str]:
+        for name, text in {**sources, **changed}.items():
+            (package / f"{name}.py").write_text(text)
+        for name in [name for name in sys.modules if name.partition(".")[0] == "kernels"]:
+            del sys.modules[name]
+        program_of.cache_clear()
+        _sources.cache_clear()
+        importlib.invalidate_caches()
+        module = importlib.import_module("kernels.reaches")
+        return {name: program_of(getattr(module, name).py_func) for name in kernels}
+
+    def moved(**changed: str) -> set[str]:
+        now = programs(**changed)
+        return {name for name in kernels if now[name] != before[name]}
+
+    before = programs()
+    assert moved() == set()
+    called = {"through_a_name", "through_a_module", "of_a_class"}
+    assert moved(inner=INNER.format("3.0")) == called
+    assert moved(far=FAR.replace("1.0", "2.0")) == {"constant", "of_a_class"}
+    assert moved(far=FAR.replace("    b: int", "    c: int")) == {"of_a_class"}
+    assert moved(tables="UNUSED = 2\n") == {"of_a_class"}
+    assert moved(reaches=REACHES.replace("y * y", "y + y")) == {"alone", "of_a_class"}
+    told_otherwise = "# a line more\n" + REACHES.replace("What it does", "What it is for")
+    assert moved(reaches=told_otherwise) == {"of_a_class"}
 
 
 def test_without_numba_s_compiler_a_kernel_is_the_function_itself() -> None:
