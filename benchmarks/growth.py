@@ -23,7 +23,9 @@ import numpy as np
 
 from benchmarks.baseline import worse
 from central.config import CentralConfig
+from central.intake import Instant
 from central.join_rule import JoinRule
+from central.scheduler import Scheduler
 from team import translate
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
@@ -108,9 +110,11 @@ def measured(robots: int, landmarks: int, at: list[int]) -> list[dict[str, float
     """A row of figures at each number of submaps."""
     world = World(robots, landmarks)
     names = [f"r{r}" for r in range(robots)]
-    rule = JoinRule(CentralConfig(tick_s=TICK_S, broadcast_s=TICK_S), bytes(8), names)
+    config = CentralConfig(tick_s=TICK_S, broadcast_s=TICK_S)
+    scheduler = Scheduler(JoinRule(config, bytes(8), names))
+    intake = scheduler.intake
     for start in world.starts():
-        rule.take(start, 0)
+        intake.take(start, 0)
     rows: list[dict[str, float]] = []
     cpu_ms, sent = list[float](), list[tuple[int, int]]()
     for k in range(max(at) // robots):
@@ -118,8 +122,8 @@ def measured(robots: int, landmarks: int, at: list[int]) -> list[dict[str, float
         now_ns = submaps[-1].stamp_ns
         before = time.process_time()
         for submap in submaps:
-            rule.take(submap, now_ns)
-        out = rule.broadcasts(now_ns, now_ns)
+            intake.take(submap, now_ns)
+        out = scheduler.at(Instant(now_ns, intake.inputs(now_ns, now_ns)))
         cpu_ms.append(1e3 * (time.process_time() - before))
         sent.append(_bytes(out))
         if (k + 1) * robots in at:

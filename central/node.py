@@ -11,7 +11,8 @@ import msgspec
 from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.rule import rule_of
+from central.rule import final_of, rule_of
+from central.scheduler import Scheduler
 from team import translate
 from team.door import Door, absurd
 from team.estimation.gaussian import NO_LANDMARKS
@@ -41,6 +42,8 @@ class CentralNode:
         self._door = Door(robots)
         self._attendance = TeamAttendance.of(robots)
         self._rule = rule_of(config, self.announcement.digest, sorted(robots))
+        self._scheduler = Scheduler(self._rule)
+        self._intake = self._scheduler.intake
         self._broadcasts = 0
         self._newest: m.FusedMap | None = None
         self._credit: list[Outgoing] | None = None
@@ -54,12 +57,12 @@ class CentralNode:
         own = (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.GIVEN_UP, ch.HEAD, ch.ROBOT_HEAD,
                ch.END_ORDER)  # fmt: skip
         others = (ch.ROBOT_CONFIG,) if self._admits else ()
-        return tuple(dict.fromkeys((*self._rule.listens, *own, *others)))
+        return tuple(dict.fromkeys((*self._intake.listens, *own, *others)))
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings in words, the newest last."""
-        return self._rule.warnings
+        """What went wrong, in words, the newest last."""
+        return self._scheduler.warnings
 
     def begin(self) -> list[Outgoing]:
         """The first messages of the node: its configuration."""
@@ -83,7 +86,7 @@ class CentralNode:
         if not self._admits or robot is None or robot in self._attendance.robots or absurd(message):
             return
         if len(self._attendance.robots) < MOST_ROBOTS:
-            for admits in (self._door, self._attendance, self._rule):
+            for admits in (self._door, self._attendance, self._scheduler):
                 admits.admit(robot)
             self._admitted.append(robot)
 
@@ -97,21 +100,22 @@ class CentralNode:
         if isinstance(message, m.TeamEnd):  # who comes later hears of it from the centre
             repeated = [] if known else [Outgoing(ch.TEAM_END, "", message)]
             return repeated + self._advance()
-        self._credit = self._rule.take(message, self._attendance.now_ns)
+        self._credit = self._intake.take(message, self._attendance.now_ns)
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue behind a message whose handling raised an exception: its sender gets the credit.
 
-        A submap that the rule could not take counts as refused. Where the final map can not be
-        computed, the newest earlier map becomes the final one, provisional and with the reason.
+        One that the rule could not take counts as refused. A running map that raises takes nothing
+        from the final one; where that can not be computed, the newest map that could is the final
+        one, provisional and with the reason.
         """
         out, self._credit = self._credit, []
         if out is None:
-            out = self._rule.refuse(message, why, self._attendance.now_ns)
-        if self._concluding and not self.finished:
-            return out + self._conclude_anyway(why)
-        return out + (self._advance() if self._is_over else [])
+            out = self._intake.refuse(message, why, self._attendance.now_ns)
+        if self.finished or not self._is_over:
+            return out
+        return out + (self._conclude_anyway(why) if self._concluding else self._conclude())
 
     def _take_final(self, final: m.FusedMap) -> list[Outgoing]:
         """Take the final map that an earlier process of this centre has published."""
@@ -126,8 +130,8 @@ class CentralNode:
 
     @property
     def awaited(self) -> list[str]:
-        """The absent robots that the final map waits for."""
-        return [] if self.finished else self._attendance.awaited(self._rule.dealt)
+        """The robots that are not there and that the final map waits for."""
+        return [] if self.finished else self._attendance.awaited(self._intake.dealt)
 
     @property
     def ends(self) -> bool:
@@ -137,8 +141,8 @@ class CentralNode:
     def _advance(self) -> list[Outgoing]:
         if self.finished:
             return []
-        self._attendance.withdrawn = frozenset(self._rule.withdrawn)
-        out = self._counted(self._rule.advance(self._attendance))
+        self._attendance.withdrawn = frozenset(self._intake.withdrawn)
+        out = self._counted(self._scheduler.advance(self._attendance))
         return out + self._conclude() if self._is_over else out
 
     def _counted(self, out: list[Outgoing]) -> list[Outgoing]:
@@ -148,17 +152,13 @@ class CentralNode:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of everything that is here, if the last one lacks something; called in spare
-        time.
-        """
-        return [] if self.finished else self._counted(self._rule.refresh(self._attendance))
+        """A map of all that is here, if the last one lacks something; for when there is time."""
+        return [] if self.finished else self._counted(self._scheduler.refresh(self._attendance))
 
     @property
     def _is_over(self) -> bool:
-        """Whether the streams have ended and nothing of them is waited for."""
-        end = self._attendance.end
-        over = end is not None and self._attendance.concluded(self._rule.dealt)
-        return over and end is not None and self._rule.complete(end)
+        """The streams have ended, and nobody and nothing of them is waited for."""
+        return self._attendance.concluded(self._intake.dealt) and self._intake.complete
 
     def _conclude_anyway(self, why: str) -> list[Outgoing]:
         newest = self._newest
@@ -168,7 +168,7 @@ class CentralNode:
                 self.config, digest, NO_LANDMARKS, (), stamp_ns=now_ns, joint=False
             )
         reasons = (*newest.reasons, f"not the final map, which raised: {why}")
-        lost = tuple(self._attendance.missing(self._rule.dealt))
+        lost = tuple(self._attendance.missing(self._intake.dealt))
         final = msgspec.structs.replace(
             newest, final=True, provisional=True, reasons=reasons, lost=lost
         )
@@ -177,11 +177,10 @@ class CentralNode:
 
     def _conclude(self) -> list[Outgoing]:
         self._concluding = True
-        out = self._rule.conclude(self._attendance.now_ns)
+        out = self._scheduler.conclude(self._attendance.now_ns)
         self.finished = True
-        final = out[-1].message
-        assert isinstance(final, m.FusedMap)
-        lost = tuple(self._attendance.missing(self._rule.dealt))
+        final = final_of(out)
+        lost = tuple(self._attendance.missing(self._intake.dealt))
         if lost:
             final = msgspec.structs.replace(final, provisional=True, lost=lost)
         self.final = final
@@ -189,27 +188,27 @@ class CentralNode:
 
     def wanted(self) -> list[m.MeasurementsRequest]:
         """The measurements that are missing and must be asked for at their source."""
-        return [] if self.finished else self._rule.wanted(self._attendance.now_ns)
+        return [] if self.finished else self._intake.wanted(self._attendance.now_ns)
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:
         """The answer to `SubmapsRequest`: what is here of the robot, its latest incarnation
         first.
         """
-        kept = self._rule.kept(decoded(request, m.SubmapsRequest).robot)
+        kept = self._intake.kept(decoded(request, m.SubmapsRequest).robot)
         return [encoded(message) for message in kept]
 
     def lacking(self) -> list[m.SubmapsRequest]:
-        """What robots say that they have sent and is not here, to be requested from them."""
-        return [] if self.finished else self._rule.lacking(self._attendance)
+        """What robots have sent by their own word and is not here: to be asked of them."""
+        return [] if self.finished else self._intake.lacking(self._attendance)
 
     def status(self) -> m.Status:
         """The centre's status, for people."""
         figures = {
             "broadcasts": float(self._broadcasts),
-            "submaps": float(self._rule.submaps),
+            "submaps": float(self._intake.submaps),
             "landmarks": float(self._rule.landmarks),
             "team_time_s": self._attendance.now_ns * 1e-9,
-            "refused": 0.0,
+            "refused": float(self._intake.refused + self._rule.not_folded),
         }
         state = "done" if self.finished else "joining"
         given_up = [
@@ -221,7 +220,13 @@ class CentralNode:
             if self._admitted
             else ()
         )
-        warnings = (*given_up, *admitted, *self._rule.findings, *self.warnings[-3:])
+        warnings = (
+            *given_up,
+            *admitted,
+            *self._rule.findings,
+            *self._intake.findings,
+            *self.warnings[-3:],
+        )
         now_ns = self._attendance.now_ns
         return m.Status(
             stamp_ns=now_ns,

@@ -5,13 +5,11 @@ are here too. Admission enforces law 1: a submap whose measurements overlap anot
 differs from one with the same name, is refused with the reason.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from team.estimation.contribution import Stream
 from team.wire.messages import SightingFactor, Submap, VersionEntry
-
-Stream = tuple[str, int]
-"""(robot, incarnation)."""
 
 
 @dataclass
@@ -90,15 +88,14 @@ class SubmapSet:
         found = stream.get(submap.sequence, {})
         return [found[key] for key in sorted(found)]
 
-    def chain(self, stream: Stream) -> list[Submap]:
-        """The submaps of a stream from sequence 0 up to the first missing or incomplete one."""
-        return list(self._chain(stream))
-
     def count(self, stream: Stream) -> int:
-        """Number of submaps from sequence 0 on without a gap."""
-        return len(self._chain(stream))
+        """How many submaps from sequence 0 on are there without a gap."""
+        return len(self.chain(stream))
 
-    def _chain(self, stream: Stream) -> list[Submap]:
+    def chain(self, stream: Stream) -> Sequence[Submap]:
+        """The submaps of a stream from sequence 0 up to the first missing or incomplete one; what
+        is returned grows with the set.
+        """
         found, seen = self.streams.get(stream, {}), self.seen.get(stream, {})
         chain = self.chains.setdefault(stream, [])
         while (submap := found.get(len(chain))) is not None:

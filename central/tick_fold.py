@@ -21,7 +21,7 @@ from central.members import Members
 from central.withdrawal import convicted, suspects
 from team import translate
 from team.config import UNNAMED
-from team.estimation.contribution import named
+from team.estimation.contribution import Stream, named
 from team.estimation.hybrid_slam.sensitivity import BIASES
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.association.landmarks import Verdict
@@ -41,8 +41,6 @@ from team.estimation.map_joining.relinearising import is_due, relinearised
 from team.estimation.map_joining.submap_graph import CommonBias, CondensedError
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
 from team.wire.messages import SightingFactor, Submap
-
-Stream = tuple[str, int]
 
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The errors that the whole team has."""
@@ -110,7 +108,7 @@ class TickFold:
     convicted: whom the fold found to be wrong, with the reason in words; nobody, unless `convicts`.
     bounded: what is old is condensed, but for the ticks up to `_raw_until`, behind which an island
     whose frame had to turn was found to be condensed.
-    verdicts: an operator's on unnamed landmarks that hold; `_no_more`: those that were withdrawn.
+    verdicts: an operator's on unnamed landmarks.
     """
 
     def __init__(self, config: CentralConfig, bounded: bool = True) -> None:
@@ -127,7 +125,6 @@ class TickFold:
         self._members = Members(self._tick_ns)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self.verdicts: set[Verdict] = set()
-        self._no_more: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
         self._taken: list[Checkpoint] = []
         self._agreed: tuple[Fold, Agreement] | None = None
@@ -147,28 +144,21 @@ class TickFold:
         if submap.robot not in self._gone or tick <= self._convicted_at:
             self._roll_back(tick)
 
-    def judge(self, verdict: Verdict, withdrawn: bool = False) -> None:
-        """What an operator says of two unnamed landmarks, in whichever submaps, here or to come.
+    def judge(self, verdicts: Collection[Verdict]) -> None:
+        """What an operator says of pairs of unnamed landmarks, in submaps that are here or to come.
 
-        withdrawn: that it holds no more, whichever of the two comes first. The fold goes back to
-        before the tick that has both.
+        The fold goes back to before the first tick that has both landmarks of what is new, or holds
+        no more.
         """
-        held = verdict in self.verdicts
-        if withdrawn:
-            self._no_more.add(verdict)
-        if held is not withdrawn or (not withdrawn and verdict in self._no_more):
+        changed = self.verdicts.symmetric_difference(verdicts)
+        if not changed:
             return
         until_ns = self._until_ns
-        self.verdicts ^= {verdict}
-        tick = self._tick_judging(verdict)
-        if tick is not None:
-            self._roll_back(tick)
+        self.verdicts.symmetric_difference_update(changed)
+        ticks = [tick for each in changed if (tick := self._tick_judging(each)) is not None]
+        if ticks:
+            self._roll_back(min(ticks))
             self.take_until(until_ns)
-
-    @property
-    def judged(self) -> int:
-        """Verdicts that have come, and withdrawals of verdicts."""
-        return len(self.verdicts | self._no_more) + len(self._no_more)
 
     def _tick_judging(self, verdict: Verdict) -> int | None:
         """The first tick with both landmarks' submaps behind it or in it; None: one is not here."""

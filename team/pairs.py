@@ -38,7 +38,7 @@ class RuleRow(NamedTuple):
 
 _RUNNING = "team.robot.baselines.running:running_estimator"
 _WHOLE = ("latest", "alone")
-_ROUNDS = "central.baselines.map_rules:ExchangeRule"
+_ROUNDS = "central.baselines.feedback_rule:ExchangeRule"
 _SVD = "central.baselines.svd_rule:SvdJoinRule"
 _CHEAP = ("hybrid", "dead-reckoning")
 _PER_AXIS = ("hybrid", "hybrid-thesis", "hybrid-thesis-coded")

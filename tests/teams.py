@@ -9,7 +9,9 @@ import msgspec
 import numpy as np
 
 from central.config import CentralConfig
+from central.intake import Instant
 from central.node import CentralNode
+from central.scheduler import Scheduler
 from sim.publisher.node import WorldNode, expected_nodes
 from sim.world.streams import (
     Detections,
@@ -288,3 +290,8 @@ class Team:
     def final(self) -> m.FusedMap:
         (final,) = self.sent[ch.FINAL_MAP.key()]
         return final
+
+
+def broadcasts(found: Scheduler, closed_ns: float, now_ns: int) -> list[Outgoing]:
+    """What a scheduler says when all that ends up to a time is closed."""
+    return found.at(Instant(now_ns, found.intake.inputs(closed_ns, now_ns)))

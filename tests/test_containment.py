@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from central.attendance import TeamAttendance
 from central.desk.evaluation.evaluation import evaluate
 from central.desk.verification.verification import verify
-from central.join_rule import JoinRule
 from central.main import CentralShell
 from central.node import CentralNode
+from central.scheduler import Scheduler
+from central.submap_intake import SubmapIntake
 from sim.in_memory.team import final_map
 from team.containment import Boundary
 from team.recording.recorder import Recorder
@@ -109,14 +111,14 @@ def submaps(out: list[Outgoing]) -> list[m.Message]:
 def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_in_the_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    whole = JoinRule.take_submap
+    whole = SubmapIntake.take_submap
 
-    def take(self: JoinRule, of: m.Submap) -> int:
+    def take(self: SubmapIntake, of: m.Submap) -> int:
         if (of.robot, of.sequence) == ("r1", 1):
             raise np.linalg.LinAlgError("singular")
         return whole(self, of)
 
-    monkeypatch.setattr(JoinRule, "take_submap", take)
+    monkeypatch.setattr(SubmapIntake, "take_submap", take)
     samples = list(team_samples(thesis(90)))
     (fault,) = faults(samples)
     assert (fault.node, fault.message, fault.error) == ("central", "submap/1", "LinAlgError")
@@ -133,15 +135,28 @@ def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_i
 def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def conclude(self: JoinRule, now_ns: int) -> list[Outgoing]:
+    def conclude(self: Scheduler, now_ns: int) -> list[Outgoing]:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(JoinRule, "conclude", conclude)
+    monkeypatch.setattr(Scheduler, "conclude", conclude)
     samples = list(team_samples(thesis(45)))
     final = final_map(samples)
     assert final.provisional
     assert "not the final map, which raised" in final.reasons[-1]
     assert len(faults(samples)) == 1
+
+
+def test_running_maps_that_raise_take_nothing_from_the_final_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def advance(self: Scheduler, attendance: TeamAttendance) -> list[Outgoing]:
+        raise np.linalg.LinAlgError("singular")
+
+    whole = final_map(list(team_samples(thesis(20))))
+    monkeypatch.setattr(Scheduler, "advance", advance)
+    final = final_map(list(team_samples(thesis(20))))
+    assert not final.provisional
+    assert (final.means, final.covariance) == (whole.means, whole.covariance)
 
 
 class Brittle:

@@ -94,7 +94,7 @@ def test_a_submap_enters_the_map_when_its_last_sighting_has_come(first):
         centre.handle(submap, 0)
     for each in (whole, *mine[:-1]):
         centre.handle(each, 0)
-    before = centre._rule.count((robot, whole.incarnation))
+    before = centre._intake.count((robot, whole.incarnation))
     out = centre.handle(mine[-1], 0)
     assert before == whole.sequence
     assert [x.submaps for x in of(out, ch.CENTRAL_PROGRESS)] == [whole.sequence + 1]

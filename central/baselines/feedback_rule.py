@@ -5,10 +5,11 @@ landmarks, so the next round's maps hold this round's: under `kalman` and `kalma
 measurements are counted again and again, and the covariance that they give is worth nothing.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import msgspec
 
+from central.attendance import TeamAttendance
 from central.baselines.map_fusion import (
     covariance_intersection,
     fused_totally,
@@ -17,14 +18,17 @@ from central.baselines.map_fusion import (
 )
 from central.config import CentralConfig
 from central.fused import fused_message
+from central.intake import Instant, Intake, MapInputs
+from central.rule import FusionRule, Tail
+from central.submap_set import SubmapSet
 from team import translate
-from team.config import FusionRule
+from team.estimation.contribution import Stream
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 
-RULES: Mapping[FusionRule, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian]] = {
+RULES: Mapping[str, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian]] = {
     "kalman": kalman,
     "kalman-per-axis": kalman_per_axis,
     "covariance-intersection": covariance_intersection,
@@ -32,62 +36,90 @@ RULES: Mapping[FusionRule, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussi
 _NOT_VALID = "this rule counts measurements more than once: its covariance is not valid"
 
 
-class FeedbackRule:
-    """Waits for every robot's map of a round, fuses them in the order of the robots' names."""
+class Rounds(Intake[MapInputs]):
+    """Every robot's map of a round, and the submaps beside it, for the robots' next lives."""
 
-    def __init__(self, config: CentralConfig, digest: bytes) -> None:
-        self._config = config
-        self._config_digest = digest
+    listens = (ch.START, ch.SUBMAP, ch.OWN_MAP)
+    due = "now"
+
+    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
+        super().__init__(config, robots)
         self._rounds: dict[int, dict[str, m.MapEstimate]] = {}
-        self._fused: m.FusedMap | None = None
         self._next = 1
-        self.landmarks = 0
+        self._set = SubmapSet()
+        self._starts: dict[Stream, m.InitialPose] = {}
 
-    def take_map(self, estimate: m.MapEstimate) -> None:
-        """A robot's map for the round that it names."""
-        if estimate.exchange >= self._next:
-            self._rounds.setdefault(estimate.exchange, {})[estimate.robot] = estimate
+    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """File a map for the round that it names."""
+        match message:
+            case m.InitialPose():
+                self._starts.setdefault((message.robot, message.incarnation), message)
+            case m.Submap():
+                self._set.admit(message)
+            case m.MapEstimate() if message.exchange >= self._next:
+                self._rounds.setdefault(message.exchange, {})[message.robot] = message
+            case _:
+                pass
+        return []
 
-    def advance(
-        self, taking_part: Callable[[str, int], bool], robots: Sequence[str]
-    ) -> list[Outgoing]:
-        """Fuse every round that no robot is missing from; `taking_part(robot, round)` says who.
+    def inputs(self, closed_ns: float, now_ns: int) -> MapInputs:
+        """No maps: a round's go into its own."""
+        return MapInputs(now_ns=now_ns)
+
+    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MapInputs]]:
+        """Every round that no robot is missing from which may still send a map.
 
         A centre that was started again goes on with the round that everybody is in.
         """
 
         def complete(number: int) -> bool:
             maps = self._rounds.get(number, {})
-            return bool(maps) and all(r in maps or not taking_part(r, number) for r in robots)
+            return bool(maps) and all(
+                r in maps or not attendance.takes_part(r) for r in attendance.robots
+            )
 
         later = min(self._rounds, default=self._next)
         if complete(later):
             self._next = later
-        out: list[Outgoing] = []
         while complete(self._next):
-            maps = self._rounds[self._next]
-            self._fused = self._fuse(self._next, [maps[r] for r in sorted(maps)])
-            del self._rounds[self._next]
+            maps = self._rounds.pop(self._next)
+            inputs = MapInputs(
+                now_ns=attendance.now_ns, maps=[maps[r] for r in sorted(maps)], exchange=self._next
+            )
             self._next += 1
-            out.append(Outgoing(ch.FUSED_MAP, "", self._fused))
-        return out
+            yield Instant(attendance.now_ns, inputs)
 
-    def conclude(self, now_ns: int) -> list[Outgoing]:
-        """The last round's map is the final one."""
+    def kept(self, robot: str) -> Sequence[m.Message]:
+        """The start of the robot's latest incarnation and its submaps without a gap."""
+        incarnations = [incarnation for name, incarnation in self._set.streams if name == robot]
+        submaps = self._set.chain((robot, max(incarnations))) if incarnations else []
+        start = self._starts.get((robot, submaps[0].incarnation)) if submaps else None
+        return () if start is None else (start, *submaps)
+
+
+class ExchangeRule(FusionRule[MapInputs]):
+    """Fuses the maps of a round in the order of the robots' names; a round names those before."""
+
+    intake = Rounds
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
+        super().__init__(config, digest, robots)
+        self._fused: m.FusedMap | None = None
+
+    def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
+        """A round's map from the maps that it names; the last round's is the final one."""
+        if tail == "final":
+            return [Outgoing(ch.FINAL_MAP, "", self._final(inputs.now_ns))]
+        self._fused = self._fuse(inputs.exchange, inputs.maps)
+        return [Outgoing(ch.FUSED_MAP, "", self._fused)]
+
+    def _final(self, now_ns: int) -> m.FusedMap:
         last = self._fused
         if last is None:
-            last = self._message(
-                0,
-                now_ns,
-                (),
-                NO_LANDMARKS,
-                b"",
-            )
-        counted_often = self._config.fusion != "covariance-intersection"
-        final = msgspec.structs.replace(
-            last, final=True, reasons=(*last.reasons, *([_NOT_VALID] if counted_often else []))
-        )
-        return [Outgoing(ch.FINAL_MAP, "", final)]
+            last = self._message(0, now_ns, (), NO_LANDMARKS, b"")
+        counted_often = self.config.fusion != "covariance-intersection"
+        reasons = (*last.reasons, *([_NOT_VALID] if counted_often else []))
+        return msgspec.structs.replace(last, final=True, reasons=reasons)
 
     def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> m.FusedMap:
         values = {
@@ -97,7 +129,7 @@ class FeedbackRule:
             for x in maps
         }
         value, refused = fused_totally(
-            RULES[self._config.fusion], values, self._config.bounds.coordinate_m
+            RULES[self.config.fusion], values, self.config.bounds.coordinate_m
         )
         members = tuple(
             m.VersionEntry(robot=x.robot, incarnation=x.incarnation, sequence=x.sequence)
@@ -119,12 +151,12 @@ class FeedbackRule:
     ) -> m.FusedMap:
         self.landmarks = len(value.ids)
         return fused_message(
-            self._config,
-            translate.digest_of(self._config_digest, number.to_bytes(8, "little"), inputs),
+            self.config,
+            translate.digest_of(self.config_digest, number.to_bytes(8, "little"), inputs),
             value,
             members,
             stamp_ns=stamp_ns,
-            joint=self._config.fusion != "kalman-per-axis",
+            joint=self.config.fusion != "kalman-per-axis",
             exchange=number,
             reasons=reasons,
         )

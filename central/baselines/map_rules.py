@@ -1,129 +1,76 @@
-"""The rules on robots' whole maps: exchanged in lockstep, fused once as they are, or left alone."""
+"""The rules on robots' whole maps that nobody absorbs: fused once as they are, or left alone."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from central.attendance import TeamAttendance
-from central.baselines.feedback_rule import FeedbackRule
 from central.baselines.map_fusion import fused_totally, kalman
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.rule import FusionRule, Inputs, Stream, Tail
-from central.submap_set import SubmapSet
+from central.intake import Instant, Intake, MapInputs
+from central.rule import FusionRule, Tail
 from team import translate
+from team.estimation.contribution import Stream
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 
-class ExchangeRule(FusionRule):
-    """Rounds in lockstep; the robots absorb what comes back.
+class NewestMaps(Intake[MapInputs]):
+    """The newest map of every robot, and where the streams start."""
 
-    It keeps the submaps that the robots send beside their maps, for their next lives.
-    """
+    listens = (ch.START, ch.OWN_MAP)
 
-    listens = (ch.START, ch.SUBMAP, ch.OWN_MAP)
-
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
-        super().__init__(config, digest, robots)
-        self._rounds = FeedbackRule(config, digest)
-        self._set = SubmapSet()
+    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
+        super().__init__(config, robots)
+        self._maps: dict[str, m.MapEstimate] = {}
         self._starts: dict[Stream, m.InitialPose] = {}
 
-    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
-        """A round's map from the maps that it names; the rounds follow one another."""
-        if tail == "final":
-            return self.conclude(inputs.stamp_ns)
-        for estimate in inputs.maps:
-            self._rounds.take_map(estimate)
-        return self.advance(TeamAttendance.of(()))
-
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """File a map for its round."""
+        """Keep a start, and a map that is newer than the robot's last one."""
         match message:
             case m.InitialPose():
-                self._starts.setdefault((message.robot, message.incarnation), message)
-            case m.Submap():
-                self._set.admit(message)
+                self._starts[message.robot, message.incarnation] = message
             case m.MapEstimate():
-                self._rounds.take_map(message)
+                last = self._maps.get(message.robot)
+                if last is None or _name(last) < _name(message):
+                    self._maps[message.robot] = message
             case _:
                 pass
         return []
 
-    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """Every round that no robot is missing from."""
-        out = self._rounds.advance(
-            lambda name, _round: attendance.takes_part(name), list(attendance.robots)
-        )
-        self.landmarks = self._rounds.landmarks
-        return out
+    def inputs(self, closed_ns: float, now_ns: int) -> MapInputs:
+        """The maps by robot."""
+        maps = [self._maps[robot] for robot in sorted(self._maps)]
+        return MapInputs(now_ns=now_ns, maps=maps, starts=self._starts)
 
-    def conclude(self, now_ns: int) -> list[Outgoing]:
-        """The last round's map."""
-        return self._rounds.conclude(now_ns)
+    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MapInputs]]:
+        """Now."""
+        yield Instant(attendance.now_ns, self.inputs(float("inf"), attendance.now_ns))
 
-    def kept(self, robot: str) -> Sequence[m.Message]:
-        """The start of the robot's latest incarnation and its submaps without a gap."""
-        incarnations = [incarnation for name, incarnation in self._set.streams if name == robot]
-        submaps = self._set.chain((robot, max(incarnations))) if incarnations else []
-        start = self._starts.get((robot, submaps[0].incarnation)) if submaps else None
-        return () if start is None else (start, *submaps)
-
-
-class _OwnMaps(FusionRule):
-    """The newest map of every robot."""
-
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
-        super().__init__(config, digest, robots)
-        self._maps: dict[str, m.MapEstimate] = {}
-
-    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Keep a map that is newer than the robot's last one."""
-        if isinstance(message, m.MapEstimate):
-            last = self._maps.get(message.robot)
-            if last is None or _name(last) < _name(message):
-                self._maps[message.robot] = message
-        return []
+    def members(self, until_ns: float) -> Mapping[Stream, int]:
+        """The maps in the team's frame."""
+        placed = (each for each in self._maps.values() if is_placed(each, self._starts))
+        return {(each.robot, each.incarnation): each.sequence for each in placed}
 
     def dealt(self, done: m.Done) -> bool:
-        """The robot's last map is here."""
+        """The robot's last map is here, and the start of its stream."""
         found = self._maps.get(done.robot)
         last = (done.incarnation, done.last_map)
-        return done.last_map < 0 or (found is not None and _name(found) >= last)
-
-    def conclude(self, now_ns: int) -> list[Outgoing]:
-        """The map of the robots' last maps."""
-        return self.fuse(Inputs(maps=self._known(), stamp_ns=now_ns), "final")
-
-    def _known(self) -> list[m.MapEstimate]:
-        """The maps by robot."""
-        return [self._maps[robot] for robot in sorted(self._maps)]
-
-    def _message(
-        self,
-        maps: Sequence[m.MapEstimate],
-        value: LandmarkGaussian,
-        *,
-        stamp_ns: int,
-        final: bool,
-        joint: bool,
-        reasons: tuple[str, ...],
-    ) -> m.FusedMap:
-        self.landmarks = len(value.ids)
-        return fused_message(
-            self.config,
-            translate.digest_of(self.config_digest, *(_payload(x) for x in maps)),
-            value,
-            tuple(_member(x) for x in maps),
-            stamp_ns=max((x.stamp_ns for x in maps), default=stamp_ns),
-            final=final,
-            joint=joint,
-            reasons=reasons,
+        return done.last_map < 0 or (
+            found is not None
+            and _name(found) >= last
+            and (done.robot, done.incarnation) in self._starts
         )
 
 
-class LatestRule(_OwnMaps):
+def is_placed(estimate: m.MapEstimate, starts: Mapping[Stream, m.InitialPose]) -> bool:
+    """Whether a map is in the team's frame: its stream's initial pose is known."""
+    start = starts.get((estimate.robot, estimate.incarnation))
+    return start is not None and bool(start.pose)
+
+
+class LatestRule(FusionRule[MapInputs]):
     """The latest whole map of every robot as one, nothing fed back (`kalman` of independent maps).
 
     Each map rests on its own robot's measurements alone, so the maps are independent and no
@@ -131,71 +78,52 @@ class LatestRule(_OwnMaps):
     pose is not known has its map in a frame of its own and is left out.
     """
 
-    listens = (ch.START, ch.OWN_MAP)
+    intake = NewestMaps
     unnamed = ("reasons",)
 
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
-        super().__init__(config, digest, robots)
-        self._placed: dict[Stream, bool] = {}
-        self._said: tuple[m.VersionEntry, ...] = ()
-
-    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Keep a start, and a map that is newer than the robot's last one."""
-        if isinstance(message, m.InitialPose):
-            self._placed[message.robot, message.incarnation] = bool(message.pose)
-        return super().take(message, now_ns)
-
-    def dealt(self, done: m.Done) -> bool:
-        """The robot's last map is here, and the start of its stream."""
-        return done.last_map < 0 or (
-            super().dealt(done) and (done.robot, done.incarnation) in self._placed
-        )
-
-    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """A broadcast, when one is due and there is something new in it."""
-        maps = self._known()
-        members = tuple(_member(x) for x in maps)
-        if not self.is_due(attendance.now_ns) or not members or members == self._said:
-            return []
-        self.broadcast_ns, self._said = attendance.now_ns, members
-        return self.fuse(Inputs(maps=maps), "closed")
-
-    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+    def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
         """These maps as one."""
-        maps, final = inputs.maps, tail == "final"
+        maps = [each for each in inputs.maps if is_placed(each, inputs.starts)]
         values = {x.robot: _value(x) for x in maps}
         value, refused = fused_totally(kalman, values, self.config.bounds.coordinate_m)
-        own = self._maps.values()
-        away = sorted(x.robot for x in own if not self._placed.get((x.robot, x.incarnation)))
+        away = sorted({x.robot for x in inputs.maps} - {x.robot for x in maps})
         reasons = (*(f"{robot}: its start pose is not known" for robot in away), *refused)
-        fused = self._message(maps, value, stamp_ns=0, final=final, joint=True, reasons=reasons)
+        self.landmarks = len(value.ids)
+        final = tail == "final"
+        fused = fused_message(
+            self.config,
+            _digest(self.config_digest, maps),
+            value,
+            _members(maps),
+            stamp_ns=max((x.stamp_ns for x in maps), default=0),
+            final=final,
+            reasons=reasons,
+        )
         return [Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]
 
-    def _known(self) -> list[m.MapEstimate]:
-        """The maps in the team's frame, by robot."""
-        return [x for x in super()._known() if self._placed.get((x.robot, x.incarnation))]
 
-
-class AloneRule(_OwnMaps):
+class AloneRule(FusionRule[MapInputs]):
     """No fusion: publishes a final map for single-robot teams only."""
 
-    listens = (ch.OWN_MAP,)
+    intake = NewestMaps
 
-    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """There is nothing to broadcast."""
-        return []
-
-    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+    def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
         """The map of the one robot; of several robots a map without landmarks that says so."""
+        if tail != "final":
+            return []
         maps, reason = inputs.maps, ""
         if not maps:
             reason = "no fusion, and this estimator makes no map"
         elif len(self.team) != 1:
             reason = "no fusion: each robot has its own map"
-        fused = self._message(
-            maps,
-            NO_LANDMARKS if reason else _value(maps[0]),
-            stamp_ns=inputs.stamp_ns,
+        value = NO_LANDMARKS if reason else _value(maps[0])
+        self.landmarks = len(value.ids)
+        fused = fused_message(
+            self.config,
+            _digest(self.config_digest, maps),
+            value,
+            _members(maps),
+            stamp_ns=max((x.stamp_ns for x in maps), default=inputs.now_ns),
             final=True,
             joint=not maps or maps[0].joint,
             reasons=(reason,) if reason else (),
@@ -207,14 +135,14 @@ def _name(estimate: m.MapEstimate) -> tuple[int, int]:
     return estimate.incarnation, estimate.sequence
 
 
-def _member(estimate: m.MapEstimate) -> m.VersionEntry:
-    return m.VersionEntry(
-        robot=estimate.robot, incarnation=estimate.incarnation, sequence=estimate.sequence
+def _members(maps: Sequence[m.MapEstimate]) -> tuple[m.VersionEntry, ...]:
+    return tuple(
+        m.VersionEntry(robot=x.robot, incarnation=x.incarnation, sequence=x.sequence) for x in maps
     )
 
 
-def _payload(estimate: m.MapEstimate) -> bytes:
-    return estimate.ids + estimate.means + estimate.covariance
+def _digest(settings: bytes, maps: Sequence[m.MapEstimate]) -> bytes:
+    return translate.digest_of(settings, *(x.ids + x.means + x.covariance for x in maps))
 
 
 def _value(estimate: m.MapEstimate) -> LandmarkGaussian:

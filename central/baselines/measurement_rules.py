@@ -1,8 +1,8 @@
 """What rules on raw measurements share: the team's keyframes in, poses and the map out."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -11,7 +11,8 @@ from central.attendance import TeamAttendance
 from central.baselines.team_keyframes import RobotKeyframe, TeamKeyframes
 from central.config import CentralConfig
 from central.fused import START_POSES, fused_message
-from central.rule import FusionRule, Inputs, Tail
+from central.intake import Inputs, Instant, Intake
+from central.rule import FusionRule, Tail
 from team import translate
 from team.config import RobotConfig
 from team.estimation.baselines.robot_step import RobotStep
@@ -37,49 +38,30 @@ class MapContent:
     before: tuple[Outgoing, ...] = ()
 
 
-class MeasurementRule(FusionRule):
-    """An estimate over all robots' raw measurements at the centre.
+@dataclass(frozen=True, kw_only=True)
+class MeasurementInputs(Inputs):
+    """The team's keyframes, those of one team time as one step; they grow.
 
-    The keyframes of one team time are one step. The robots' models come with what they announce. A
-    robot whose start pose is not known is left out; where no start is known the first robot's is
-    the frame. A map's members name each robot's last measurement in it.
+    starts: the models and the start of each robot, once all are here. broken: robots whose stream
+    began anew.
     """
 
+    starts: Mapping[str, tuple[RobotConfig, m.InitialPose]] = field(default_factory=dict)
+    steps: Sequence[Sequence[RobotKeyframe]] = ()
+    broken: Sequence[str] = ()
+
+
+class MeasurementIntake(Intake[MeasurementInputs]):
+    """Raw measurements and the models that the robots announce; the keyframes are the clock."""
+
     listens = (*ch.SENSORS, ch.ROBOT_CONFIG)
+    due = "period"
 
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
-        super().__init__(config, digest, robots)
+    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
+        super().__init__(config, robots)
         self._keyframes = TeamKeyframes(robots)
-        self.models: dict[str, RobotConfig] = {}
-        self.members: dict[str, m.VersionEntry] = {}
-        self._pose_ns: dict[str, int] = {}
-        self._reasons: list[str] = []
-        self._frame = START_POSES
-        self.now_ns = 0
-        self._fused = False
-
-    @abstractmethod
-    def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        """The robots' start poses; covariances in (x, y, θ), None: exactly known."""
-
-    @abstractmethod
-    def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
-        """One step of the team, which the members already name; the poses that it gives."""
-
-    @abstractmethod
-    def _content(self, *, final: bool) -> MapContent:
-        """The map of all steps so far."""
-
-    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
-        """Everything that the team's measurements give, at the first map that is asked for."""
-        if self._fused:
-            return []
-        self._fused = True
-        for message in inputs.heard:
-            self.take(message, 0)
-        out = self.advance(TeamAttendance.of(self.team))
-        ended = any(isinstance(message, m.End) for message in inputs.heard)
-        return out + self.conclude(0) if ended else out
+        self._starts: Mapping[str, tuple[RobotConfig, m.InitialPose]] = {}
+        self._steps: list[Sequence[RobotKeyframe]] = []
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """File a measurement, a robot's models or the last counters."""
@@ -102,33 +84,85 @@ class MeasurementRule(FusionRule):
         else:
             self._keyframes.configure(config.id, config)
 
-    def complete(self, end: m.End) -> bool:
+    @property
+    def complete(self) -> bool:
         """Every measurement of every stream has been used."""
         return self._keyframes.complete
 
-    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """Every step whose turn has come: the poses, and the map at broadcasts."""
-        if not self.models and not self._begin():
-            return []
-        out: list[Outgoing] = []
-        for step in self._keyframes.steps():
-            out += self._broadcast(step[0].stamp_ns)
-            out += self._take_step([each for each in step if each.robot in self.models])
-        return out
+    def inputs(self, closed_ns: float, now_ns: int) -> MeasurementInputs:
+        """All steps whose turn has come."""
+        return MeasurementInputs(
+            now_ns=now_ns,
+            starts=self._starts,
+            steps=self._steps,
+            broken=self._keyframes.broken,
+        )
 
-    def conclude(self, now_ns: int) -> list[Outgoing]:
-        """The map after the last step."""
-        return self._map_messages(final=True)
+    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MeasurementInputs]]:
+        """Before every step whose turn has come, when a map may be due, and behind it."""
+        self._starts = self._starts or self._keyframes.starts or {}
+        if not self._starts:
+            return
+        for step in self._keyframes.steps():
+            now_ns = step[0].stamp_ns
+            since_ns = self._steps[0][0].stamp_ns if self._steps else now_ns
+            yield Instant(now_ns, self.inputs(now_ns, now_ns), since_ns)
+            self._steps.append(step)
+            yield Instant(now_ns, self.inputs(now_ns, now_ns), since_ns)
 
     def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
         """Measurements that the link has lost."""
         return self._keyframes.wanted(now_ns)
 
-    def _begin(self) -> bool:
-        """The start poses, when all of them are here."""
-        starts = self._keyframes.starts
-        if not starts:
-            return False
+
+class MeasurementRule(FusionRule[MeasurementInputs]):
+    """An estimate over all robots' raw measurements at the centre.
+
+    The keyframes of one team time are one step. The robots' models come with what they announce. A
+    robot whose start pose is not known is left out; where no start is known the first robot's is
+    the frame. A map's members name each robot's last measurement in it.
+    """
+
+    intake = MeasurementIntake
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
+        super().__init__(config, digest, robots)
+        self._taken = 0
+        self.models: dict[str, RobotConfig] = {}
+        self.members: dict[str, m.VersionEntry] = {}
+        self._pose_ns: dict[str, int] = {}
+        self._reasons: list[str] = []
+        self._frame = START_POSES
+        self.now_ns = 0
+
+    @abstractmethod
+    def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
+        """The robots' start poses; covariances in (x, y, θ), None: exactly known."""
+
+    @abstractmethod
+    def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
+        """One step of the team, which the members already name; the poses that it gives."""
+
+    @abstractmethod
+    def _content(self, *, final: bool) -> MapContent:
+        """The map of all steps so far."""
+
+    def fuse(self, inputs: MeasurementInputs, tail: Tail) -> list[Outgoing]:
+        """The map of all steps, behind the poses that they give."""
+        return [*self.take(inputs), *self._map_messages(inputs.broken, final=tail == "final")]
+
+    def take(self, inputs: MeasurementInputs) -> list[Outgoing]:
+        """The steps that are new; the poses that they give."""
+        if not self.models and inputs.starts:
+            self._begin(inputs.starts)
+        out: list[Outgoing] = []
+        for step in inputs.steps[self._taken :]:
+            self._taken += 1
+            out += self._take_step([each for each in step if each.robot in self.models])
+        return out
+
+    def _begin(self, starts: Mapping[str, tuple[RobotConfig, m.InitialPose]]) -> None:
+        """Where the robots start, in one frame."""
         placed = {name: start for name, (_, start) in starts.items() if self._is_placed(start)}
         if not placed:
             name = min(starts)
@@ -151,7 +185,6 @@ class MeasurementRule(FusionRule):
                 for name, (pose, covariance) in known.items()
             }
         )
-        return True
 
     def _sensors_start(
         self, robot: str, pose: Pose, covariance: Matrix | None
@@ -210,15 +243,6 @@ class MeasurementRule(FusionRule):
         )
         return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 
-    def _broadcast(self, stamp_ns: int) -> list[Outgoing]:
-        """The map before the first step of each broadcast_s of team time."""
-        if self.broadcast_ns is None:
-            self.broadcast_ns = stamp_ns
-        if stamp_ns - self.broadcast_ns < self.config.broadcast_s * 1e9:
-            return []
-        self.broadcast_ns = stamp_ns
-        return self._map_messages(final=False)
-
     @property
     def digest(self) -> bytes:
         """The name of the measurements so far."""
@@ -226,10 +250,10 @@ class MeasurementRule(FusionRule):
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
         return translate.digest_of(self.config_digest, named)
 
-    def _map_messages(self, *, final: bool) -> list[Outgoing]:
+    def _map_messages(self, broken: Sequence[str], *, final: bool) -> list[Outgoing]:
         content = self._content(final=final) if self.models else MapContent()
         self.landmarks = len(content.landmarks.ids)
-        lost = [f"{robot}: its stream began anew" for robot in self._keyframes.broken]
+        lost = [f"{robot}: its stream began anew" for robot in broken]
         fused = fused_message(
             self.config,
             self.digest,

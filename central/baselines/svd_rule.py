@@ -12,11 +12,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.fused import fused_message, version_entry
-from central.rule import Inputs, Stream, Tail
-from central.submap_rule import SubmapRule
+from central.rule import FusionRule, Tail
+from central.submap_intake import SubmapInputs, SubmapIntake
 from team import translate
 from team.estimation.baselines import svd_joining
 from team.estimation.baselines.svd_joining import (
@@ -26,7 +25,7 @@ from team.estimation.baselines.svd_joining import (
     TooFewPointsError,
     Weighting,
 )
-from team.estimation.contribution import named
+from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.estimation.geometry import Pose
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
@@ -53,53 +52,27 @@ class _Joined:
     refused: str = ""
 
 
-class SvdJoinRule(SubmapRule):
+class SvdJoinRule(FusionRule[SubmapInputs]):
     """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
-    A later incarnation of a robot is a stream of its own, in a frame of its own.
+    A later incarnation of a robot is a stream of its own, in a frame of its own. A running map has
+    whatever is here: a later one may put any of it elsewhere.
     """
+
+    intake = SubmapIntake
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
         super().__init__(config, digest, robots)
         self._weighting: Weighting = "full" if config.fusion == "svd-join" else "identity"
         self._joined: dict[Stream, _Joined] = {}
 
-    @property
-    def figures(self) -> Mapping[str, float]:
-        """Refused submaps."""
-        return {"refused": float(self.refused)}
-
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """Orders that are not believed."""
-        return self.withdrawal_witnesses.unconfirmed(self.withdrawn)
-
-    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """A broadcast of what is here, when one is due; a later one may put any of it elsewhere."""
-        if not self.is_due(attendance.now_ns):
-            return []
-        inputs = self._inputs()
-        if not inputs.submaps:
-            return []
-        self.broadcast_ns = attendance.now_ns
-        return self.fuse(inputs, "closed")
-
-    def conclude(self, now_ns: int) -> list[Outgoing]:
-        """The map of all submaps."""
-        return self.fuse(self._inputs(), "final")
-
-    def _inputs(self) -> Inputs:
-        found = {s: self.members.chain(s) for s in self.streams if s in self.starts}
-        chains = {stream: chain for stream, chain in found.items() if chain}
-        return Inputs(starts=self.starts, submaps=chains)
-
-    def fuse(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+    def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
         """The map of these submaps: a function of them and of the starts alone."""
         channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
         return [Outgoing(channel, "", self._fused(inputs, final=tail == "final"))]
 
-    def _fused(self, inputs: Inputs, *, final: bool) -> m.FusedMap:
-        chains = inputs.submaps
+    def _fused(self, inputs: SubmapInputs, *, final: bool) -> m.FusedMap:
+        chains = {stream: chain for stream, chain in inputs.submaps.items() if chain}
         if not chains:
             return fused_message(
                 self.config,

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from sim.publisher.configurations import Configurations
-from sim.world import streams as s
-from sim.world.streams import RobotStream, WorldStreams
+from sim.publisher.source import TRUTH_BATCH_NS, Source, for_the_evaluator
+from sim.world.streams import WorldStreams
 from team.driver.source import (
     BATCH,
     CREDIT_MEASUREMENTS,
@@ -24,178 +24,14 @@ from team.driver.source import (
 )
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded
 
-TRUTH_BATCH_NS = 1_000_000_000
 HELD_UP_S = 5.0
 """A node without whose progress the world can not go on is named after so long."""
 RESUME_S = 2.0
 """A world that is started again waits so long for everyone to say how far he is."""
-
-
-@dataclass
-class _Source:
-    """One robot's stream; its present incarnation began at measurement `base` of the whole."""
-
-    stream: RobotStream
-    incarnation: int = FIRST_INCARNATION
-    base: int = 0
-    published: int = 0
-    consumed: int = 0
-    truth_sent: int = 0
-    alive: bool = False
-
-    @property
-    def counter(self) -> int:
-        """Measurements published in this incarnation."""
-        return self.published - self.base
-
-    def message(self, index: int) -> m.Measurement:
-        """The measurement at `index` of the whole stream, as this incarnation counts it."""
-        robot, incarnation, measurement = self.stream.robot, self.incarnation, index - self.base
-        stamp_ns = int(self.stream.stamps_ns[index])
-        if measurement == 0 and incarnation > FIRST_INCARNATION:
-            return m.InitialPose(
-                stamp_ns=stamp_ns,
-                robot=robot,
-                incarnation=incarnation,
-                number=0,
-                pose=b"",
-                covariance=b"",
-            )
-        kind = self.stream.kinds[index]
-        if kind == s.ODOMETRY:
-            stamp_ns -= self.stream.clock_offset_ns
-            return _odometry(
-                self.stream.odometry(index), stamp_ns, (robot, incarnation, measurement)
-            )
-        if kind == s.OBSERVATIONS:
-            z = self.stream.observations(index)
-            covariances = b"" if z.covariances is None else from_floats(z.covariances)
-            if z.hidden:
-                return m.Detections(
-                    stamp_ns=stamp_ns,
-                    robot=robot,
-                    incarnation=incarnation,
-                    number=measurement,
-                    ranges=from_floats(z.ranges),
-                    bearings=from_floats(z.bearings),
-                    covariances=covariances,
-                    signatures=b"" if z.signatures is None else from_floats(z.signatures),
-                )
-            if z.points is not None:
-                return m.Points(
-                    stamp_ns=stamp_ns,
-                    robot=robot,
-                    incarnation=incarnation,
-                    number=measurement,
-                    ids=from_ids(z.ids),
-                    positions=from_floats(z.points),
-                    covariances=covariances,
-                )
-            return m.Observations(
-                stamp_ns=stamp_ns,
-                robot=robot,
-                incarnation=incarnation,
-                number=measurement,
-                ids=from_ids(z.ids),
-                ranges=from_floats(z.ranges),
-                bearings=from_floats(z.bearings),
-                covariances=covariances,
-            )
-        if kind == s.SIGHTINGS:
-            t = self.stream.sightings(index)
-            return m.Sightings(
-                stamp_ns=stamp_ns,
-                robot=robot,
-                incarnation=incarnation,
-                number=measurement,
-                teammates=t.teammates,
-                ranges=from_floats(t.ranges),
-                bearings=from_floats(t.bearings),
-            )
-        start = self.stream.start
-        pose = b"" if start is None else from_floats(start.pose)
-        known = start is not None and start.covariance is not None
-        covariance = from_floats(start.covariance) if start is not None and known else b""
-        return m.InitialPose(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=incarnation,
-            number=measurement,
-            pose=pose,
-            covariance=covariance,
-        )
-
-
-def _odometry(
-    told: s.OdometryMeasurement, stamp_ns: int, name: tuple[str, int, int]
-) -> m.AnyOdometry:
-    """One interval as the odometry tells it; name: robot, incarnation, number."""
-    robot, incarnation, number = name
-    if told.increment is not None:
-        return m.Increment(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=incarnation,
-            number=number,
-            duration_ns=told.duration_ns,
-            increment=from_floats(told.increment),
-            covariance=b"" if told.covariance is None else from_floats(told.covariance),
-        )
-    if told.steered:
-        return m.Steering(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=incarnation,
-            number=number,
-            duration_ns=told.duration_ns,
-            wheel_speed=told.forward,
-            steering=told.yaw_rate,
-        )
-    return m.Odometry(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
-        number=number,
-        duration_ns=told.duration_ns,
-        forward=told.forward,
-        yaw_rate=told.yaw_rate,
-    )
-
-
-def _for_the_evaluator(stream: RobotStream) -> list[Outgoing]:
-    """The true identities of what is told without, and where another sensor says the robot was."""
-    out, seen, first_ns = [], stream.landmark_detections, int(stream.stamps_ns[0])
-    if seen.hidden is not None and seen.hidden.any():
-        rows = np.repeat(seen.hidden, np.diff(seen.offsets))
-        labels = m.TruthLabels(
-            stamp_ns=first_ns,
-            robot=stream.robot,
-            stamps=from_stamps(seen.stamps_ns[seen.hidden]),
-            counts=from_ids(np.diff(seen.offsets)[seen.hidden]),
-            labels=from_ids(seen.ids[rows]),
-        )
-        out.append(Outgoing(ch.TRUTH_LABELS, stream.robot, labels))
-    if stream.positions is not None and stream.positions_ns is not None:
-        positions = m.TruthPositions(
-            stamp_ns=first_ns,
-            robot=stream.robot,
-            stamps=from_stamps(stream.positions_ns),
-            positions=from_floats(stream.positions),
-        )
-        out.append(Outgoing(ch.TRUTH_POSITIONS, stream.robot, positions))
-    return out
-
-
-_CHANNEL_OF_KIND = {
-    s.START: ch.START,
-    s.ODOMETRY: ch.ODOMETRY,
-    s.OBSERVATIONS: ch.OBSERVATIONS,
-    s.SIGHTINGS: ch.SIGHTINGS,
-}
 
 
 @dataclass
@@ -226,7 +62,7 @@ class WorldNode:
     final: m.FusedMap | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        self._sources = {x.robot: _Source(x) for x in self.streams.streams}
+        self._sources = {x.robot: Source(x) for x in self.streams.streams}
         self._names = [x.robot for x in self.streams.streams]
         robots, indices = self.streams.order()
         self._order = deque(zip(robots.tolist(), indices.tolist(), strict=True))
@@ -281,7 +117,7 @@ class WorldNode:
                 told = m.KnownMap(stamp_ns=self._first_ns, ids=truth.ids, positions=truth.positions)
                 out.append(Outgoing(ch.KNOWN_MAP, "", told))
         for stream in self.streams.streams:
-            out += _for_the_evaluator(stream)
+            out += for_the_evaluator(stream)
         return out
 
     def refusal(self, message: m.Message) -> str | None:
@@ -460,16 +296,14 @@ class WorldNode:
             self._held_up = None
             self._order.popleft()
             self.now_ns = max(self.now_ns, stamp_ns)
-            kind = int(source.stream.kinds[index])
-            name = source.stream.robot
-            out.append(Outgoing(_CHANNEL_OF_KIND[kind], name, source.message(index)))
+            out.append(source.said(index))
             source.published = index + 1
             self._published += 1
-            out += self._truth(source, stamp_ns, TRUTH_BATCH_NS)
+            out += source.truth(stamp_ns)
         if not self._order:
             self.ended = True
             for source in self._sources.values():
-                out += self._truth(source, 2**62, 0)
+                out += source.truth(2**62, 0)
             out.append(Outgoing(ch.END, "", self._end()))
         return out
 
@@ -479,30 +313,11 @@ class WorldNode:
             return self.speed  # at the first look no time has passed: 0 · ∞ is not a number
         return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
-    def _without_credit(self, source: _Source) -> str | None:
+    def _without_credit(self, source: Source) -> str | None:
         """Who has to get on before the next measurement of this robot; None: nobody."""
         if source.alive and source.published - source.consumed >= CREDIT_MEASUREMENTS:
             return ch.robot_node(source.stream.robot)
         return "recorder" if self.unrecorded >= CREDIT_RECORDER else None
-
-    def _truth(self, source: _Source, stamp_ns: int, batch_ns: int) -> list[Outgoing]:
-        stream = source.stream
-        if stream.truth is None or stream.truth_ns is None:
-            return []
-        begin = source.truth_sent
-        if begin >= len(stream.truth_ns) or stamp_ns - stream.truth_ns[begin] < batch_ns:
-            return []
-        end = int(np.searchsorted(stream.truth_ns, stamp_ns, side="right"))
-        if end <= begin:
-            return []
-        source.truth_sent = end
-        truth = m.Truth(
-            stamp_ns=int(stream.truth_ns[end - 1]),
-            robot=stream.robot,
-            stamps=from_stamps(stream.truth_ns[begin:end]),
-            poses=from_floats(stream.truth[begin:end]),
-        )
-        return [Outgoing(ch.TRUTH, stream.robot, truth)]
 
     def _end(self) -> m.End:
         ends = tuple(
@@ -531,7 +346,7 @@ class WorldNode:
         kept = msgspec.structs.replace(wanted, first=first)
         return answered(kept, source.counter, lambda n: source.message(source.base + n))
 
-    def _begin_incarnation(self, source: _Source) -> None:
+    def _begin_incarnation(self, source: Source) -> None:
         """The stream can not be continued where the robot is: it begins anew at a free pose."""
         source.incarnation += 1
         source.base = source.published - 1

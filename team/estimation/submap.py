@@ -56,6 +56,18 @@ class Became:
     landmarks: Int64[np.ndarray, " n"]
     clutter: Bool[np.ndarray, " n"]
 
+    @property
+    def silent(self) -> list[tuple[int, bool]]:
+        """The stamps of the scans that are not in the submap at all; whether they are clutter."""
+        k = len(self.counts)
+        scan = np.repeat(np.arange(k), self.counts)
+        used = np.bincount(scan[self.landmarks > 0], minlength=k)
+        false = np.bincount(scan[self.clutter], minlength=k)
+        return [
+            (int(self.stamps[i]), bool(false[i] == self.counts[i]))
+            for i in np.nonzero(used == 0)[0]
+        ]
+
 
 NONE_UNNAMED = Unnamed(np.empty(0, np.uint32), np.empty((0, 0), np.bool_))
 

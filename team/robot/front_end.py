@@ -189,6 +189,11 @@ class FrontEnd:
         if self._windows is not None:
             self._windows.consumed(measurement.number)
 
+    @property
+    def makes_submaps(self) -> bool:
+        """Whether the estimator cuts the stream into windows."""
+        return self._windows is not None
+
     def open_window(self) -> LocalMap | None:
         """The Gaussian since the last submap, if there is one."""
         return None if self._windows is None else self._windows.open_window()

@@ -1,6 +1,7 @@
 """The ledger of law 1: the disposition of each measurement of an incarnation."""
 
 from collections import Counter
+from collections.abc import Callable, Iterable
 
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.rejection import Rejection
@@ -12,48 +13,94 @@ INITIAL_POSE = "start pose"
 """The disposition of an incarnation's measurement 0."""
 
 
+OnDisposition = Callable[[int, str], None]
+"""Hears of a measurement, by its counter, what becomes of it; of the same one the last word holds.
+"""
+
+
+def unheard(_number: int, _disposition: str) -> None:
+    """Nobody asks what became of a single measurement."""
+
+
 class Ledger:
     """Counts the measurements of an incarnation by their disposition.
 
     used: the disposition of a measurement that the estimator takes. A measurement is counted as
-    used when it arrives; when its window ends, those that it has not used are moved to their
-    reason.
+    used when it comes; the window that ends says which of them it has not used after all, so scans
+    and inter-robot measurements are kept until then. said: hears what becomes of each one.
     """
 
-    def __init__(self, used: str, resumed: int = 0) -> None:
+    def __init__(self, used: str, resumed: int = 0, said: OnDisposition = unheard) -> None:
         self.used = used
         self.counts = Counter({used: resumed} if resumed else {})
+        self._said = said
+        self._scans: dict[int, int] = {}
+        self._detections: dict[int, int] = {}
         self._sighted: set[int] = set()
 
-    def count(self, rejected: Rejection | None, used: str | None = None) -> None:
-        """Count a measurement: rejected for this reason, or used."""
+    def count(
+        self, measurement: m.Measurement, rejected: Rejection | None, used: str | None = None
+    ) -> None:
+        """One measurement more: rejected for this reason, or used."""
+        number, stamp_ns = measurement.number, measurement.stamp_ns
         taken = self.used if used is None else used
-        self.counts[taken if rejected is None else rejected.disposition] += 1
-
-    def count_sighting(self, number: int, rejected: Rejection | None) -> None:
-        """Count an inter-robot measurement; its window decides whether it reaches a pose node."""
         if rejected is None:
-            self._sighted.add(number)
-        self.count(rejected, IN_SIGHTING)
+            match measurement:
+                case m.Detections():
+                    self._scans[number] = self._detections[number] = stamp_ns
+                case m.Observations() | m.Points():
+                    self._scans[number] = stamp_ns
+                case m.Sightings():
+                    self._sighted.add(number)
+                    taken = IN_SIGHTING
+                case _:
+                    pass
+        disposition = taken if rejected is None else rejected.disposition
+        self.counts[disposition] += 1
+        self._said(number, disposition)
 
-    def reject(self, count: int, reason: Rejection, used: str | None = None) -> None:
-        """Move measurements that were counted as used to this reason for rejection."""
-        if count:
-            self.counts[self.used if used is None else used] -= count
-            self.counts[reason.disposition] += count
+    def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
+        """Measurements that were counted as used were not, for this reason."""
+        for number in numbers:
+            self.counts[used] -= 1
+            self.counts[reason.disposition] += 1
+            self._said(number, reason.disposition)
+            self._scans.pop(number, None)
+            self._detections.pop(number, None)
+
+    def _behind(self, count: int) -> list[int]:
+        """The last scans by their stamps."""
+        by_stamp = sorted(self._scans, key=lambda number: (self._scans[number], number))
+        return by_stamp[len(by_stamp) - count :]
+
+    def cover(self, until_ns: int) -> None:
+        """An estimator without windows has used every scan up to a time."""
+        self._scans = {n: at_ns for n, at_ns in self._scans.items() if at_ns > until_ns}
+        self._detections.clear()
 
     def close(self, closed: ClosedWindow) -> None:
-        """Take the dispositions of a window that has become a submap."""
+        """A window has become a submap, which says what it could not use."""
         self.leave_out(set().union(*(each.measurements for each in closed.sightings)))
-        self.reject(closed.late, Rejection.LATE)
-        self.reject(closed.unconfirmed, Rejection.UNCONFIRMED)
-        self.reject(closed.clutter, Rejection.CLUTTER)
-        self.reject(closed.unsolved, Rejection.UNSOLVED)
+        self._reject(self._behind(closed.late), Rejection.LATE, self.used)
+        behind = {n: at_ns for n, at_ns in self._scans.items() if at_ns > closed.end_ns}
+        if closed.unsolved:
+            self._reject(sorted(self._scans.keys() - behind), Rejection.UNSOLVED, self.used)
+        for at_ns, is_clutter in () if closed.became is None else closed.became.silent:
+            number = next((n for n, at in self._detections.items() if at == at_ns), None)
+            if number is not None:
+                reason = Rejection.CLUTTER if is_clutter else Rejection.UNCONFIRMED
+                self._reject([number], reason, self.used)
+        self._scans = behind
+        self._detections.clear()
 
     def leave_out(self, used: set[int]) -> None:
-        """Reject a window's inter-robot measurements that reached no pose node."""
-        self.reject(len(self._sighted - used), Rejection.NO_NODE, IN_SIGHTING)
+        """The window ends: inter-robot measurements beyond those used reached no pose node."""
+        self._reject(sorted(self._sighted - used), Rejection.NO_NODE, IN_SIGHTING)
         self._sighted.clear()
+
+    def uncover(self, count: int) -> None:
+        """The stream ends: its last scans are behind all odometry."""
+        self._reject(self._behind(count), Rejection.NOT_COVERED, self.used)
 
     def entries(self) -> tuple[m.Disposition, ...]:
         """The dispositions as the robot's `Done` reports them."""

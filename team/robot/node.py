@@ -22,10 +22,10 @@ from team.door import absurd
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, PAIRS
-from team.rejection import Rejection
+from team.rejection import UNMEASURED, Rejection
 from team.robot.estimator import Estimates
 from team.robot.front_end import FrontEnd
-from team.robot.ledger import INITIAL_POSE, Ledger
+from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition, unheard
 from team.robot.maps import RunningMaps
 from team.robot.outbox import Outbox
 from team.robot.pace import Pace
@@ -76,6 +76,7 @@ class RobotNode:
         poses: RunningPoses | None = None,
         replaced: Replaced | None = None,
         on_window: Callable[[ClosedWindow], None] = lambda _: None,
+        on_disposition: OnDisposition = unheard,
     ) -> None:
         self.config = config
         self.robot = config.id
@@ -85,11 +86,12 @@ class RobotNode:
             self._announcement = msgspec.structs.replace(self._announcement, digest=announced)
         self._replaced = replaced
         self._on_window = on_window
+        self._on_disposition = on_disposition
         self._inbox = Inbox()
         self._stream_end = EndOfStream(config.id, self._inbox)
         self._front = FrontEnd(config, self.warnings)
-        self.ledger = Ledger(self._front.estimator.used)
-        """The ledger of the incarnation that is being consumed."""
+        self.ledger = Ledger(self._front.estimator.used, said=self._on_disposition)
+        """Law 1's account of the incarnation that is being consumed."""
         self._outbox = Outbox(config.id, exchange)
         submaps = PAIRS[config.estimator, config.fusion] == "submap"
         self._pace = Pace(lockstep=config.fusion in FEEDBACK, credit=submaps)
@@ -181,7 +183,7 @@ class RobotNode:
             self._front.resume(submap)
         last = submaps[-1]
         self._consumed = last.last_measurement + 1
-        self.ledger = Ledger(self._front.estimator.used, resumed=self._consumed)
+        self.ledger = Ledger(self._front.estimator.used, self._consumed, self._on_disposition)
         self._pace.acknowledged = len(submaps)
         self._now_ns = self._passed_ns = last.stamp_ns
         self._inbox.resume(last.incarnation, last.last_measurement + 1)
@@ -254,8 +256,8 @@ class RobotNode:
         that raises as it closes its last window ends with `Done` without it.
         """
         if self._taking is not None:
+            self.ledger.count(self._taking, Rejection.SET_ASIDE)
             self._taking = None
-            self.ledger.count(Rejection.SET_ASIDE)
             self._front.put_back()
         if self._done and not self._has_said_done:
             self._pending += self._last_words()
@@ -380,16 +382,15 @@ class RobotNode:
         self._passed_ns = max(self._passed_ns, stamp_ns - ahead)
         match measurement:
             case m.InitialPose():
-                self.ledger.count(None, INITIAL_POSE)
+                self.ledger.count(measurement, None, INITIAL_POSE)
             case m.Odometry() | m.Increment() | m.Steering():
                 self._steps += 1
                 estimates, self._rejected = self._front.drive(measurement)
                 out += self._said_of(estimates)
             case m.Observations() | m.Points() | m.Detections():
-                self.ledger.count(self._front.observe(measurement))
+                self.ledger.count(measurement, self._front.observe(measurement))
             case m.Sightings():
-                rejected = self._front.sight(measurement)
-                self.ledger.count_sighting(measurement.number, rejected)
+                self.ledger.count(measurement, self._front.sight(measurement))
                 out += self._release(measurement.teammates)
         self._taken()
         if self._pace.counted():
@@ -400,7 +401,10 @@ class RobotNode:
         """Account for the measurement in progress and add it to the open window."""
         if self._taking is not None:
             if isinstance(self._taking, m.AnyOdometry):
-                self.ledger.count(self._rejected)
+                self.ledger.count(self._taking, self._rejected)
+                if not self._front.makes_submaps and self._rejected in UNMEASURED:
+                    offset_s = self.config.clock_offset_s
+                    self.ledger.cover(translate.team_time_of(self._taking, offset_s))
             self._front.keep(self._taking)
             self._taking = None
 
@@ -475,7 +479,7 @@ class RobotNode:
 
     def _begin_incarnation(self, start: m.InitialPose) -> None:
         self._front.begin(start)
-        self.ledger = Ledger(self._front.estimator.used)
+        self.ledger = Ledger(self._front.estimator.used, said=self._on_disposition)
         self._outbox.keep(start)
         self._maps.begin_incarnation()
         self._pace.begin_incarnation()
@@ -504,7 +508,7 @@ class RobotNode:
         out = self._said_of(estimates)
         if estimates.closed is None:
             self.ledger.leave_out(set())
-        self.ledger.reject(uncovered, Rejection.NOT_COVERED)
+        self.ledger.uncover(uncovered)
         return out
 
     def _finish(self) -> list[Outgoing]:

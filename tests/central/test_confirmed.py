@@ -6,10 +6,11 @@ import pytest
 
 from central.config import CentralConfig
 from central.join_rule import JoinRule
+from central.scheduler import Scheduler
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_ids, ids
-from tests.teams import of, published, stream, submaps_of
+from tests.teams import broadcasts, of, published, stream, submaps_of
 
 STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
@@ -28,20 +29,20 @@ def last_seen(robot: str, k: int) -> int:
     return int(ids(SUBMAPS[robot][k].ids, "ids")[-1])
 
 
-def rule(spoilt: set[tuple[str, int]], **options: object) -> JoinRule:
+def rule(spoilt: set[tuple[str, int]], **options: object) -> Scheduler:
     """The submaps of both robots, some misread, joined."""
     config = CentralConfig(tick_s=3.0, broadcast_s=3.0, **options)
-    found = JoinRule(config, b"settings")
+    found = Scheduler(JoinRule(config, b"settings"))
     for each in STREAMS.values():
-        found.take_start(published(each)[0])
+        found.intake.take_start(published(each)[0])
     for k in range(5):
         for name in STREAMS:
             submap = SUBMAPS[name][k]
-            found.take_submap(misread(submap) if (name, k) in spoilt else submap)
+            found.intake.take_submap(misread(submap) if (name, k) in spoilt else submap)
     return found
 
 
-def final(found: JoinRule) -> m.FusedMap:
+def final(found: Scheduler) -> m.FusedMap:
     return of(found.conclude(END_NS), ch.FINAL_MAP)[0]
 
 
@@ -85,7 +86,7 @@ def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
 
 def test_running_maps_and_priors_have_the_same_landmarks() -> None:
     found = rule({("r1", 3)}, landmark_submaps=2)
-    out = found.broadcasts(END_NS, END_NS)
+    out = broadcasts(found, END_NS, END_NS)
     (fused,) = of(out, ch.FUSED_MAP)
     shown = ids(fused.ids, "ids").tolist()
     assert shown

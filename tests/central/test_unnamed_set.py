@@ -7,12 +7,14 @@ import pytest
 
 from central.config import CentralConfig
 from central.join_rule import JoinRule
-from central.rule import Inputs
+from central.scheduler import Scheduler
+from central.submap_intake import SubmapInputs
 from team import translate
 from team.association import AssociationProfile
 from team.wire import messages as m
 from team.wire.codec import encoded
 from tests.estimation.map_joining.association.unnamed_worlds import circle, drive
+from tests.teams import broadcasts
 
 CONFIG = CentralConfig(association=AssociationProfile(recent=4), withdraw_above=None)
 RING = 20.0
@@ -45,13 +47,13 @@ def _team() -> dict[str, list[m.Submap]]:
 TEAM = _team()
 
 
-def _rule() -> JoinRule:
-    rule = JoinRule(CONFIG, bytes(8), ("r1", "r2"))
+def _rule() -> Scheduler:
+    rule = Scheduler(JoinRule(CONFIG, bytes(8), ("r1", "r2")))
     for robot in TEAM:
         start = m.InitialPose(
             stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
         )
-        rule.take_start(start)
+        rule.intake.take_start(start)
     return rule
 
 
@@ -68,7 +70,7 @@ def _verdict(same: bool = False, withdrawn: bool = False) -> m.Verdict:
     )
 
 
-def _final(rule: JoinRule) -> m.FusedMap:
+def _final(rule: Scheduler) -> m.FusedMap:
     final = rule.conclude(10**12)[-1].message
     assert isinstance(final, m.FusedMap)
     return final
@@ -79,7 +81,7 @@ def final() -> m.FusedMap:
     rule = _rule()
     for robot in TEAM:
         for submap in TEAM[robot]:
-            rule.take(submap, 0)
+            rule.intake.take(submap, 0)
     return _final(rule)
 
 
@@ -88,11 +90,11 @@ def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(
 ) -> None:
     rule = _rule()
     for k in range(8):
-        rule.take(TEAM["r2"][k], 0)
+        rule.intake.take(TEAM["r2"][k], 0)
         if k % 3 == 2:
-            rule.broadcasts(TEAM["r2"][k].stamp_ns, TEAM["r2"][k].stamp_ns)
+            broadcasts(rule, TEAM["r2"][k].stamp_ns, TEAM["r2"][k].stamp_ns)
     for submap in reversed(TEAM["r1"]):
-        rule.take(submap, 0)
+        rule.intake.take(submap, 0)
     assert encoded(_final(rule)) == encoded(final)
     assert final.memberships
     assert [each.kind for each in final.decisions if each.kind == "merge"] == ["merge"]
@@ -104,7 +106,7 @@ def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map() 
         rule = _rule()
         for what in order[:3]:
             for message in [_verdict()] if what == "verdict" else TEAM[what]:
-                rule.take(message, 0)
+                rule.intake.take(message, 0)
         if order[0] == "r1":
             maps.append(_final(rule))
     assert len({encoded(each) for each in maps}) == 1
@@ -117,7 +119,7 @@ def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said
     for order in ((_verdict(), _verdict(withdrawn=True)), (_verdict(withdrawn=True), _verdict())):
         rule = _rule()
         for message in (*TEAM["r1"], order[0], *TEAM["r2"], order[1]):
-            rule.take(message, 0)
+            rule.intake.take(message, 0)
         found = _final(rule)
         assert found.verdicts == ()
         assert (found.means, found.digest) == (final.means, final.digest)
@@ -132,9 +134,10 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedM
         for robot in TEAM
     }
     submaps = {(robot, 1): TEAM[robot] for robot in TEAM}
-    told = Inputs(starts=starts, submaps=submaps, verdicts=(_verdict().judgement,))
-    with_verdict = rule.fuse(told, "final")[-1].message
-    without = rule.fuse(Inputs(starts=starts, submaps=submaps), "final")[-1].message
+    told = translate.verdict_of(_verdict().judgement)
+    inputs = SubmapInputs(starts=starts, submaps=submaps, verdicts=(told,))
+    with_verdict = rule.rule.fuse(inputs, "final")[-1].message
+    without = rule.rule.fuse(SubmapInputs(starts=starts, submaps=submaps), "final")[-1].message
     assert isinstance(with_verdict, m.FusedMap)
     assert isinstance(without, m.FusedMap)
     assert with_verdict.digest != without.digest
@@ -146,16 +149,16 @@ def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been(
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
     alone = _rule()
     for submap in TEAM["r1"]:
-        alone.take(submap, 0)
+        alone.intake.take(submap, 0)
     wanted = _final(alone)
     maps = []
     for at in (0, 5, 16):
         rule = _rule()
         both = [each for pair in zip(TEAM["r1"], TEAM["r2"], strict=True) for each in pair]
         for k, message in enumerate([*both[:at], order, *both[at:]]):
-            rule.take(message, 0)
+            rule.intake.take(message, 0)
             if k % 6 == 5:
-                rule.broadcasts(message.stamp_ns, message.stamp_ns)
+                broadcasts(rule, message.stamp_ns, message.stamp_ns)
         maps.append(_final(rule))
     assert len({encoded(each) for each in maps}) == 1
     assert (maps[0].means, maps[0].memberships) == (wanted.means, wanted.memberships)

@@ -14,6 +14,7 @@ from central.desk.ledger import ledger
 from central.desk.verification.recorded import recorded
 from central.desk.verification.verification import verify
 from central.join_rule import JoinRule
+from central.scheduler import Scheduler
 from central.tick_fold import TickFold
 from central.withdrawal import convicted, disagreement
 from sim.in_memory.team import final_map, run_team
@@ -28,6 +29,7 @@ from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
 from tests.sim.reruns import written
+from tests.teams import broadcasts
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02))
@@ -134,15 +136,19 @@ def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was() -> None:
     assert bits(ticks) == bits(of_set(samples))
 
 
-def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> JoinRule:
-    rule = JoinRule(scenario(withdraw_above=None).central, bytes(8))
+def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> Scheduler:
+    rule = Scheduler(JoinRule(scenario(withdraw_above=None).central, bytes(8)))
     for message in (*messages(samples, m.InitialPose), *withdrawals):
-        take = rule.take_start if isinstance(message, m.InitialPose) else rule.take_withdrawal
+        take = (
+            rule.intake.take_start
+            if isinstance(message, m.InitialPose)
+            else rule.intake.take_withdrawal
+        )
         take(message)
     for sighting in messages(samples, m.SightingFactor):
-        rule.take_sighting(sighting)
+        rule.intake.take_sighting(sighting)
     for submap in messages(samples, m.Submap):
-        rule.take_submap(submap)
+        rule.intake.take_submap(submap)
     return rule
 
 
@@ -201,20 +207,20 @@ OPERATOR = CentralConfig(tick_s=10.0, broadcast_s=10.0, withdraw_above=None)
 UNTIL_S = 40
 
 
-def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[JoinRule, bytes]:
+def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Scheduler, bytes]:
     """A rule that takes messages in an order, is told a watermark [s] after so many, and ends."""
-    rule = JoinRule(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8))
+    rule = Scheduler(JoinRule(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8)))
     for start in one_closes_windows_often():
         if isinstance(start, m.InitialPose):
-            rule.take_start(start)
+            rule.intake.take_start(start)
     out = []
     for k, message in enumerate(order):
         if isinstance(message, m.Submap):
-            rule.take_submap(message)
+            rule.intake.take_submap(message)
         else:
-            rule.take_sighting(message)
+            rule.intake.take_sighting(message)
         if k in watermarks:
-            out += rule.broadcasts(1e9 * watermarks[k], round(1e9 * watermarks[k]))
+            out += broadcasts(rule, 1e9 * watermarks[k], round(1e9 * watermarks[k]))
     out += rule.conclude(10**12)
     return rule, encoded(out[-1].message)
 
@@ -224,7 +230,7 @@ def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent() ->
     by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.InitialPose)]
     ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
     at_once, expected = delivered(by_time, {})
-    assert at_once.withdrawn == ("r3",)
+    assert at_once.intake.withdrawn == ("r3",)
     rng = np.random.default_rng(0)
     for _ in range(2):
         few = sorted(rng.choice(len(by_time), 6, replace=False).tolist())
@@ -358,17 +364,21 @@ def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
 
 
 def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
-    rule = JoinRule(CentralConfig(), bytes(8))
+    rule = Scheduler(JoinRule(CentralConfig(), bytes(8)))
     samples = team_run()
     for message in (*messages(samples, m.InitialPose), *messages(samples, m.Submap)):
         if message.robot == "r1":
-            take = rule.take_start if isinstance(message, m.InitialPose) else rule.take_submap
+            take = (
+                rule.intake.take_start
+                if isinstance(message, m.InitialPose)
+                else rule.intake.take_submap
+            )
             take(
                 msgspec.structs.replace(message, sightings=0)
                 if isinstance(message, m.Submap)
                 else message
             )
-    rule.take_withdrawal(
+    rule.intake.take_withdrawal(
         m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="it fell into the pool")
     )
     fused = rule.conclude(0)[-1].message

@@ -1,15 +1,22 @@
 """The centre's messages again: each recorded map from the inputs that it names.
 
-The rule is the centre's own, and so is its function of the inputs (`central.rule`): what a rule
-knew beyond them when it spoke (`unnamed`) is taken from the recorded map.
+The rule is the centre's own (`central.rule`), and so is the scheduler of those whose maps rest on
+each other: what a rule knew beyond the inputs (`unnamed`) is taken from the recorded map.
 """
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import msgspec
 
-from central.desk.verification.recorded import Identity, Recorded, Stream, identity
-from central.rule import FusionRule, Inputs, Tail, rule_of
+from central.attendance import TeamAttendance
+from central.desk.verification.recorded import Identity, Recorded, identity
+from central.intake import Inputs, MapInputs
+from central.rule import FusionRule, Tail, rule_of
+from central.scheduler import Scheduler
+from central.submap_intake import SubmapInputs
+from central.submap_set import SubmapSet
+from team import translate
 from team.pairs import RULES, Channel
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -59,6 +66,9 @@ def _retold(
     config, digest = log.central_config()
     announced = {n.removeprefix("robot/") for n in log.configured if n.startswith("robot/")}
     rule = rule_of(config, digest, sorted(announced.union(log.robots)))
+    if RULES[config.fusion].consumes == "measurements":
+        yield from _heard_again(log, Scheduler(rule))
+        return
     inputs = _LogInputs(log, RULES[config.fusion].consumes)
     lost = finals[-1].lost if finals else ()
     for fused in (*sorted(maps, key=lambda f: f.exchange), *finals):
@@ -74,7 +84,7 @@ def _tail(fused: m.FusedMap) -> Tail:
     return "final" if fused.final else "provisional" if fused.provisional else "closed"
 
 
-def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule) -> m.Message:
+def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule[Any]) -> m.Message:
     """With what the centre knew beyond the inputs when it said `fused`."""
     if isinstance(message, m.FusedMap | m.Prior):
         fields = set(rule.unnamed) & set(message.__struct_fields__)
@@ -82,59 +92,75 @@ def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule) -> m.Mess
     return message
 
 
-def _order(robot: str) -> m.Withdrawal:
-    """What a peer's fold has found by itself, and says nowhere but in its maps."""
-    return m.Withdrawal(stamp_ns=0, robot=robot, by="central", reason="")
+def _heard_again(log: Recorded, scheduler: Scheduler) -> Iterator[Outgoing]:
+    """What a rule on raw measurements says: of the whole stream, as each map changes the next."""
+    for message in _heard(log):
+        scheduler.intake.take(message, 0)
+    yield from scheduler.advance(TeamAttendance.of(scheduler.rule.team))
+    if log.published:
+        yield from scheduler.conclude(0)
+
+
+def _heard(log: Recorded) -> Iterator[m.Message]:
+    """The robots' models, every measurement by stream and counter, the end of the streams."""
+    for node in sorted(log.configured):
+        if node.startswith("robot/"):
+            yield log.configured[node]
+    for stream in sorted(log.measurements):
+        measurements = log.measurements[stream]
+        yield from (measurements[counter] for counter in sorted(measurements))
+    ends = tuple(
+        m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
+        for (robot, incarnation), count in log.published.items()
+    )
+    if ends:
+        yield m.End(stamp_ns=0, streams=ends)
 
 
 class _LogInputs:
     """The inputs that a map names, out of a log."""
 
     def __init__(self, log: Recorded, consumed: Channel) -> None:
-        self._log, self._consumed = log, consumed
-        self._submaps, self._sightings = log.submaps(), log.sightings()
+        self._consumed = consumed
+        self._set = SubmapSet()
+        sightings = log.sightings()
+        for stream, submaps in log.submaps().items():
+            for sequence in sorted(submaps):
+                self._set.admit(submaps[sequence])
+                for each in sightings.get((*stream, sequence), ()):
+                    self._set.admit_sighting(each)
         starts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
         self._starts = {s: start for s, start in starts.items() if isinstance(start, m.InitialPose)}
         own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
         self._maps = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
 
     def of(self, fused: m.FusedMap) -> Inputs | None:
-        """None where the log lacks a submap of the map's version vector."""
+        """None where the log lacks a submap of the map's version vector, or something of it."""
         vector = {(x.robot, x.incarnation): x.sequence for x in fused.members}
-        if self._consumed == "measurements":
-            return Inputs(starts=self._starts, heard=tuple(self._heard()))
         if self._consumed == "own/map":
             named = ((*stream, k, fused.exchange) for stream, k in vector.items())
             maps = [self._maps[name] for name in named if name in self._maps]
-            return Inputs(maps=maps, exchange=fused.exchange, stamp_ns=fused.stamp_ns)
-        chains: dict[Stream, list[m.Submap]] = {}
-        for stream, last in vector.items():
-            found = self._submaps.get(stream, {})
-            if not all(k in found for k in range(last + 1)):
-                return None
-            chains[stream] = [found[k] for k in range(last + 1)]
-        orders = self._log.withdrawals
-        return Inputs(
+            return MapInputs(
+                recorded=True,
+                maps=maps,
+                starts=self._starts,
+                exchange=fused.exchange,
+                now_ns=fused.stamp_ns,
+            )
+        chains = {stream: self._set.chain(stream)[: last + 1] for stream, last in vector.items()}
+        if any(
+            len(chains[stream]) <= last or stream not in self._starts
+            for stream, last in vector.items()
+        ):
+            return None
+        return SubmapInputs(
+            recorded=True,
             starts=self._starts,
             submaps=chains,
-            sightings=self._sightings,
-            withdrawals={r: orders.get(r) or _order(r) for r in fused.withdrawn},
-            verdicts=fused.verdicts,
-            stamp_ns=fused.stamp_ns,
+            sightings=self._set.sightings,
+            withdrawn=fused.withdrawn,
+            verdicts={translate.verdict_of(each) for each in fused.verdicts},
+            missing=fused.missing,
+            heard=fused.heard,
+            now_ns=fused.stamp_ns,
         )
-
-    def _heard(self) -> Iterator[m.Message]:
-        """The robots' models, every measurement by stream and counter, the end of the streams."""
-        log = self._log
-        for node in sorted(log.configured):
-            if node.startswith("robot/"):
-                yield log.configured[node]
-        for stream in sorted(log.measurements):
-            measurements = log.measurements[stream]
-            yield from (measurements[counter] for counter in sorted(measurements))
-        ends = tuple(
-            m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
-            for (robot, incarnation), count in log.published.items()
-        )
-        if ends:
-            yield m.End(stamp_ns=0, streams=ends)

@@ -1,24 +1,19 @@
 """One robot's messages again: its node over its recorded measurements."""
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import takewhile
 
-import numpy as np
-
 from central.desk.verification.recorded import Identity, Recorded, identity
-from team.config import UNNAMED, RobotConfig
+from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
-from team.rejection import Rejection
 from team.robot.front_end import FrontEnd
-from team.robot.hybrid import HybridEstimator
+from team.robot.ledger import OnDisposition, unheard
 from team.robot.node import RobotNode
 from team.robot.poses import RunningPoses
 from team.robot.statements import MessageWriter
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.arrays import ids, stamps
 from team.wire.bus import Outgoing
 
 PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
@@ -50,40 +45,24 @@ class RecomputedRobot:
     The configuration keeps the digest under which it was announced.
     """
 
-    def __init__(self, config: RobotConfig, digest: bytes, recorded: PriorsNamed) -> None:
-        self.node = RobotNode(config, announced=digest, poses=RecordedPoses(config, recorded))
+    def __init__(
+        self,
+        config: RobotConfig,
+        digest: bytes,
+        recorded: PriorsNamed,
+        on_disposition: OnDisposition = unheard,
+    ) -> None:
+        self.node = RobotNode(
+            config,
+            announced=digest,
+            poses=RecordedPoses(config, recorded),
+            on_disposition=on_disposition,
+        )
         self._boundary = Boundary(ch.robot_node(config.id))
-        self._associated: m.Association | None = None
 
     def given(self, message: m.Message) -> list[Outgoing]:
         """Handle a message as the shell did: one that raises is set aside."""
-        out = self._boundary.give(self.node, message)
-        for each in out:
-            if isinstance(each.message, m.Association):
-                self._associated = each.message
-        return out
-
-    def silent(self) -> dict[int, str]:
-        """By stamp, the scans of the last window none of whose detections is in its submap."""
-        said: dict[int, str] = {}
-        if self._associated is None:
-            return said
-        landmarks = ids(self._associated.landmarks, "landmarks")
-        bounds = np.cumsum([0, *ids(self._associated.counts, "counts").tolist()])
-        for k, stamp in enumerate(stamps(self._associated.stamps, "stamps").tolist()):
-            of_scan = landmarks[bounds[k] : bounds[k + 1]]
-            if (of_scan < UNNAMED).all():
-                clutter = (of_scan == m.CLUTTER).all()
-                reason = Rejection.CLUTTER if clutter else Rejection.UNCONFIRMED
-                said[stamp] = reason.disposition
-        return said
-
-    def took(self, message: m.Message) -> Counter[str]:
-        """Take a measurement or the end; the dispositions that it gave, how many of each."""
-        begins = isinstance(message, m.InitialPose)
-        before = Counter[str]() if begins else Counter(self.node.ledger.counts)
-        self.given(message)
-        return self.node.ledger.counts - before
+        return self._boundary.give(self.node, message)
 
 
 NewRobot = Callable[[], RecomputedRobot]
@@ -230,59 +209,25 @@ def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]
                 inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
 
 
-SILENT = {Rejection.UNCONFIRMED.disposition, Rejection.CLUTTER.disposition}
-"""What becomes of scans without identities of which nothing is in the submap."""
-
-
-def _silent(
-    node: RecomputedRobot, scans: Iterable[int], measurements: Mapping[int, m.Measurement]
-) -> dict[int, str]:
-    """What the last window has found out about these scans."""
-    said = node.silent()
-    detected = [n for n in scans if isinstance(measurements[n], m.Detections)]
-    return {n: said[measurements[n].stamp_ns] for n in detected if measurements[n].stamp_ns in said}
-
-
 def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     """What the robot's node does with each measurement of an incarnation that it consumed, in its
     own words.
 
-    Without a centre nothing holds it up. Scans that no odometry covers and inter-robot measurements
-    whose pose node did not come are known at the end only.
+    Without a centre nothing holds it up.
     """
     config, digest = log.robot_config(robot)
-    node = RecomputedRobot(config, digest, {})
+    said: dict[int, str] = {}
+    node = RecomputedRobot(config, digest, {}, said.__setitem__)
     if log.known_map is not None:
         node.given(log.known_map)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
     measurements = log.measurements.get((robot, incarnation), {})
     done = max((d.measurements for d in _dones(log, robot, incarnation)), default=None)
-    said: dict[int, str] = {}
-    for counter in takewhile(
-        measurements.__contains__, range(len(measurements) if done is None else done)
-    ):
-        took, late = node.took(measurements[counter]), Rejection.LATE.disposition
-        scans = [n for n in said if isinstance(measurements[n], m.AnyScan | m.Detections)]
-        scans = [n for n in scans if not said[n].startswith("rejected")]
-        silent = SILENT & set(took)
-        if late in took:  # an odometry interval that ends a window, and scans that it leaves behind
-            said |= dict.fromkeys(scans[-took.pop(late) :], late)
-            said[counter] = HybridEstimator.used
-        if silent:  # … and scans that it has found nothing in
-            said |= _silent(node, scans, measurements)
-            said[counter] = HybridEstimator.used
-        said.setdefault(counter, next(iter(took), "lost"))
-    if said and done is not None:
-        end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(said))
-        took = node.took(m.End(stamp_ns=0, streams=(end,)))
-        if SILENT & set(took):
-            said |= _silent(node, list(said), measurements)
-        for reason, count in took.items():
-            if reason in SILENT:
-                continue
-            sighted = reason == Rejection.NO_NODE.disposition
-            kinds = (m.Sightings,) if sighted else (m.Observations, m.Points, m.Detections)
-            taken = [n for n in said if isinstance(measurements[n], kinds)]
-            taken = [n for n in taken if not said[n].startswith("rejected")]
-            said |= dict.fromkeys(taken[-count:], reason)
-    return said
+    most = len(measurements) if done is None else done
+    consumed = list(takewhile(measurements.__contains__, range(most)))
+    for counter in consumed:
+        node.given(measurements[counter])
+    if consumed and done is not None:
+        end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(consumed))
+        node.given(m.End(stamp_ns=0, streams=(end,)))
+    return {counter: said.get(counter, "lost") for counter in consumed}

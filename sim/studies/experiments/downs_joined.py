@@ -17,7 +17,6 @@ from jaxtyping import Float
 from central.baselines.svd_rule import tied
 from central.desk.evaluation.errors import MapErrors, Path, map_errors, pose_errors
 from central.desk.evaluation.evaluation import Evaluation, evaluate
-from central.submap_set import Stream
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, loads, with_options
 from sim.scenarios.source import streams_of
@@ -36,7 +35,7 @@ from team.estimation.baselines.svd_joining import (
     mutual_sighting,
     weighted,
 )
-from team.estimation.contribution import Contribution
+from team.estimation.contribution import Contribution, Stream
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.map_joining import joining
 from team.estimation.models import corrected

@@ -15,10 +15,9 @@ class ClosedWindow:
     window, keyframes_ns: its particles with their paths, and the keyframes' team times; None where
     the window had no solution. innovation: of the window's measurements that were predicted.
     gated: measurements that no others of the window confirmed, and that are not in the submap.
-    late: scans that arrived in the window and are stamped behind its end; they are rejected.
-    unconfirmed, clutter: scans without identities of which no detection is in the submap. became:
-    what became of each detection; None where there was none. slips: motions that the odometry
-    missed.
+    late: scans of the interval that are stamped behind the window's end; they are rejected.
+    became: what became of each detection without identity; None where there was none. slips:
+    motions that the odometry missed.
     unsolved: scans that led to no Gaussian, of which only the odometry's motion is in the submap.
     """
 
@@ -35,7 +34,5 @@ class ClosedWindow:
     gated: int = 0
     late: int = 0
     unsolved: int = 0
-    unconfirmed: int = 0
-    clutter: int = 0
     became: Became | None = None
     slips: tuple[Slipped, ...] = ()

@@ -144,8 +144,6 @@ class HybridSlam:
             closed = replace(
                 closed,
                 local=replace(submap, unnamed=found.unnamed),
-                unconfirmed=found.unconfirmed,
-                clutter=found.clutter,
                 became=found.became,
                 slips=found.slips,
                 sightings=() if self._grid is None else self._grid.sightings(),

@@ -27,14 +27,12 @@ from team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 class Settled:
     """A window's keyframes with their associated detections, and the detections that stay out.
 
-    unconfirmed, clutter: scans of which no detection is in the submap. gated: detections that stay
-    out. slips: motions that the odometry missed. became: the outcome of each detection.
+    gated: detections that stay
+    out. slips: motions that the odometry missed. became: what became of each detection.
     """
 
     keyframes: tuple[Keyframe, ...]
     unnamed: Unnamed = NONE_UNNAMED
-    unconfirmed: int = 0
-    clutter: int = 0
     gated: int = 0
     slips: tuple[Slipped, ...] = ()
     became: Became | None = None
@@ -73,14 +71,11 @@ def settled(
     numbers = np.where(kept, number[found.landmark_of], 0)[is_detection]
     with_detections = np.array([each.look is not None for each in events], np.bool_)
     became = _became(events, numbers, found.clutter[is_detection])
-    silent, clutter = _silent(became)
     return Settled(
         keyframes=_keyframes(keyframes, events, numbers, found.slips),
         unnamed=Unnamed(
             found.counts[local].astype(np.uint32), found.seen[local][:, with_detections]
         ),
-        unconfirmed=silent - clutter,
-        clutter=clutter,
         gated=int(np.count_nonzero(numbers == 0)),
         slips=tuple(Slipped(events[slip.keyframe].at_ns, slip.by) for slip in found.slips),
         became=became,
@@ -142,18 +137,6 @@ def _became(
         landmarks=landmarks,
         clutter=clutter,
     )
-
-
-def _silent(became: Became) -> tuple[int, int]:
-    """Numbers of scans without any detection in the submap: of all, and of those with clutter
-    only.
-    """
-    scan = np.repeat(np.arange(len(became.counts)), became.counts)
-    k = len(became.counts)
-    used = np.bincount(scan[became.landmarks > 0], minlength=k)
-    false = np.bincount(scan[became.clutter], minlength=k)
-    silent = used == 0
-    return int(silent.sum()), int((silent & (false == became.counts)).sum())
 
 
 def _keyframes(

@@ -166,7 +166,8 @@ def test_a_broadcast_comes_when_it_is_due_and_something_is_new():
 def test_alone_the_map_of_one_robot_is_the_final_one(joint):
     last = estimate("r1", 5, at=2.0, joint=joint)
     end = m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=9),))
-    node, _ = heard("alone", [estimate("r1", 4), last, done("r1", 5), end], robots=["r1"])
+    messages = [start("r1"), estimate("r1", 4), last, done("r1", 5), end]
+    node, _ = heard("alone", messages, robots=["r1"])
     assert (node.final.means, node.final.covariance) == (last.means, last.covariance)
     assert (node.final.joint, node.final.reasons) == (joint, ())
 

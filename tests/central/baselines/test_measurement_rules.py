@@ -79,7 +79,7 @@ def test_any_order_of_arrival_and_duplicates_give_the_same_messages(fusion, orde
 
 
 def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_keyframes():
-    state = joint_fastslam.begun(
+    state = joint_fastslam.initial_state(
         {name: np.array([0.0, y, 0.0]) for name, y in (("r1", 0.0), ("r2", 1.0))},
         PARTICLES,
         "fastslam1",
@@ -99,7 +99,7 @@ def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_keyframes():
             increment = increment_of(CONFIGS[name].motion, *map(float, step))
             looks = (*(x[rows] for x in seen), each.landmark_detections.bearings[rows])
             turns.append(RobotStep(name, increment, CONFIGS[name].sensor, *looks))
-        state = joint_fastslam.stepped(state, turns, drawn)
+        state = joint_fastslam.filter_step(state, turns, drawn)
         for turn in turns:
             poses[turn.robot].append(joint_fastslam.pose_gaussian(state, turn.robot).mean)
     node, out = heard("joint-fastslam", everything())

@@ -30,7 +30,7 @@ def test_a_window_that_confirms_no_detection_has_none() -> None:
     window = [keyframe(0, [3.0]), keyframe(1, []), keyframe(2, [30.0])]
     found = settled(window, Association(least_seen=2), Sensor(), 100)
     assert [len(each.ids) for each in found.keyframes] == [0, 0, 0]
-    assert (found.gated, found.unconfirmed + found.clutter) == (2, 2)
+    assert (found.gated, len(found.became.silent)) == (2, 2)
     assert len(found.unnamed.counts) == 0
     assert found.became is not None
     assert found.became.landmarks.tolist() == [0, 0]

@@ -1,52 +1,100 @@
-"""What rules on submaps share: the set, credit for each submap, orders, and who lacks what."""
+"""The submaps of a team: the set, credit for each of them, orders, and who lacks what."""
 
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from central.attendance import TeamAttendance
 from central.config import CentralConfig
-from central.rule import FusionRule, Stream
+from central.intake import Inputs, Instant, Intake
 from central.submap_set import SubmapSet
 from central.withdrawal_witnesses import WithdrawalWitnesses
+from team import translate
+from team.estimation.contribution import Stream
+from team.estimation.map_joining.association.landmarks import Verdict
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 
-class SubmapRule(FusionRule):
+def _none(_submap: m.Submap) -> Sequence[m.SightingFactor]:
+    return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmapInputs(Inputs):
+    """A set of submaps, and what is said of them.
+
+    starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
+    from a submap. withdrawn: whom the team goes on without by an order. verdicts: an operator's on
+    unnamed landmarks. missing: what streams wait for. heard: how much was, for who compares maps.
+    """
+
+    starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
+    submaps: Mapping[Stream, Sequence[m.Submap]] = field(default_factory=dict)
+    sightings: Callable[[m.Submap], Sequence[m.SightingFactor]] = _none
+    withdrawn: Collection[str] = ()
+    verdicts: Collection[Verdict] = ()
+    missing: tuple[m.VersionEntry, ...] = ()
+    heard: int = 0
+
+
+class SubmapIntake(Intake[SubmapInputs]):
     """A set of submaps; every submap is acknowledged when nobody need send it any more."""
 
     listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.ORDER, ch.WITHDRAWALS_HEARD, ch.VERDICT)
 
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
-        super().__init__(config, digest, robots)
-        self.withdrawal_witnesses = WithdrawalWitnesses(robots)
-        self.reset()
+    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
+        super().__init__(config, robots)
+        self._withdrawal_witnesses = WithdrawalWitnesses(robots)
+        self._set = SubmapSet()
+        self._starts: dict[Stream, m.InitialPose] = {}
+        self._refusals: dict[Stream, set[int]] = {}
+        self._verdicts: set[Verdict] = set()
+        self._no_more: set[Verdict] = set()
 
     def admit(self, robot: str) -> None:
-        """From now on the robot is in the team, and may be heard of others."""
-        super().admit(robot)
-        self.withdrawal_witnesses.admit(robot)
+        """From now on the robot may be heard of others."""
+        self._withdrawal_witnesses.admit(robot)
 
-    def reset(self) -> None:
-        """Nothing is here."""
-        self.members = SubmapSet()
-        self.starts: dict[Stream, m.InitialPose] = {}
-        self.entered: dict[Stream, int] = {}
-        self._refusals: dict[Stream, set[int]] = {}
-        self.orders: set[str] = set()
-        self.refused = 0
+    # What goes into a map.
 
-    def _enters(self, submap: m.Submap, sightings: Sequence[m.SightingFactor]) -> None:
-        """A submap is there without a gap, and all inter-robot measurements from it."""
+    def inputs(self, closed_ns: float, now_ns: int) -> SubmapInputs:
+        """The set as it is; it grows under whoever holds it."""
+        return SubmapInputs(
+            closed_ns=closed_ns,
+            now_ns=now_ns,
+            starts=self._starts,
+            submaps=self._chains(),
+            sightings=self._set.sightings,
+            withdrawn=self.orders,
+            verdicts=self._verdicts,
+            missing=self._set.missing(),
+            heard=self._heard,
+        )
 
-    def _began(self, start: m.InitialPose) -> None:
-        """A stream begins."""
+    @property
+    def _heard(self) -> int:
+        """Submaps in the map's reach, orders, and verdicts and their withdrawals."""
+        verdicts = len(self._verdicts | self._no_more) + len(self._no_more)
+        return sum(map(len, self._chains().values())) + len(self.orders) + verdicts
 
-    def _goes(self, robot: str) -> None:
-        """The team goes on without a robot."""
+    def _chains(self) -> dict[Stream, Sequence[m.Submap]]:
+        """Of each stream that has begun, the submaps in the map's reach; they grow in place."""
+        return {stream: self._set.chain(stream) for stream in self._starts}
 
-    def _judges(self, verdict: m.Verdict) -> None:
-        """An operator says that two unnamed landmarks are one, or two."""
+    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[SubmapInputs]]:
+        """Now: what the least progress of the live robots has closed, and what is ahead of it."""
+        watermark_ns = attendance.watermark_ns(self.dealt, self.count)
+        yield Instant(attendance.now_ns, self.inputs(watermark_ns, attendance.now_ns))
+
+    def members(self, until_ns: float) -> Mapping[Stream, int]:
+        """The last submap of each stream that ends up to a time."""
+        found = {
+            stream: bisect_right(chain, until_ns, key=_end_ns) - 1
+            for stream, chain in self._chains().items()
+        }
+        return {stream: last for stream, last in found.items() if last >= 0}
 
     # What comes.
 
@@ -66,9 +114,9 @@ class SubmapRule(FusionRule):
             case m.Withdrawal():
                 return self._follow(message)
             case m.Verdict():
-                self._judges(message)
+                self._judge_landmarks(message)
             case m.WithdrawalHeard():
-                order = self.withdrawal_witnesses.take(message)
+                order = self._withdrawal_witnesses.take(message)
                 return [] if order is None else self._follow(order)
             case _:
                 pass
@@ -77,42 +125,40 @@ class SubmapRule(FusionRule):
     def take_start(self, start: m.InitialPose) -> None:
         """A stream begins; its submaps wait for this."""
         stream = (start.robot, start.incarnation)
-        if stream not in self.starts:
-            self.starts[stream] = start
-            self._began(start)
-            self._enter(stream)
+        self._starts.setdefault(stream, start)
 
     def take_submap(self, submap: m.Submap) -> int:
         """Admit a submap; how many of its stream have been dealt with."""
         stream = (submap.robot, submap.incarnation)
-        self._judge(submap, self.members.admit(submap))
-        self._enter(stream)
-        return self._dealt_with(stream, self.members.count(stream))
+        self._judge(submap, self._set.admit(submap))
+        return self._dealt_with(stream, self._set.count(stream))
 
     def take_sighting(self, sighting: m.SightingFactor) -> int:
         """Admit an inter-robot measurement; how many submaps of its stream have been dealt with."""
         stream = (sighting.robot, sighting.incarnation)
-        self._judge(sighting, self.members.admit_sighting(sighting))
-        self._enter(stream)
-        return self._dealt_with(stream, self.members.count(stream))
-
-    def _enter(self, stream: Stream) -> None:
-        """Hand on what now is there without a gap."""
-        if stream not in self.starts:
-            return
-        chain = self.members.chain(stream)
-        for submap in chain[self.entered.get(stream, 0) :]:
-            self._enters(submap, self.members.sightings(submap))
-        self.entered[stream] = len(chain)
+        self._judge(sighting, self._set.admit_sighting(sighting))
+        return self._dealt_with(stream, self._set.count(stream))
 
     def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
         """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
         robot, known = withdrawal.robot, self.withdrawn
-        self._goes(robot)
         self.orders.add(robot)
         if robot not in known:
+            self.withdrawn = tuple(sorted({*known, robot}))
             said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
             self.warnings.append(said)
+
+    def _judge_landmarks(self, verdict: m.Verdict) -> None:
+        """An operator says that two unnamed landmarks are one, or two, or that it holds no more.
+
+        That it holds no more may come first.
+        """
+        judged = translate.verdict_of(verdict.judgement)
+        if verdict.withdrawn:
+            self._no_more.add(judged)
+            self._verdicts.discard(judged)
+        elif judged not in self._no_more:
+            self._verdicts.add(judged)
 
     def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
         """Who joins later hears of every order from the centre: an operator does not stay.
@@ -126,9 +172,9 @@ class SubmapRule(FusionRule):
         return [] if order.robot in known else [Outgoing(ch.WITHDRAWAL, order.robot, order)]
 
     @property
-    def withdrawn(self) -> tuple[str, ...]:
-        """The robots that the team goes on without, ascending."""
-        return tuple(sorted(self.orders))
+    def findings(self) -> tuple[str, ...]:
+        """Orders that are not believed."""
+        return self._withdrawal_witnesses.unconfirmed(self.withdrawn)
 
     # What is refused.
 
@@ -156,23 +202,18 @@ class SubmapRule(FusionRule):
         refused = self._refusals.get(stream, set())
         if count not in refused:
             return count
-        return max(*refused, *self.members.streams.get(stream, {}), count) + 1
+        return max(*refused, *self._set.streams.get(stream, {}), count) + 1
 
     # What is here.
 
-    @property
-    def streams(self) -> list[Stream]:
-        """The streams that the set has submaps of."""
-        return sorted(self.members.streams)
-
     def count(self, stream: Stream) -> int:
         """How many submaps of a stream are in the map's reach, or will never be."""
-        return self._dealt_with(stream, self.entered.get(stream, 0))
+        return self._dealt_with(stream, self._set.count(stream) if stream in self._starts else 0)
 
     @property
     def submaps(self) -> int:
         """In the map's reach, or refused."""
-        return sum(self.count(stream) for stream in self.streams)
+        return sum(self.count(stream) for stream in self._set.streams)
 
     def dealt(self, done: m.Done) -> bool:
         """Every submap that the robot has sent is in the map's reach."""
@@ -184,11 +225,11 @@ class SubmapRule(FusionRule):
         It is the initial pose, the submaps without a gap and the inter-robot factors from them.
         """
         found: list[m.Message] = []
-        for stream in sorted((s for s in self.members.streams if s[0] == robot), reverse=True):
-            chain, start = self.members.chain(stream), self.starts.get(stream)
+        for stream in sorted((s for s in self._set.streams if s[0] == robot), reverse=True):
+            chain, start = self._set.chain(stream), self._starts.get(stream)
             if chain and start is not None:
                 found += [start, *chain]
-                found += [each for submap in chain for each in self.members.sightings(submap)]
+                found += [each for submap in chain for each in self._set.sightings(submap)]
         return found
 
     def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
@@ -210,6 +251,10 @@ class SubmapRule(FusionRule):
             for stream in sorted(sent)
             if here[stream] < sent[stream]
         ]
+
+
+def _end_ns(submap: m.Submap) -> int:
+    return submap.stamp_ns
 
 
 def _credit(of: m.Submap | m.SightingFactor, count: int, now_ns: int) -> list[Outgoing]:

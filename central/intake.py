@@ -1,0 +1,142 @@
+"""What a fusion rule rests on, and who files it: the messages of the robots, as they come.
+
+An intake files and acknowledges; it folds nothing and does not know when a map is due. That says
+the scheduler (`central.scheduler`), by the rule's own clock and by what the intake has.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Generic, Literal, TypeVar
+
+from central.attendance import TeamAttendance
+from central.config import CentralConfig
+from team.estimation.contribution import Stream
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+Due = Literal["news", "period", "now"]
+"""When a running map is due: broadcast_s of team time after the last one, if an input is new; each
+broadcast_s; at every instant."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What one map rests on; each intake adds what it collects.
+
+    closed_ns: no input that ends up to here is still to come. ahead: inputs behind it are in the
+    map, too. recorded: a recorded map has named them, so they are all that it rests on: nobody is
+    convicted beside those whom they leave out, and every message that goes with the map is made.
+    now_ns: team time.
+    """
+
+    closed_ns: float = float("inf")
+    ahead: bool = True
+    recorded: bool = False
+    now_ns: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapInputs(Inputs):
+    """The robots' own maps; exchange: the round that they are of, of rules in lockstep."""
+
+    maps: Sequence[m.MapEstimate] = ()
+    starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
+    exchange: int = 0
+
+
+I = TypeVar("I", bound=Inputs)  # noqa: E741 - the inputs of one family of rules
+
+
+@dataclass(frozen=True)
+class Instant(Generic[I]):
+    """The inputs at one instant of a rule's clock, `now_ns`.
+
+    since_ns: a first map is due a period after this; None: at once.
+    """
+
+    now_ns: int
+    inputs: I
+    since_ns: int | None = None
+
+
+class Intake(ABC, Generic[I]):
+    """Files what a rule rests on; knows what is here and what is waited for.
+
+    listens: the channels whose messages it takes. due: when a running map of it is. orders: robots
+    that the team goes on without, by an order. withdrawn: those, and whom the rule has convicted.
+    warnings: what went wrong, the newest last. refused: messages that were.
+    """
+
+    listens: ClassVar[tuple[ch.Channel, ...]]
+    due: ClassVar[Due] = "news"
+
+    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
+        self.config = config
+        self.orders: set[str] = set()
+        self.withdrawn: tuple[str, ...] = ()
+        self.warnings: list[str] = []
+        self.refused = 0
+
+    @abstractmethod
+    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        """File one message; the credit that it gives."""
+
+    @abstractmethod
+    def inputs(self, closed_ns: float, now_ns: int) -> I:
+        """All that is here."""
+
+    @abstractmethod
+    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[I]]:
+        """The instants at which a map may be due, those that are over by now."""
+
+    def members(self, until_ns: float) -> Mapping[Stream, int]:
+        """The last input of each stream that ends up to a time, as a map of them names it."""
+        return {}
+
+    def admit(self, robot: str) -> None:
+        """From now on the robot is in the team."""
+
+    def dealt(self, done: m.Done) -> bool:
+        """True once all messages announced in the robot's `Done` have arrived."""
+        return True
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything of the streams that it needs itself is here."""
+        return True
+
+    def count(self, stream: Stream) -> int:
+        """How many submaps of a stream are in the map's reach, or will never be."""
+        return 0
+
+    @property
+    def submaps(self) -> int:
+        """How many submaps it has dealt with."""
+        return 0
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What a reader of the map must know of what came."""
+        return ()
+
+    def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
+        """A message whose handling raised counts as refused; the credit that this gives."""
+        return []
+
+    def kept(self, robot: str) -> Sequence[m.Message]:
+        """What the robot's next process takes over; nothing: it begins its stream again.
+
+        Of each incarnation, the latest first: its initial pose, the submaps without a gap and the
+        inter-robot factors from them.
+        """
+        return ()
+
+    def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
+        """What robots say that they have sent, and what is not here."""
+        return []
+
+    def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
+        """Measurements that are missing and must be asked for at their source."""
+        return []

@@ -1,0 +1,197 @@
+"""What the rule `join` says of a fold: the team's map, priors for its robots, their paths."""
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from central.config import CentralConfig
+from central.fused import JOINT_LANDMARKS, version_entry
+from central.monitor import miscalibrations
+from central.rule import Tail
+from central.sent_priors import SentPriors
+from team import translate
+from team.estimation.contribution import Stream
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.association.landmarks import Decision
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.marginals import BiasEstimate
+from team.estimation.map_joining.refusal import refusals
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.bus import Outgoing
+
+PRIOR_LANDMARKS = 30
+"""Landmarks in a robot's prior at the most: the nearest ones."""
+NAMED = 10
+"""Landmarks that are left out of the map, and refusals, are named up to so many."""
+
+
+def team_map(
+    fold: Fold,
+    tail: Tail,
+    shown: Sequence[int],
+    *,
+    digest: bytes,
+    members: Mapping[Stream, int],
+    withdrawn: tuple[str, ...],
+    missing: tuple[m.VersionEntry, ...],
+    heard: int,
+    cost: tuple[float, float],
+    covariance_scale: float,
+    biases: Sequence[BiasEstimate],
+    reasons: tuple[str, ...],
+) -> m.FusedMap:
+    """The map of a fold with the landmarks `shown`; cost: (χ², dof). The covariance is the joint
+    one of a final map of no more than JOINT_LANDMARKS, else each landmark's own.
+    """
+    joint = tail == "final" and len(shown) <= JOINT_LANDMARKS and bool(fold.contributions)
+    if joint:
+        ids, means, matrix = marginals.landmark_map(fold, shown)
+        covariance = translate.joint_bytes(matrix)
+    elif fold.contributions:
+        ids, means, blocks = marginals.landmark_blocks(fold, shown)
+        covariance = translate.block_bytes(blocks)
+    else:
+        ids, means, covariance = np.empty(0, np.uint32), np.empty((0, 2)), b""
+    frame = fold.frame
+    return m.FusedMap(
+        stamp_ns=fold.contributions[-1].end_ns if fold.contributions else 0,
+        rule="join",
+        digest=digest,
+        frame="" if frame is None else f"{frame[0]}/{frame[1]}",
+        final=tail == "final",
+        provisional=tail == "provisional",
+        exchange=0,
+        members=tuple(version_entry(*each) for each in members.items()),
+        missing=missing,
+        joint=joint,
+        ids=from_ids(ids),
+        means=from_floats(means),
+        covariance=covariance,
+        chi2=cost[0],
+        dof=round(cost[1]),
+        reasons=reasons,
+        biases=tuple(
+            m.BiasEstimate(
+                robot=b.stream[0],
+                incarnation=b.stream[1],
+                bias=b.bias,
+                value=b.value,
+                sigma=b.sigma,
+            )
+            for b in biases
+        ),
+        joined=tuple(fold.joined[k] for k in sorted(fold.joined)),
+        withdrawn=withdrawn,
+        covariance_scale=covariance_scale,
+        heard=heard,
+        memberships=translate.memberships_of(fold.landmarks),
+        decisions=translate.decisions_of(fold.landmarks),
+        verdicts=tuple(translate.judgement_of(v) for v in fold.landmarks.verdicts),
+    )
+
+
+def shown_landmarks(fold: Fold, config: CentralConfig) -> list[int]:
+    """The landmarks that the map has, by ascending id."""
+    if not fold.contributions:
+        return []
+    return marginals.confirmed(fold, config.landmark_submaps)
+
+
+def reasons(
+    fold: Fold, shown: Sequence[int], biases: Sequence[BiasEstimate], landmark_submaps: int
+) -> tuple[str, ...]:
+    """Why robots and landmarks are not in the map, and why it is to be doubted, in words."""
+    return (
+        *(fold.reasons[k] for k in sorted(fold.reasons)),
+        *_worded(refusals(fold)),
+        *fold.warnings,
+        *_worded([_awaited(each) for each in _waiting(fold)]),
+        *_unconfirmed(fold, shown, landmark_submaps),
+        *miscalibrations(biases),
+    )
+
+
+def _unconfirmed(fold: Fold, shown: Sequence[int], landmark_submaps: int) -> tuple[str, ...]:
+    """What is left out of the map, in words."""
+    known = fold.main.graph.landmarks.keys() if fold.contributions else set[int]()
+    out = sorted(known - set(shown))
+    if not out:
+        return ()
+    named = ", ".join(str(id_) for id_ in out[:NAMED]) + (", …" if len(out) > NAMED else "")
+    return (
+        f"left out, {landmark_submaps} submaps that agree needed: "
+        f"{len(out)} of {len(known)} landmarks ({named})",
+    )
+
+
+def priors(
+    fold: Fold, shown: Sequence[int], fused: m.FusedMap, sent_priors: SentPriors | None
+) -> list[Outgoing]:
+    """For the latest stream of every robot that is in the team's frame, if it has news; None: for
+    each.
+    """
+    if not fold.contributions:
+        return []
+    latest: dict[str, int] = {}
+    for robot, incarnation in fold.home:
+        latest[robot] = max(latest.get(robot, 0), incarnation)
+    streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
+    if sent_priors is not None:
+        blocks = marginals.landmark_blocks(fold, shown)
+        poses = ((each, marginals.last_pose(fold, each)) for each in streams)
+        streams = [each for each, pose in poses if sent_priors.is_worth(each, pose, blocks)]
+    if not streams:
+        return []
+    found = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, shown)
+    stamp_ns = fold.contributions[-1].end_ns
+    out = []
+    for stream, prior in found.items():
+        sequence = fold.next_sequence(stream) - 1
+        message = translate.prior_message(
+            stamp_ns, *stream, sequence, fused.digest, prior, fused.members, fused.heard
+        )
+        out.append(Outgoing(ch.PRIOR, stream[0], message))
+    return out
+
+
+def trajectories(
+    fold: Fold, digest: bytes, submaps: Mapping[Stream, Sequence[m.Submap]]
+) -> list[Outgoing]:
+    """The path of every stream that is in the team's frame: where its submaps end."""
+    paths = []
+    for robot, incarnation in sorted(fold.home):
+        if fold.home[(robot, incarnation)] != fold.main_key:
+            continue
+        found = marginals.trajectory(fold, robot, incarnation)
+        poses, covariances = found.poses, found.covariances
+        ends = [s.stamp_ns for s in submaps[(robot, incarnation)]][: len(poses)]
+        message = translate.trajectory_message(
+            ends[-1], robot, incarnation, digest, ends, poses, covariances
+        )
+        with_start = msgspec.structs.replace(
+            message,
+            start=from_floats(found.start),
+            start_covariance=from_floats(found.start_covariance),
+            crosses=from_floats(found.crosses),
+        )
+        paths.append(Outgoing(ch.TRAJECTORY, robot, with_start))
+    return paths
+
+
+def _waiting(fold: Fold) -> list[Decision]:
+    """Merges of robots by their maps that wait, by whom they are about."""
+    waits = fold.landmarks.waits
+    return [waits[of] for of in sorted(waits) if of[1] in fold.islands and of[0] != of[1]]
+
+
+def _awaited(decision: Decision) -> str:
+    return f"{decision.about} not joined by their maps: {decision.why}"
+
+
+def _worded(words: Sequence[str]) -> tuple[str, ...]:
+    """So many of them, and how many more there are."""
+    more = len(words) - NAMED
+    return (*words[:NAMED], *([f"{more} more refusals"] if more > 0 else []))

@@ -1,0 +1,157 @@
+"""When a map is due: the one scheduler of every fusion rule.
+
+Team time is cut into ticks, whose submaps are folded together, and into broadcasts. A running map
+is *closed* where nothing of the time that it speaks of can still come, else *provisional*; the
+*final* one comes at the end. What a map says is the rule's business (`central.rule`), what it rests
+on its intake's (`central.intake`).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from central.attendance import TeamAttendance
+from central.intake import Inputs, Instant
+from central.rule import FusionRule, Tail
+from team.estimation.contribution import Stream
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+PATIENCE = 3.0
+"""What a robot that has stalled holds back goes out provisionally after so many broadcasts, or
+ticks where these are longer."""
+
+
+class Scheduler:
+    """Asks one rule for its maps; `intake` is the rule's own."""
+
+    def __init__(self, rule: FusionRule[Any]) -> None:
+        self.rule = rule
+        self.intake = rule.intake(rule.config, rule.team)
+        self.warnings = self.intake.warnings
+        rule.warnings = self.warnings
+        self._tick_ns = round(rule.config.tick_s * 1e9)
+        self._period_ns = rule.config.broadcast_s * 1e9
+        self._patience_ns = PATIENCE * 1e9 * max(rule.config.broadcast_s, rule.config.tick_s)
+        self._said_ns: int | None = None
+        self._quiet_ns: int | None = None
+        self._published: Mapping[Stream, int] = {}
+        self._announced: dict[str, str] = {}
+
+    def admit(self, robot: str) -> None:
+        """From now on the robot is in the team."""
+        self.rule.admit(robot)
+        self.intake.admit(robot)
+
+    def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
+        """What is due at each instant that is over by now."""
+        return [each for instant in self.intake.instants(attendance) for each in self.at(instant)]
+
+    def refresh(self, attendance: TeamAttendance) -> list[Outgoing]:
+        """A map of all that is here at once, though none is due, if the last one lacks something.
+
+        It waits for no tick's end and no teammate: what lies ahead of the watermark is provisional.
+        Rules with a clock of their own have none.
+        """
+        if self.intake.due != "news" or not self._is_news(math.inf):
+            return []
+        out: list[Outgoing] = []
+        for instant in self.intake.instants(attendance):
+            out += self.rule.take(instant.inputs)
+            out += self._whole(instant.inputs)
+        return out
+
+    def conclude(self, now_ns: int) -> list[Outgoing]:
+        """The last messages, the final map behind all others."""
+        return self._said(self.intake.inputs(math.inf, now_ns), "final")
+
+    def at(self, instant: Instant[Any]) -> list[Outgoing]:
+        """Fold what is closed at an instant; a map if one is due."""
+        inputs, now_ns = instant.inputs, instant.now_ns
+        out = self.rule.take(inputs)
+        convictions = self._convictions(now_ns)
+        if convictions or self._is_due(instant):
+            return [*out, *convictions, *self._newest(inputs)]
+        if self.intake.due == "news" and self.intake.members(math.inf):
+            if self._quiet_ns is None:
+                self._quiet_ns = now_ns
+            if now_ns - self._quiet_ns >= self._patience_ns and self._is_news(math.inf):
+                return [*out, *self._said(inputs, "provisional")]
+        return out
+
+    def _is_due(self, instant: Instant[Any]) -> bool:
+        due = self.intake.due
+        if due == "now":
+            return True
+        last_ns = instant.since_ns if self._said_ns is None else self._said_ns
+        if last_ns is not None and instant.now_ns - last_ns < self._period_ns:
+            return False
+        return due == "period" or self._is_news(instant.inputs.closed_ns)
+
+    def _is_news(self, until_ns: float) -> bool:
+        """Whether an input up to then is not in the last map."""
+        return _lacks(self._published, self._members(until_ns))
+
+    def _members(self, until_ns: float) -> Mapping[Stream, int]:
+        """What a map of all inputs up to then names."""
+        gone = self.intake.withdrawn
+        return {s: n for s, n in self.intake.members(until_ns).items() if s[0] not in gone}
+
+    def _newest(self, inputs: Inputs) -> list[Outgoing]:
+        """The map of the ticks that are closed; of all that is here if that is more.
+
+        What a teammate has just closed is worth most to who sees the same landmarks, so it does not
+        wait for the end of its tick. And no map has less than the one before it: what lies ahead of
+        the watermark is in a provisional map and not yet in a closed one.
+        """
+        whole = self._members(self._ticks_end_ns(inputs.closed_ns))
+        gone = self.intake.withdrawn
+        published = {s: n for s, n in self._published.items() if s[0] not in gone}
+        if _lacks(whole, published) or _lacks(whole, self._members(inputs.closed_ns)):
+            return self._whole(inputs)
+        return self._said(replace(inputs, ahead=False), "closed")
+
+    def _whole(self, inputs: Inputs) -> list[Outgoing]:
+        """The map of all that is here, closed if nothing of it is ahead of the watermark."""
+        ahead = _lacks(self._members(inputs.closed_ns), self._members(math.inf))
+        return self._said(inputs, "provisional" if ahead else "closed")
+
+    def _ticks_end_ns(self, closed_ns: float) -> float:
+        """The end of the last tick that is over; a tick has the submaps that end in (a, b]."""
+        return closed_ns if math.isinf(closed_ns) else closed_ns // self._tick_ns * self._tick_ns
+
+    def _said(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+        """A map and what goes out with it; before them whom it convicts."""
+        out = self.rule.fuse(inputs, tail)
+        self._said_ns = self._quiet_ns = inputs.now_ns
+        maps = [each.message for each in out if isinstance(each.message, m.FusedMap)]
+        if maps:
+            members = maps[-1].members
+            self._published = {(x.robot, x.incarnation): x.sequence for x in members}
+        return [*self._convictions(inputs.now_ns), *out]
+
+    def _convictions(self, now_ns: int) -> list[Outgoing]:
+        """Whom the fold has convicted since this was asked last; what came late may acquit."""
+        found = self.rule.convicted
+        self.intake.withdrawn = tuple(sorted(self.intake.orders | found.keys()))
+        for robot in sorted(self._announced.keys() - found.keys()):
+            del self._announced[robot]
+            self.warnings.append(f"{robot} is withdrawn no more: what came late speaks for it")
+        new = [robot for robot in found if robot not in self._announced]
+        self._announced |= found
+        self.warnings += [f"{robot} withdrawn by central: {found[robot]}" for robot in new]
+        return [
+            Outgoing(
+                ch.WITHDRAWAL,
+                robot,
+                m.Withdrawal(stamp_ns=now_ns, robot=robot, by="central", reason=found[robot]),
+            )
+            for robot in new
+        ]
+
+
+def _lacks(members: Mapping[Stream, int], of: Mapping[Stream, int]) -> bool:
+    """Whether the first version vector lacks an input of the other."""
+    return any(members.get(stream, -1) < last for stream, last in of.items())

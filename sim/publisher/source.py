@@ -1,0 +1,207 @@
+"""One robot's stream as a world publishes it: each measurement as its message, and the truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.world import streams as s
+from sim.world.streams import RobotStream
+from team.driver.source import FIRST_INCARNATION
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids, from_stamps
+from team.wire.bus import Outgoing
+
+TRUTH_BATCH_NS = 1_000_000_000
+_CHANNEL_OF_KIND = {
+    s.START: ch.START,
+    s.ODOMETRY: ch.ODOMETRY,
+    s.OBSERVATIONS: ch.OBSERVATIONS,
+    s.SIGHTINGS: ch.SIGHTINGS,
+}
+
+
+@dataclass
+class Source:
+    """One robot's stream; its present incarnation began at measurement `base` of the whole."""
+
+    stream: RobotStream
+    incarnation: int = FIRST_INCARNATION
+    base: int = 0
+    published: int = 0
+    consumed: int = 0
+    truth_sent: int = 0
+    alive: bool = False
+
+    @property
+    def counter(self) -> int:
+        """Measurements published in this incarnation."""
+        return self.published - self.base
+
+    def said(self, index: int) -> Outgoing:
+        """The measurement at `index` of the whole stream, on its channel."""
+        channel = _CHANNEL_OF_KIND[int(self.stream.kinds[index])]
+        return Outgoing(channel, self.stream.robot, self.message(index))
+
+    def message(self, index: int) -> m.Measurement:
+        """The measurement at `index` of the whole stream, as this incarnation counts it."""
+        stream, number = self.stream, index - self.base
+        name = (stream.robot, self.incarnation, number)
+        stamp_ns = int(stream.stamps_ns[index])
+        if number == 0 and self.incarnation > FIRST_INCARNATION:
+            return _start(None, stamp_ns, name)
+        kind = stream.kinds[index]
+        if kind == s.ODOMETRY:
+            return _odometry(stream.odometry(index), stamp_ns - stream.clock_offset_ns, name)
+        if kind == s.OBSERVATIONS:
+            return _observations(stream.observations(index), stamp_ns, name)
+        if kind == s.SIGHTINGS:
+            return _sightings(stream.sightings(index), stamp_ns, name)
+        return _start(stream.start, stamp_ns, name)
+
+    def truth(self, until_ns: int, batch_ns: int = TRUTH_BATCH_NS) -> list[Outgoing]:
+        """The true poses up to a time that are not said yet, once they span `batch_ns`."""
+        stream = self.stream
+        if stream.truth is None or stream.truth_ns is None:
+            return []
+        begin = self.truth_sent
+        if begin >= len(stream.truth_ns) or until_ns - stream.truth_ns[begin] < batch_ns:
+            return []
+        end = int(np.searchsorted(stream.truth_ns, until_ns, side="right"))
+        if end <= begin:
+            return []
+        self.truth_sent = end
+        truth = m.Truth(
+            stamp_ns=int(stream.truth_ns[end - 1]),
+            robot=stream.robot,
+            stamps=from_stamps(stream.truth_ns[begin:end]),
+            poses=from_floats(stream.truth[begin:end]),
+        )
+        return [Outgoing(ch.TRUTH, stream.robot, truth)]
+
+
+Name = tuple[str, int, int]
+"""(robot, incarnation, number)."""
+
+
+def _start(start: s.StartPose | None, stamp_ns: int, name: Name) -> m.InitialPose:
+    robot, incarnation, number = name
+    covariance = None if start is None else start.covariance
+    return m.InitialPose(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        number=number,
+        pose=b"" if start is None else from_floats(start.pose),
+        covariance=b"" if covariance is None else from_floats(covariance),
+    )
+
+
+def _observations(
+    z: s.ObservationMeasurement, stamp_ns: int, name: Name
+) -> m.Observations | m.Points | m.Detections:
+    """A scan as its sensor tells it: without identities, as points, as ranges and bearings."""
+    robot, incarnation, number = name
+    covariances = b"" if z.covariances is None else from_floats(z.covariances)
+    if z.hidden:
+        return m.Detections(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=incarnation,
+            number=number,
+            ranges=from_floats(z.ranges),
+            bearings=from_floats(z.bearings),
+            covariances=covariances,
+            signatures=b"" if z.signatures is None else from_floats(z.signatures),
+        )
+    if z.points is not None:
+        return m.Points(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=incarnation,
+            number=number,
+            ids=from_ids(z.ids),
+            positions=from_floats(z.points),
+            covariances=covariances,
+        )
+    return m.Observations(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        number=number,
+        ids=from_ids(z.ids),
+        ranges=from_floats(z.ranges),
+        bearings=from_floats(z.bearings),
+        covariances=covariances,
+    )
+
+
+def _sightings(t: s.SightingMeasurement, stamp_ns: int, name: Name) -> m.Sightings:
+    robot, incarnation, number = name
+    return m.Sightings(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        number=number,
+        teammates=t.teammates,
+        ranges=from_floats(t.ranges),
+        bearings=from_floats(t.bearings),
+    )
+
+
+def _odometry(told: s.OdometryMeasurement, stamp_ns: int, name: Name) -> m.AnyOdometry:
+    """One interval as the odometry tells it; name: robot, incarnation, number."""
+    robot, incarnation, number = name
+    if told.increment is not None:
+        return m.Increment(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=incarnation,
+            number=number,
+            duration_ns=told.duration_ns,
+            increment=from_floats(told.increment),
+            covariance=b"" if told.covariance is None else from_floats(told.covariance),
+        )
+    if told.steered:
+        return m.Steering(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=incarnation,
+            number=number,
+            duration_ns=told.duration_ns,
+            wheel_speed=told.forward,
+            steering=told.yaw_rate,
+        )
+    return m.Odometry(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        number=number,
+        duration_ns=told.duration_ns,
+        forward=told.forward,
+        yaw_rate=told.yaw_rate,
+    )
+
+
+def for_the_evaluator(stream: RobotStream) -> list[Outgoing]:
+    """The true identities of what is told without, and where another sensor says the robot was."""
+    out, seen, first_ns = [], stream.landmark_detections, int(stream.stamps_ns[0])
+    if seen.hidden is not None and seen.hidden.any():
+        rows = np.repeat(seen.hidden, np.diff(seen.offsets))
+        labels = m.TruthLabels(
+            stamp_ns=first_ns,
+            robot=stream.robot,
+            stamps=from_stamps(seen.stamps_ns[seen.hidden]),
+            counts=from_ids(np.diff(seen.offsets)[seen.hidden]),
+            labels=from_ids(seen.ids[rows]),
+        )
+        out.append(Outgoing(ch.TRUTH_LABELS, stream.robot, labels))
+    if stream.positions is not None and stream.positions_ns is not None:
+        positions = m.TruthPositions(
+            stamp_ns=first_ns,
+            robot=stream.robot,
+            stamps=from_stamps(stream.positions_ns),
+            positions=from_floats(stream.positions),
+        )
+        out.append(Outgoing(ch.TRUTH_POSITIONS, stream.robot, positions))
+    return out

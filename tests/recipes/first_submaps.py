@@ -1,0 +1,44 @@
+"""A fusion rule as docs/architecture.md says how to add one: one class with `fuse` in one file."""
+
+import numpy as np
+
+from central.fused import fused_message, version_entry
+from central.rule import FusionRule, Tail
+from central.submap_intake import SubmapInputs, SubmapIntake
+from team import translate
+from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.geometry import transformed
+from team.wire import channels as ch
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded
+
+
+class FirstSubmaps(FusionRule[SubmapInputs]):
+    """The landmarks of each robot's first submap at its initial pose; of two, the first robot's."""
+
+    intake = SubmapIntake
+
+    def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
+        """A function of the set alone."""
+        landmarks: dict[int, np.ndarray] = {}
+        heard = {stream: chain for stream, chain in sorted(inputs.submaps.items()) if chain}
+        for stream, chain in heard.items():
+            start = translate.start_of(inputs.starts[stream])
+            local = translate.local_map_of(chain[0])
+            if start is not None:
+                for id_, mean in zip(local.ids.tolist(), local.landmarks, strict=True):
+                    landmarks.setdefault(id_, transformed(start.pose, mean))
+        ids = sorted(landmarks)
+        means = np.array([landmarks[id_] for id_ in ids]).reshape(-1, 2)
+        value = LandmarkGaussian(np.array(ids, np.uint32), means, np.eye(means.size))
+        named = (encoded(chain[0]) for chain in heard.values())
+        fused = fused_message(
+            self.config,
+            translate.digest_of(self.config_digest, tail.encode(), *named),
+            value,
+            tuple(version_entry(stream, len(chain) - 1) for stream, chain in heard.items()),
+            stamp_ns=max((chain[-1].stamp_ns for chain in heard.values()), default=0),
+            final=tail == "final",
+        )
+        self.landmarks = len(ids)
+        return [Outgoing(ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP, "", fused)]

@@ -1,0 +1,54 @@
+"""An estimator as docs/architecture.md says how to add one: one class in one file."""
+
+import numpy as np
+
+from team.config import RobotConfig
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
+from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from team.estimation.odometry import Moved
+from team.estimation.scans import Scan
+from team.rejection import Rejection
+from team.robot.estimator import NOTHING_NEW, Estimates, InitialPose, KnownMap
+
+
+class Standing:
+    """A robot that believes that it stands still, and sees nothing."""
+
+    sequence = 0
+    used = "in no map"
+    joint = True
+    innovation: Innovation = NOTHING
+
+    def __init__(
+        self, config: RobotConfig, incarnation: int, initial: InitialPose, known: KnownMap
+    ) -> None:
+        self._pose = np.zeros(3) if initial.pose is None else initial.pose
+
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
+        """It has no use for landmarks."""
+        return Rejection.NO_LANDMARKS
+
+    def drive(
+        self,
+        stamp_ns: int,
+        duration_ns: int,
+        forward: float,
+        yaw_rate: float,
+        moved: Moved | None = None,
+        *,
+        measured: bool = True,
+    ) -> Estimates:
+        """Each interval ends with a pose."""
+        return Estimates(pose_ns=stamp_ns)
+
+    def finish(self) -> tuple[Estimates, int]:
+        """Nothing was waited for."""
+        return NOTHING_NEW, 0
+
+    def own_pose(self) -> PoseGaussian:
+        """Where it began."""
+        return PoseGaussian(self._pose, np.eye(3))
+
+    def own_map(self) -> LandmarkGaussian:
+        """None."""
+        return NO_LANDMARKS

@@ -1,0 +1,54 @@
+"""Adds a fusion rule and an estimator by their rows alone, runs teams with them, and verifies.
+
+python -m tests.recipes.walk FOLDER
+"""
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import team
+
+ROWS = {
+    "ESTIMATORS: Mapping[str, EstimatorRow] = MappingProxyType(\n    {\n": (
+        '"standing": EstimatorRow("tests.recipes.standing:Standing", ("alone",)),\n'
+    ),
+    "RULES: Mapping[str, RuleRow] = MappingProxyType(\n    {\n": (
+        '"first-submaps": RuleRow("tests.recipes.first_submaps:FirstSubmaps", "submap"),\n'
+    ),
+}
+"""What a user writes into team/pairs.py, by what it is written behind."""
+
+
+def add_rows() -> None:
+    """`team.pairs` as it is with the rows in it, before anything imports it."""
+    path = Path(team.__file__).parent / "pairs.py"
+    source = path.read_text()
+    for before, row in ROWS.items():
+        assert source.count(before) == 1, before
+        source = source.replace(before, before + row)
+    module = ModuleType("team.pairs")
+    sys.modules["team.pairs"] = module
+    exec(compile(source, str(path), "exec"), vars(module))
+    team.pairs = module
+
+
+def main(folder: Path) -> None:
+    """Says of each run what its final map has and what the verification finds."""
+    add_rows()
+    from central.desk.verification.verification import verify
+    from sim.in_memory.team import final_map
+    from tests.sim.reruns import team_samples, thesis, written
+
+    ours = thesis(24, fusion="first-submaps"), thesis(24, estimator="standing", fusion="alone")
+    for scenario in ours:
+        samples = team_samples(scenario)
+        final = final_map(samples)
+        found = verify(written(folder / f"{final.rule}.mcap", samples))
+        compared = {c.channel: (c.messages, c.equal) for c in found.channels}
+        assert found.first is None, str(found.first)
+        print(final.rule, len(final.ids) // 4, final.final, compared)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
