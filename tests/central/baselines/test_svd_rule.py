@@ -64,7 +64,9 @@ def test_the_final_map_is_downs_exchange_of_the_robots_own_joined_maps(rule):
     full = rule == "svd-join"
     maps = []
     for name, y in (("r1", 0.0), ("r2", 1.0)):
-        state = svd_joining.initial_state({name: np.array([0.0, y, 0.0])}, "full" if full else "identity")
+        state = svd_joining.initial_state(
+            {name: np.array([0.0, y, 0.0])}, "full" if full else "identity"
+        )
         for submap in SUBMAPS[name]:
             state = svd_joining.filter_step(state, name, translate.local_map_of(submap))
         maps.append(svd_joining.landmark_gaussian(svd_joining.solved(state)))
