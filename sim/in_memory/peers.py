@@ -240,14 +240,12 @@ class PeerTeam:
 
     @property
     def _agree(self) -> bool:
-        """Whether all have a final map of one set and know that of each other, and nothing is on
-        its way.
-        """
+        """Whether all have a final map and one set, and nothing is on its way."""
         finals = [seat.node.final for seat in self.seats.values()]
         if len(self.seats) < len(self.scenario.robots):
             return False
-        digests = {final.digest for final in finals if final is not None}
-        return not self._heap and len(digests) == 1 and all(f is not None for f in finals)
+        sets = {seat.node.peer.replica.digest for seat in self.seats.values()}
+        return not self._heap and len(sets) == 1 and all(f is not None for f in finals)
 
     def _sample(self, out: Outgoing) -> Sample:
         counter = self._counters.get(out.key, 0)

@@ -61,7 +61,7 @@ def test_every_peers_final_map_is_the_central_runs_though_it_meets_one_teammate_
 
 
 def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(central):
-    """Robots meet two by two, r2 carries; r2 dies and has lost what it kept last.
+    """Two by two they meet, r2 carries; it dies, once behind the end, and has lost what it kept.
 
     A centre is there for a while, meets r1 only, dies, and comes back with what it kept.
     """
@@ -73,7 +73,7 @@ def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(cen
             Meeting(frozenset({"r1", "r2", "r3", "central"}), 60 * SECOND, 10**6 * SECOND),
         ]
     )
-    deaths = iter([16, 27])
+    deaths = iter([16, 27, 40])
     due = next(deaths)
 
     disk: list[Member] = []
