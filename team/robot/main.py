@@ -23,8 +23,8 @@ SECOND_PATIENCE_S = 6.0
 SECOND_PERIOD_S = 0.5
 CONFIRMED_S = 1.0
 """Wait [s] between two questions to the source which incarnation its stream is in."""
-LOG_LOOK_S = 2.0
-"""Wait [s] between two checks for what the robot's own log lacks."""
+LOG_LOOK_S, LOG_RARELY_S = 2.0, 60.0
+"""Least and greatest wait [s] between two checks for what the robot's own log lacks."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -51,6 +51,7 @@ class RobotShell:
         self._first_of: dict[int, Sample] = {}
         self._confirm_at = 0.0
         self._log_due_s = 0.0
+        self._log_look_s = LOG_LOOK_S
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
 
     def run_in(self, shell: Shell) -> None:
@@ -95,19 +96,22 @@ class RobotShell:
         wanted = self.node.wanted()
         self._missing.look(() if wanted is None else (wanted,))
         if time.monotonic() >= self._log_due_s:
-            self._log_due_s = time.monotonic() + LOG_LOOK_S
-            self._complete_log()
+            lost = self._complete_log()
+            self._log_look_s = min(2.0 * self._log_look_s, LOG_RARELY_S) if lost else LOG_LOOK_S
+            self._log_due_s = time.monotonic() + self._log_look_s
 
-    def _complete_log(self) -> None:
-        """Ask the source for what a death has cost the robot's own log.
+    def _complete_log(self) -> bool:
+        """Ask the source for what a death has cost the robot's own log; whether there was any.
 
         What the robot lacks, too, it asks for itself, and the log has the answer.
         """
+        lost = False
         tap: Tap | None = getattr(self.bus, "tap", None)
         for incarnation, first, last in () if tap is None else tap.lost(self.node.robot):
             here = incarnation == self.node.incarnation
             used = min(last, self.node.next_measurement - 1) if here else last
             if first <= used:
+                lost = True
                 wanted = m.MeasurementsRequest(
                     stamp_ns=0,
                     robot=self.node.robot,
@@ -119,7 +123,8 @@ class RobotShell:
                     self.bus.ask(ch.MEASUREMENTS, self.node.robot, wanted, ASK_TIMEOUT_S)
                 except BusError as error:
                     _LOG.warning("its own log lacks measurements %d to %d: %s", first, used, error)
-                    return
+                    break
+        return lost
 
     def _look_for_driver(self) -> None:
         """Find out whether the robot's driver is present before any other message is handled."""
