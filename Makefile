@@ -105,11 +105,13 @@ $(VENV)/.python:
 	touch $@
 
 $(VENV)/.runtime: pyproject.toml constraints.txt hashes-run.txt | $(VENV)/.python
+	@echo "Installing $$(grep -c == hashes-run.txt) packages at pinned versions into $(VENV): a minute or two, once"
 	$(PIP) $(LISTED) hashes-run.txt
 	$(OWN) install --constraint constraints.txt --no-build-isolation --editable .
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python
+	@echo "Installing $$(grep -c == hashes.txt) packages at pinned versions into $(VENV): a minute or two, once"
 	$(PIP) $(LISTED) hashes.txt
 	$(OWN) install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
 	touch $(VENV)/.runtime $@

@@ -246,23 +246,32 @@ def _keep_earlier(log: Path) -> None:
         typer.echo(f"{log} was there already: it is now {aside}", err=True)
 
 
+KERNELS_TO_ESTIMATE = 5
+"""The first kernels take longer than most: they say nothing of the rest."""
+
+
 class _Compiling:
     """Reports the compilation of kernels, which happens once per machine."""
 
     def __init__(self) -> None:
-        self._began = time.monotonic()
-        self._due = self._began + COMPILING_S
+        self._due = time.monotonic() + COMPILING_S
+        self._first: tuple[int, float] | None = None
 
     def tell(self, done: int, of: int) -> None:
         """Print now and then how many kernels of about how many are compiled, and how long it
         takes.
         """
         now = time.monotonic()
-        if now >= self._due:
-            self._due = now + COMPILING_S
-            left_s = (now - self._began) / done * (of - done)
-            text = f"compiling the kernels, once per machine: {done} of about {of}"
-            typer.echo(f"{text}, about {left_s:.0f} s left", err=True)
+        self._first = self._first or (done, now)
+        if now < self._due:
+            return
+        self._due = now + COMPILING_S
+        before, began = self._first
+        text = f"compiling the kernels, once per machine: {done} of about {of}"
+        if done - before >= KERNELS_TO_ESTIMATE:
+            left_s = (now - began) / (done - before) * max(0, of - done)
+            text += f", about {left_s:.0f} s left"
+        typer.echo(text, err=True)
 
 
 def _compile(scenario: Scenario) -> None:

@@ -268,21 +268,32 @@ def _log_scale(axis: "Axes") -> None:
     axis.yaxis.set_minor_formatter(NullFormatter())
 
 
+THICKEST = 4
+"""Robots beyond so many have the thickest curve of all."""
+
+
 def latency_picture(history: History, path: FilePath) -> bool:
-    """Wall time from a submap's first and last measurement to the first map that used it."""
+    """Wall time from a submap's first and last measurement to the first map that used it.
+
+    Robots whose submaps came into one map have one curve: the first is drawn the thickest.
+    """
     if not history.latencies:
         return False
     figure, axes = new_figure(9.0, 3.6, 1, 1)
     axis = axes[0][0]
     colours = robot_colours({*history.innovations, *history.latencies})
-    for name, of in history.latencies.items():
+    for behind, (name, of) in enumerate(reversed(list(history.latencies.items()))):
         kept = thinning(len(of.stamps_ns))
         seconds = history.seconds(of.stamps_ns[kept])
+        wider = 1.3 * min(behind, THICKEST)
         axis.plot(
-            seconds, of.last_s[kept], color=colours[name], linewidth=0.8, marker="o", markersize=3,
-            label=name,
+            seconds, of.last_s[kept], color=colours[name], linewidth=0.8 + wider, marker="o",
+            markersize=3 + 1.5 * wider, label=name, zorder=2.9 - 0.01 * behind,
         )  # fmt: skip
-        axis.plot(seconds, of.first_s[kept], color=colours[name], linewidth=0.8, linestyle=":")
+        axis.plot(
+            seconds, of.first_s[kept], color=colours[name], linewidth=0.8 + wider, linestyle=":",
+            zorder=2.9 - 0.01 * behind,
+        )  # fmt: skip
     axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last measurement")
     axis.plot([], [], color="#555555", linestyle=":", label="from its first measurement")
     if all((of.last_s > 0.0).all() for of in history.latencies.values()):
@@ -291,7 +302,12 @@ def latency_picture(history: History, path: FilePath) -> bool:
     axis.set_ylabel("wall time to the map [s]")
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
-    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+    handles, names = axis.get_legend_handles_labels()
+    order = sorted(range(len(names)), key=lambda k: (names[k] not in colours, names[k]))
+    axis.legend(
+        [handles[k] for k in order], [names[k] for k in order],
+        loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False,
+    )  # fmt: skip
     save(figure, path)
     return True
 
