@@ -11,6 +11,7 @@ from central.monitor import miscalibrations
 from central.rule import Tail
 from central.sent_priors import SentPriors
 from team import translate
+from team.config import UNNAMED
 from team.estimation.contribution import Stream
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.association.landmarks import Decision
@@ -24,6 +25,9 @@ from team.wire.bus import Outgoing
 
 PRIOR_LANDMARKS = 30
 """Landmarks in a robot's prior at the most: the nearest ones."""
+CONFIRMED_BY = 2
+"""So many submaps have a landmark without a name that is in the final map: a few false detections
+in a row look like one in a single window. Running maps show what is tentative."""
 NAMED = 10
 """Landmarks that are left out of the map, and refusals, are named up to so many."""
 
@@ -93,11 +97,13 @@ def team_map(
     )
 
 
-def shown_landmarks(fold: Fold, config: CentralConfig) -> list[int]:
+def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> list[int]:
     """The landmarks that the map has, by ascending id."""
     if not fold.contributions:
         return []
-    return marginals.confirmed(fold, config.landmark_submaps)
+    most = len(fold.main.graph.submaps) + fold.departed
+    unnamed = min(CONFIRMED_BY, most) if tail == "final" else 1
+    return marginals.confirmed(fold, config.landmark_submaps, unnamed)
 
 
 def reasons(
@@ -120,9 +126,10 @@ def _unconfirmed(fold: Fold, shown: Sequence[int], landmark_submaps: int) -> tup
     out = sorted(known - set(shown))
     if not out:
         return ()
+    needed = landmark_submaps if out[-1] < UNNAMED else max(landmark_submaps, CONFIRMED_BY)
     named = ", ".join(str(id_) for id_ in out[:NAMED]) + (", …" if len(out) > NAMED else "")
     return (
-        f"left out, {landmark_submaps} submaps that agree needed: "
+        f"left out, {needed} submaps that agree needed: "
         f"{len(out)} of {len(known)} landmarks ({named})",
     )
 

@@ -110,7 +110,7 @@ class JoinRule(FusionRule[SubmapInputs]):
         biases = marginals.bias_estimates(fold)
         found = NOTHING if agreement is None else finding(agreement, self.config.normal_scale)
         self.finding = found.with_biases(biases)
-        shown = shown_landmarks(fold, self.config)
+        shown = shown_landmarks(fold, self.config, tail)
         self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps)
         fused = team_map(
             fold,

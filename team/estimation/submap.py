@@ -105,6 +105,16 @@ class LocalMap:
         """Landmark positions in the start frame [m]."""
         return self.mean[3 + 3 * len(self.node_stamps) :].reshape(-1, 2)
 
+    @cached_property
+    def spacings(self) -> Float[np.ndarray, "U U"]:
+        """Distances between landmarks without names that one keyframe saw [m]; ∞ between others."""
+        x, y = self.landmarks[self.ids >= UNNAMED].T
+        masks = self.unnamed.seen.astype(np.float32)
+        away = np.hypot(x[:, None] - x, y[:, None] - y)
+        away[masks @ masks.T == 0.0] = np.inf
+        np.fill_diagonal(away, np.inf)
+        return np.asarray(away)
+
     @property
     def nodes(self) -> Float[np.ndarray, "K 3"]:
         """start_from_node of each pose node."""

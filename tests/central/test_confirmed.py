@@ -7,6 +7,7 @@ import pytest
 from central.config import CentralConfig
 from central.join_rule import JoinRule
 from central.scheduler import Scheduler
+from team.config import UNNAMED
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_ids, ids
@@ -109,3 +110,21 @@ def test_a_map_in_which_nothing_is_confirmed_yet_is_empty() -> None:
     assert fused.ids == b""
     assert fused.means == b""
     assert len(left_out(fused)) == 1
+
+
+def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_final_one() -> None:
+    found = Scheduler(JoinRule(CentralConfig(tick_s=3.0, broadcast_s=3.0), b"settings"))
+    found.intake.take_start(published(STREAMS["r1"])[0])
+    for k in range(5):
+        submap = SUBMAPS["r1"][k]
+        if k == 2:
+            seen = ids(submap.ids, "ids")
+            named = from_ids(np.array([*seen[:-1], UNNAMED], np.uint32))
+            two = from_ids(np.array([2], np.uint32))
+            submap = msgspec.structs.replace(submap, ids=named, counts=two, seen=b"\1", keyframes=1)
+        found.intake.take_submap(submap)
+    (running,) = of(broadcasts(found, END_NS), ch.FUSED_MAP)
+    last = final(found)
+    tentative, kept = (int(ids(each.ids, "ids")[-1]) for each in (running, last))
+    assert tentative >= UNNAMED > kept
+    assert [text.startswith("left out, 2 submaps") for text in left_out(last)] == [True]

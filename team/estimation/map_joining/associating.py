@@ -11,11 +11,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 
 from team.config import UNNAMED
 from team.estimation.contribution import Contribution, Stream
+from team.estimation.map_joining.association.crowding import Crowd
 from team.estimation.map_joining.association.growing import Indices, Joint, Pair, conditioned, grow
+from team.estimation.map_joining.association.hypotheses import jointly
 from team.estimation.map_joining.association.landmarks import (
     Landmarks,
     Tie,
@@ -29,6 +31,16 @@ from team.estimation.map_joining.gauss_newton import (
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.submap_graph import Graph, tied
 
+OVERLOOKED = 0.4
+"""How often a window sees a landmark and overlooks one beside it …"""
+LEAST_OVERLOOKED = 0.1
+"""… and how much that is believed at the most: some are seen from one side alone."""
+
+AGAIN = 8
+"""So many older submaps, of which landmarks are alone, are looked at again in a tick …"""
+AGAIN_WITHIN = 10.0
+"""… if they lie within so many radii of one object of what has come."""
+
 
 class View:
     """An island's landmarks as a joint Gaussian, and what is merged in it, step by step.
@@ -39,8 +51,9 @@ class View:
 
     def __init__(self, island: Island, landmarks: Landmarks) -> None:
         self.island = island
-        self.profile = island.settings.association
         graph = island.graph
+        around = Crowd(each.contribution.local for each in graph.submaps)
+        self.profile = around.bounded(island.settings.association)
         ordered = sorted(graph.landmarks.items(), key=lambda each: each[1])
         self.ids = [id_ for id_, _ in ordered]
         nodes = np.array([node for _, node in ordered], np.int64)
@@ -50,7 +63,9 @@ class View:
         mean, covariance = joint_marginal(island, nodes.tolist())
         self.place_of = {id_: at for at, id_ in enumerate(self.ids)}
         apart = _apart(graph, self.seen_by, self.ids, landmarks, self.place_of)
-        self.joint = Joint(mean.reshape(-1, 2), covariance, apart)
+        points = mean.reshape(-1, 2)
+        unseen = _unseen(points, self.seen_by, self.profile.same)
+        self.joint = Joint(points, covariance, apart, around, unseen)
         self.gone = np.zeros(len(nodes), np.bool_)
         self.ties: list[tuple[int, Tie]] = []
         self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
@@ -69,14 +84,33 @@ class View:
             self.ties.append((self.ids[pair.first], tie))
             self.gone[pair.first] = True
 
-    def step(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
+    def step(
+        self,
+        kind: str,
+        first: Indices,
+        second: Indices,
+        most_sd: float,
+        joint_sd: float | None = None,
+    ) -> None:
         """Grow from nothing with the pairs of two lists of landmarks, as far as it is sure."""
         first, second = first[~self.gone[first]], second[~self.gone[second]]
         if not len(first) or not len(second):
             return
         one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
         different = one != two
-        self._grow(kind, one[different], two[different], most_sd)
+        one, two = one[different], two[different]
+        self._grow(kind, one, two, most_sd)
+        if joint_sd is not None:
+            self.assign(kind, first, second, joint_sd)
+
+    def assign(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
+        """Of two lists of landmarks, what their joint assignments agree on."""
+        first, second = first[~self.gone[first]], second[~self.gone[second]]
+        if not len(first) or not len(second):
+            return
+        one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
+        found = jointly(self.joint, one, two, self.profile, most_sd)
+        self.take(found.pairs, found.joint, kind)
 
     def _grow(self, kind: str, one: Indices, two: Indices, most_sd: float) -> None:
         found = grow(
@@ -106,6 +140,17 @@ class View:
                 continue
             joint = conditioned(self.joint, one, two, self.profile)
             self.take([Pair(one, two, np.inf, 0.0, -np.inf)], joint, "verdict")
+
+
+def _unseen(
+    points: Float[np.ndarray, "n 2"], seen_by: Sequence[Indices], radius: float
+) -> Float[np.ndarray, " n"]:
+    """How likely it is that a landmark beside each one has been overlooked by all that saw it."""
+    counts = np.zeros(len(points))
+    for places in seen_by:
+        away = np.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
+        counts += (away < radius).any(axis=1)
+    return np.asarray(np.maximum(OVERLOOKED ** np.maximum(counts - 1.0, 0.0), LEAST_OVERLOOKED))
 
 
 def _apart(
@@ -162,9 +207,30 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
         )
         view.step("track", fresh, union(view.seen_by[at] for at in before), np.inf)
         others = np.setdiff1d(np.arange(len(view.ids)), view.seen_by[k])
-        view.step("near", fresh, others, view.profile.near)
+        view.step("near", fresh, others, view.profile.near, view.profile.near)
+    for k in _doubtful(view, order, news):
+        own = _unnamed(view, k)
+        others = np.setdiff1d(np.arange(len(view.ids)), view.seen_by[k])
+        view.assign("near", own, others, view.profile.near)
     view.sweep()
     return applied(fold, key, view)
+
+
+def _doubtful(view: View, order: Mapping[int, int], news: Sequence[Contribution]) -> list[int]:
+    """The places of the newest submaps with two landmarks or more that nobody else has, near the
+    news: what was not to be decided may be so now.
+    """
+    fresh = [k for each in news if (k := order.get(id(each))) is not None]
+    near = union(view.seen_by[k] for k in fresh)
+    if not len(near):
+        return []
+    count = np.bincount(np.concatenate(view.seen_by), minlength=len(view.ids))
+    alone = np.flatnonzero((count == 1) & ~view.gone)
+    away = np.abs(view.joint.mean[alone, None] - view.joint.mean[near][None]).max(axis=2)
+    loose = np.zeros(len(view.ids), np.bool_)
+    loose[alone[(away < AGAIN_WITHIN * view.profile.same).any(axis=1)]] = True
+    found = [k for k, each in enumerate(view.seen_by) if k not in fresh and loose[each].sum() >= 2]
+    return found[-AGAIN:]
 
 
 def applied(fold: Fold, key: Stream, view: View) -> Fold:

@@ -256,6 +256,7 @@ def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Vie
             2 * n, 2 * n
         ),
         mine.joint.apart[np.ix_(patch, patch)],
+        mine.joint.crowd,
     )
     of_patch = _patch_side(mine, patch, submaps)._replace(at=np.arange(n))
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import Bias
+from team.config import UNNAMED, Bias
 from team.estimation.contribution import Stream
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
@@ -105,14 +105,15 @@ def _biases_in(island: Island) -> list[BiasEstimate]:
     return found
 
 
-def confirmed(fold: Fold, submaps: int) -> list[int]:
-    """The main island's landmarks, by id, that so many submaps or more have and are believed in.
+def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
+    """The main island's landmarks, by id, that so many submaps or more have and are believed in;
+    of those without a name `unnamed`, if that is more.
 
     A submap is believed where the robust loss does not discount its landmark below BELIEVED: of
     two that contradict each other one is left, and nothing confirms it.
     """
     island = fold.main
-    if submaps <= 1:
+    if submaps <= 1 and unnamed <= 1:
         return sorted(island.graph.landmarks)
     nodes = np.concatenate([each.landmarks for each in island.graph.submaps])
     found, counts = np.unique(nodes[island.landmark_weight >= BELIEVED], return_counts=True)
@@ -122,7 +123,8 @@ def confirmed(fold: Fold, submaps: int) -> list[int]:
     return sorted(
         id_
         for id_, node in island.graph.landmarks.items()
-        if count_of.get(node, 0) + before.get(id_, 0) >= submaps
+        if count_of.get(node, 0) + before.get(id_, 0)
+        >= (max(submaps, unnamed) if id_ >= UNNAMED else submaps)
     )
 
 

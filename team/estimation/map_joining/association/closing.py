@@ -285,6 +285,7 @@ def free_joint(
             2 * len(kept), 2 * len(kept)
         ),
         target.apart[np.ix_(kept, kept)],
+        target.crowd,
     )
     m = len(kept)
     c, s = np.cos(vote.motion[2]), np.sin(vote.motion[2])
@@ -300,7 +301,7 @@ def free_joint(
     covariance[2 * n :, 2 * n :] = target.covariance
     apart = np.zeros((n + m, n + m), np.bool_)
     apart[:n, :n], apart[n:, n:] = patch.apart, target.apart
-    both = Joint(np.concatenate([there, target.mean]), covariance, apart)
+    both = Joint(np.concatenate([there, target.mean]), covariance, apart, target.crowd)
     return both, Side(n + np.arange(m), side.points, side.names[kept], kept, side.views)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.association import AssociationProfile
+from team.estimation.map_joining.association.crowding import Crowd
 
 Indices = Int64[np.ndarray, " _"]
 PREGATE = 4.0
@@ -29,12 +30,15 @@ class Joint(NamedTuple):
     """Landmarks with their joint covariance, in one frame.
 
     mean: [m]. covariance: of (x₁, y₁, x₂, …) [m²]. apart: which two can not be one, symmetric:
-    they were seen in one scan, have different names, or somebody said so.
+    they were seen in one scan, have different names, or somebody said so. crowd: how densely they
+    stand about one another; None: as the profile says.
     """
 
     mean: Float[np.ndarray, "n 2"]
     covariance: Float[np.ndarray, "m m"]
     apart: Bool[np.ndarray, "n n"]
+    crowd: Crowd | None = None
+    unseen: Float[np.ndarray, " n"] | None = None
 
 
 class Pair(NamedTuple):
@@ -86,8 +90,14 @@ def likelihoods(
     determinant = np.maximum(a * c - b * b, 1e-18)
     x, y = difference.T
     chi2 = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
-    prior = np.log(2.0 * np.pi * profile.density)
-    llr = -0.5 * chi2 - 0.5 * np.log(determinant) - prior
+    density = np.full(len(x), profile.density)
+    if joint.crowd is not None:
+        radius = np.sqrt(profile.gate) * determinant**0.25
+        crowded = joint.crowd.density(radius)
+        if joint.unseen is not None:
+            crowded *= joint.unseen[second]
+        density = np.maximum(density, crowded)
+    llr = -0.5 * chi2 - 0.5 * np.log(determinant) - np.log(2.0 * np.pi * density)
     return Likelihoods(chi2, llr, np.sqrt(np.maximum(half + spread, 0.0)))
 
 
@@ -104,7 +114,7 @@ def conditioned(joint: Joint, first: int, second: int, profile: AssociationProfi
     apart = joint.apart.copy()
     both = apart[first] | apart[second]
     apart[second], apart[:, second] = both, both
-    return Joint(mean, P - gain @ weighted, apart)
+    return Joint(mean, P - gain @ weighted, apart, joint.crowd, joint.unseen)
 
 
 def grow(

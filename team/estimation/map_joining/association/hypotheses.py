@@ -1,0 +1,153 @@
+"""Which landmarks are one where each pair by itself has a rival: all joint assignments weighed.
+
+Two landmarks that stand side by side, of which each may be either of two known ones, are told apart
+by one another: their relative places are known far better than where both are. The landmarks to be
+assigned are taken one after the other; each is one of those known, given the pairs before it, or
+none of them. An assignment has the weight exp(Σ LLR) of its pairs (`growing`), and a pair is taken
+when the assignments that have it outweigh all others. Neira and Tardós (2001, IEEE T-RA 17(6)) take
+the assignment with the most pairs; here it has to be the only one that is likely.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.association import AssociationProfile
+from team.estimation.map_joining.association.growing import (
+    Grown,
+    Indices,
+    Joint,
+    Pair,
+    conditioned,
+    likelihoods,
+)
+
+MOST_ASSIGNED = 10
+"""So many landmarks are assigned together, those whose candidates are known best."""
+BEAM = 100
+"""So many assignments are kept from landmark to landmark."""
+HOPELESS = 12.0
+"""An assignment whose weight is so many nats below the best one's is left out."""
+
+
+class _Assignment(NamedTuple):
+    """Pairs so far, their log weight, and the joint Gaussian given them."""
+
+    weight: float
+    pairs: tuple[Pair, ...]
+    joint: Joint
+
+
+def jointly(
+    joint: Joint, first: Indices, second: Indices, profile: AssociationProfile, most_sd: float
+) -> Grown:
+    """The pairs of candidates that nearly all of the weight of joint assignments agrees on.
+
+    A pair needs log odds of `odds` against every assignment without it, and one that stands alone
+    a standard deviation below `tight`. most_sd: candidates with a larger one are left out.
+    """
+    at = likelihoods(joint, first, second, profile)
+    open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
+    first, second, sd = first[open_], second[open_], at.sd[open_]
+    if not len(first):
+        return Grown((), joint, 0)
+    order = _order(first, sd)
+    taken = np.isin(first, order)
+    kept = np.unique(np.concatenate((first[taken], second[taken])))
+    part = Joint(
+        joint.mean[kept],
+        joint.covariance.reshape(len(joint.mean), 2, -1, 2)[kept][:, :, kept].reshape(
+            2 * len(kept), -1
+        ),
+        joint.apart[np.ix_(kept, kept)],
+        joint.crowd,
+        None if joint.unseen is None else joint.unseen[kept],
+    )
+    place = {int(each): k for k, each in enumerate(kept)}
+    assigned, lost = [_Assignment(0.0, (), part)], 0.0
+    for each in order:
+        own = place[each]
+        others = _of_each(part, own, [place[int(k)] for k in second[first == each]], profile)
+        longer = [more for one in assigned for more in _with(one, own, others, profile, most_sd)]
+        longer.sort(key=lambda one: -one.weight)
+        best = longer[0].weight
+        lost += sum(float(np.exp(one.weight - best)) for one in longer[BEAM:])
+        assigned = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
+    return _agreed(joint, assigned, kept, profile, lost)
+
+
+def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
+    """The landmarks to assign: who has the surest candidates first."""
+    surest: dict[int, float] = {}
+    for each, own in zip(first.tolist(), sd.tolist(), strict=True):
+        surest[each] = min(own, surest.get(each, np.inf))
+    return sorted(surest, key=lambda each: (surest[each], each))[:MOST_ASSIGNED]
+
+
+def _of_each(joint: Joint, first: int, others: list[int], profile: AssociationProfile) -> Indices:
+    """The candidates of a landmark, the likeliest one of those that are likely to be one."""
+    at = likelihoods(joint, np.full(len(others), first), np.array(others), profile)
+    kept: list[int] = []
+    for k in np.argsort(-at.llr, kind="stable").tolist():
+        if not _fragments(joint, others[k], profile).intersection(kept):
+            kept.append(others[k])
+    return np.array(kept, np.int64)
+
+
+def _with(
+    one: _Assignment, first: int, others: Indices, profile: AssociationProfile, most_sd: float
+) -> list[_Assignment]:
+    """An assignment with one landmark more: as none of those known, and as each that fits."""
+    found = [one]
+    others = others[~one.joint.apart[first, others]]
+    if not len(others):
+        return found
+    at = likelihoods(one.joint, np.full(len(others), first), others, profile)
+    for k in np.flatnonzero((at.chi2 < profile.gate) & (at.sd <= most_sd)).tolist():
+        other, llr = int(others[k]), float(at.llr[k])
+        joint = conditioned(one.joint, first, other, profile)
+        pair = Pair(first, other, llr, float(at.sd[k]), -np.inf)
+        found.append(_Assignment(one.weight + llr, (*one.pairs, pair), joint))
+    return found
+
+
+def _fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[int]:
+    """The landmark and those that are likely to be it: two parts of one are no rivals."""
+    n = len(joint.mean)
+    at = likelihoods(joint, np.full(n, landmark), np.arange(n), profile)
+    near = np.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
+    one = (at.llr >= profile.llr_tight) & near & ~joint.apart[landmark]
+    return {landmark, *np.flatnonzero(one).tolist()}
+
+
+def _agreed(
+    joint: Joint,
+    assigned: list[_Assignment],
+    kept: Indices,
+    profile: AssociationProfile,
+    lost: float,
+) -> Grown:
+    """The best assignment's pairs that the others have as well, by weight.
+
+    lost: the weight of the assignments that there was no room for, in terms of the best one's.
+    """
+    best = assigned[0]
+    weights = np.exp([one.weight - best.weight for one in assigned])
+    others = [{pair.first: pair.second for pair in one.pairs} for one in assigned]
+    sure = []
+    for pair in best.pairs:
+        same = _fragments(best.joint, pair.second, profile)
+        having = np.array([each.get(pair.first, -1) in same for each in others])
+        against = float(weights[~having].sum()) + lost
+        odds = float(np.log(weights[having].sum() / against)) if against > 0.0 else HOPELESS
+        if odds >= profile.odds:
+            sure.append(pair._replace(rival=pair.llr - odds))
+    if len(sure) == 1 and sure[0].sd > profile.tight:
+        sure = []
+    pairs = []
+    for pair in sure:
+        own = pair._replace(first=int(kept[pair.first]), second=int(kept[pair.second]))
+        joint = conditioned(joint, own.first, own.second, profile)
+        pairs.append(own)
+    return Grown(tuple(pairs), joint, 0)

@@ -1,0 +1,65 @@
+"""Pairs that stand side by side, told apart by one another; and the spacing that tells of them."""
+
+import numpy as np
+import pytest
+
+from team.association import AssociationProfile
+from team.config import UNNAMED
+from team.estimation.map_joining.association.crowding import Crowd
+from team.estimation.map_joining.association.growing import Joint, grow
+from team.estimation.map_joining.association.hypotheses import jointly
+from team.estimation.submap import LocalMap, Unnamed
+
+PROFILE = AssociationProfile(slack=0.0, density=1.0)
+TWINS = [(0.0, 0.0), (0.2, 0.0), (3.0, 1.0), (3.0, 1.2)]
+
+
+def _twins(seen: list[int], common: float) -> tuple[Joint, np.ndarray, np.ndarray]:
+    """Known landmarks in twos, and some of them seen again with an error that they share."""
+    n, m = len(TWINS), len(seen)
+    points = np.array([*TWINS, *(TWINS[k] for k in seen)])
+    covariance = 0.01**2 * np.eye(2 * (n + m))
+    both = np.zeros((2 * (n + m), 2))
+    both[2 * n :: 2, 0] = both[2 * n + 1 :: 2, 1] = common
+    apart = np.zeros((n + m, n + m), np.bool_)
+    apart[:n, :n] = apart[n:, n:] = True
+    np.fill_diagonal(apart, False)
+    one, two = np.meshgrid(np.arange(n, n + m), np.arange(n), indexing="ij")
+    return Joint(points, covariance + both @ both.T, apart), one.ravel(), two.ravel()
+
+
+def test_neighbours_are_told_apart_by_one_another_where_each_by_itself_is_not():
+    joint, one, two = _twins([0, 1, 2, 3], common=0.15)
+    alone = grow(joint, (one, two), PROFILE)
+    assert alone is not None and not alone.pairs
+    found = jointly(joint, one, two, PROFILE, 0.5)
+    assert sorted((p.first, p.second) for p in found.pairs) == [(4, 0), (5, 1), (6, 2), (7, 3)]
+
+
+def test_one_of_two_neighbours_alone_waits():
+    joint, one, two = _twins([0], common=0.15)
+    assert not jointly(joint, one, two, PROFILE, 0.5).pairs
+
+
+def _submap(points: np.ndarray, together: bool) -> LocalMap:
+    n = len(points)
+    seen = np.ones((n, 1), np.bool_) if together else np.eye(n, dtype=np.bool_)
+    ids = (UNNAMED + np.arange(n)).astype(np.uint32)
+    mean = np.concatenate([np.zeros(3), points.ravel()])
+    return LocalMap(ids, mean, np.eye(len(mean)), unnamed=Unnamed(np.ones(n, np.uint32), seen))
+
+
+def test_a_profiles_lengths_are_bounded_by_the_spacing_of_what_is_seen_together():
+    rng = np.random.default_rng(2)
+    groups = np.repeat(rng.uniform(0.0, 12.0, (8, 2)), 2, axis=0)
+    groups[1::2] += [0.2, 0.0]
+    crowd = Crowd([_submap(groups, together=True)])
+    bounded = crowd.bounded(AssociationProfile(same=1.7, tight=0.5, slack=0.1))
+    assert bounded.same == pytest.approx(0.3)
+    assert (bounded.tight, bounded.slack) == pytest.approx((0.1, 0.036))
+    assert bounded.near == PROFILE.near
+    within = crowd.density(np.array([0.3]))[0]
+    assert within == pytest.approx(1.0 / (np.pi * 0.3**2), rel=0.1)
+    nobody = Crowd([_submap(groups, together=False)])
+    assert nobody.bounded(PROFILE) == PROFILE
+    assert nobody.density(np.array([0.3]))[0] < 0.1 * within
