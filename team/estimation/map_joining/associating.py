@@ -208,7 +208,7 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
         view.step("track", fresh, union(view.seen_by[at] for at in before), np.inf)
         others = np.setdiff1d(np.arange(len(view.ids)), view.seen_by[k])
         view.step("near", fresh, others, view.profile.near, view.profile.near)
-    for k in _doubtful(view, order, news):
+    for k in _doubtful(view, order, arrived):
         own = _unnamed(view, k)
         others = np.setdiff1d(np.arange(len(view.ids)), view.seen_by[k])
         view.assign("near", own, others, view.profile.near)
@@ -216,11 +216,11 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
     return applied(fold, key, view)
 
 
-def _doubtful(view: View, order: Mapping[int, int], news: Sequence[Contribution]) -> list[int]:
+def _doubtful(view: View, order: Mapping[int, int], arrived: Sequence[Contribution]) -> list[int]:
     """The places of the newest submaps with two landmarks or more that nobody else has, near the
     news: what was not to be decided may be so now.
     """
-    fresh = [k for each in news if (k := order.get(id(each))) is not None]
+    fresh = [k for each in arrived if (k := order.get(id(each))) is not None]
     near = union(view.seen_by[k] for k in fresh)
     if not len(near):
         return []

@@ -31,7 +31,8 @@ def _twins(seen: list[int], common: float) -> tuple[Joint, np.ndarray, np.ndarra
 def test_neighbours_are_told_apart_by_one_another_where_each_by_itself_is_not():
     joint, one, two = _twins([0, 1, 2, 3], common=0.15)
     alone = grow(joint, (one, two), PROFILE)
-    assert alone is not None and not alone.pairs
+    assert alone is not None
+    assert not alone.pairs
     found = jointly(joint, one, two, PROFILE, 0.5)
     assert sorted((p.first, p.second) for p in found.pairs) == [(4, 0), (5, 1), (6, 2), (7, 3)]
 
