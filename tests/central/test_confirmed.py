@@ -123,7 +123,7 @@ def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_fi
             two = from_ids(np.array([2], np.uint32))
             submap = msgspec.structs.replace(submap, ids=named, counts=two, seen=b"\1", keyframes=1)
         found.intake.take_submap(submap)
-    (running,) = of(broadcasts(found, END_NS), ch.FUSED_MAP)
+    (running,) = of(broadcasts(found, END_NS, END_NS), ch.FUSED_MAP)
     last = final(found)
     tentative, kept = (int(ids(each.ids, "ids")[-1]) for each in (running, last))
     assert tentative >= UNNAMED > kept
