@@ -10,6 +10,7 @@ from central.fused import JOINT_LANDMARKS, version_entry
 from central.monitor import miscalibrations
 from central.rule import Tail
 from central.sent_priors import SentPriors
+from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
 from team.estimation.contribution import Stream
@@ -91,9 +92,9 @@ def team_map(
         withdrawn=withdrawn,
         covariance_scale=covariance_scale,
         heard=heard,
-        memberships=translate.memberships_of(fold.landmarks),
-        decisions=translate.decisions_of(fold.landmarks),
-        verdicts=tuple(translate.judgement_of(v) for v in fold.landmarks.verdicts),
+        memberships=memberships_of(fold.landmarks),
+        decisions=decisions_of(fold.landmarks),
+        verdicts=tuple(judgement_of(v) for v in fold.landmarks.verdicts),
     )
 
 

@@ -24,6 +24,7 @@ from team.estimation.map_joining.joining import Fold
 from team.wire import channels as ch
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded, unsound
+from team.wire.digest import digest_of
 
 
 class JoinRule(FusionRule[SubmapInputs]):
@@ -84,7 +85,7 @@ class JoinRule(FusionRule[SubmapInputs]):
             for submap in chain[filed:]:
                 sightings = inputs.sightings(submap)
                 messages = (submap, *sightings)
-                ticks.add(submap, translate.digest_of(*map(encoded, messages)), sightings)
+                ticks.add(submap, digest_of(*map(encoded, messages)), sightings)
                 self._filed[stream] = submap.sequence + 1
 
     @property

@@ -12,6 +12,7 @@ from weakref import WeakValueDictionary
 from team import translate
 from team.estimation.contribution import Contribution
 from team.estimation.inter_robot import Sighting
+from team.wire.digest import Digest
 from team.wire.messages import SightingFactor, Submap
 
 Key = tuple[int, str, int, int]
@@ -31,7 +32,7 @@ class Members:
         self._sightings: dict[Key, tuple[Sighting, ...]] = {}
         self._digests: dict[Key, bytes] = {}
         self._made: WeakValueDictionary[Key, Contribution] = WeakValueDictionary()
-        self._named: dict[tuple[bytes, ...], tuple[float, translate.Digest]] = {}
+        self._named: dict[tuple[bytes, ...], tuple[float, Digest]] = {}
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
         """File a submap, with what else `digest` names; returns its tick."""
@@ -92,9 +93,9 @@ class Members:
 
         The digest of the ticks up to `closed` is cached, by the parts in front of them.
         """
-        until, digest = self._named.pop(before, (math.inf, translate.Digest()))
+        until, digest = self._named.pop(before, (math.inf, Digest()))
         if until > closed:
-            until, digest = -math.inf, translate.Digest()
+            until, digest = -math.inf, Digest()
             digest.update(*before)
         digest.update(*self._digests_between(until, closed, gone))
         self._named[before] = closed, digest

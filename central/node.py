@@ -13,13 +13,13 @@ from central.config import CentralConfig
 from central.fused import fused_message
 from central.rule import final_of, rule_of
 from central.scheduler import Scheduler
-from team import translate
 from team.door import Door, absurd
 from team.estimation.gaussian import NO_LANDMARKS
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
+from team.wire.digest import configured
 
 MOST_ROBOTS = 100
 """Most robots of a team, admitted ones included."""
@@ -38,7 +38,7 @@ class CentralNode:
         self.config = config
         self._admits = admit
         self._admitted: list[str] = []
-        self.announcement = translate.configured("central", 0, 0, config)
+        self.announcement = configured("central", 0, 0, config)
         self._door = Door(robots)
         self._attendance = TeamAttendance.of(robots)
         self._rule = rule_of(config, self.announcement.digest, sorted(robots))

@@ -8,8 +8,8 @@ from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.intake import Inputs, Instant, Intake
 from central.submap_set import SubmapSet
+from central.unnamed_landmarks import verdict_of
 from central.withdrawal_witnesses import WithdrawalWitnesses
-from team import translate
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.association.landmarks import Verdict
 from team.wire import channels as ch
@@ -153,7 +153,7 @@ class SubmapIntake(Intake[SubmapInputs]):
 
         That it holds no more may come first.
         """
-        judged = translate.verdict_of(verdict.judgement)
+        judged = verdict_of(verdict.judgement)
         if verdict.withdrawn:
             self._no_more.add(judged)
             self._verdicts.discard(judged)

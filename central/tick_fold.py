@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from central.config import CentralConfig
 from central.members import Members
 from central.withdrawal import convicted, suspects
-from team import translate
 from team.config import UNNAMED
 from team.estimation.contribution import Stream, named
 from team.estimation.hybrid_slam.sensitivity import BIASES
@@ -40,6 +39,7 @@ from team.estimation.map_joining.marginals import Agreement
 from team.estimation.map_joining.relinearising import is_due, relinearised
 from team.estimation.map_joining.submap_graph import CommonBias, CondensedError
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
+from team.wire.digest import digest_of
 from team.wire.messages import SightingFactor, Submap
 
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
@@ -420,7 +420,7 @@ class TickFold:
     def digest(self, fold: Fold, *more: bytes) -> bytes:
         """The name of the fold's set: starts and submaps in canonical order, and `more`."""
         starts = [
-            translate.digest_of(
+            digest_of(
                 robot.encode(),
                 incarnation.to_bytes(8, "little"),
                 start.pose.tobytes(),

@@ -1,6 +1,5 @@
 """Estimation values to messages and back: the one module that knows both."""
 
-import hashlib
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -10,7 +9,6 @@ from jaxtyping import Float, UInt32
 
 from team.config import UNNAMED, RobotConfig
 from team.estimation.gaussian import Matrix, packed, unpacked
-from team.estimation.map_joining.association.landmarks import Landmarks, Member, Verdict
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
 from team.estimation.map_joining.joining import Contribution, InitialPoseFactor, Sighting
 from team.estimation.odometry import Interval, moved, steered
@@ -19,54 +17,6 @@ from team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, octets, stamps
 from team.wire.codec import unsound
-
-NO_MAP = bytes(8)
-"""The digest that stands for no map."""
-
-
-class Digest:
-    """A digest that goes on: of all parts that it was given so far."""
-
-    def __init__(self) -> None:
-        self._hash = hashlib.blake2b(digest_size=8)
-
-    def update(self, *parts: bytes) -> None:
-        """Take more parts."""
-        for part in parts:
-            self._hash.update(len(part).to_bytes(8, "little"))
-            self._hash.update(part)
-
-    def copy(self) -> "Digest":
-        """Another one of the same parts."""
-        other = Digest()
-        other._hash = self._hash.copy()
-        return other
-
-    @property
-    def value(self) -> bytes:
-        """8 bytes."""
-        return self._hash.digest()
-
-
-def digest_of(*parts: bytes) -> bytes:
-    """The 8-byte BLAKE2b digest by which messages name a configuration or a set."""
-    digest = Digest()
-    digest.update(*parts)
-    return digest.value
-
-
-def configured(
-    node: str, incarnation: int, stamp_ns: int, configuration: msgspec.Struct
-) -> m.Configuration:
-    """The announcement of a configuration, with its digest."""
-    text = msgspec.json.encode(configuration, order="deterministic")
-    return m.Configuration(
-        stamp_ns=stamp_ns,
-        node=node,
-        incarnation=incarnation,
-        digest=digest_of(text),
-        configuration=text.decode(),
-    )
 
 
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
@@ -465,62 +415,3 @@ def trajectory_of(
         stamps(message.stamps, "stamps").astype(np.int64),
         floats(message.poses, "poses").astype(np.float64).reshape(-1, 3),
     )
-
-
-STEPS = ("", "track", "near", "sweep", "closure", "merge", "verdict")
-"""Why an unnamed landmark went into another set than its own, by its number on the wire."""
-DECISIONS = 100
-"""So many of the newest decisions go with a map, and so many that wait."""
-LARGEST = 1e300
-
-
-def memberships_of(landmarks: Landmarks) -> tuple[m.Membership, ...]:
-    """The table of unnamed landmarks: member, identity, why."""
-    streams: dict[tuple[str, int], list[Member]] = {}
-    for member in sorted(landmarks.number):
-        streams.setdefault((member.robot, member.incarnation), []).append(member)
-    table = []
-    for (robot, incarnation), members in streams.items():
-        ties = [landmarks.ties.get(landmarks.number[member]) for member in members]
-        figures = [(0.0, 0.0, 0.0) if t is None else (t.llr, t.rival, t.sd) for t in ties]
-        table.append(
-            m.Membership(
-                robot=robot,
-                incarnation=incarnation,
-                sequences=from_ids(np.array([x.sequence for x in members], np.uint32)),
-                locals=from_ids(np.array([x.local for x in members], np.uint32)),
-                identities=from_ids(
-                    np.array([landmarks.identity(x) or 0 for x in members], np.uint32)
-                ),
-                steps=bytes(0 if t is None else STEPS.index(t.kind) for t in ties),
-                figures=from_floats(np.clip(np.array(figures), -LARGEST, LARGEST)),
-            )
-        )
-    return tuple(table)
-
-
-def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
-    """The newest closures and merges, then what waits, by whom it is about."""
-    waits = [landmarks.waits[of] for of in sorted(landmarks.waits)][-DECISIONS:]
-    return tuple(
-        m.AssociationDecision(**each._asdict())
-        for each in (*landmarks.decisions[-DECISIONS:], *waits)
-    )
-
-
-def verdict_of(judgement: m.Judgement) -> Verdict:
-    """A judgement as the fold takes it."""
-    first, second = (
-        Member(each.robot, each.incarnation, each.sequence, each.local)
-        for each in sorted(
-            (judgement.first, judgement.second),
-            key=lambda x: (x.robot, x.incarnation, x.sequence, x.local),
-        )
-    )
-    return Verdict(first, second, judgement.same)
-
-
-def judgement_of(verdict: Verdict) -> m.Judgement:
-    """A verdict as maps name it."""
-    first, second = (m.LocalLandmark(**each._asdict()) for each in verdict[:2])
-    return m.Judgement(first=first, second=second, same=verdict.same)

@@ -19,7 +19,7 @@ STUDY = "reproduces one source's tables: read beside that source"
 COMMAND = "commands: typer reads their options from signatures"
 REASONS = {
     "team/robot/node.py": "the node: its parts are modules of their own, here is who hears what",
-    "team/translate.py": "one function a message and direction, alphabetical to a reader",
+    "team/translate.py": "both directions of each message side by side",
     "team/driver/driver.py": "a user's face: a method for each kind of measurement",
     "team/library.py": "a user's face: what `from team import …` gives",
     "team/config.py": "tables of fields with their meaning",

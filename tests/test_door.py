@@ -6,7 +6,6 @@ import pytest
 from central.config import CentralConfig
 from central.node import CentralNode
 from sim.publisher.node import WorldNode
-from team import translate
 from team.config import RobotConfig
 from team.containment import Boundary, Handler
 from team.door import LATE_NS, MOST_COUNT, MOST_LIVES, Door
@@ -15,6 +14,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
+from team.wire.digest import configured
 from tests.support import examples
 from tests.teams import of, published, stream, submaps_of, world_of
 
@@ -226,7 +226,7 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
 
 def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own() -> None:
     streams = world_of(*STREAMS.values())
-    announced = translate.configured("world", 0, 0, RobotConfig("r1"))
+    announced = configured("world", 0, 0, RobotConfig("r1"))
     node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
     assert node.publish(0.0)
     node.ended = False

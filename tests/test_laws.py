@@ -30,6 +30,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, opened
 from team.wire.codec import encoded
+from team.wire.digest import NO_MAP, digest_of
 from tests.support import ROOT, fused_map
 from tests.teams import Team, config, driven, of, published, stream, world_of
 
@@ -266,7 +267,7 @@ def test_configurations_maps_priors_and_poses_name_their_inputs():
     messages = [opened(x) for x in run_team(scenario, streams_of(scenario))]
     announced = {n: x for c, n, x in messages if c is ch.ROBOT_CONFIG}
     for each in announced.values():
-        assert each.digest == translate.digest_of(each.configuration.encode())
+        assert each.digest == digest_of(each.configuration.encode())
     maps = [x for _, _, x in messages if isinstance(x, m.FusedMap)]
     by_digest = {each.digest: each for each in maps}
     assert len(by_digest) == len(maps) >= 2
@@ -279,7 +280,7 @@ def test_configurations_maps_priors_and_poses_name_their_inputs():
     assert {(x.robot, x.config) for x in submaps} == {(n, x.digest) for n, x in announced.items()}
     poses = [x for c, _, x in messages if c is ch.TEAM_POSE]
     assert {x.map_digest for x in poses} <= set(by_digest)
-    assert {x.map_digest for c, _, x in messages if c is ch.OWN_POSE} == {translate.NO_MAP}
+    assert {x.map_digest for c, _, x in messages if c is ch.OWN_POSE} == {NO_MAP}
     final = maps[-1]
     paths = [x for _, _, x in messages if isinstance(x, m.Trajectory)]
     assert {x.digest for x in paths} == {final.digest}

@@ -15,6 +15,7 @@ from team.estimation.submap import LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import decoded, encoded
+from team.wire.digest import NO_MAP, configured, digest_of
 from tests.estimation.submap_world import correlated
 
 
@@ -163,7 +164,7 @@ def test_a_map_without_landmarks_has_an_empty_covariance():
 def test_a_pose_passes_the_door_although_rounding_made_it_skew():
     covariance = np.diag([1.0, 2.0, 3.0])
     covariance[0, 1] = 1e-17
-    message = translate.pose_message(1, "r1", 1, 2, translate.NO_MAP, np.zeros(3), covariance)
+    message = translate.pose_message(1, "r1", 1, 2, NO_MAP, np.zeros(3), covariance)
     assert over_the_wire(message) == message
 
 
@@ -179,12 +180,12 @@ def test_a_trajectory_comes_back_with_its_stamps():
 
 
 def test_the_digest_is_that_of_the_announced_text_and_tells_its_parts_apart():
-    announced = translate.configured("robot/r1", 0, 0, RobotConfig("r1"))
+    announced = configured("robot/r1", 0, 0, RobotConfig("r1"))
     text = announced.configuration.encode()
     by_hand = hashlib.blake2b(len(text).to_bytes(8, "little") + text, digest_size=8).digest()
     assert announced.digest == by_hand
-    assert translate.digest_of(b"ab", b"c") != translate.digest_of(b"a", b"bc")
-    assert translate.digest_of(b"a", b"") != translate.digest_of(b"a")
+    assert digest_of(b"ab", b"c") != digest_of(b"a", b"bc")
+    assert digest_of(b"a", b"") != digest_of(b"a")
 
 
 def test_every_field_of_a_configuration_changes_its_digest():
@@ -197,7 +198,7 @@ def test_every_field_of_a_configuration_changes_its_digest():
         RobotConfig("r1", fusion="kalman"),
         RobotConfig("r1", estimator="hybrid-thesis"),
     ]
-    digests = {translate.configured("x", 0, 0, each).digest for each in (base, *others)}
+    digests = {configured("x", 0, 0, each).digest for each in (base, *others)}
     assert len(digests) == 1 + len(others)
 
 

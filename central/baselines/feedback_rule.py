@@ -27,6 +27,7 @@ from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
+from team.wire.digest import digest_of
 
 RULES: Mapping[str, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian]] = {
     "kalman": kalman,
@@ -152,7 +153,7 @@ class ExchangeRule(FusionRule[MapInputs]):
         self.landmarks = len(value.ids)
         return fused_message(
             self.config,
-            translate.digest_of(self.config_digest, number.to_bytes(8, "little"), inputs),
+            digest_of(self.config_digest, number.to_bytes(8, "little"), inputs),
             value,
             members,
             stamp_ns=stamp_ns,

@@ -14,6 +14,7 @@ from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
+from team.wire.digest import digest_of
 
 
 class NewestMaps(Intake[MapInputs]):
@@ -142,7 +143,7 @@ def _members(maps: Sequence[m.MapEstimate]) -> tuple[m.VersionEntry, ...]:
 
 
 def _digest(settings: bytes, maps: Sequence[m.MapEstimate]) -> bytes:
-    return translate.digest_of(settings, *(x.ids + x.means + x.covariance for x in maps))
+    return digest_of(settings, *(x.ids + x.means + x.covariance for x in maps))
 
 
 def _value(estimate: m.MapEstimate) -> LandmarkGaussian:

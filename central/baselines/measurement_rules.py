@@ -23,6 +23,7 @@ from team.estimation.plausible import start_beyond
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
+from team.wire.digest import NO_MAP, digest_of
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,7 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
             pose = moved_by(pose, inverse(np.array(sensor.mount)))
         incarnation = self.members[each.robot].incarnation
         message = translate.pose_message(
-            each.stamp_ns, each.robot, incarnation, each.number, translate.NO_MAP, *pose
+            each.stamp_ns, each.robot, incarnation, each.number, NO_MAP, *pose
         )
         return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 
@@ -248,7 +249,7 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
         """The name of the measurements so far."""
         members = (self.members[robot] for robot in sorted(self.members))
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
-        return translate.digest_of(self.config_digest, named)
+        return digest_of(self.config_digest, named)
 
     def _map_messages(self, broken: Sequence[str], *, final: bool) -> list[Outgoing]:
         content = self._content(final=final) if self.models else MapContent()

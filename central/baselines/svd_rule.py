@@ -35,6 +35,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
+from team.wire.digest import digest_of
 
 NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
@@ -94,7 +95,7 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
         self.landmarks = len(fused.ids)
         return fused_message(
             self.config,
-            translate.digest_of(self.config_digest, *(joined[s].digest for s in sorted(joined))),
+            digest_of(self.config_digest, *(joined[s].digest for s in sorted(joined))),
             fused,
             tuple(version_entry(stream, joined[stream].count - 1) for stream in sorted(joined)),
             stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
@@ -126,7 +127,7 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
             before = _Joined(0, begin, self.config_digest)
         state, digest, refused = before.state, before.digest, before.refused
         for submap in chain[before.count :]:
-            digest = translate.digest_of(digest, encoded(submap))
+            digest = digest_of(digest, encoded(submap))
             if not refused:
                 local = translate.local_map_of(submap).without_nodes.without_biases
                 why = submap_beyond(local, self.config.bounds)

@@ -350,9 +350,9 @@ def record(
     expected += [] if resolved.is_live else ["world"]
     told = []
     if resolved.is_live:  # what a recorder of other teams does not need: it takes 105 MB
-        from team import translate
+        from team.wire.digest import configured
 
-        told = [translate.configured("world", 0, 0, resolved)]
+        told = [configured("world", 0, 0, resolved)]
     with (
         process("recorder", endless=True) as stop,
         connected(resolved.team, connect, keys, "recorder") as bus,

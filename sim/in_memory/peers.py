@@ -16,7 +16,6 @@ from sim.publisher.node import WorldNode, expected_nodes
 from sim.scenarios.scenario import Scenario
 from sim.scenarios.source import tells_map
 from sim.world.streams import WorldStreams
-from team import translate
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.peers.members import Member
@@ -24,6 +23,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
+from team.wire.digest import configured
 
 AFTER_S = 3600.0
 """Team time after the streams' end at which peers that lack something give up."""
@@ -265,7 +265,7 @@ def _listened(node: PeerRobot | PeerCentre) -> tuple[ch.Channel, ...]:
 def peer_world(scenario: Scenario, streams: WorldStreams, late: Collection[str] = ()) -> WorldNode:
     """The world of a team without a centre; it does not wait for robots that join late."""
     names = [each.id for each in scenario.robots if each.id not in late]
-    announced = translate.configured("world", 0, 0, scenario)
+    announced = configured("world", 0, 0, scenario)
     return WorldNode(
         streams,
         expected_nodes(names, recorder=False, centre=False),

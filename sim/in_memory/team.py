@@ -11,13 +11,13 @@ from sim.publisher.node import WorldNode, expected_nodes
 from sim.scenarios.scenario import Scenario
 from sim.scenarios.source import tells_map
 from sim.world.streams import WorldStreams
-from team import translate
 from team.config import Exchange, RobotConfig
 from team.containment import Boundary
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from team.wire.digest import configured
 
 ROUND_S = 1.0
 """Team time of one round: every robot gets its measurements before the next round, so that none
@@ -74,7 +74,7 @@ def run_team(
 ) -> Iterator[Sample]:
     """Run the team to its final map; everything that a recorder would take, in its order."""
     expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
-    announced = translate.configured("world", 0, 0, scenario)
+    announced = configured("world", 0, 0, scenario)
     world = WorldNode(
         streams, expected, announced, tells_map=tells_map(scenario, streams), batch_s=ROUND_S
     )

@@ -11,11 +11,11 @@ from sim.scenarios.scenario import Scenario
 from sim.scenarios.source import tells_map
 from sim.world.radio import reach_of
 from sim.world.streams import WorldStreams
-from team import translate
 from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, Outgoing
+from team.wire.digest import configured
 
 PACE_S = 0.002
 """Wait when there is nothing to publish: the clock or the credit must move first."""
@@ -34,11 +34,11 @@ def run_world(
 ) -> None:
     """Publish every measurement of the world, then wait for the final map."""
     robots = [robot.id for robot in scenario.robots]
-    configured = translate.configured("world", 0, 0, scenario)
+    announcement = configured("world", 0, 0, scenario)
     node = WorldNode(
         streams,
         expected_nodes(robots, recorder=recorder, centre=scenario.centre),
-        configured,
+        announcement,
         speed,
         cache,
         Configurations(expected_configurations(scenario)),
@@ -77,6 +77,6 @@ def run_world(
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configuration]:
     """What the centre and the robots of a scenario announce, by node."""
     nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
-    robots = {node: translate.configured(node, 0, 0, robot) for node, robot in nodes.items()}
-    central = translate.configured("central", 0, 0, scenario.central)
+    robots = {node: configured(node, 0, 0, robot) for node, robot in nodes.items()}
+    central = configured("central", 0, 0, scenario.central)
     return ({"central": central} if scenario.centre else {}) | robots

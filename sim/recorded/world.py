@@ -6,12 +6,12 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 from central.desk.verification.recorded import RerunError
 from sim.scenarios.scenario import Scenario, loads
-from team import translate
 from team.pairs import NEEDS_MAP
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import WireError
+from team.wire.digest import configured
 
 STEP_NS = 1_000_000_000
 """Team time between two looks at what became of the messages."""
@@ -94,9 +94,7 @@ class RecordedWorld:
                 stamp_ns=truth[0].stamp_ns, ids=truth[0].ids, positions=truth[0].positions
             )
             self._said.append(Outgoing(ch.KNOWN_MAP, "", told))
-        self._said.insert(
-            0, Outgoing(ch.WORLD_CONFIG, "", translate.configured("world", 0, 0, scenario))
-        )
+        self._said.insert(0, Outgoing(ch.WORLD_CONFIG, "", configured("world", 0, 0, scenario)))
 
     def begin(self) -> list[Outgoing]:
         """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""

@@ -38,6 +38,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import unsound
+from team.wire.digest import configured
 
 AHEAD = 64
 """Number of submaps of an earlier process that the centre may have taken since it was asked for
@@ -81,7 +82,7 @@ class RobotNode:
         self.config = config
         self.robot = config.id
         self.warnings: list[str] = []
-        self._announcement = translate.configured(ch.robot_node(config.id), 0, 0, config)
+        self._announcement = configured(ch.robot_node(config.id), 0, 0, config)
         if announced is not None:
             self._announcement = msgspec.structs.replace(self._announcement, digest=announced)
         self._replaced = replaced

@@ -13,6 +13,7 @@ from team.robot.team_map import TeamMap
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
+from team.wire.digest import NO_MAP
 from team.wire.newer import is_newer_prior
 
 
@@ -74,7 +75,7 @@ class RunningPoses:
         """The message of the own pose and, given a prior, of the pose in the team's map."""
         sequence = front.estimator.sequence
         own = front.estimator.own_pose()
-        out = [writer.pose(ch.OWN_POSE, stamp_ns, sequence, translate.NO_MAP, own)]
+        out = [writer.pose(ch.OWN_POSE, stamp_ns, sequence, NO_MAP, own)]
         if prior is None:
             return out
         try:

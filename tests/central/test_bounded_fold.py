@@ -17,6 +17,7 @@ from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.joining import EMPTY_FOLD
 from team.estimation.map_joining.relinearising import is_due
 from team.wire.codec import encoded
+from team.wire.digest import digest_of
 from tests.teams import stream, submaps_of
 
 CONFIG = CentralConfig(tick_s=4.0)
@@ -41,7 +42,7 @@ def fresh(bounded=True):
 
 
 def add(ticks, submap):
-    ticks.add(submap, translate.digest_of(encoded(submap)))
+    ticks.add(submap, digest_of(encoded(submap)))
 
 
 def bits(fold):

@@ -5,10 +5,10 @@ import pytest
 
 from central.config import CentralConfig
 from central.node import CentralNode
-from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded, encoded
+from team.wire.digest import digest_of
 from tests.teams import of, published, stream, submaps_of
 
 CONFIG = CentralConfig(tick_s=3.0, broadcast_s=3.0)
@@ -82,7 +82,7 @@ def joined(*, robots=("r1", "r2"), config=CONFIG):
 def test_it_announces_the_configuration_that_its_maps_hang_on():
     (one,) = of(Centre().said, ch.CENTRAL_CONFIG)
     (other,) = of(Centre(CentralConfig(tick_s=4.0)).said, ch.CENTRAL_CONFIG)
-    assert one.digest == translate.digest_of(one.configuration.encode())
+    assert one.digest == digest_of(one.configuration.encode())
     assert one.digest != other.digest
 
 

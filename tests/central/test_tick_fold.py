@@ -10,6 +10,7 @@ from central.tick_fold import TickFold
 from team import translate
 from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.wire.codec import encoded
+from team.wire.digest import digest_of
 from tests.teams import stream, submaps_of
 
 CONFIG = CentralConfig(tick_s=4.0)
@@ -25,7 +26,7 @@ def fresh(config=CONFIG):
 
 
 def add(ticks, submap):
-    ticks.add(submap, translate.digest_of(encoded(submap)))
+    ticks.add(submap, digest_of(encoded(submap)))
 
 
 def bits(fold):

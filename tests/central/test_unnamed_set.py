@@ -9,6 +9,7 @@ from central.config import CentralConfig
 from central.join_rule import JoinRule
 from central.scheduler import Scheduler
 from central.submap_intake import SubmapInputs
+from central.unnamed_landmarks import verdict_of
 from team import translate
 from team.association import AssociationProfile
 from team.wire import messages as m
@@ -134,7 +135,7 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedM
         for robot in TEAM
     }
     submaps = {(robot, 1): TEAM[robot] for robot in TEAM}
-    told = translate.verdict_of(_verdict().judgement)
+    told = verdict_of(_verdict().judgement)
     inputs = SubmapInputs(starts=starts, submaps=submaps, verdicts=(told,))
     with_verdict = rule.rule.fuse(inputs, "final")[-1].message
     without = rule.rule.fuse(SubmapInputs(starts=starts, submaps=submaps), "final")[-1].message

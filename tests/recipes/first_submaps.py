@@ -11,6 +11,7 @@ from team.estimation.geometry import transformed
 from team.wire import channels as ch
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
+from team.wire.digest import digest_of
 
 
 class FirstSubmaps(FusionRule[SubmapInputs]):
@@ -34,7 +35,7 @@ class FirstSubmaps(FusionRule[SubmapInputs]):
         named = (encoded(chain[0]) for chain in heard.values())
         fused = fused_message(
             self.config,
-            translate.digest_of(self.config_digest, tail.encode(), *named),
+            digest_of(self.config_digest, tail.encode(), *named),
             value,
             tuple(version_entry(stream, len(chain) - 1) for stream, chain in heard.items()),
             stamp_ns=max((chain[-1].stamp_ns for chain in heard.values()), default=0),

@@ -19,6 +19,7 @@ from team.rejection import Rejection
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
+from team.wire.digest import configured
 from tests.sim.reruns import written
 
 MOUNT = (0.8, -0.3, 0.2)
@@ -94,7 +95,7 @@ def test_the_batch_reference_takes_claims() -> None:
 
 def told(of: Scenario, samples: list[Sample]) -> list[Sample]:
     """The same run with another scenario in its log."""
-    payload = encoded(translate.configured("world", 0, 0, of))
+    payload = encoded(configured("world", 0, 0, of))
     return [
         replace(sample, payload=payload)
         if isinstance(opened(sample)[2], m.Configuration)

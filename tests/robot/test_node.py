@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team import translate
 from team.pairs import PAIRS
 from team.rejection import Rejection
 from team.robot import pace
@@ -18,6 +17,7 @@ from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
+from team.wire.digest import digest_of
 from tests.support import fused_map, packed, spd
 from tests.teams import config, driven, of, published, stream
 
@@ -251,7 +251,7 @@ def test_a_robot_that_was_started_again_sends_the_same_following_submaps(name, t
 def test_submaps_and_maps_name_the_configuration_that_was_announced():
     node = RobotNode(config())
     (announced,) = of(node.begin(), ch.ROBOT_CONFIG)
-    assert announced.digest == translate.digest_of(announced.configuration.encode())
+    assert announced.digest == digest_of(announced.configuration.encode())
     submaps = of(driven(node, MEASUREMENTS), ch.SUBMAP)
     assert {each.config for each in submaps} == {announced.digest}
     (other,) = of(RobotNode(config(seed=2)).begin(), ch.ROBOT_CONFIG)

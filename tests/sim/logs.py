@@ -18,6 +18,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import encoded
+from team.wire.digest import configured
 from tests.support import fused_map
 
 STEPS = 20
@@ -54,7 +55,7 @@ def samples(out: Sequence[Outgoing]) -> list[Sample]:
 
 def world_log(of: Scenario) -> list[Sample]:
     """Everything that the world publishes, with nobody listening."""
-    node = WorldNode(streams(of), frozenset(), translate.configured("world", 0, 0, of))
+    node = WorldNode(streams(of), frozenset(), configured("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
         out += node.publish(0.0)

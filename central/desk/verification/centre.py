@@ -16,7 +16,7 @@ from central.rule import FusionRule, Tail, rule_of
 from central.scheduler import Scheduler
 from central.submap_intake import SubmapInputs
 from central.submap_set import SubmapSet
-from team import translate
+from central.unnamed_landmarks import verdict_of
 from team.pairs import RULES, Channel
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -159,7 +159,7 @@ class _LogInputs:
             submaps=chains,
             sightings=self._set.sightings,
             withdrawn=fused.withdrawn,
-            verdicts={translate.verdict_of(each) for each in fused.verdicts},
+            verdicts={verdict_of(each) for each in fused.verdicts},
             missing=fused.missing,
             heard=fused.heard,
             now_ns=fused.stamp_ns,

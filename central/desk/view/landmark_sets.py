@@ -1,6 +1,6 @@
 """Why an unnamed landmark of a map is one: its members, and the step by which each came to it."""
 
-from team.translate import STEPS
+from central.unnamed_landmarks import STEPS
 from team.wire import messages as m
 from team.wire.arrays import floats, ids
 

@@ -17,6 +17,7 @@ from team.config import FrontEnd, RobotConfig, Sensor
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
+from team.wire.digest import configured
 from tests.sim.reruns import messages, team_samples
 from tests.teams import config, of, published, stream
 
@@ -64,7 +65,7 @@ def heard(configs, **options):
     node = CentralNode(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
     out = []
     for name, told in configs.items():
-        out += node.handle(translate.configured(ch.robot_node(name), 0, 0, told), 0)
+        out += node.handle(configured(ch.robot_node(name), 0, 0, told), 0)
         for measurement in MEASUREMENTS[name]:
             out += node.handle(measurement, 0)
         out += node.handle(

@@ -19,6 +19,7 @@ from team.wire import messages as m
 from team.wire.arrays import floats
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
+from team.wire.digest import configured
 from tests.teams import config, of, published, stream
 
 PARTICLES = 20
@@ -35,7 +36,7 @@ LAST_WORDS = [
 
 
 def announced(name):
-    return translate.configured(ch.robot_node(name), 0, 0, CONFIGS[name])
+    return configured(ch.robot_node(name), 0, 0, CONFIGS[name])
 
 
 def end(measurements=MEASUREMENTS):

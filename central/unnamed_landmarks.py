@@ -1,0 +1,65 @@
+"""What the centre says of landmarks without names, and what an operator says of them."""
+
+import numpy as np
+
+from team.estimation.map_joining.association.landmarks import Landmarks, Member, Verdict
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+
+STEPS = ("", "track", "near", "sweep", "closure", "merge", "verdict")
+"""Why an unnamed landmark went into another set than its own, by its number on the wire."""
+DECISIONS = 100
+"""So many of the newest decisions go with a map, and so many that wait."""
+LARGEST = 1e300
+
+
+def memberships_of(landmarks: Landmarks) -> tuple[m.Membership, ...]:
+    """The table of unnamed landmarks: member, identity, why."""
+    streams: dict[tuple[str, int], list[Member]] = {}
+    for member in sorted(landmarks.number):
+        streams.setdefault((member.robot, member.incarnation), []).append(member)
+    table = []
+    for (robot, incarnation), members in streams.items():
+        ties = [landmarks.ties.get(landmarks.number[member]) for member in members]
+        figures = [(0.0, 0.0, 0.0) if t is None else (t.llr, t.rival, t.sd) for t in ties]
+        table.append(
+            m.Membership(
+                robot=robot,
+                incarnation=incarnation,
+                sequences=from_ids(np.array([x.sequence for x in members], np.uint32)),
+                locals=from_ids(np.array([x.local for x in members], np.uint32)),
+                identities=from_ids(
+                    np.array([landmarks.identity(x) or 0 for x in members], np.uint32)
+                ),
+                steps=bytes(0 if t is None else STEPS.index(t.kind) for t in ties),
+                figures=from_floats(np.clip(np.array(figures), -LARGEST, LARGEST)),
+            )
+        )
+    return tuple(table)
+
+
+def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
+    """The newest closures and merges, then what waits, by whom it is about."""
+    waits = [landmarks.waits[of] for of in sorted(landmarks.waits)][-DECISIONS:]
+    return tuple(
+        m.AssociationDecision(**each._asdict())
+        for each in (*landmarks.decisions[-DECISIONS:], *waits)
+    )
+
+
+def verdict_of(judgement: m.Judgement) -> Verdict:
+    """A judgement as the fold takes it."""
+    first, second = (
+        Member(each.robot, each.incarnation, each.sequence, each.local)
+        for each in sorted(
+            (judgement.first, judgement.second),
+            key=lambda x: (x.robot, x.incarnation, x.sequence, x.local),
+        )
+    )
+    return Verdict(first, second, judgement.same)
+
+
+def judgement_of(verdict: Verdict) -> m.Judgement:
+    """A verdict as maps name it."""
+    first, second = (m.LocalLandmark(**each._asdict()) for each in verdict[:2])
+    return m.Judgement(first=first, second=second, same=verdict.same)
