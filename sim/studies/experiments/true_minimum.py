@@ -78,7 +78,7 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
     log = Recorded()
     for sample in samples:
         log.take(sample)
-    ticks = TickFold(log.central_config()[0])
+    ticks = TickFold(log.central_config()[0], bounded=False)
     sightings = log.sightings()
     for stream, measurements in log.measurements.items():
         start = measurements.get(0)

@@ -1,0 +1,95 @@
+"""Whether the consistency monitor sees a factor of two, profile by profile.
+
+    python benchmarks/monitor_power.py [--seeds FIRST-LAST] [--dataset ZIP …] [--profiles NAME …]
+
+A team runs in memory; its final map is solved again with all submaps' covariances as they are, and
+as a team would have them that claims half and twice: the monitor is to be silent of the first and
+to tell of both others. Profiles: the built-in worlds with plain squares; `thesis-b` with one
+measurement in ten an outlier, under a robust loss; the UTIAS profile on each data set that is given
+(a minute and more of a processor). Exit status 1 if one is not as it should be.
+"""
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+
+from central.monitor import Finding, finding
+from sim.in_memory.team import run_team
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.source import streams_of
+from sim.studies.experiments.true_minimum import final_fold
+from team.estimation.map_joining.gauss_newton import settled
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.marginals import joint_cost
+
+SIMULATED = ("thesis", "thesis-b", "waypoints", "random-3")
+ROBUST = "robust"
+OUTLIERS = 0.1
+CLAIMED = ((1.0, ""), (0.5, "too much"), (2.0, "too little"))
+"""What all covariances are taken times, and the words that the monitor then owes."""
+
+
+def robust() -> Scenario:
+    """`thesis-b` with outliers, and a team that expects them."""
+    scenario = load("thesis-b")
+    world = msgspec.structs.replace(scenario.world, outlier_share=OUTLIERS)
+    central = msgspec.structs.replace(scenario.central, robust_c=2.0, landmark_submaps=2)
+    robots = tuple(
+        msgspec.structs.replace(
+            robot, front_end=msgspec.structs.replace(robot.front_end, outlier_share=OUTLIERS)
+        )
+        for robot in scenario.robots
+    )
+    return msgspec.structs.replace(scenario, world=world, central=central, robots=robots)
+
+
+def found_at(fold: Fold, claimed: float, normal: float) -> Finding:
+    """What the monitor says of the map, all of whose covariances are taken times `claimed`."""
+    key = fold.main_key
+    assert key is not None
+    settings = replace(
+        fold.main.settings, covariance_factor=claimed * fold.main.settings.covariance_factor
+    )
+    island, _, _ = settled(replace(fold.main, settings=settings))
+    return finding(joint_cost(replace(fold, islands={**fold.islands, key: island})), normal)
+
+
+def seen(name: str, scenario: Scenario) -> bool:
+    """Print one run's line; whether the monitor said what it owes."""
+    fold = final_fold(run_team(scenario, streams_of(scenario)))
+    line, right = [], True
+    for claimed, words in CLAIMED:
+        told = found_at(fold, claimed, scenario.central.normal_scale)
+        of_team = [said for said in told.warnings if said.startswith("the team's covariances")]
+        right &= bool(of_team) == bool(words) and all(words in said for said in of_team)
+        line.append(f"{told.figures['covariance_scale']:.2f}")
+    figures = ", ".join(
+        f"claimed {claimed:g}: {scale}" for (claimed, _), scale in zip(CLAIMED, line, strict=True)
+    )
+    print(f"{name:24} {figures}  {'seen' if right else 'NOT SEEN'}", flush=True)
+    return right
+
+
+def main() -> int:
+    """One line for each run."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--profiles", nargs="*", default=[*SIMULATED, ROBUST])
+    parser.add_argument("--seeds", default="1000-1001", help="FIRST-LAST, both in it")
+    parser.add_argument("--dataset", nargs="*", type=Path, default=[])
+    asked = parser.parse_args()
+    first, _, last = asked.seeds.partition("-")
+    right = True
+    for name in asked.profiles:
+        scenario = robust() if name == ROBUST else load(name)
+        for seed in range(int(first), int(last or first) + 1):
+            right &= seen(f"{name} {seed}", with_options(scenario, seed=seed))
+    for path in asked.dataset:
+        right &= seen(path.name, with_options(load("utias"), dataset=path))
+    return 0 if right else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
