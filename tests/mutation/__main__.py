@@ -186,6 +186,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--only", action="append", help="mutants whose text has this, all of them")
     options = parser.parse_args()
+    if unknown := [module for module in options.modules if module not in MODULES]:
+        parser.error(f"{', '.join(unknown)} is not in tests/mutation/table.py: add its row there")
     chosen: list[tuple[str, Mutant | None]] = []
     for module in options.modules:
         count = max(1, round(options.share * MODULES[module][0]))

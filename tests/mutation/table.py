@@ -82,7 +82,10 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
         ("estimation/map_joining/test_whole_map.py", "estimation/map_joining/test_conditioning.py"),
     ),
     "team/estimation/map_joining/joining.py": (10, (*JOIN, *CENTRE)),
-    "team/estimation/map_joining/joining_kernel.py": (10, JOIN),
+    "team/estimation/map_joining/joining_kernel.py": (
+        10,
+        (*JOIN, "estimation/map_joining/test_range_scale.py"),
+    ),
     "team/estimation/map_joining/gauss_newton.py": (14, JOIN),
     "team/estimation/map_joining/submap_graph.py": (8, JOIN),
     "team/estimation/map_joining/submap_factor.py": (
@@ -138,6 +141,10 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "central/join_messages.py": (8, CENTRE),
     "central/scheduler.py": (12, CENTRE),
     "central/submap_intake.py": (10, CENTRE),
+    "team/estimation/consistency.py": (
+        6,
+        ("estimation/test_consistency.py", "central/test_monitor.py"),
+    ),
     "central/monitor.py": (12, ("central/test_monitor.py", "central/test_withdrawal.py")),
     "central/withdrawal.py": (8, ("central/test_withdrawal.py", "central/test_monitor.py")),
     "central/roll.py": (8, ("central/test_node.py", "central/test_withdrawal.py")),
