@@ -289,6 +289,7 @@ def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
         words = ["launch", place / "live.toml", "--listen", router, "-o", run / "out"]
         words += ["--no-report", "--no-views"]
         team = begin([*PROGRAM, *words], "launch.log", stdout=subprocess.DEVNULL)
+        awaited(run / "launch.log", "reach the team by", team)
         drivers = [
             begin([*PROGRAM, "driver", robot, "--ros2", place / "topics.toml", "--team", "live",
                    "--connect", router, "--start", start, "--latency", "30",
@@ -304,11 +305,8 @@ def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
         assert publisher.stdout is not None
         publisher.stdout.readline()
         logs = [run / f"driver_{robot}.log" for robot in at]
-        until = time.monotonic() + 300.0
-        while not all("listening to" in log.read_text() for log in logs):
-            if time.monotonic() > until or team.poll() is not None:
-                raise RuntimeError(f"the team of {run} did not come up")
-            time.sleep(0.2)
+        for log in logs:
+            awaited(log, "listening to", team)
         time.sleep(1.0)
         publisher.stdin.write("go\n")
         publisher.stdin.flush()
@@ -328,6 +326,15 @@ def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
             if process.poll() is None:
                 process.terminate()
     return next(run.glob("out/**/*.mcap"))
+
+
+def awaited(log: Path, text: str, team: "subprocess.Popen[str]") -> None:
+    """Return when a log has the text."""
+    until = time.monotonic() + 400.0
+    while text not in log.read_text():
+        if time.monotonic() > until or team.poll() is not None:
+            raise RuntimeError(f"{log}: {log.read_text()[-500:]}")
+        time.sleep(0.2)
 
 
 def settled(run: Path, robots: list[str]) -> None:

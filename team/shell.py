@@ -306,11 +306,15 @@ class Shell:
 
 
 @contextmanager
-def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
+def process(
+    name: str, *, endless: bool = False, patient: bool = False
+) -> Iterator[threading.Event]:
     """Run a process of a team: it stops at SIGTERM and SIGINT and ends when its parent dies.
 
     A process that was told to stop before its work was done ends with status 128 + the signal's
-    number; an `endless` one works until it is told to stop, and ends with 0.
+    number; an `endless` one works until it is told to stop, and ends with 0. The kernel ends it
+    LAST_S after that; a `patient` one only at the second signal, since it has to deliver what it
+    has, however long that takes.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
     stop = threading.Event()
@@ -319,6 +323,9 @@ def process(name: str, *, endless: bool = False) -> Iterator[threading.Event]:
     def take(number: int, _: FrameType | None) -> None:
         told.append(number)
         stop.set()
+        if patient:
+            signal.alarm(min(len(told) - 1, 1))  # of 0: never
+            return
         signal.alarm(LAST_S)  # by the kernel: neither a closing link nor the exit holds it
 
     handlers = {number: signal.signal(number, take) for number in (signal.SIGTERM, signal.SIGINT)}

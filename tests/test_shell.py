@@ -1,13 +1,14 @@
 """A node's shell: what it says while the node waits."""
 
 import logging
+import signal
 import threading
 from collections.abc import Callable
 
 import pytest
 
 from team import shell
-from team.shell import BACK_S, RECORDER, RECORDER_S, Shell
+from team.shell import BACK_S, RECORDER, RECORDER_S, Shell, process
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 
@@ -90,3 +91,16 @@ def test_a_process_stays_while_who_records_may_still_ask_for_something(
     stayed = clock[0] - 100.0
     expected = {"lacks": 4.0, "away": RECORDER_S, "back": 2.0 + BACK_S}
     assert stayed == expected.get(case, 0.0)
+
+
+def test_who_has_to_deliver_is_ended_by_the_second_signal_only() -> None:
+    with process("driver", endless=True, patient=True) as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.is_set()
+        assert signal.alarm(0) == 0  # nothing ends it
+        signal.raise_signal(signal.SIGINT)
+        assert signal.alarm(0) > 0
+    with process("node", endless=True) as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.is_set()
+        assert signal.alarm(0) > 0

@@ -75,7 +75,7 @@ def driver(
     variances = [pose[3] ** 2, pose[3] ** 2, pose[4] ** 2] if len(pose) == 5 else None
     try:
         with (
-            process(f"driver-{robot}", endless=True) as stop,
+            process(f"driver-{robot}", endless=True, patient=True) as stop,
             Driver(
                 robot,
                 team=team,
@@ -103,6 +103,9 @@ def driver(
                     for sample in foreign.receive(LAST_S):
                         translated.put(sample)
                 translated.deliver()
+                _LOG.info(
+                    "the stream of %s ends here and is delivered; %s keeps it", robot, source.path
+                )
                 source.tell(translated.figures(), translated.warnings())
             for topic, count in translated.taken.items():
                 _LOG.info("%s: %d messages", topic, count)

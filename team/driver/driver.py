@@ -256,6 +256,11 @@ class Driver:
     # What a program may want to know.
 
     @property
+    def path(self) -> Path:
+        """The file that has all measurements."""
+        return self._journal.path
+
+    @property
     def last_time(self) -> float | None:
         """The newest time in the file [s]; None where nothing was measured."""
         return 1e-9 * self._journal.newest_ns if self._journal.incarnation else None
