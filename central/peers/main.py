@@ -11,17 +11,17 @@ from pathlib import Path
 from central.config import CentralConfig
 from central.peers.centre import PeerCentre
 from central.peers.fold import FoldWhen
-from central.peers.peer import CENTRE, Peer
+from central.peers.peer import CENTRE
 from central.peers.robot import PeerRobot
 from team.config import Exchange, RobotConfig
 from team.peers.members import Member
 from team.peers.proofs import Signs
-from team.peers.store import Store, StoreError
+from team.peers.store import Keeper
 from team.robot.main import SECOND_PATIENCE_S, RobotShell
 from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import NO_COUNTER, Bus, Sample, Tap
+from team.wire.bus import Bus, Tap
 
 LINGER_S = 5.0
 """A robot that knows that all others have concluded stays so long, so that they know of it, too."""
@@ -30,40 +30,6 @@ FRESH_SHARE = 0.2
 WORLD_GONE_S = 1.0
 """The world leaves when everyone has concluded; one that died is there again sooner."""
 _LOG = logging.getLogger("teamslam")
-
-
-def _as_heard(member: Member) -> Sample:
-    stamp_ns = member.message.stamp_ns
-    return Sample(member.key, member.payload, stamp_ns, time.time_ns(), NO_COUNTER)
-
-
-class Keeper:
-    """Keeps a peer's set in its file; `kept`: what was there. Raises StoreError."""
-
-    def __init__(self, path: Path | None) -> None:
-        self._store = None if path is None else Store(path)
-
-    @property
-    def kept(self) -> list[Member]:
-        """What an earlier life has kept."""
-        return [] if self._store is None else self._store.kept
-
-    def save(self, peer: Peer) -> None:
-        """Keep what was news since the last time."""
-        members, peer.peer.unsaved = peer.peer.unsaved, []
-        if self._store is None or not members:
-            return
-        try:
-            self._store.append(members)
-        except StoreError as error:
-            _LOG.error("the set is not kept any more: %s", error)
-            self.close()
-
-    def close(self) -> None:
-        """Nothing more is kept."""
-        if self._store is not None:
-            self._store.close()
-            self._store = None
 
 
 class Alone:
@@ -156,7 +122,7 @@ class PeerShell(RobotShell):
         now = time.monotonic()
         self.shell.publish(self._peer.tick(now))
         self._log_carried()
-        self._keeper.save(self._peer)
+        self._keeper.append(self._peer.news_of_set())
         self._peer.finished = self._may_leave(now)
 
     def _log_carried(self) -> None:
@@ -170,7 +136,8 @@ class PeerShell(RobotShell):
         """Into the robot's own log: what a death has torn off that may still be in the set."""
         tap: Tap | None = getattr(self.bus, "tap", None)
         if tap is not None and members:
-            tap([_as_heard(member) for member in members])
+            now_ns = time.time_ns()
+            tap([member.heard(now_ns) for member in members])
 
     def _may_leave(self, now: float) -> bool:
         """Nobody needs this peer any more: all have concluded, or the world has left."""
@@ -231,6 +198,6 @@ class CentreShell:
     def _duty(self) -> None:
         now = time.monotonic()
         self._shell.publish(self._peer.tick(now))
-        self._keeper.save(self._peer)
+        self._keeper.append(self._peer.news_of_set())
         alone = self._alone.since(time.monotonic(), alone=self._peer.is_left_alone)
         self._peer.finished = self._peer.all_concluded or alone

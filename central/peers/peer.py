@@ -83,6 +83,11 @@ class Peer:
         for member in members:
             self.peer.take(member, self.name)
 
+    def news_of_set(self) -> list[Member]:
+        """The members that are new since this was asked last."""
+        members, self.peer.unsaved = self.peer.unsaved, []
+        return members
+
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take a message without its key: as `handle_sample` of a reply."""
         return self.handle_sample(message, reply_sample(m.tag_of(type(message)), encoded(message)))

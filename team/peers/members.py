@@ -11,7 +11,7 @@ from functools import cached_property
 
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Sample, opened
+from team.wire.bus import NO_COUNTER, Sample, opened
 
 Stream = tuple[str, int]
 """(robot, incarnation)."""
@@ -42,6 +42,10 @@ class Member:
     def size(self) -> int:
         """Approximate size on the wire and on disk [bytes]."""
         return len(self.key) + len(self.payload) + len(self.signature)
+
+    def heard(self, now_ns: int) -> Sample:
+        """The member as a sample that arrives now (wall clock [ns])."""
+        return Sample(self.key, self.payload, self.message.stamp_ns, now_ns, NO_COUNTER)
 
 
 def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:

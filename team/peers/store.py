@@ -7,9 +7,10 @@ computed again. A record is in the hands of the operating system when `append` r
 that is killed loses nothing, a computer without power the last seconds.
 """
 
+import logging
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import msgpack
@@ -18,6 +19,7 @@ from team.peers.members import LARGEST_MEMBER, Member, member_of
 
 MAGIC = b"tmsset1\n"
 _HEAD = struct.Struct("<II")
+_LOG = logging.getLogger("teamslam")
 _LARGEST = LARGEST_MEMBER + 2**16
 
 
@@ -80,3 +82,30 @@ class Store:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+class Keeper:
+    """Keeps a set in its file as long as this can be written; without a path nowhere.
+
+    kept: the members in it when it was opened. Raises StoreError where the file can not be used.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._store = None if path is None else Store(path)
+        self.kept = [] if self._store is None else self._store.kept
+
+    def append(self, members: Sequence[Member]) -> None:
+        """Append members; an error of the file is logged, and nothing more is kept."""
+        if self._store is None or not members:
+            return
+        try:
+            self._store.append(members)
+        except StoreError as error:
+            _LOG.error("the set is not kept any more: %s", error)
+            self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._store is not None:
+            self._store.close()
+            self._store = None
