@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
+from jaxtyping import Float, UInt32
 
 from central.config import CentralConfig
 from central.fused import JOINT_LANDMARKS, version_entry
@@ -52,14 +53,7 @@ def team_map(
     one of a final map of no more than JOINT_LANDMARKS, else each landmark's own.
     """
     joint = tail == "final" and len(shown) <= JOINT_LANDMARKS and bool(fold.contributions)
-    if joint:
-        ids, means, matrix = marginals.landmark_map(fold, shown)
-        covariance = translate.joint_bytes(matrix)
-    elif fold.contributions:
-        ids, means, blocks = marginals.landmark_blocks(fold, shown)
-        covariance = translate.block_bytes(blocks)
-    else:
-        ids, means, covariance = np.empty(0, np.uint32), np.empty((0, 2)), b""
+    ids, means, covariance = _landmarks(fold, shown, joint=joint)
     frame = fold.frame
     return m.FusedMap(
         stamp_ns=fold.contributions[-1].end_ns if fold.contributions else 0,
@@ -96,6 +90,19 @@ def team_map(
         decisions=decisions_of(fold.landmarks),
         verdicts=tuple(judgement_of(v) for v in fold.landmarks.verdicts),
     )
+
+
+def _landmarks(
+    fold: Fold, shown: Sequence[int], *, joint: bool
+) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"], bytes]:
+    """Identities, positions [m] and the packed covariance of these landmarks."""
+    if not fold.contributions:
+        return np.empty(0, np.uint32), np.empty((0, 2)), b""
+    if joint:
+        ids, means, matrix = marginals.landmark_map(fold, shown)
+        return ids, means, translate.joint_bytes(matrix)
+    ids, means, blocks = marginals.landmark_blocks(fold, shown)
+    return ids, means, translate.block_bytes(blocks)
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> list[int]:

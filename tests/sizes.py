@@ -38,6 +38,7 @@ REASONS = {
     "team/estimation/map_joining/marginals.py": "what is read off a fold",
     "team/estimation/map_joining/association/closing.py": "one test of a closure, step by step",
     "team/estimation/map_joining/map_matching.py": "one search for a place by the maps alone",
+    "team/estimation/association/tracking.py": "one tracker of unnamed landmarks in a window",
     "team/estimation/map_joining/minima.py": "one search for other minima",
     "team/estimation/baselines/batch.py": "the batch estimate; baseline",
     "team/estimation/baselines/batch_factors.py": "its residuals and their places; baseline",

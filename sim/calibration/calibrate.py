@@ -22,9 +22,7 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
-from sim.calibration import claims
-from sim.calibration import motion as motion
-from sim.calibration import sensor as sensor
+from sim.calibration import claims, motion, sensor
 from sim.calibration.consistency import covariance_factor, normal_scale
 from sim.calibration.data import Reference, references, true_paths
 from sim.calibration.figures import CalibrationError, Figure, jackknifed
