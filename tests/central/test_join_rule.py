@@ -161,6 +161,7 @@ def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_on
     assert fused.provisional
     assert fused.members == (m.VersionEntry(robot="r1", incarnation=1, sequence=4),)
     assert broadcasts(found, float("-inf"), late_ns + 1) == []
+    assert broadcasts(found, float("-inf"), 10 * late_ns) == [], "there is nothing new to say"
     assert encoded(final(_completed(found))) == encoded(final(whole())), "it leaves no trace"
 
 
