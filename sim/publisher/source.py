@@ -1,6 +1,7 @@
 """One robot's stream as a world publishes it: each measurement as its message, and the truth."""
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 
@@ -19,6 +20,15 @@ _CHANNEL_OF_KIND = {
     s.OBSERVATIONS: ch.OBSERVATIONS,
     s.SIGHTINGS: ch.SIGHTINGS,
 }
+
+
+class Name(TypedDict):
+    """The fields that every measurement has."""
+
+    stamp_ns: int
+    robot: str
+    incarnation: int
+    number: int
 
 
 @dataclass
@@ -45,19 +55,23 @@ class Source:
 
     def message(self, index: int) -> m.Measurement:
         """The measurement at `index` of the whole stream, as this incarnation counts it."""
-        stream, number = self.stream, index - self.base
-        name = (stream.robot, self.incarnation, number)
+        stream, kind = self.stream, self.stream.kinds[index]
         stamp_ns = int(stream.stamps_ns[index])
-        if number == 0 and self.incarnation > FIRST_INCARNATION:
-            return _start(None, stamp_ns, name)
-        kind = stream.kinds[index]
+        name = Name(
+            stamp_ns=stamp_ns - stream.clock_offset_ns if kind == s.ODOMETRY else stamp_ns,
+            robot=stream.robot,
+            incarnation=self.incarnation,
+            number=index - self.base,
+        )
+        if index == self.base and self.incarnation > FIRST_INCARNATION:
+            return _start(None, name | {"stamp_ns": stamp_ns})
         if kind == s.ODOMETRY:
-            return _odometry(stream.odometry(index), stamp_ns - stream.clock_offset_ns, name)
+            return _odometry(stream.odometry(index), name)
         if kind == s.OBSERVATIONS:
-            return _observations(stream.observations(index), stamp_ns, name)
+            return _observations(stream.observations(index), name)
         if kind == s.SIGHTINGS:
-            return _sightings(stream.sightings(index), stamp_ns, name)
-        return _start(stream.start, stamp_ns, name)
+            return _sightings(stream.sightings(index), name)
+        return _start(stream.start, name)
 
     def truth(self, until_ns: int, batch_ns: int = TRUTH_BATCH_NS) -> list[Outgoing]:
         """The true poses up to a time that are not said yet, once they span `batch_ns`."""
@@ -80,35 +94,23 @@ class Source:
         return [Outgoing(ch.TRUTH, stream.robot, truth)]
 
 
-Name = tuple[str, int, int]
-"""(robot, incarnation, number)."""
-
-
-def _start(start: s.StartPose | None, stamp_ns: int, name: Name) -> m.InitialPose:
-    robot, incarnation, number = name
+def _start(start: s.StartPose | None, name: Name) -> m.InitialPose:
     covariance = None if start is None else start.covariance
     return m.InitialPose(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
-        number=number,
+        **name,
         pose=b"" if start is None else from_floats(start.pose),
         covariance=b"" if covariance is None else from_floats(covariance),
     )
 
 
 def _observations(
-    z: s.ObservationMeasurement, stamp_ns: int, name: Name
+    z: s.ObservationMeasurement, name: Name
 ) -> m.Observations | m.Points | m.Detections:
     """A scan as its sensor tells it: without identities, as points, as ranges and bearings."""
-    robot, incarnation, number = name
     covariances = b"" if z.covariances is None else from_floats(z.covariances)
     if z.hidden:
         return m.Detections(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=incarnation,
-            number=number,
+            **name,
             ranges=from_floats(z.ranges),
             bearings=from_floats(z.bearings),
             covariances=covariances,
@@ -116,19 +118,13 @@ def _observations(
         )
     if z.points is not None:
         return m.Points(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=incarnation,
-            number=number,
+            **name,
             ids=from_ids(z.ids),
             positions=from_floats(z.points),
             covariances=covariances,
         )
     return m.Observations(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
-        number=number,
+        **name,
         ids=from_ids(z.ids),
         ranges=from_floats(z.ranges),
         bearings=from_floats(z.bearings),
@@ -136,47 +132,33 @@ def _observations(
     )
 
 
-def _sightings(t: s.SightingMeasurement, stamp_ns: int, name: Name) -> m.Sightings:
-    robot, incarnation, number = name
+def _sightings(t: s.SightingMeasurement, name: Name) -> m.Sightings:
     return m.Sightings(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
-        number=number,
+        **name,
         teammates=t.teammates,
         ranges=from_floats(t.ranges),
         bearings=from_floats(t.bearings),
     )
 
 
-def _odometry(told: s.OdometryMeasurement, stamp_ns: int, name: Name) -> m.AnyOdometry:
-    """One interval as the odometry tells it; name: robot, incarnation, number."""
-    robot, incarnation, number = name
+def _odometry(told: s.OdometryMeasurement, name: Name) -> m.AnyOdometry:
+    """One interval as the odometry tells it."""
     if told.increment is not None:
         return m.Increment(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=incarnation,
-            number=number,
+            **name,
             duration_ns=told.duration_ns,
             increment=from_floats(told.increment),
             covariance=b"" if told.covariance is None else from_floats(told.covariance),
         )
     if told.steered:
         return m.Steering(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=incarnation,
-            number=number,
+            **name,
             duration_ns=told.duration_ns,
             wheel_speed=told.forward,
             steering=told.yaw_rate,
         )
     return m.Odometry(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
-        number=number,
+        **name,
         duration_ns=told.duration_ns,
         forward=told.forward,
         yaw_rate=told.yaw_rate,
