@@ -147,6 +147,6 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "central/monitor.py": (12, ("central/test_monitor.py", "central/test_withdrawal.py")),
     "central/withdrawal.py": (8, ("central/test_withdrawal.py", "central/test_monitor.py")),
-    "central/roll.py": (8, ("central/test_node.py", "central/test_withdrawal.py")),
+    "central/attendance.py": (8, ("central/test_node.py", "central/test_withdrawal.py")),
     "central/node.py": (6, ("central/test_node.py", "central/test_withdrawal.py")),
 }
