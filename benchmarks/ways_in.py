@@ -8,7 +8,7 @@ mcap, db3  ROS 2 bags of it (odometry as twists, detections as points), imported
 rmw, bridge  the bag's bytes published on rmw_zenoh's and on zenoh-bridge-ros2dds' keys by a process
          that has nothing of ours, at so many times real time, to `teamslam driver` for each robot
          and a live team of processes
-log      the log of the team that was driven by rmw, imported
+log      the log of a team that was driven live, imported
 
 A range and bearing become a point in a bag, which costs its last bit: the first two maps must be
 equal byte for byte, and so must the other five; the table says how far those are from the first.
@@ -369,7 +369,8 @@ def one(way: str, source: Scenario, place: Path, speed: float) -> tuple[bytes, b
         (of_bag / "scenario.toml").write_text(folder_scenario(source), "utf-8")
         return of_data_set(with_options(load(of_bag / "scenario.toml"), dataset=of_bag))
     if way == "log":
-        log = next((place / "run_rmw").glob("out/**/*.mcap"))
+        driven = next(each for each in ("rmw", "bridge") if (place / f"{each}.map.json").exists())
+        log = next((place / f"run_{driven}").glob("out/**/*.mcap"))
         return of_data_set(imported(log, place / "of_log"))
     text = folder_scenario(source).replace('kind = "folder"', 'kind = "live"')
     text = text.replace('path = "."\n', "").replace(f'name = "{source.name}"', 'name = "live"')

@@ -192,15 +192,19 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
         changed = recorded if plain else evaluate(changed_run(log, changes))
     except RerunError as error:
         fail(f"{path}: {error}", FAILED)
-    table = Table("", "recorded", "recomputed")
+    columns = ("", "computed") if plain else ("", "recorded", "recomputed")
+    table = Table(*columns)
     for row in comparison_rows(recorded, changed):
-        table.add_row(*(Text(cell) for cell in row))
+        table.add_row(*(Text(cell) for cell in row[: len(columns)]))
     console = Console()
     console.print(table)
+    for note in recorded.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
     moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
     verdict = "the same bytes" if same else f"another one{moved}"
-    console.print(f"final map: {verdict}", highlight=False)
+    if not plain:
+        console.print(f"final map: {verdict}", highlight=False)
     if json_file is not None:
         figures = {
             "changes": asdict(changes),

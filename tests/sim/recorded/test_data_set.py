@@ -49,3 +49,15 @@ def test_a_data_set_is_rerun_under_other_conditions(data_set: Path, tmp_path: Pa
     assert result.exit_code == 0, result.output
     assert "final map: the same bytes" in result.output
     assert json.loads(to.read_text())["same_final_map"]
+
+
+def test_a_data_set_without_changes_is_computed_once_and_told_with_its_notes(
+    data_set: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sim.recorded.changed_run.changed_run", None)  # a second run would call it
+    (data_set / "r2" / "truth.csv").unlink()
+    result = CliRunner().invoke(app, ["rerun", str(data_set)])
+    assert result.exit_code == 0, result.output
+    assert "computed" in result.output
+    assert "recorded" not in result.output
+    assert "note: r2: no truth.csv" in result.output
