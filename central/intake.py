@@ -137,6 +137,6 @@ class Intake(ABC, Generic[I]):
         """What robots say that they have sent, and what is not here."""
         return []
 
-    def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
+    def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
         """Measurements that are missing and must be asked for at their source."""
         return []

@@ -84,7 +84,7 @@ class CentralShell:
             self._shell.take(self._patient(samples))
             self._shell.take(self._long_lost())
             self._give_up()
-            self._shell.contained("wanted", lambda: self._missing.look(self.node.wanted()))
+            self._shell.contained("wanted", lambda: self._missing.look(self.node.requests()))
             self._shell.contained("wanted", self._gather)
             self._hear_orders()
             self._shell.report()
@@ -190,13 +190,15 @@ class CentralShell:
         for robot in sorted(robots.intersection(self.node.robots) - self._greeted):
             self._bus.request(ch.SENT, robot, m.SubmapsRequest(stamp_ns=0, robot=robot))
         self._greeted |= robots.intersection(self.node.robots)
-        wanted = {(each.robot, each.incarnation): each for each in self.node.lacking()}
-        firsts = {stream: each.first for stream, each in wanted.items()}
+        requested = {(each.robot, each.incarnation): each for each in self.node.lacking()}
+        firsts = {stream: each.first for stream, each in requested.items()}
         for stream in self._patience.due(firsts, time.monotonic()):
             _LOG.warning(
-                "submaps of %s from %d on are missing: asked for", stream[0], wanted[stream].first
+                "submaps of %s from %d on are missing: asked for",
+                stream[0],
+                requested[stream].first,
             )
-            self._bus.request(ch.SENT, stream[0], wanted[stream])
+            self._bus.request(ch.SENT, stream[0], requested[stream])
 
     def _leave_last(self) -> None:
         """Wait until robots and world have left at the final map, since one that missed it may

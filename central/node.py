@@ -186,9 +186,9 @@ class CentralNode:
         self.final = final
         return [*out[:-1], Outgoing(ch.FINAL_MAP, "", final)]
 
-    def wanted(self) -> list[m.MeasurementsRequest]:
+    def requests(self) -> list[m.MeasurementsRequest]:
         """The measurements that are missing and must be asked for at their source."""
-        return [] if self.finished else self._intake.wanted(self._attendance.now_ns)
+        return [] if self.finished else self._intake.requests(self._attendance.now_ns)
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:
         """The answer to `SubmapsRequest`: what is here of the robot, its latest incarnation

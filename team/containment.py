@@ -191,8 +191,8 @@ def reply_of(payload: bytes, expected: type[M]) -> M:
     """The message of a reply; raises WireError if it is invalid or of another kind."""
     message: m.Message = decoded(payload)
     if not isinstance(message, expected):
-        wanted = expected.__name__
-        raise WireError("wrong tag", f"a reply is {type(message).__name__}, no {wanted}")
+        expected_tag = expected.__name__
+        raise WireError("wrong tag", f"a reply is {type(message).__name__}, no {expected_tag}")
     return message
 
 

@@ -25,16 +25,16 @@ class MissingMeasurements:
         self._shell = shell
         self._since_s: float | None = None
 
-    def look(self, wanted: Sequence[m.MeasurementsRequest]) -> None:
+    def look(self, requested: Sequence[m.MeasurementsRequest]) -> None:
         """Send the requests, once any has been open for PATIENCE_S."""
         now_s = time.monotonic()
-        if not wanted:
+        if not requested:
             self._since_s = None
         elif self._since_s is None:
             self._since_s = now_s
         elif now_s - self._since_s > PATIENCE_S:
             self._since_s = now_s
-            for each in wanted:
+            for each in requested:
                 _LOG.warning(
                     "measurements %d to %d of %s are missing: asked for",
                     each.first,
@@ -43,14 +43,16 @@ class MissingMeasurements:
                 )
                 self.ask(each)
 
-    def ask(self, wanted: m.MeasurementsRequest) -> int:
+    def ask(self, requested: m.MeasurementsRequest) -> int:
         """Send one request now; returns the number of measurements that came, which the node has
         taken.
         """
         try:
-            replies = self._shell.bus.ask(ch.MEASUREMENTS, wanted.robot, wanted, ASK_TIMEOUT_S)
+            replies = self._shell.bus.ask(
+                ch.MEASUREMENTS, requested.robot, requested, ASK_TIMEOUT_S
+            )
         except BusError as error:
             _LOG.warning("%s", error)
             return 0
-        self._shell.take_replies(ch.MEASUREMENTS, wanted.robot, replies, m.Measurement)
+        self._shell.take_replies(ch.MEASUREMENTS, requested.robot, replies, m.Measurement)
         return len(replies)

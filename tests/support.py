@@ -155,8 +155,10 @@ def peers_examples(digest: bytes) -> Iterator[m.Message]:
         holdings=(holding,),
         statements=(statements,),
     )
-    wanted = m.Wanted(robot="alpha", incarnation=1, start=False, first=5, last=5)
-    yield m.MembersRequest(stamp_ns=9, node="robot/bravo", wanted=(wanted,), statements=("alpha",))
+    wanted = m.Requested(robot="alpha", incarnation=1, start=False, first=5, last=5)
+    yield m.MembersRequest(
+        stamp_ns=9, node="robot/bravo", requested=(wanted,), statements=("alpha",)
+    )
     yield m.Members(
         stamp_ns=9,
         node="robot/alpha",

@@ -264,7 +264,7 @@ class Team:
         """Robots ask their source for what they miss, as their shells do."""
         found = False
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
-            wanted = node.wanted()
+            wanted = node.request()
             if wanted is None and not node.finished and not node._inbox.waiting:
                 wanted = m.MeasurementsRequest(
                     stamp_ns=0,

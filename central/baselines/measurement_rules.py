@@ -111,9 +111,9 @@ class MeasurementIntake(Intake[MeasurementInputs]):
             self._steps.append(step)
             yield Instant(now_ns, self.inputs(now_ns, now_ns), since_ns)
 
-    def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
+    def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
         """Measurements that the link has lost."""
-        return self._keyframes.wanted(now_ns)
+        return self._keyframes.requests(now_ns)
 
 
 class MeasurementRule(FusionRule[MeasurementInputs]):

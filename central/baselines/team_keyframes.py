@@ -163,7 +163,7 @@ class TeamKeyframes:
         for _, step in groupby(ready, key=lambda each: each.stamp_ns):
             yield list(step)
 
-    def wanted(self, now_ns: int) -> list[m.MeasurementsRequest]:
+    def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
         """The measurements that are missing and must be asked for at their source."""
         found = []
         for name, stream in self._streams.items():

@@ -61,15 +61,15 @@ def _translated(bag: Bag, topics: Topics) -> Imported:
     frames = _static_frames(bag)
     translators = {name: Translator(each, frames) for name, each in topics.robots.items()}
     tables = {name: RobotTables(name) for name in topics.robots}
-    wanted: dict[str, list[str]] = {}
+    robots_by_topic: dict[str, list[str]] = {}
     for name, robot in topics.robots.items():
         for topic in {robot.odometry, *robot.detections, robot.truth} - {""}:
-            wanted.setdefault(topic, []).append(name)
+            robots_by_topic.setdefault(topic, []).append(name)
     damaged: Counter[str] = Counter()
     first: dict[str, str] = {}
     unstamped: Counter[str] = Counter()
     seen: Counter[str] = Counter()
-    for raw in bag.messages(list(wanted)):
+    for raw in bag.messages(list(robots_by_topic)):
         seen[raw.topic] += 1
         try:
             record = decode(raw.kind, raw.data, bag.store)
@@ -80,7 +80,7 @@ def _translated(bag: Bag, topics: Topics) -> Imported:
         if getattr(record, "stamp_ns", 1) == 0:
             record = _stamped(record, raw.arrival_ns)
             unstamped[raw.topic] += 1
-        for name in wanted[raw.topic]:
+        for name in robots_by_topic[raw.topic]:
             for measured in translators[name].take(raw.topic, record):
                 tables[name].take(measured)
     said = [

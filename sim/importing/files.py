@@ -65,11 +65,11 @@ def _take(
     kind: str, table: Table, files: dict[str, CsvTable], tables: RobotTables, used: set[str]
 ) -> list[str]:
     side_by_side: list[CsvTable] = []
-    for wanted in table.files:
-        named = [name for name in files if name.endswith(wanted)]
+    for ending in table.files:
+        named = [name for name in files if name.endswith(ending)]
         if len(named) != 1:
             raise DatasetError(
-                f"{kind}: {len(named)} files end in {wanted!r}; there are {', '.join(files)}"
+                f"{kind}: {len(named)} files end in {ending!r}; there are {', '.join(files)}"
             )
         used.add(named[0])
         side_by_side.append(files[named[0]])

@@ -51,14 +51,14 @@ def judge(
         withdrawn=withdrawn,
     )
     ordered(bus, Outgoing(ch.VERDICT, robot, verdict), signer)
-    wanted = {judgement.first, judgement.second}
+    pair = {judgement.first, judgement.second}
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         for _, _, message in sound(bus.receive(LOOK_S)):
             if not isinstance(message, m.FusedMap):
                 continue
             holds = any(
-                {each.first, each.second} == wanted and each.same == judgement.same
+                {each.first, each.second} == pair and each.same == judgement.same
                 for each in message.verdicts
             )
             if holds is not withdrawn:

@@ -333,17 +333,17 @@ class WorldNode:
         """The answer to `MeasurementsRequest`: the published measurements asked for, ANSWER at
         most.
         """
-        wanted = decoded(request, m.MeasurementsRequest)
-        source = self._sources.get(wanted.robot)
-        if source is None or wanted.incarnation not in (0, source.incarnation):
+        requested = decoded(request, m.MeasurementsRequest)
+        source = self._sources.get(requested.robot)
+        if source is None or requested.incarnation not in (0, source.incarnation):
             return []
-        first = wanted.first
+        first = requested.first
         if self.cache is not None and first < source.counter - self.cache:
-            if not wanted.only:
+            if not requested.only:
                 self._begin_incarnation(source)
                 return []
             first = source.counter - self.cache
-        kept = msgspec.structs.replace(wanted, first=first)
+        kept = msgspec.structs.replace(requested, first=first)
         return answered(kept, source.counter, lambda n: source.message(source.base + n))
 
     def _begin_incarnation(self, source: Source) -> None:

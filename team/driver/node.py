@@ -204,12 +204,12 @@ class SourceNode:
 
     def measurements(self, request: bytes) -> list[bytes]:
         """The answer to `MeasurementsRequest`."""
-        wanted = decoded(request, m.MeasurementsRequest)
-        incarnation = wanted.incarnation or self._incarnation
-        if wanted.robot != self._robot or incarnation not in self.journal.incarnations:
+        requested = decoded(request, m.MeasurementsRequest)
+        incarnation = requested.incarnation or self._incarnation
+        if requested.robot != self._robot or incarnation not in self.journal.incarnations:
             return []
         count = self.journal.count(incarnation)
-        return answered(wanted, count, lambda number: self.journal.message(incarnation, number))
+        return answered(requested, count, lambda number: self.journal.message(incarnation, number))
 
     @property
     def is_delivered(self) -> bool:

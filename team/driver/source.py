@@ -23,12 +23,12 @@ def channel_of(measurement: m.Measurement) -> ch.Channel:
 
 
 def answered(
-    wanted: m.MeasurementsRequest, count: int, measurement: Callable[[int], m.Measurement]
+    requested: m.MeasurementsRequest, count: int, measurement: Callable[[int], m.Measurement]
 ) -> list[bytes]:
     """The answer to a query: of the `count` measurements that there are those asked for.
 
     ANSWER at most; measurement: gives one by its number.
     """
-    last = count - 1 if wanted.last < 0 else min(wanted.last, count - 1)
-    last = min(last, wanted.first + ANSWER - 1)
-    return [encoded(measurement(number)) for number in range(wanted.first, last + 1)]
+    last = count - 1 if requested.last < 0 else min(requested.last, count - 1)
+    last = min(last, requested.first + ANSWER - 1)
+    return [encoded(measurement(number)) for number in range(requested.first, last + 1)]

@@ -8,7 +8,7 @@ from team.peers.members import Member, Stream
 from team.peers.replica import MOST_SEQUENCES, Replica, intervals
 from team.wire import messages as m
 
-MOST_WANTED = 64
+MOST_REQUESTED = 64
 """Most intervals in one request."""
 MOST_ASKED = 512
 """Most submaps in one request."""
@@ -19,7 +19,7 @@ BATCH_BYTES = 64 * 2**10
 """Bytes of members in one message of an answer."""
 
 
-def wanted(
+def request_for(
     replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
 ) -> m.MembersRequest | None:
     """The request for what the summary's node has and this replica lacks; None where that is
@@ -31,7 +31,7 @@ def wanted(
     """
     if summary.digest == replica.digest:
         return None
-    found: list[m.Wanted] = []
+    found: list[m.Requested] = []
     asked = 0
     for each in summary.holdings:
         if each.robot not in replica.robots:
@@ -50,9 +50,9 @@ def wanted(
             lacks, start = sorted(share.complete)[:MOST_ASKED], each.start
         asked += len(lacks)
         spans = _pairs(intervals(set(lacks), 0)) or ([(0, -1)] if start else [])
-        for i, (first, last) in enumerate(spans[:MOST_WANTED]):
+        for i, (first, last) in enumerate(spans[:MOST_REQUESTED]):
             found.append(
-                m.Wanted(
+                m.Requested(
                     robot=each.robot,
                     incarnation=each.incarnation,
                     start=start and i == 0,
@@ -72,14 +72,14 @@ def wanted(
     return m.MembersRequest(
         stamp_ns=summary.stamp_ns,
         node="",
-        wanted=tuple(found[:MOST_WANTED]),
+        requested=tuple(found[:MOST_REQUESTED]),
         statements=statements,
     )
 
 
 def named(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
     """The (stream, sequence) of a request, as `not_now` takes them."""
-    for each in request.wanted:
+    for each in request.requested:
         stream = each.robot, each.incarnation
         yield stream, -2
         if each.start:
@@ -130,7 +130,7 @@ def _asked(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
     for robot in request.statements:
         found = replica.statements.get(robot, {})
         yield from (found[name] for name in sorted(found))
-    for each in request.wanted[:MOST_WANTED]:
+    for each in request.requested[:MOST_REQUESTED]:
         share = replica.streams.get((each.robot, each.incarnation))
         if share is None:
             continue

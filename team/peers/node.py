@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from team.peers.exchange import answered, named, wanted
+from team.peers.exchange import answered, named, request_for
 from team.peers.members import CHANNELS, Member, Stream, member_of
 from team.peers.proofs import Proofs
 from team.peers.replica import SHARE, RefusedError, Replica
@@ -233,7 +233,7 @@ class PeerNode:
         return [] if heard is None else self._ask(heard[1])
 
     def _ask(self, summary: m.SetSummary) -> list[Outgoing]:
-        request = wanted(self.replica, summary, self._asked)
+        request = request_for(self.replica, summary, self._asked)
         if request is None:
             return []
         until = self._now_s + PATIENCE_S, summary.node
@@ -241,7 +241,7 @@ class PeerNode:
         asked = m.MembersRequest(
             stamp_ns=request.stamp_ns,
             node=self.node,
-            wanted=request.wanted,
+            requested=request.requested,
             statements=request.statements,
         )
         return [Outgoing(ch.MEMBERS, summary.node, asked)]

@@ -186,7 +186,7 @@ class RecordLoop:
             first, last = self._inventory.span(stream)
             _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
             if kind == "measurements":
-                wanted = MeasurementsRequest(
+                requested = MeasurementsRequest(
                     stamp_ns=self._newest_ns,
                     robot=robot,
                     incarnation=incarnation,
@@ -194,7 +194,7 @@ class RecordLoop:
                     last=last,
                     only=True,
                 )
-                self._bus.request(MEASUREMENTS, robot, wanted)
+                self._bus.request(MEASUREMENTS, robot, requested)
             else:
                 self._bus.request(
                     SENT,

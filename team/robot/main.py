@@ -93,8 +93,8 @@ class RobotShell:
 
     def look_for_gaps(self) -> None:
         """Ask the source for missing measurements of the stream."""
-        wanted = self.node.wanted()
-        self._missing.look(() if wanted is None else (wanted,))
+        requested = self.node.request()
+        self._missing.look(() if requested is None else (requested,))
         if time.monotonic() >= self._log_due_s:
             lost = self._complete_log()
             self._log_look_s = min(2.0 * self._log_look_s, LOG_RARELY_S) if lost else LOG_LOOK_S
@@ -112,7 +112,7 @@ class RobotShell:
             used = min(last, self.node.next_measurement - 1) if here else last
             if first <= used:
                 lost = True
-                wanted = m.MeasurementsRequest(
+                requested = m.MeasurementsRequest(
                     stamp_ns=0,
                     robot=self.node.robot,
                     incarnation=incarnation,
@@ -120,7 +120,7 @@ class RobotShell:
                     last=used,
                 )
                 try:
-                    self.bus.ask(ch.MEASUREMENTS, self.node.robot, wanted, ASK_TIMEOUT_S)
+                    self.bus.ask(ch.MEASUREMENTS, self.node.robot, requested, ASK_TIMEOUT_S)
                 except BusError as error:
                     _LOG.warning("its own log lacks measurements %d to %d: %s", first, used, error)
                     break
@@ -163,9 +163,9 @@ class RobotShell:
 
     def _resume(self) -> bool:
         """Take over the submaps of an earlier process from the centre; False if there are none."""
-        wanted = m.SubmapsRequest(stamp_ns=0, robot=self.node.robot)
+        requested = m.SubmapsRequest(stamp_ns=0, robot=self.node.robot)
         try:
-            replies = self.bus.ask(ch.SUBMAPS, "", wanted, ASK_TIMEOUT_S)
+            replies = self.bus.ask(ch.SUBMAPS, "", requested, ASK_TIMEOUT_S)
         except BusError as error:  # a centre that does not answer: the same submaps once more
             _LOG.warning("%s", error)
             return False

@@ -138,7 +138,7 @@ class RobotNode:
         orders = (ch.ORDER, ch.WITHDRAWAL)
         return (*orders, ch.RENDEZVOUS) if self._outbox.buffers else orders
 
-    def wanted(self) -> m.MeasurementsRequest | None:
+    def request(self) -> m.MeasurementsRequest | None:
         """The measurements that are missing and must be asked for at their source."""
         missing = self._stream_end.missing()
         if missing is None:

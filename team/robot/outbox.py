@@ -86,7 +86,7 @@ class Outbox:
         """The answer to `SubmapsRequest`: everything sent for fusion, also by an earlier
         process.
         """
-        wanted = decoded(request, m.SubmapsRequest)
-        if wanted.robot != self._robot:
+        requested = decoded(request, m.SubmapsRequest)
+        if requested.robot != self._robot:
             return []
-        return [encoded(message) for message in self._sent.wanted(wanted)]
+        return [encoded(message) for message in self._sent.answer(requested)]

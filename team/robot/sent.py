@@ -31,12 +31,14 @@ class Sent:
             case _:
                 pass
 
-    def wanted(self, wanted: m.SubmapsRequest) -> Iterator[m.Message]:
+    def answer(self, request: m.SubmapsRequest) -> Iterator[m.Message]:
         """Answer a request: of each incarnation its initial pose, then factors and submaps by
         sequence.
         """
-        for incarnation in sorted(self.starts) if wanted.incarnation == 0 else [wanted.incarnation]:
-            first = wanted.first if wanted.incarnation else 0
+        for incarnation in (
+            sorted(self.starts) if request.incarnation == 0 else [request.incarnation]
+        ):
+            first = request.first if request.incarnation else 0
             if incarnation in self.starts:
                 yield self.starts[incarnation]
             factors = self.factors.get(incarnation, {})

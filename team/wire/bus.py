@@ -249,7 +249,7 @@ class MemoryBus:
     def __init__(self, network: MemoryNetwork) -> None:
         self._network = network
         self._arrived: deque[Sample] = deque()
-        self._wanted: list[tuple[Channel, str]] = []
+        self._requested: list[tuple[Channel, str]] = []
         self._whole: set[str] = set()
         self._known: dict[str, bool] = {}
         self._counters: dict[str, int] = defaultdict(int)
@@ -271,20 +271,20 @@ class MemoryBus:
         """Receive this channel, what is kept for late joiners first."""
         for key, kept in self._network.kept.items():
             if _is_of(channel, name, key) and not self._subscribed(key):
-                wanted = list(kept) if whole or channel.delivery == "all" else [kept[-1]]
-                self._arrived.extend(sample for source, sample in wanted if source is not self)
+                requested = list(kept) if whole or channel.delivery == "all" else [kept[-1]]
+                self._arrived.extend(sample for source, sample in requested if source is not self)
         if whole:
             self._whole.add(channel.name)
         self._want(channel, name)
 
     def _want(self, channel: Channel, name: str) -> None:
-        self._wanted.append((channel, name))
+        self._requested.append((channel, name))
         self._known.clear()
 
     def _subscribed(self, key: str) -> bool:
         known = self._known.get(key)
         if known is None:
-            known = any(_is_of(channel, name, key) for channel, name in self._wanted)
+            known = any(_is_of(channel, name, key) for channel, name in self._requested)
             self._known[key] = known
         return known
 

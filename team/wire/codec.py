@@ -117,10 +117,12 @@ def _kind(fields: object, expected: tuple[type[Message], ...]) -> type[Message]:
     kind = BY_TAG.get(tag)
     if kind is not None and (not expected or kind in expected):
         return kind
-    wanted = [str(each.__struct_config__.tag) for each in expected]
+    requested = [str(each.__struct_config__.tag) for each in expected]
     name = tag[:60].partition("/")[0]
-    known = [t for t in wanted or BY_TAG if t.startswith(f"{name}/")]
+    known = [t for t in requested or BY_TAG if t.startswith(f"{name}/")]
     if known:
         raise WireError("wrong version", f"{tag[:60]!r} where {', '.join(known)} is understood")
-    belongs = " or ".join(map(repr, wanted))
-    raise WireError("wrong tag", f"{tag[:60]!r}" + (f" where {belongs} belongs" if wanted else ""))
+    belongs = " or ".join(map(repr, requested))
+    raise WireError(
+        "wrong tag", f"{tag[:60]!r}" + (f" where {belongs} belongs" if requested else "")
+    )

@@ -135,11 +135,11 @@ def robot_with(count):
 
 def test_a_robot_asks_for_what_its_driver_has_numbered_and_it_has_not():
     node, measured = robot_with(5)
-    assert node.wanted() is None
+    assert node.request() is None
     node.handle(head("r1", 12, "open"), 0)
-    assert (node.wanted().first, node.wanted().last) == (5, 11)
+    assert (node.request().first, node.request().last) == (5, 11)
     node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False), 0)
-    assert node.wanted() is None
+    assert node.request() is None
     assert "its driver is away after measurement 4" in node.status().warnings[0]
     assert len(measured) > 12
 

@@ -5,7 +5,7 @@ import random
 import msgspec
 import pytest
 
-from team.peers.exchange import MOST_ASKED, answered, wanted
+from team.peers.exchange import MOST_ASKED, answered, request_for
 from team.peers.members import LARGEST_MEMBER, Member, member_of
 from team.peers.node import GIVEN_BYTES, PeerNode
 from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica, intervals
@@ -59,7 +59,7 @@ def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> Non
         for each in out:
             if each.channel is ch.MEMBERS:
                 asked.append(each.name)
-                assert sum(1 + w.last - w.first for w in each.message.wanted) <= MOST_ASKED
+                assert sum(1 + w.last - w.first for w in each.message.requested) <= MOST_ASKED
                 if each.name == "robot/r2":
                     for reply in honest.answer(encoded(each.message)):
                         node.take_carried(decoded(reply, m.Members))
@@ -74,8 +74,8 @@ def test_questions_without_end_are_given_so_many_bytes_a_second() -> None:
     node = PeerNode("robot/r1", ("r1", "r2"))
     for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
         node.take(each, "robot/r2")
-    want = m.Wanted(robot="r2", incarnation=1, start=True, first=0, last=39)
-    request = encoded(m.MembersRequest(stamp_ns=0, node="robot/r2", wanted=(want,)))
+    want = m.Requested(robot="r2", incarnation=1, start=True, first=0, last=39)
+    request = encoded(m.MembersRequest(stamp_ns=0, node="robot/r2", requested=(want,)))
     one = sum(map(len, node.answer(request)))
     node._given.note("robot/r2", GIVEN_BYTES)
     assert one > 0
@@ -119,12 +119,12 @@ def test_a_summary_names_gaps_and_what_is_asked_for_is_what_lacks() -> None:
     (holding,) = here.summary("", 0, 0).holdings
     assert holding.sequences == (0, 1, 4, 5, 8, 8)
     there = replica_of(*parcels[:7])
-    asked = wanted(here, there.summary("robot/r2", 0, 0))
+    asked = request_for(here, there.summary("robot/r2", 0, 0))
     assert asked is not None
-    assert [(w.start, w.first, w.last) for w in asked.wanted] == [(False, 2, 3), (False, 6, 6)]
-    back = wanted(there, here.summary("robot/r1", 0, 0))
+    assert [(w.start, w.first, w.last) for w in asked.requested] == [(False, 2, 3), (False, 6, 6)]
+    back = request_for(there, here.summary("robot/r1", 0, 0))
     assert back is not None
-    assert [(w.start, w.first, w.last) for w in back.wanted] == [(True, 8, 8)]
+    assert [(w.start, w.first, w.last) for w in back.requested] == [(True, 8, 8)]
 
 
 def test_two_peers_that_ask_each_other_end_with_one_set() -> None:
@@ -134,7 +134,7 @@ def test_two_peers_that_ask_each_other_end_with_one_set() -> None:
     )
     for _ in range(3):
         for asker, answerer in ((one, other), (other, one)):
-            request = wanted(asker, answerer.summary("robot/r2", 0, 0))
+            request = request_for(asker, answerer.summary("robot/r2", 0, 0))
             for batch in [] if request is None else answered(answerer, request, "robot/r2"):
                 for key, payload in zip(batch.keys, batch.payloads, strict=True):
                     asker.add(member_of(key, payload))
@@ -168,11 +168,11 @@ def test_what_is_asked_for_is_bounded_whatever_a_summary_claims() -> None:
     summary = m.SetSummary(
         stamp_ns=0, node="robot/r2", serial=0, digest=bytes(8), holdings=(claim,), statements=()
     )
-    asked = wanted(replica_of(), summary)
+    asked = request_for(replica_of(), summary)
     assert asked is not None
-    assert sum(w.last - w.first + 1 for w in asked.wanted) == MOST_ASKED
+    assert sum(w.last - w.first + 1 for w in asked.requested) == MOST_ASKED
     strange = msgspec.structs.replace(claim, robot="r9")
-    assert wanted(replica_of(), msgspec.structs.replace(summary, holdings=(strange,))) is None
+    assert request_for(replica_of(), msgspec.structs.replace(summary, holdings=(strange,))) is None
 
 
 def test_what_is_no_member_is_refused_at_the_door() -> None:
@@ -214,4 +214,4 @@ def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn() 
     one, other = replica_of(*told), replica_of(*reversed(told), told[0])
     assert digest_of(one) == digest_of(other)
     assert {each.payload for each in one.members()} == {each.payload for each in told}
-    assert wanted(replica_of(*told[:2]), one.summary("n", 0, 0)) is not None
+    assert request_for(replica_of(*told[:2]), one.summary("n", 0, 0)) is not None

@@ -312,31 +312,31 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
 
 def test_missing_measurements_are_asked_for():
     node = RobotNode(config())
-    assert node.wanted() is None
+    assert node.request() is None
     node.handle(MEASUREMENTS[3], 0)
-    assert node.wanted() == m.MeasurementsRequest(
+    assert node.request() == m.MeasurementsRequest(
         stamp_ns=0, robot="r1", incarnation=1, first=0, last=2
     ), "the very first ones too"
     for measurement in MEASUREMENTS[:3]:
         node.handle(measurement, 0)
-    assert node.wanted() is None
+    assert node.request() is None
     node.handle(MEASUREMENTS[8], 0)
-    wanted = node.wanted()
+    wanted = node.request()
     assert (wanted.incarnation, wanted.first, wanted.last) == (1, 4, 7)
     for measurement in MEASUREMENTS[4:8]:
         node.handle(measurement, 0)
     node.handle(END, 0)
-    wanted = node.wanted()
+    wanted = node.request()
     assert (wanted.incarnation, wanted.first, wanted.last) == (1, 9, len(MEASUREMENTS) - 1)
     for measurement in MEASUREMENTS[9:]:
         node.handle(measurement, 0)
-    assert node.wanted() is None
+    assert node.request() is None
 
 
 def test_a_stream_that_was_missed_entirely_is_asked_for_at_its_end():
     node = RobotNode(config())
     node.handle(END, 0)
-    wanted = node.wanted()
+    wanted = node.request()
     assert (wanted.incarnation, wanted.first, wanted.last) == (1, 0, len(MEASUREMENTS) - 1)
 
 

@@ -49,7 +49,7 @@ class Style:
     only: Picture | None = None
 
     @property
-    def wanted(self) -> tuple[Picture, ...]:
+    def drawn(self) -> tuple[Picture, ...]:
         """The pictures that are drawn."""
         return tuple(Picture) if self.only is None else (self.only,)
 

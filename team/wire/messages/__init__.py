@@ -72,10 +72,10 @@ from team.wire.messages.peers import FoldRequest as FoldRequest
 from team.wire.messages.peers import Holding as Holding
 from team.wire.messages.peers import Members as Members
 from team.wire.messages.peers import MembersRequest as MembersRequest
+from team.wire.messages.peers import Requested as Requested
 from team.wire.messages.peers import SetSummary as SetSummary
 from team.wire.messages.peers import Signature as Signature
 from team.wire.messages.peers import Statements as Statements
-from team.wire.messages.peers import Wanted as Wanted
 from team.wire.messages.submaps import CLUTTER as CLUTTER
 from team.wire.messages.submaps import UNCONFIRMED as UNCONFIRMED
 from team.wire.messages.submaps import Association as Association

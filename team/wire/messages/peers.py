@@ -54,7 +54,7 @@ class SetSummary(Message, frozen=True, kw_only=True, tag="set_summary/1"):
                 raise ValueError("not ascending: sequences")
 
 
-class Wanted(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+class Requested(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """Of one stream: its initial pose if `start`, and submaps first … last (none: last < first)."""
 
     robot: Name
@@ -71,7 +71,7 @@ class MembersRequest(Message, frozen=True, kw_only=True, tag="members_wanted/1")
     """
 
     node: Text
-    wanted: tuple[Wanted, ...]
+    requested: tuple[Requested, ...]
     statements: tuple[Name, ...] = ()
 
 

@@ -75,7 +75,7 @@ class ZenohBus:
         self._queue: SimpleQueue[_Item] = SimpleQueue()
         self._publishers: dict[str, Publisher] = {}
         self._counters: dict[str, int] = {}
-        self._wanted: set[tuple[str, str]] = set()
+        self._requested: set[tuple[str, str]] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._published: dict[str, int] = {}
         self._newest_ns = 0
@@ -170,13 +170,13 @@ class ZenohBus:
         whole: of a `latest` channel not the newest one, but all that the publishers still have.
         """
         self._check_open()
-        if {(channel.name, "*"), (channel.name, name)} & self._wanted:
+        if {(channel.name, "*"), (channel.name, name)} & self._requested:
             return
-        if name == "*" and any(wanted == channel.name for wanted, _ in self._wanted):
+        if name == "*" and any(requested == channel.name for requested, _ in self._requested):
             raise BusError(
                 f"{channel.name}: subscribed by name already, so `*` would deliver twice"
             )
-        self._wanted.add((channel.name, name))
+        self._requested.add((channel.name, name))
         if whole:
             self._recovery.take_whole(channel.name)
         key = self._prefix + channel.key(_every(channel, name))

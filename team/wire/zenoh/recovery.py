@@ -124,11 +124,11 @@ class Recovery:
         late: list[Sample] = []
         for key, publisher in sorted(self._incomplete):
             arrivals = self._arrivals[key, publisher]
-            wanted = arrivals.due(now_s)
+            requested = arrivals.due(now_s)
             if arrivals.missing is None:
                 self._incomplete.discard((key, publisher))
-            elif wanted is not None:
-                self._ask_cache(key, publisher, *wanted)
+            elif requested is not None:
+                self._ask_cache(key, publisher, *requested)
             late += arrivals.overdue(now_s)
         return late
 

@@ -144,7 +144,7 @@ def test_it_waits_for_every_robots_models_start_and_last_measurement(fusion):
 @pytest.mark.parametrize("fusion", RULES)
 def test_missing_measurements_are_asked_for(fusion):
     node, _ = heard(fusion, (x for x in everything() if x not in MEASUREMENTS["r1"][4:6]))
-    assert node.wanted() == [
+    assert node.requests() == [
         m.MeasurementsRequest(
             stamp_ns=node.status().stamp_ns, robot="r1", incarnation=1, first=4, last=5
         )
@@ -152,7 +152,7 @@ def test_missing_measurements_are_asked_for(fusion):
     for measurement in MEASUREMENTS["r1"][4:6]:
         node.handle(measurement, 0)
     assert node.finished
-    assert node.wanted() == []
+    assert node.requests() == []
 
 
 @pytest.mark.parametrize("fusion", RULES)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from central.config import BiasSigmas
 from sim.scenarios.scenario import Scenario
-from sim.studies.batch_reference.errors import add_errors, bias_key, looks_of, profile_graph
+from sim.studies.batch_reference.errors import add_errors, bias_key, detections_of, profile_graph
 from sim.studies.batch_reference.graph import pose_key, values_of
 from sim.studies.batch_reference.measurements import Chain, Scan, chains_of
 from sim.studies.batch_reference.reference import batch_map
@@ -59,7 +59,7 @@ def standing(sensor: Sensor, robot: str = "r1", start: Pose | None = None) -> Ch
 
 def marginal_cost(chain: Chain, shares: tuple[float, float]) -> float:
     """rᵀ(C + H B Hᵀ)⁻¹r of all measurements at once, by the definition of the process."""
-    looks = looks_of([chain])
+    looks = detections_of([chain])
     times = 1e-9 * chain.stamps_ns[[look.pose for look in looks]]
     same = np.equal.outer([look.landmark for look in looks], [look.landmark for look in looks])
     gaps = np.abs(np.subtract.outer(times, times))
@@ -121,7 +121,7 @@ def test_the_derivatives_are_those_of_the_residuals() -> None:
     graph = profile_graph(gtsam, [chain], poses, LANDMARKS, None, BiasSigmas())
     values = add_errors(gtsam, values_of(gtsam, poses, LANDMARKS), [chain])
     values.update(bias_key(0), np.array([0.02, 0.01, 0.03]))
-    for look in looks_of([chain]):
+    for look in detections_of([chain]):
         values.update(look.key, np.array([0.7, -0.4]))
     linear = graph.linearize(values)
     step = linear.optimize()
