@@ -16,7 +16,14 @@ from jaxtyping import Bool, Float, Int64
 from team.config import UNNAMED
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.map_joining.association.crowding import Crowd
-from team.estimation.map_joining.association.growing import Indices, Joint, Pair, conditioned, grow
+from team.estimation.map_joining.association.growing import (
+    Indices,
+    Joint,
+    Pair,
+    conditioned,
+    grow,
+    likelihoods,
+)
 from team.estimation.map_joining.association.hypotheses import jointly
 from team.estimation.map_joining.association.landmarks import (
     Landmarks,
@@ -128,7 +135,16 @@ class View:
         if len(later):
             one, two = at[later], at[earlier]
             close = np.hypot(*(self.joint.mean[one] - self.joint.mean[two]).T) < self.profile.same
+            close &= ~self._left_apart(one, two)
             self._grow("sweep", one[close], two[close], self.profile.tight)
+
+    def _left_apart(self, one: Indices, two: Indices) -> Bool[np.ndarray, " k"]:
+        """Pairs that one window had and did not make one, unless all speaks for it by now."""
+        own = np.zeros((len(self.ids), len(self.ids)), np.bool_)
+        for places in self.seen_by:
+            own[np.ix_(places, places)] = True
+        at = likelihoods(self.joint, one, two, self.profile)
+        return np.asarray(own[one, two] & (at.llr < self.profile.odds))
 
     def agreed(self, landmarks: Landmarks) -> None:
         """What an operator has said to be one."""

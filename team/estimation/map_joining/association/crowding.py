@@ -20,7 +20,7 @@ from team.estimation.submap import LocalMap
 CLOSE = 0.1
 """The spacing that so large a part of the landmarks falls short of is taken for that of groups."""
 FEWEST = 10
-"""From so many landmarks with a neighbour on their spacing is known."""
+"""Of fewer landmarks with a neighbour the smallest spacing is taken."""
 SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
 """A profile's lengths are so many of these spacings at the most."""
 
@@ -52,9 +52,10 @@ class Crowd:
 
     def bounded(self, profile: AssociationProfile) -> AssociationProfile:
         """The profile with lengths that tell neighbours apart."""
-        if len(self.nearest) < FEWEST:
+        if not len(self.nearest):
             return profile
-        spacing = float(np.quantile(self.nearest, CLOSE))
+        share = CLOSE if len(self.nearest) >= FEWEST else 0.0
+        spacing = float(np.quantile(self.nearest, share))
         return msgspec.structs.replace(
             profile,
             same=min(profile.same, SAME * spacing),

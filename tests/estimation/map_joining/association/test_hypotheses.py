@@ -61,6 +61,8 @@ def test_a_profiles_lengths_are_bounded_by_the_spacing_of_what_is_seen_together(
     assert bounded.near == PROFILE.near
     within = crowd.density(np.array([0.3]))[0]
     assert within == pytest.approx(1.0 / (np.pi * 0.3**2), rel=0.1)
+    few = Crowd([_submap(groups[:3], together=True)]).bounded(AssociationProfile(same=1.7))
+    assert few.same == pytest.approx(0.3)
     nobody = Crowd([_submap(groups, together=False)])
     assert nobody.bounded(PROFILE) == PROFILE
     assert nobody.density(np.array([0.3]))[0] < 0.1 * within
