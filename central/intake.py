@@ -1,7 +1,8 @@
-"""What a fusion rule rests on, and who files it: the messages of the robots, as they come.
+"""The inputs of a fusion rule, and their collection from the messages of the robots.
 
-An intake files and acknowledges; it folds nothing and does not know when a map is due. That says
-the scheduler (`central.scheduler`), by the rule's own clock and by what the intake has.
+An intake files and acknowledges messages; it does not fold, and does not decide when a map is due.
+That is done by the scheduler (`central.scheduler`), by the rule's own clock and by what the intake
+has.
 """
 
 from abc import ABC, abstractmethod
@@ -23,12 +24,11 @@ broadcast_s; at every instant."""
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """What one map rests on; each intake adds what it collects.
+    """The inputs of one map; each intake adds what it collects.
 
-    closed_ns: no input that ends up to here is still to come. ahead: inputs behind it are in the
-    map, too. recorded: a recorded map has named them, so they are all that it rests on: nobody is
-    convicted beside those whom they leave out, and every message that goes with the map is made.
-    now_ns: team time.
+    closed_ns: every input that ends up to here has arrived. ahead: later inputs are in the map,
+    too. recorded: the inputs are those that a recorded map has named: no further robot is
+    withdrawn, and every message that goes with the map is made. now_ns: team time.
     """
 
     closed_ns: float = float("inf")
@@ -39,7 +39,7 @@ class Inputs:
 
 @dataclass(frozen=True, kw_only=True)
 class MapInputs(Inputs):
-    """The robots' own maps; exchange: the round that they are of, of rules in lockstep."""
+    """The robots' own maps; exchange: their round, for rules in lockstep."""
 
     maps: Sequence[m.MapEstimate] = ()
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
@@ -62,11 +62,11 @@ class Instant(Generic[I]):
 
 
 class Intake(ABC, Generic[I]):
-    """Files what a rule rests on; knows what is here and what is waited for.
+    """Files the inputs of a rule; knows which have arrived and which are waited for.
 
     listens: the channels whose messages it takes. due: when a running map of it is. orders: robots
-    that the team goes on without, by an order. withdrawn: those, and whom the rule has convicted.
-    warnings: what went wrong, the newest last. refused: messages that were.
+    that the team goes on without, by an order. withdrawn: those, and the robots that the rule has
+    withdrawn. warnings: in words, the newest last. refused: number of refused messages.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]]
@@ -81,22 +81,22 @@ class Intake(ABC, Generic[I]):
 
     @abstractmethod
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """File one message; the credit that it gives."""
+        """File one message; returns the credit that it gives."""
 
     @abstractmethod
     def inputs(self, closed_ns: float, now_ns: int) -> I:
-        """All that is here."""
+        """Everything that is here."""
 
     @abstractmethod
     def instants(self, attendance: TeamAttendance) -> Iterator[Instant[I]]:
-        """The instants at which a map may be due, those that are over by now."""
+        """The instants until now at which a map may be due."""
 
     def members(self, until_ns: float) -> Mapping[Stream, int]:
-        """The last input of each stream that ends up to a time, as a map of them names it."""
+        """The last input of each stream that ends up to a time, as a map names it."""
         return {}
 
     def admit(self, robot: str) -> None:
-        """From now on the robot is in the team."""
+        """Add a robot to the team."""
 
     def dealt(self, done: m.Done) -> bool:
         """True once all messages announced in the robot's `Done` have arrived."""
@@ -104,25 +104,25 @@ class Intake(ABC, Generic[I]):
 
     @property
     def complete(self) -> bool:
-        """Whether everything of the streams that it needs itself is here."""
+        """Whether everything of the streams that the rule itself consumes is here."""
         return True
 
     def count(self, stream: Stream) -> int:
-        """How many submaps of a stream are in the map's reach, or will never be."""
+        """Number of submaps of a stream that are in the map's reach, or will never be."""
         return 0
 
     @property
     def submaps(self) -> int:
-        """How many submaps it has dealt with."""
+        """Number of submaps that were dealt with."""
         return 0
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What a reader of the map must know of what came."""
+        """Warnings about the inputs, for readers of the map."""
         return ()
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
-        """A message whose handling raised counts as refused; the credit that this gives."""
+        """Count a message whose handling raised as refused; returns the credit that this gives."""
         return []
 
     def kept(self, robot: str) -> Sequence[m.Message]:
@@ -134,9 +134,9 @@ class Intake(ABC, Generic[I]):
         return ()
 
     def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
-        """What robots say that they have sent, and what is not here."""
+        """What robots say that they have sent and is not here."""
         return []
 
     def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
-        """Measurements that are missing and must be asked for at their source."""
+        """Requests for missing measurements, for their source."""
         return []

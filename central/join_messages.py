@@ -1,4 +1,6 @@
-"""What the rule `join` says of a fold: the team's map, priors for its robots, their paths."""
+"""Makes the messages of the rule `join` from a fold: the team's map, priors for its robots,
+their paths.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -26,12 +28,13 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 
 PRIOR_LANDMARKS = 30
-"""Landmarks in a robot's prior at the most: the nearest ones."""
+"""Most landmarks in a robot's prior: the nearest ones."""
 CONFIRMED_BY = 2
-"""So many submaps have a landmark without a name that is in the final map: a few false detections
-in a row look like one in a single window. Running maps show what is tentative."""
+"""Least number of submaps of a landmark without identity in the final map: a few false
+detections in a row look like a landmark in a single window. Running maps show tentative ones,
+too."""
 NAMED = 10
-"""Landmarks that are left out of the map, and refusals, are named up to so many."""
+"""Most landmarks left out of the map, and most refusals, that are named."""
 
 
 def team_map(
@@ -106,7 +109,7 @@ def _landmarks(
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> list[int]:
-    """The landmarks that the map has, by ascending id."""
+    """The landmarks of the map, by ascending id."""
     if not fold.contributions:
         return []
     most = len(fold.main.graph.submaps) + fold.departed
@@ -117,7 +120,7 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> list[int]:
 def reasons(
     fold: Fold, shown: Sequence[int], biases: Sequence[BiasEstimate], landmark_submaps: int
 ) -> tuple[str, ...]:
-    """Why robots and landmarks are not in the map, and why it is to be doubted, in words."""
+    """Why robots and landmarks are not in the map, and warnings about it, in words."""
     return (
         *(fold.reasons[k] for k in sorted(fold.reasons)),
         *_worded(refusals(fold)),
@@ -129,7 +132,7 @@ def reasons(
 
 
 def _unconfirmed(fold: Fold, shown: Sequence[int], landmark_submaps: int) -> tuple[str, ...]:
-    """What is left out of the map, in words."""
+    """Landmarks left out of the map, in words."""
     known = fold.main.graph.landmarks.keys() if fold.contributions else set[int]()
     out = sorted(known - set(shown))
     if not out:
@@ -145,8 +148,8 @@ def _unconfirmed(fold: Fold, shown: Sequence[int], landmark_submaps: int) -> tup
 def priors(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, sent_priors: SentPriors | None
 ) -> list[Outgoing]:
-    """For the latest stream of every robot that is in the team's frame, if it has news; None: for
-    each.
+    """The prior of the latest stream of every robot in the team's frame for which it has new
+    information; None: of each.
     """
     if not fold.contributions:
         return []
@@ -175,7 +178,7 @@ def priors(
 def trajectories(
     fold: Fold, digest: bytes, submaps: Mapping[Stream, Sequence[m.Submap]]
 ) -> list[Outgoing]:
-    """The path of every stream that is in the team's frame: where its submaps end."""
+    """The path of every stream in the team's frame: the end poses of its submaps."""
     paths = []
     for robot, incarnation in sorted(fold.home):
         if fold.home[(robot, incarnation)] != fold.main_key:
@@ -197,7 +200,7 @@ def trajectories(
 
 
 def _waiting(fold: Fold) -> list[Decision]:
-    """Merges of robots by their maps that wait, by whom they are about."""
+    """Merges of robots by their maps that wait, by the robots."""
     waits = fold.landmarks.waits
     return [waits[of] for of in sorted(waits) if of[1] in fold.islands and of[0] != of[1]]
 

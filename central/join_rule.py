@@ -28,10 +28,10 @@ from team.wire.digest import digest_of
 
 
 class JoinRule(FusionRule[SubmapInputs]):
-    """Keeps the fold of a set that grows; a set without what is folded is folded anew.
+    """Keeps the fold of a growing set; a set that lacks folded submaps is folded anew.
 
-    finding: of the monitor, on the newest map. reasons: why robots are not joined, or it is to be
-    doubted.
+    finding: of the monitor, on the newest map. reasons: why robots are not joined, and warnings
+    about the map.
     """
 
     intake = SubmapIntake
@@ -64,7 +64,9 @@ class JoinRule(FusionRule[SubmapInputs]):
         return self._said(inputs, fold, tail)
 
     def _file(self, inputs: SubmapInputs) -> None:
-        """Put what is new into its tick; what was folded already is folded again with it."""
+        """File the new submaps by tick; ticks that were folded already are folded again with
+        them.
+        """
         submaps, ticks = inputs.submaps, self._ticks
         if not self._gone.issubset(inputs.withdrawn) or any(
             len(submaps.get(stream, ())) < filed for stream, filed in self._filed.items()
@@ -90,21 +92,23 @@ class JoinRule(FusionRule[SubmapInputs]):
 
     @property
     def convicted(self) -> Mapping[str, str]:
-        """Whom the fold has found to be wrong beyond doubt."""
+        """The robots that the fold has withdrawn."""
         return self._ticks.convicted
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """What the monitor has found."""
+        """The monitor's figures."""
         return self.finding.figures
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """The monitor's, and why robots are not joined or the map is to be doubted, in words."""
+        """The monitor's warnings, why robots are not joined, and warnings about the map, in
+        words.
+        """
         return (*self.finding.warnings, *self.reasons)
 
     def _said(self, inputs: SubmapInputs, fold: Fold, tail: Tail) -> list[Outgoing]:
-        """The map of a fold, with priors or, at the end, the whole paths."""
+        """The messages of a fold: the map, with priors or, at the end, the whole paths."""
         ticks, final = self._ticks, tail == "final"
         digest = ticks.digest(fold, self.config_digest, tail.encode())
         agreement = ticks.agreement(fold) if fold.contributions else None
@@ -137,7 +141,7 @@ class JoinRule(FusionRule[SubmapInputs]):
         return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *with_it]
 
     def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """What every receiver takes; the rest is withheld and named."""
+        """The messages that every receiver accepts; others are withheld and named."""
         sound = []
         for each in out:
             why = unsound(each.message)

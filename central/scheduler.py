@@ -1,9 +1,9 @@
 """When a map is due: the one scheduler of every fusion rule.
 
 Team time is cut into ticks, whose submaps are folded together, and into broadcasts. A running map
-is *closed* where nothing of the time that it speaks of can still come, else *provisional*; the
-*final* one comes at the end. What a map says is the rule's business (`central.rule`), what it rests
-on its intake's (`central.intake`).
+is *closed* where every input up to its time has arrived, else *provisional*; the *final* one comes
+at the end. The rule (`central.rule`) makes the map, its intake (`central.intake`) collects the
+inputs.
 """
 
 import math
@@ -20,8 +20,8 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 PATIENCE = 3.0
-"""What a robot that has stalled holds back goes out provisionally after so many broadcasts, or
-ticks where these are longer."""
+"""Number of broadcasts, or of ticks where these are longer, after which a map goes out
+provisionally although a robot has stalled."""
 
 
 class Scheduler:
@@ -41,16 +41,16 @@ class Scheduler:
         self._announced: dict[str, str] = {}
 
     def admit(self, robot: str) -> None:
-        """From now on the robot is in the team."""
+        """Add a robot to the team."""
         self.rule.admit(robot)
         self.intake.admit(robot)
 
     def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """What is due at each instant that is over by now."""
+        """The maps that are due at the instants until now."""
         return [each for instant in self.intake.instants(attendance) for each in self.at(instant)]
 
     def refresh(self, attendance: TeamAttendance) -> list[Outgoing]:
-        """A map of all that is here at once, though none is due, if the last one lacks something.
+        """A map of everything that is here, at once, if the last one lacks something.
 
         It waits for no tick's end and no teammate: what lies ahead of the watermark is provisional.
         Rules with a clock of their own have none.
@@ -64,11 +64,11 @@ class Scheduler:
         return out
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
-        """The last messages, the final map behind all others."""
+        """The last messages, the final map after all others."""
         return self._said(self.intake.inputs(math.inf, now_ns), "final")
 
     def at(self, instant: Instant[Any]) -> list[Outgoing]:
-        """Fold what is closed at an instant; a map if one is due."""
+        """Fold what is closed at an instant; returns a map if one is due."""
         inputs, now_ns = instant.inputs, instant.now_ns
         out = self.rule.take(inputs)
         convictions = self._convictions(now_ns)
@@ -91,20 +91,20 @@ class Scheduler:
         return due == "period" or self._is_news(instant.inputs.closed_ns)
 
     def _is_news(self, until_ns: float) -> bool:
-        """Whether an input up to then is not in the last map."""
+        """Whether an input up to this time is missing in the last map."""
         return _lacks(self._published, self._members(until_ns))
 
     def _members(self, until_ns: float) -> Mapping[Stream, int]:
-        """What a map of all inputs up to then names."""
+        """The inputs up to this time, as a map names them."""
         gone = self.intake.withdrawn
         return {s: n for s, n in self.intake.members(until_ns).items() if s[0] not in gone}
 
     def _newest(self, inputs: Inputs) -> list[Outgoing]:
-        """The map of the ticks that are closed; of all that is here if that is more.
+        """The map of the closed ticks, or of everything that is here if that is more.
 
-        What a teammate has just closed is worth most to who sees the same landmarks, so it does not
-        wait for the end of its tick. And no map has less than the one before it: what lies ahead of
-        the watermark is in a provisional map and not yet in a closed one.
+        A teammate's new submap is worth most to robots that measure the same landmarks, so it does
+        not wait for the end of its tick. And no map has less than the one before it: submaps ahead
+        of the watermark are in a provisional map and not yet in a closed one.
         """
         whole = self._members(self._ticks_end_ns(inputs.closed_ns))
         gone = self.intake.withdrawn
@@ -114,7 +114,7 @@ class Scheduler:
         return self._said(replace(inputs, ahead=False), "closed")
 
     def _whole(self, inputs: Inputs) -> list[Outgoing]:
-        """The map of all that is here, closed if nothing of it is ahead of the watermark."""
+        """The map of everything that is here, closed if nothing of it is ahead of the watermark."""
         ahead = _lacks(self._members(inputs.closed_ns), self._members(math.inf))
         return self._said(inputs, "provisional" if ahead else "closed")
 
@@ -123,7 +123,7 @@ class Scheduler:
         return closed_ns if math.isinf(closed_ns) else closed_ns // self._tick_ns * self._tick_ns
 
     def _said(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
-        """A map and what goes out with it; before them whom it convicts."""
+        """A map and the messages that go out with it, after the withdrawals that it causes."""
         out = self.rule.fuse(inputs, tail)
         self._said_ns = self._quiet_ns = inputs.now_ns
         maps = [each.message for each in out if isinstance(each.message, m.FusedMap)]
@@ -133,7 +133,9 @@ class Scheduler:
         return [*self._convictions(inputs.now_ns), *out]
 
     def _convictions(self, now_ns: int) -> list[Outgoing]:
-        """Whom the fold has convicted since this was asked last; what came late may acquit."""
+        """The robots that the fold has withdrawn since the last call; late inputs may take a
+        withdrawal back.
+        """
         found = self.rule.convicted
         self.intake.withdrawn = tuple(sorted(self.intake.orders | found.keys()))
         for robot in sorted(self._announced.keys() - found.keys()):

@@ -1,4 +1,4 @@
-"""The submaps of a team: the set, credit for each of them, orders, and who lacks what."""
+"""The submaps of a team: the set, the credit for each of them, orders, and missing submaps."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -23,11 +23,11 @@ def _none(_submap: m.Submap) -> Sequence[m.SightingFactor]:
 
 @dataclass(frozen=True, kw_only=True)
 class SubmapInputs(Inputs):
-    """A set of submaps, and what is said of them.
+    """A set of submaps, and orders and verdicts about it.
 
     starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
-    from a submap. withdrawn: whom the team goes on without by an order. verdicts: an operator's on
-    unnamed landmarks. missing: what streams wait for. heard: how much was, for who compares maps.
+    from a submap. withdrawn: robots withdrawn by an order. verdicts: an operator's on unnamed
+    landmarks. missing: what streams wait for. heard: how much has arrived, to compare maps by.
     """
 
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
@@ -40,7 +40,7 @@ class SubmapInputs(Inputs):
 
 
 class SubmapIntake(Intake[SubmapInputs]):
-    """A set of submaps; every submap is acknowledged when nobody need send it any more."""
+    """Collects a set of submaps; every submap is acknowledged when nobody need send it any more."""
 
     listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.ORDER, ch.WITHDRAWALS_HEARD, ch.VERDICT)
 
@@ -54,7 +54,7 @@ class SubmapIntake(Intake[SubmapInputs]):
         self._no_more: set[Verdict] = set()
 
     def admit(self, robot: str) -> None:
-        """From now on the robot may be heard of others."""
+        """Add a robot to the team."""
         self._withdrawal_witnesses.admit(robot)
 
     # What goes into a map.
@@ -99,9 +99,7 @@ class SubmapIntake(Intake[SubmapInputs]):
     # What comes.
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Admit a submap or an inter-robot measurement; the last inter-robot measurement of a
-        submap completes it.
-        """
+        """Admit a submap or an inter-robot factor; the last factor of a submap completes it."""
         match message:
             case m.InitialPose():
                 self.take_start(message)
@@ -123,24 +121,28 @@ class SubmapIntake(Intake[SubmapInputs]):
         return []
 
     def take_start(self, start: m.InitialPose) -> None:
-        """A stream begins; its submaps wait for this."""
+        """Begin a stream, for which its submaps wait."""
         stream = (start.robot, start.incarnation)
         self._starts.setdefault(stream, start)
 
     def take_submap(self, submap: m.Submap) -> int:
-        """Admit a submap; how many of its stream have been dealt with."""
+        """Admit a submap; returns how many of its stream have been dealt with."""
         stream = (submap.robot, submap.incarnation)
         self._judge(submap, self._set.admit(submap))
         return self._dealt_with(stream, self._set.count(stream))
 
     def take_sighting(self, sighting: m.SightingFactor) -> int:
-        """Admit an inter-robot measurement; how many submaps of its stream have been dealt with."""
+        """Admit an inter-robot factor; returns how many submaps of its stream have been dealt
+        with.
+        """
         stream = (sighting.robot, sighting.incarnation)
         self._judge(sighting, self._set.admit_sighting(sighting))
         return self._dealt_with(stream, self._set.count(stream))
 
     def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
-        """The team goes on without a robot; its submaps are still admitted, for whoever asks."""
+        """Withdraw a robot by an order; its submaps are still admitted, since others may request
+        them.
+        """
         robot, known = withdrawal.robot, self.withdrawn
         self.orders.add(robot)
         if robot not in known:
@@ -149,9 +151,8 @@ class SubmapIntake(Intake[SubmapInputs]):
             self.warnings.append(said)
 
     def _judge_landmarks(self, verdict: m.Verdict) -> None:
-        """An operator says that two unnamed landmarks are one, or two, or that it holds no more.
-
-        That it holds no more may come first.
+        """Take an operator's verdict that two unnamed landmarks are one or two, or its
+        withdrawal.
         """
         judged = verdict_of(verdict.judgement)
         if verdict.withdrawn:

@@ -1,15 +1,16 @@
 """The fold over the set in its canonical order, by ticks of team time, with its checkpoints.
 
-Tick b takes the submaps that end in (b·tick, (b + 1)·tick]. Behind the watermark every submap of a
-tick is there, so the fold is final; what comes late rolls it back to the checkpoint before.
+Tick b takes the submaps that end in (b·tick, (b + 1)·tick]. Before the watermark every submap of a
+tick has arrived, so the fold is final; a late submap rolls it back to the checkpoint before its
+tick.
 
-Who contradicts the rest beyond doubt is withdrawn by the fold itself: it is asked after the first
-tick of each broadcast's time and of the full solution, never when a broadcast happens to be due,
-and begins again without the robot. So who is withdrawn depends on the set alone, whenever and in
-whichever order it came.
+The fold itself withdraws a robot that contradicts the rest beyond chance, and begins again without
+it. It tests this after the first tick of each broadcast's time and of the full solution, never when
+a broadcast happens to be due. So a withdrawal depends on the set alone, not on the order or time of
+arrival.
 
-The running fold is bounded (`condensing`): what is old of it is condensed before each tick. The
-full solution is one of the raw set: it takes the ticks again that were condensed (but see FULL).
+The running fold is bounded (`condensing`): its old submaps are condensed before each tick. The full
+solution uses the raw submaps: it takes the condensed ticks again (but see FULL).
 """
 
 import math
@@ -45,12 +46,14 @@ from team.wire.messages import SightingFactor, Submap
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The errors that the whole team has."""
 GROWTH = 1.25
-"""Suspects whom nothing convicted are tried again when there are so many times the submaps."""
+"""Suspects that were not withdrawn are tested again once the number of submaps has grown by this
+factor."""
 FULL = 2000
-"""The full solution of so many submaps takes all ticks again; of more it is solved from where the
-running fold has them, since the ticks would take hours."""
+"""The full solution of up to this many submaps takes all ticks again; with more it starts from
+the running fold, since the ticks would take hours."""
 NEWEST = 8
-"""So many checkpoints are kept of the newest ticks, and of each time as long again before."""
+"""Number of newest ticks whose checkpoints are all kept; of older ones as many for each doubling
+of the age."""
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
@@ -105,10 +108,9 @@ def _spacing(age: int) -> int:
 class TickFold:
     """Holds the contributions by tick and the fold after each tick that has been taken.
 
-    convicted: whom the fold found to be wrong, with the reason in words; nobody, unless `convicts`.
-    bounded: what is old is condensed, but for the ticks up to `_raw_until`, behind which an island
-    whose frame had to turn was found to be condensed.
-    verdicts: an operator's on unnamed landmarks.
+    convicted: the robots that the fold has withdrawn, with the reason in words; none, unless
+    `convicts`. bounded: old submaps are condensed, except in ticks up to `_raw_until`, since a
+    condensed island's frame had to be turned there. verdicts: an operator's on unnamed landmarks.
     """
 
     def __init__(self, config: CentralConfig, bounded: bool = True) -> None:
@@ -130,7 +132,7 @@ class TickFold:
         self._agreed: tuple[Fold, Agreement] | None = None
 
     def know_start(self, start: InitialPoseFactor) -> None:
-        """Where a stream starts; to be told before its first submap is added."""
+        """Take a stream's initial pose, before its first submap is added."""
         self._starts[(start.robot, start.incarnation)] = start
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor] = ()) -> None:
@@ -145,10 +147,10 @@ class TickFold:
             self._roll_back(tick)
 
     def judge(self, verdicts: Collection[Verdict]) -> None:
-        """What an operator says of pairs of unnamed landmarks, in submaps that are here or to come.
+        """Take an operator's verdicts on pairs of unnamed landmarks, in present or future submaps.
 
-        The fold goes back to before the first tick that has both landmarks of what is new, or holds
-        no more.
+        The fold goes back to before the first tick with both landmarks of a verdict that is new or
+        withdrawn.
         """
         changed = self.verdicts.symmetric_difference(verdicts)
         if not changed:
@@ -161,7 +163,9 @@ class TickFold:
             self.take_until(until_ns)
 
     def _tick_judging(self, verdict: Verdict) -> int | None:
-        """The first tick with both landmarks' submaps behind it or in it; None: one is not here."""
+        """The first tick by which both landmarks' submaps have arrived; None while one is
+        missing.
+        """
         ticks = [self._tick_with.get(each[:3]) for each in verdict[:2]]
         known = [tick for tick in ticks if tick is not None]
         return max(known) if len(known) == len(ticks) else None
@@ -170,8 +174,8 @@ class TickFold:
         """Leave out a robot's submaps, and the inter-robot measurements by it or of it, now and in
         future.
 
-        What is left is what there would be had the robot never been; the fold goes back to the
-        checkpoint before it first said something, or was first seen, and takes the ticks again.
+        The result is that of a team without the robot: the fold goes back to the checkpoint before
+        the robot's first submap, or the first measurement of it, and takes the ticks again.
         """
         if robot in self._ordered:
             return
@@ -186,7 +190,7 @@ class TickFold:
     def without(self, robots: Collection[str]) -> "TickFold":
         """Another one of the same submaps without some robots' that has taken the same ticks.
 
-        It convicts nobody.
+        It withdraws no further robot.
         """
         other = self._other(self._bounded)
         other.convicts = False
@@ -216,7 +220,7 @@ class TickFold:
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
-        """The robots that the team goes on without."""
+        """The withdrawn robots."""
         return tuple(sorted(self._gone))
 
     @property
@@ -225,7 +229,7 @@ class TickFold:
         return (self._taken[-1].tick + 1) * self._tick_ns if self._taken else -math.inf
 
     def _roll_back(self, tick: int) -> None:
-        """Forget what was folded from a tick on, and with it who was convicted by it.
+        """Forget what was folded from a tick on, and withdrawals caused by it.
 
         The robot was left out from the first tick on: there is no checkpoint that still has it.
         """
@@ -260,8 +264,8 @@ class TickFold:
     def _take(self, tick: int) -> bool:
         """Take a tick; False if ticks before it are to be taken again.
 
-        If it convicts a robot there is none that is taken any more; if it has to move an island
-        that is condensed, none since then.
+        If it withdraws a robot, all ticks are taken again; if it has to move a condensed island,
+        those since it was condensed.
         """
         before = self._taken[-1] if self._taken else None
         try:
@@ -282,7 +286,7 @@ class TickFold:
         return True
 
     def _convict(self, fold: Fold, at: float) -> bool:
-        """Whether somebody is wrong beyond doubt; he is left out from the first tick on."""
+        """Whether a robot is withdrawn; it is then left out from the first tick on."""
         limit = self._config.withdraw_above
         if limit is None or not self.convicts or not fold.contributions:
             return False
@@ -312,7 +316,7 @@ class TickFold:
         return marginals.joint_cost(fold if fold.departed else converged(fold, self.settings))
 
     def solved(self) -> Fold:
-        """The full solution of everything that is there, without whom it convicts."""
+        """The full solution of everything that is here, without the robots that it withdraws."""
         self.take_until(math.inf)
         if self.fold.departed:
             raw = self._raw(self.fold, math.inf) if self.fold.size > FULL else self.fold
