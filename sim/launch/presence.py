@@ -1,4 +1,6 @@
-"""Who of a team is there, how far and how fast each is, by which clock, and who waits for whom."""
+"""Observes a running team: its nodes, their progress and rates, their clocks, and which wait for
+which.
+"""
 
 import time
 from dataclasses import dataclass, field
@@ -12,7 +14,7 @@ from team.wire.newer import later_head
 
 LOOK_S = 0.1
 APART_S = 1.0
-"""Clocks that are farther apart than this are named: a measurement is not so long on its way."""
+"""Clocks that differ by more than this [s] are named: no measurement is on its way for so long."""
 
 
 @dataclass
@@ -47,7 +49,7 @@ class Member:
 
 @dataclass
 class Presence:
-    """A team as it was seen for a while; members by node."""
+    """A team as observed for a while; members by node."""
 
     members: dict[str, Member] = field(default_factory=dict)
     heads: dict[str, m.StreamHead] = field(default_factory=dict)
@@ -58,7 +60,7 @@ class Presence:
         return self.members.setdefault(node, Member())
 
     def take(self, bus: Bus, for_s: float) -> None:
-        """Look for so long."""
+        """Observe the team for this time."""
         for channel in (ch.STATUS, ch.HEAD, ch.ROBOT_HEAD, ch.TEAM_END, ch.FINAL_MAP):
             bus.subscribe(channel)
         bus.watch_alive()
@@ -93,7 +95,7 @@ class Presence:
 
     @property
     def robots(self) -> list[str]:
-        """Whoever has, or had, a process or a driver."""
+        """The robots that have, or had, a process or a driver."""
         named = (node.partition("/") for node in self.members)
         found = {robot for kind, _, robot in named if kind in ("robot", "source")}
         return sorted(found | self.heads.keys())
@@ -109,7 +111,7 @@ class Presence:
         return {node: clock_s - middle for node, clock_s in found.items()}
 
     def advice(self) -> list[str]:
-        """Who waits for whom, and what to do."""
+        """Which nodes wait for which, and what to do."""
         said = []
         if self.has_ended:
             said.append("the final map is out: the team has ended")

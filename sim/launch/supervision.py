@@ -1,4 +1,4 @@
-"""The supervision of a team: who dies is started again, who makes no progress is given up by name.
+"""Supervises the processes of a team: restarts those that die and gives up those without progress.
 
 Recorder and viewer are not essential to the map: where they are given up the team goes on, and the
 run fails in the end. A robot that is given up is named as lost in the final map. Without router,
@@ -16,13 +16,13 @@ from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Outgoing
 
 SILENT_S = 10.0
-"""A process that runs and has said nothing for so long is named."""
+"""A running process without a message for this long [s] is named."""
 STARTING_S = 60.0
-"""… one that starts and has not said anything yet, after so long: a busy machine is slow."""
+"""… and a starting process without any message for this long: a busy machine is slow."""
 MEASURE_S = 2.0
-"""Between two looks at the processes' share of memory; the last is at the final map."""
+"""Time [s] between two measurements of the processes' memory; the last is at the final map."""
 LEAVING_S = 60.0
-"""A process that is there so long after the final map is ended, and named."""
+"""A process that is left this long [s] after the final map is ended, and named."""
 _NODES = {"router": "router", "world": "world", "central": "central"}
 _WITHOUT_IT_NO_MAP = frozenset(_NODES)
 
@@ -33,7 +33,7 @@ def node_of(name: str) -> str:
 
 
 def _is_needed(name: str, watch: Watch) -> bool:
-    """Whether there is no map without a process."""
+    """Whether there is no map without this process."""
     return name in _WITHOUT_IT_NO_MAP and not (name == "central" and watch.peers)
 
 
@@ -121,7 +121,7 @@ class Memory:
         self._over = False
 
     def look(self, services: Sequence[Supervised], *, is_final: bool) -> None:
-        """Measure if it is time."""
+        """Measure, if it is time."""
         now = time.monotonic()
         if (now >= self._due or is_final) and not self._over:
             self._due, self._over = now + MEASURE_S, is_final
@@ -130,7 +130,7 @@ class Memory:
 
 
 class Silence:
-    """Names who is there but says nothing."""
+    """Names processes that are connected and send nothing."""
 
     def __init__(self, end_s: float | None) -> None:
         self._end_s = end_s

@@ -1,4 +1,4 @@
-"""Child processes: started, started again, ended, and spoken of by name when they fail."""
+"""Child processes: starts, restarts and ends them, and names those that fail."""
 
 import math
 import signal
@@ -12,12 +12,12 @@ from sim.launch.processes import Starter, Used
 LAST_LINES = 12
 """Lines of a failed process's output that are shown."""
 GRACE_S = 5.0
-"""A process that was asked to stop has this long."""
+"""Time [s] for a process to stop when it is asked to."""
 FRUITLESS = 5
-"""Deaths in a row, without progress between them, after which a process is given up."""
+"""A process is given up after this many deaths in a row without progress."""
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
-"""A process that dies waits from the first to the longest of these until it is started again."""
+"""Longest wait [s] before a process that has died is started again."""
 _PROC = Path("/proc")
 
 

@@ -1,4 +1,4 @@
-"""How consistent a team is while it runs: its poses and its map against the truth, as they come.
+"""Compares a running team's poses and map with the truth as they arrive.
 
 An evaluation like `central.desk.evaluation` of what has arrived so far; without a truth it stays
 empty.
@@ -31,7 +31,7 @@ class _Robot:
 
 @dataclass
 class LiveErrors:
-    """What the truth says of a team so far.
+    """The errors of a team so far.
 
     landmarks: of the newest fused map, each in its own 2 × 2 covariance, in the frame as the map
     lies.
@@ -49,7 +49,9 @@ class LiveErrors:
     )
 
     def of(self, robot: str) -> NeesTally:
-        """Of a robot's online poses: of those given the team's map where there are any."""
+        """The errors of a robot's online poses: given the team's map, where there are such
+        poses.
+        """
         return self._robots[robot].tally if robot in self._robots else NeesTally()
 
     def wants(self, channel: ch.Channel, robot: str, sample: Sample) -> bool:
@@ -89,7 +91,7 @@ class LiveErrors:
         robot.judge()
 
     def _take_map(self, fused: m.FusedMap) -> None:
-        """The latest map replaces what the one before was worth."""
+        """Take a map in place of the one before."""
         self.landmarks = NeesTally()
         if (fit := self._truth.fit(fused)) is not None:
             self.landmarks.take(fit.nees, 2)

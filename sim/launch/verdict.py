@@ -31,11 +31,11 @@ def judge(
     *,
     withdrawn: bool = False,
 ) -> m.FusedMap:
-    """Say the verdict and wait for the first map that rests on it, a centre's or a peer's.
+    """Publish the verdict and wait for the first map that takes it into account, a centre's or a
+    peer's.
 
-    withdrawn: say that it holds no more, and wait for a map without it. signer: the operator's,
-    where there are keys. Raises WithdrawError where there is neither, or no such map within the
-    time.
+    withdrawn: withdraw the verdict, and wait for a map without it. signer: the operator's, where
+    there are keys. Raises WithdrawError where there is neither, or no such map within the time.
     """
     for channel in (ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)

@@ -1,4 +1,4 @@
-"""What is known of a running team: its nodes' last words, its map, and what became of processes."""
+"""The state of a running team: its nodes' last statuses, its map, and events of its processes."""
 
 import time
 from dataclasses import dataclass, field
@@ -81,14 +81,16 @@ class Watch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the final map is there: the centre's, and every peer's of whom one is awaited."""
+        """Whether the final map is there: the centre's, and that of every peer that is waited
+        for.
+        """
         if self.fused is None or not self.fused.final:
             return False
         lost = {*self.fused.lost, *(name.removeprefix("robot-") for name in self.given_up)}
         return self.concluded.keys() >= self.peers - lost
 
     def take(self, bus: Bus) -> None:
-        """Take what has come since."""
+        """Take the messages that have arrived since the last call."""
         for sample in bus.receive(TURN_S):
             self._take(sample)
             said = self._centre.of(sample) if self.peers else None
@@ -124,12 +126,12 @@ class Watch:
             self.failures.append(f"{named}{what}")
 
     def note(self, text: str) -> None:
-        """Say what became of a process."""
+        """Note an event of a process."""
         elapsed = time.monotonic() - self.began
         self.notes.append(f"at {elapsed:.1f} s {text}")
 
     def progress(self, node: str) -> float:
-        """How far a node has got by its last status; the router is as far as the whole team."""
+        """The progress of a node by its last status; for the router, that of the whole team."""
         names = list(self.statuses) if node == "router" else [node]
         statuses = [self.statuses[name] for name in names if name in self.statuses]
         figures = [status.figures.get(name, 0.0) for status in statuses for name in _PROGRESS]

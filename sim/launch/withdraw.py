@@ -10,21 +10,21 @@ from team.wire.bus import Bus, Outgoing, sound
 from team.wire.codec import encoded
 
 CENTRE_S = 10.0
-"""A living centre and robot are heard of within this time."""
+"""Time [s] within which a running centre or robot is noticed."""
 LOOK_S = 0.05
 NO_CENTRE = "no centre and no peer answers; is the team running there? see --team, --connect"
 PEERS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL)
-"""What peers say of their own folds."""
+"""The channels of peers' own folds."""
 _PEER = "*"
 """Stands among the robots that were heard of once one has said that it folds by itself."""
 
 
 class WithdrawError(RuntimeError):
-    """The order could not be given, or was not followed: why, and what to do."""
+    """The order could not be given, or was not followed; the text says why and what to do."""
 
 
 def ordered(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
-    """Say an order; with keys its signature behind it, for peers that hear of it over others."""
+    """Publish an order; with keys its signature after it, for peers that receive it over others."""
     bus.publish(order)
     if signer is not None:
         member = Member(order.key, encoded(order.message), order.message)

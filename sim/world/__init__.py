@@ -1,1 +1,1 @@
-"""What a world is, and a simulated one: arrays, no model of the filter."""
+"""Worlds: the streams of any world, and a simulated one that shares no model with the filter."""

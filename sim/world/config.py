@@ -24,32 +24,40 @@ class SimulatedWorld(
     """A square place of side size_m with point landmarks; robots drive steps of step_s seconds.
 
     radius_m: the place is a disc about (0, 0) instead: random landmarks and way-points have a
-    radius that is uniform up to it and a uniform direction, and robots start at its centre.
-    landmarks: their positions, or landmark_count of them at random. layout: how those lie:
-    "uniform"; as "twins", each with another one twin_m beside it; or in "rooms": a grid of rooms ×
-    rooms equal squares that all have the same pattern, which no map can tell apart. paths: path i
-    is the way-points of robot i. A robot without one drives to random way-points at up to speed_m_s
-    and turn_rate_rad_s, a way-point being reached within way_point_tolerance_m; way_point_count: to
-    so many of them, and the world ends, before `steps`, when all robots have. steering: "together"
-    turns and drives in one step; "turn-first" drives no step that turns. observe_at_start: there is
-    a message of what is seen before the first step, too. visible_from_m, visible_to_m: what lies at
-    a *true* range between them is seen; absent: the limits of the robot's sensor. They are the
-    world's, since a robot that gates its noisy measurements at the same limits selects by the
-    noise, and its map is biased. unknown_starts: the robots whose start pose is not told to the
-    team; "*" is all of them, "!r1" after it all but that one. outlier_share: the probability of
-    each measurement of a landmark to be spoilt. outlier_kind: "measurement" gives it a uniform
-    range and bearing of what can be seen, "identity" the identity of another of the world's
-    landmarks; "drop" leaves out the very measurements that the others spoil, all else being the
-    same: what a run with outliers is compared with. odometry: what it tells: "speeds", "increments"
-    on SE(2) or a car's wheel speed and "steering". odometry_claims: increments come with their
-    covariance, that of the motion model's forward, lateral and turn; the errors of the last two
-    have the correlation odometry_correlation. landmark_form: as range and bearing, or as "points"
-    in the sensor's frame. landmark_claims: each comes with a covariance of its own, whose standard
-    deviations are factors from the first to the second of these of the sensor's, and with errors of
-    that size. claims_factor: what is claimed is the true covariance divided by this. identities:
-    "hidden" tells detections without them, but of the share `tagged` of landmarks. missed: the
-    probability of a measurement of a landmark to be left out. clutter: with hidden identities, the
-    share of detections that are of nothing at all.
+    uniform direction and a radius that is uniform up to it, and robots start at its centre.
+
+    landmarks: their positions, or landmark_count of them at random. layout: "uniform"; "twins",
+    each with another one twin_m beside it; or "rooms", a grid of rooms × rooms equal squares with
+    the same pattern, which no map can tell apart.
+
+    paths: path i has the way-points of robot i. A robot without one drives to random way-points at
+    up to speed_m_s and turn_rate_rad_s; a way-point is reached within way_point_tolerance_m. With
+    way_point_count the world ends, before `steps`, when all robots have reached that many.
+    steering: "together" turns and drives in one step; "turn-first" does not drive in a step that
+    turns.
+
+    observe_at_start: there is a message of landmarks before the first step, too. visible_from_m,
+    visible_to_m: landmarks at a *true* range between them are measured; absent: the limits of the
+    robot's sensor. They belong to the world, since a gate on noisy measurements at the same limits
+    selects by the noise and biases the map. unknown_starts: the robots whose initial pose the team
+    is not given; "*" is all of them, "!r1" after it all but that one.
+
+    outlier_share: the probability of a measurement of a landmark to be an outlier. outlier_kind: a
+    "measurement" gets a uniform range and bearing, an "identity" becomes that of another landmark;
+    "drop" leaves out the very measurements that the others spoil, all else being the same, for
+    comparison.
+
+    odometry: its form: "speeds", "increments" on SE(2), or a car's wheel speed and "steering".
+    odometry_claims: increments come with a covariance, that of the motion model's forward, lateral
+    and turn; the errors of the last two have the correlation odometry_correlation. landmark_form:
+    "ranges" and bearings, or "points" in the sensor's frame. landmark_claims: each comes with a
+    covariance of its own, whose standard deviations are the sensor's times factors between these
+    two, and with errors of that size. claims_factor: these covariances are the true ones divided by
+    this.
+
+    identities: "hidden" publishes detections without identities, except for the share `tagged` of
+    landmarks. missed: the probability of a measurement to be left out. clutter: with hidden
+    identities, the share of detections that are of nothing at all.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -139,10 +147,10 @@ class FolderWorld(
 class LiveWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="live"
 ):
-    """No world: each robot has a driver that says what it measures, and ends its own stream.
+    """No world: each robot has a driver that publishes its measurements and ends its own stream.
 
-    admit: robots that the scenario does not name are taken into the team. newcomer: what such a
-    robot is unless its own process says otherwise; the scenario's [defaults].
+    admit: robots that the scenario does not name may join. newcomer: the configuration of such a
+    robot unless its own process gives another; the scenario's [defaults].
     """
 
     admit: bool = False
@@ -169,7 +177,9 @@ World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld | UnlabelledWorld
 
 
 def starts_unknown(world: World, robot: str) -> bool:
-    """Whether the team is not told where this robot starts; of a live one its driver says it."""
+    """Whether the team is not given this robot's initial pose; that of a live robot comes from
+    its driver.
+    """
     if isinstance(world, LiveWorld):
         return False
     named = world.unknown_starts
@@ -185,7 +195,7 @@ class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What robots without a centre reach each other by; the default is everyone, at once.
+    """The radio of robots without a centre; by default every message arrives at once.
 
     comm_range_m: by true distance; absent: any. windows: if there are any, only then, and within
     the range. loss: the share of messages that never arrive. delay_s: until one does. bytes_per_s:

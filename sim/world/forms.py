@@ -1,4 +1,4 @@
-"""The forms in which a simulated robot's sensors tell what they measure, beside the plain ones.
+"""Further forms of a simulated robot's measurements.
 
 Odometry as motions on SE(2), with or without a covariance, or as a car's encoders; landmarks as
 points, each with a covariance of its own. The formulas are written here, not taken from the filter.

@@ -1,6 +1,6 @@
-"""Worlds whose landmarks have no names: identities hidden, detections missed, clutter among them.
+"""Worlds without identities: they are hidden, detections are missed, and clutter is added.
 
-The stream keeps the true identities, for whoever scores; what is published is told without them.
+The stream keeps the true identities for the evaluation; they are not published.
 """
 
 from dataclasses import dataclass, replace

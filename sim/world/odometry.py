@@ -1,7 +1,7 @@
-"""What the odometry of the simulated world tells of a true step, and how the robot slips besides.
+"""Simulated odometry of a true step, and the slip that it does not measure.
 
-A step is a pair (distance [m], turn [rad]). What is told is the true step with the noise of the
-robot's motion model in it, taken back through its calibration. The formulas are written from the
+A step is a pair (distance [m], turn [rad]). The odometry is the true step with the noise of the
+robot's motion model, converted back through its calibration. The formulas are written from the
 sources, not taken from the filter.
 """
 
@@ -56,7 +56,7 @@ def told(
 def slip(
     motion: MotionModel, step: tuple[float, float], seconds: float, normals: Float[np.ndarray, "2"]
 ) -> tuple[float, float]:
-    """The turn [rad] and the slip to the left [m] behind a step, which no odometry measures."""
+    """The turn [rad] and the slip to the left [m] after a step, which odometry does not measure."""
     steps, duration = np.array([step]), np.array([seconds])
     _, _, of_turn = _held(motion, steps, duration)
     turn = np.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]

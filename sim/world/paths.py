@@ -1,4 +1,4 @@
-"""How the robots of a simulated world truly move.
+"""The true motion of the robots of a simulated world.
 
 A step is a pair (distance [m], turn [rad]); poses (x, y, θ) are in the world's frame. Two ways to
 make steps: `followed` cuts a polyline into equal ones, `driven` steers from way-point to way-point.

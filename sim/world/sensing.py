@@ -1,4 +1,4 @@
-"""What a range-bearing sensor of the simulated world hands out."""
+"""The range-bearing sensor of the simulated world."""
 
 from dataclasses import dataclass
 
