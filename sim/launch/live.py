@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from central.desk.evaluation.events import without_decimals
-from sim.launch.watch import Watch
+from sim.launch.watch import DRIVERS, Watch
 from team.wire import messages as m
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class _Lines:
         consistency = _consistency(watch)
         self._print(
             watch,
-            f"{_done(watch):4.0%}  team time {world.get('team_time_s', 0.0):.0f} s, "
+            f"{_share(watch):>4}  team time {world.get('team_time_s', 0.0):.0f} s, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
             f"{'; ' if consistency else ''}{consistency}",
         )
@@ -138,6 +138,12 @@ def _warnings(watch: Watch) -> list[str]:
     return [*watch.failures, *texts]
 
 
+def _share(watch: Watch) -> str:
+    """The same in words: nobody knows how much drivers will measure yet."""
+    live = watch.world is not None and watch.world.node == DRIVERS
+    return f"{_done(watch):.0%}" + " of what came so far" * live
+
+
 def _view(title: str, watch: Watch) -> Group:
     elapsed = time.monotonic() - watch.began
     world = watch.world
@@ -151,7 +157,7 @@ def _view(title: str, watch: Watch) -> Group:
         bar = Table.grid(padding=(0, 2))
         bar.add_row(
             ProgressBar(total=1.0, completed=_done(watch), width=36),
-            f"{_done(watch):.0%}",
+            _share(watch),
             f"team time {world.figures.get('team_time_s', 0.0):,.0f} s, {world.node} {world.state}",
         )
         parts.append(bar)

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from team.peers.proofs import Signs
 
 TURN_S = 0.1
+DRIVERS = "drivers"
+"""Who measures in a live team, as one node."""
 _PROGRESS = ("measurements", "submaps", "messages")
 """Figures of a status that grow as its node gets on."""
 
@@ -73,7 +75,7 @@ class Watch:
         states = {status.state for status in there}
         return m.Status(
             stamp_ns=max((status.stamp_ns for status in there), default=0),
-            node="drivers",
+            node=DRIVERS,
             state=states.pop() if len(states) == 1 else "measuring" if states else "waiting",
             figures=figures,
             warnings=waiting,

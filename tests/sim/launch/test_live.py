@@ -35,6 +35,10 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     assert place.endswith("by --team t --connect tcp/127.0.0.1:1")
     assert waiting.endswith("] waiting: 1 of 3 robots")
     assert " 50%  team time 0 s, 2 robots" in running
+    watch.drivers = ("r1",)  # nobody knows how much drivers will measure yet
+    watch.statuses["source/r1"] = status("source/r1", "measuring", measurements=60.0)
+    lines.show(watch)
+    assert "% of what came so far  team time" in " ".join(out.getvalue().split("\n")[-3:])
 
 
 def told(robots: int, *, truth: bool) -> Watch:
