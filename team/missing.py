@@ -36,10 +36,11 @@ class MissingMeasurements:
             self._since_s = now_s
             for each in requested:
                 _LOG.warning(
-                    "measurements %d to %d of %s are missing: asked for",
+                    "measurements %d to %d of %s, incarnation %d, are missing: asked for",
                     each.first,
                     each.last,
                     each.robot,
+                    each.incarnation,
                 )
                 self.ask(each)
 

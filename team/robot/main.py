@@ -23,6 +23,8 @@ SECOND_PATIENCE_S = 6.0
 SECOND_PERIOD_S = 0.5
 CONFIRMED_S = 1.0
 """Wait [s] between two questions to the source which incarnation its stream is in."""
+MOST_DOUBTED = 8
+"""Ends about which the source is asked at a time."""
 LOG_LOOK_S, LOG_RARELY_S = 2.0, 60.0
 """Least and greatest wait [s] between two checks for what the robot's own log lacks."""
 _LOG = logging.getLogger("teamslam")
@@ -50,6 +52,7 @@ class RobotShell:
         self.node = RobotNode(config, exchange)
         self._first_of: dict[int, Sample] = {}
         self._confirm_at = 0.0
+        self._doubted: dict[int, Sample] = {}
         self._log_due_s = 0.0
         self._log_look_s = LOG_LOOK_S
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
@@ -95,6 +98,8 @@ class RobotShell:
         """Ask the source for missing measurements of the stream."""
         requested = self.node.request()
         self._missing.look(() if requested is None else (requested,))
+        if self._doubted:
+            self._ask_about_ends()
         if time.monotonic() >= self._log_due_s:
             lost = self._complete_log()
             self._log_look_s = min(2.0 * self._log_look_s, LOG_RARELY_S) if lost else LOG_LOOK_S
@@ -118,6 +123,7 @@ class RobotShell:
                     incarnation=incarnation,
                     first=first,
                     last=used,
+                    only=True,
                 )
                 try:
                     self.bus.ask(ch.MEASUREMENTS, self.node.robot, requested, ASK_TIMEOUT_S)
@@ -210,6 +216,8 @@ class RobotShell:
         """
         passed = []
         for sample in samples:
+            if self._is_doubted(sample):
+                continue
             found = _beginning(sample, self.node.robot)
             if found is None or found <= self.node.incarnation:
                 passed.append(sample)
@@ -219,13 +227,55 @@ class RobotShell:
             self._confirm_at = time.monotonic() + CONFIRMED_S
             last = self._incarnation_at_source()
             first_of, self._first_of = self._first_of, {}
+            silent = last is None and self._source_is_there
             for incarnation, sample in sorted(first_of.items()):
-                if last is None or incarnation <= last:
+                if silent:  # it has not published yet what would be asked for
+                    self._first_of[incarnation] = sample
+                elif last is None or incarnation <= last:
                     passed.append(sample)
                 else:
                     why = f"of incarnation {incarnation}, of which its source knows nothing"
                     self.shell.boundary.refuse(sample, why)
         return passed
+
+    def _is_doubted(self, sample: Sample) -> bool:
+        """Whether a sample is an end before what has been consumed: it waits for the source's
+        word, since anyone may have published measurements behind it where there are no keys.
+        """
+        if sample.key != ch.END.key():
+            return False
+        try:
+            last = self.node.contradicted(decoded(sample.payload, m.End))
+        except WireError:
+            return False
+        if last is None or len(self._doubted) >= MOST_DOUBTED:
+            return False
+        self._doubted[last] = sample
+        return True
+
+    def _ask_about_ends(self) -> None:
+        """Ask the source which of the ends that were doubted is its own."""
+        doubted, self._doubted = self._doubted, {}
+        for last, sample in doubted.items():
+            wanted = m.MeasurementsRequest(
+                stamp_ns=0,
+                robot=self.node.robot,
+                incarnation=self.node.incarnation,
+                first=max(last - 1, 0),
+                last=last,
+                only=True,
+            )
+            try:
+                replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, wanted, ASK_TIMEOUT_S)
+                if {reply_of(each, m.Measurement).number for each in replies} == {last - 1}:
+                    self.node.confirm_end(last)
+            except (BusError, WireError) as error:
+                _LOG.warning("%s", error)
+            self.shell.take([sample])
+
+    @property
+    def _source_is_there(self) -> bool:
+        return any(self.bus.is_alive(n) for n in ("world", ch.source_node(self.node.robot)))
 
     def _incarnation_at_source(self) -> int | None:
         """The incarnation that the source says its stream is in; None where nobody answers."""

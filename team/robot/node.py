@@ -209,6 +209,19 @@ class RobotNode:
                 pass
         return None
 
+    def contradicted(self, end: m.End) -> int | None:
+        """The measurements of this stream by an announced end that are fewer than were consumed."""
+        if self._stream_end.refusal(end) is None:
+            return None
+        ends = {s.incarnation: s.measurements for s in end.streams if s.robot == self.robot}
+        return ends.get(self.incarnation)
+
+    def confirm_end(self, measurements: int) -> None:
+        """Take the source's own answer that this incarnation ends so: what came behind it was not
+        the source's.
+        """
+        self._stream_end.at_source = self.incarnation, measurements
+
     def status(self) -> m.Status:
         """The robot's status, for people."""
         measurements, outliers = self._inbox.next_measurement, self.config.front_end.outlier_share
@@ -528,12 +541,17 @@ class RobotNode:
         self._has_said_done = True
         return [*out, self._progress(), *(Outgoing(ch.ROBOT_DONE, self.robot, d) for d in dones)]
 
+    def _counted(self) -> int:
+        """The measurements of this incarnation, without what was consumed behind its end."""
+        last = self._stream_end.last_of(self._incarnation)
+        return self._consumed if last is None else min(self._consumed, last)
+
     def _incarnation_done(self) -> m.Done:
         return m.Done(
             stamp_ns=self._now_ns,
             robot=self.robot,
             incarnation=self._incarnation,
-            measurements=self._consumed,
+            measurements=self._counted(),
             steps=self._steps,
             submaps=self.submaps,
             ledger=self.ledger.entries(),

@@ -16,11 +16,18 @@ class EndOfStream:
         self._head: m.StreamHead | None = None
         self.driver_is_there: bool | None = None
         self.is_ordered = False
+        self.at_source: tuple[int, int] | None = None
+        """Incarnation and measurements at which the stream ends by its source's own answer."""
 
     @property
     def reached(self) -> bool:
         """Whether every measurement up to the last one has been consumed."""
         return self._last is not None and self._inbox.complete(self._last)
+
+    def last_of(self, incarnation: int) -> int | None:
+        """The measurements of an incarnation that has ended; None while it has not."""
+        last = self._last
+        return last.measurements if last is not None and last.incarnation == incarnation else None
 
     @property
     def waits_for_driver(self) -> bool:
@@ -43,7 +50,8 @@ class EndOfStream:
     def refusal(self, message: m.End | m.StreamHead) -> str | None:
         """Why an announced end can not be true of the stream, in words."""
         if isinstance(message, m.End):
-            return self._inbox.contradicts(message, self._robot)
+            of_source = self.at_source in _ends_of(message, self._robot)
+            return None if of_source else self._inbox.contradicts(message, self._robot)
         if message.robot != self._robot:
             return f"how far {message.robot} is"
         ended = message.state == "ended"
@@ -76,6 +84,10 @@ class EndOfStream:
         return m.StreamEnd(
             robot=self._robot, incarnation=self._inbox.incarnation, measurements=measurements
         )
+
+
+def _ends_of(end: m.End, robot: str) -> set[tuple[int, int]]:
+    return {(s.incarnation, s.measurements) for s in end.streams if s.robot == robot}
 
 
 def _end_at(head: m.StreamHead) -> m.End:

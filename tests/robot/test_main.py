@@ -43,6 +43,8 @@ def test_a_robot_whose_earlier_life_has_gone_begins() -> None:
 class Source:
     """The source of r1's stream on a bus: it answers for what it has published."""
 
+    answers = True
+
     def __init__(self, network: MemoryNetwork) -> None:
         self.bus = MemoryBus(network)
         self.start = published(stream("r1", 3))[0]
@@ -52,7 +54,7 @@ class Source:
     def answer(self, request: bytes) -> list[bytes]:
         wanted = decoded(request, m.MeasurementsRequest)
         self.asked.append((wanted.incarnation, wanted.first, wanted.last))
-        return [encoded(self.start)]
+        return [encoded(self.start)] if self.answers else []
 
     def begins(self, incarnation: int) -> None:
         said = msgspec.structs.replace(self.start, incarnation=incarnation)
@@ -99,6 +101,45 @@ def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path:
     assert shell.node.next_measurement == 1
     assert (1, 0, 0) in source.asked, "the robot has used it, its log has lost it"
     assert not any(first > 0 for _, first, _ in source.asked), "it asks for these itself"
+
+
+def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source() -> None:
+    """A stranger published more measurements than there are: the robot waited for ever."""
+
+    class Ending(Source):
+        def answer(self, request: bytes) -> list[bytes]:
+            if not self.asked:  # the world ends while the forged ones are consumed
+                ended = m.StreamEnd(robot="r1", incarnation=1, measurements=1)
+                end = m.End(stamp_ns=0, streams=(ended,))
+                self.bus.publish(Outgoing(ch.END, "", end))
+            return super().answer(request)
+
+    network = MemoryNetwork()
+    source, viewer = Ending(network), MemoryBus(network)
+    viewer.subscribe(ch.ROBOT_DONE)
+
+    def act() -> None:
+        source.begins(1)
+        for number in (1, 2):
+            forged = msgspec.structs.replace(odometry(number, "r1"), incarnation=1)
+            source.bus.publish(Outgoing(ch.ODOMETRY, "r1", forged))
+
+    shell = lived(network, MemoryBus(network), act)
+    assert shell.node.next_measurement == 3
+    assert source.asked == [(0, 0, 0), (1, 0, 1)]
+    (said,) = viewer.receive()
+    assert decoded(said.payload, m.Done).measurements == 1
+
+
+def test_a_source_that_has_published_nothing_yet_is_asked_again() -> None:
+    """A stranger who was there before the world made the robot begin at the stranger's word."""
+    network = MemoryNetwork()
+    source = Source(network)
+    source.answers = False
+    source.bus.declare_alive("world")
+    shell = lived(network, MemoryBus(network), lambda: source.begins(4))
+    assert shell.node.incarnation == 0
+    assert source.asked
 
 
 def test_where_no_source_answers_the_message_itself_is_believed() -> None:
