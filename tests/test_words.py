@@ -34,7 +34,7 @@ KEPT = {
     "doubts": "a verb",
 }
 """Parts of names that may stand in prose."""
-FORMER = {"sim/scenarios/renamed.py"}
+FORMER = {"team/former_names.py"}
 """Files that are about former names."""
 FOLDERS = ("team", "central", "sim", "examples", "benchmarks")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

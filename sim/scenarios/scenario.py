@@ -22,7 +22,6 @@ from sim.scenarios.document import (
     named_document,
     resolved,
 )
-from sim.scenarios.renamed import with_current_names
 from sim.world.config import (
     FolderWorld,
     LiveWorld,
@@ -34,6 +33,7 @@ from sim.world.config import (
 )
 from team.association import DEFAULT_PROFILE, AssociationProfile, profile_for
 from team.config import Estimator, Exchange, FusionRule, RobotConfig
+from team.former_names import with_current_names
 from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from team.registry import absence
 

@@ -8,6 +8,7 @@ import msgspec
 
 from central.config import CentralConfig
 from team.config import RobotConfig
+from team.former_names import with_current_names
 from team.recording.reader import Log
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -153,8 +154,8 @@ class Recorded:
 
 def _parsed(text: str, kind: type[T], what: str) -> T:
     try:
-        return msgspec.json.decode(text, type=kind)
-    except msgspec.DecodeError as error:
+        return msgspec.convert(with_current_names(msgspec.json.decode(text)), kind)
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise RerunError(f"{what} is not one of this version: {error}") from None
 
 

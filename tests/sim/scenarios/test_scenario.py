@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from sim.scenarios import renamed
+from central.desk.verification.recorded import Recorded
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import (
     builtin_names,
@@ -17,8 +17,10 @@ from sim.scenarios.scenario import (
 )
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld, UtiasWorld
+from team import former_names
 from team.association import AssociationProfile
 from team.pairs import PAIRS
+from team.wire import messages as m
 
 SMALL = """
 [world]
@@ -327,8 +329,20 @@ def test_a_scenario_of_a_log_with_former_names_is_read_with_todays() -> None:
     world = msgspec.structs.replace(load("thesis").world, **outliers)
     today = msgspec.structs.replace(load("thesis"), world=world)
     former = dumps(today)
-    for name, now in renamed.FIELDS.items():
+    for name, now in former_names.FIELDS.items():
         former = former.replace(f'"{now}":', f'"{name}":')
     former = former.replace('"garbage_kind":"measurement"', '"garbage_kind":"reading"')
     assert former.count("garbage") == 2 + len(today.robots)
     assert loads(former) == today
+
+
+def test_a_logs_configurations_with_former_names_are_read_with_todays() -> None:
+    today = load("thesis").robots[0]
+    text = msgspec.json.encode(today).decode()
+    former = text.replace('"outlier_share":', '"garbage":')
+    assert former != text
+    announced = m.Configuration(
+        stamp_ns=0, node="robot/r1", incarnation=1, digest=bytes(8), configuration=former
+    )
+    recorded = Recorded(configured={announced.node: announced})
+    assert recorded.robot_config("r1") == (today, announced.digest)

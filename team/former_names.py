@@ -1,4 +1,6 @@
-"""Former names of a scenario's fields, with which logs of that time are still read."""
+"""Former names of settings, with which the scenarios and configurations in logs of that time are
+still read.
+"""
 
 from typing import Any
 
@@ -14,7 +16,7 @@ VALUES = {("outlier_kind", "reading"): "measurement"}
 
 
 def with_current_names(value: Any) -> Any:
-    """A resolved scenario, as it was decoded from JSON, with today's names at every depth."""
+    """What was decoded from the JSON of a scenario or a configuration, with today's names."""
     if isinstance(value, list):
         return [with_current_names(each) for each in value]
     if not isinstance(value, dict):
