@@ -306,29 +306,32 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
     now_ns = 0
     counter = 0
     while counter < count:
-        counter += 1
         kind = rng.integers(12)
         stamp_ns = now_ns
         if kind == 0:  # a clock that stands, goes back or leaps
             stamp_ns = now_ns + int(rng.choice([-3600, -1, 0, 3600, 10**7, 10**9])) * S
+        end_ns = now_ns
         if kind <= 5:
             end_ns = stamp_ns + int(rng.choice([0, 1, S // 10, S, S, S, S, 3600 * S]))
-            yield _interval(rng, robot, counter, stamp_ns, end_ns)
-            if kind != 0:
-                now_ns = end_ns
+            message = _interval(rng, robot, counter + 1, stamp_ns, end_ns)
         elif kind <= 10:
-            yield _scan(rng, robot, counter, stamp_ns)
+            message = _scan(rng, robot, counter + 1, stamp_ns)
         else:
             names = tuple(str(x) for x in rng.choice(ROBOTS, int(rng.integers(0, 3))))
-            yield m.Sightings(
+            message = m.Sightings(
                 stamp_ns=stamp_ns,
                 robot=robot,
                 incarnation=1,
-                number=counter,
+                number=counter + 1,
                 teammates=names,
                 ranges=from_floats(np.abs(numbers(rng, len(names)))),
                 bearings=from_floats(rng.uniform(-np.pi, np.pi, len(names))),
             )
+        if valid(message) is not None:  # what no driver can send has no number either
+            counter += 1
+            yield message
+            if 0 < kind <= 5:
+                now_ns = end_ns
         if rng.random() < 0.05:
             yield prior(rng, robot)
     yield m.End(
