@@ -19,9 +19,7 @@ def kind_of(path: str | Path) -> Kind:
     try:
         with tables.opened(str(path), UTIAS_MARKER):
             return "utias"
-    except DatasetError as error:
-        if not Path(path).exists() or UTIAS_MARKER not in str(error):
-            raise
+    except tables.MarkerError:
         inner = _with_tables_within(Path(path))
         if inner is not None:
             raise DatasetError(

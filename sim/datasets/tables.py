@@ -18,6 +18,10 @@ class DatasetError(ValueError):
     """A data set that can not be read; the text names the file, the place and the remedy."""
 
 
+class MarkerError(DatasetError):
+    """No folder of it holds the file by which its kind of data set is known."""
+
+
 @contextmanager
 def opened(path: str, marker: str) -> Iterator[Mapping[str, File]]:
     """The files by name of the one folder, in `path` (a folder or zip), that holds `marker`."""
@@ -95,7 +99,7 @@ def _problem(words: list[str], columns: tuple[str, ...]) -> str | None:
 def _files_beside(root: File, marker: str, path: str) -> Mapping[str, File]:
     found = [folder for folder in _folders(root, depth=3) if (folder / marker).is_file()]
     if not found:
-        raise DatasetError(f"{path}: no {marker} in it; {EXPECTED}")
+        raise MarkerError(f"{path}: no {marker} in it; {EXPECTED}")
     if len(found) > 1:
         names = ", ".join(sorted(folder.name for folder in found))
         raise DatasetError(f"{path}: more than one data set in it ({names}); give one of them")
