@@ -21,6 +21,8 @@ STARTING_S = 60.0
 """… and a starting process without any message for this long: a busy machine is slow."""
 MEASURE_S = 2.0
 """Time [s] between two measurements of the processes' memory; the last is at the final map."""
+HEARD_S = 1.0
+"""Whoever leaves with the final map may leave so long before that map is heard of here."""
 LEAVING_S = 60.0
 """A process that is left this long [s] after the final map is ended, and named."""
 _NODES = {"router": "router", "world": "world", "central": "central"}
@@ -81,6 +83,8 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     status = service.child.exit
     if status is None:
         return
+    if status > 0 and not is_final and not service.has_ended_for(HEARD_S):
+        return  # it may know of a provisional end that is not heard of yet
     failed_at_the_end = is_final and status > 0
     if (status == 0 and service.name != "router") or failed_at_the_end:
         service.over = True

@@ -115,7 +115,8 @@ class Supervised:
     """A process that is started again by the same command when it dies, after longer and longer.
 
     One that dies FRUITLESS times in a row without getting any further is given up. reached: how far
-    it had come at its last death, in whatever it counts. used: what its earlier lives took.
+    it had come at its last death, in whatever it counts. ended_s: when its end was seen, by a
+    monotonic clock. used: what its earlier lives took.
     """
 
     name: str
@@ -128,6 +129,7 @@ class Supervised:
     given_up: bool = False
     over: bool = False
     due: float | None = None
+    ended_s: float | None = None
     used: Used = field(default_factory=Used)
     child: Child = field(init=False)
 
@@ -138,6 +140,11 @@ class Supervised:
     def is_watched(self) -> bool:
         """Whether it runs, or will again."""
         return not (self.over or self.given_up)
+
+    def has_ended_for(self, time_s: float) -> bool:
+        """Whether its end was seen at least so long ago."""
+        self.ended_s = self.ended_s or time.monotonic()
+        return time.monotonic() - self.ended_s >= time_s
 
     def died(self, reached: float) -> None:
         """Note a death; it will be started again, or is given up."""
@@ -152,7 +159,7 @@ class Supervised:
     def start_again(self) -> None:
         """Start it if it is time."""
         if self.due is not None and time.monotonic() >= self.due:
-            self.due = None
+            self.due = self.ended_s = None
             self.restarts += 1
             self.used = self.used.and_later(self.child.end(0.0).used)
             self.child = Child(self.name, self.arguments, self.folder, self.starter, self.restarts)
