@@ -150,6 +150,8 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     folder.mkdir(parents=True, exist_ok=True)
+    for earlier_set in sorted(folder.glob("*.set")):
+        _set_aside(earlier_set)  # what another run's robots have sent is nothing of this one
     from sim.launch.plan import Plan
 
     plan = Plan(
@@ -239,11 +241,16 @@ def _keep_earlier(log: Path) -> None:
     if log.exists() and not log.is_file():
         fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
-        number = 1
-        while (aside := log.with_name(f"{log.name}.{number}")).exists():
-            number += 1
-        log.rename(aside)
-        typer.echo(f"{log} was there already: it is now {aside}", err=True)
+        _set_aside(log)
+
+
+def _set_aside(file: Path) -> None:
+    """Rename a file of an earlier run, with the first number that is free."""
+    number = 1
+    while (aside := file.with_name(f"{file.name}.{number}")).exists():
+        number += 1
+    file.rename(aside)
+    typer.echo(f"{file} was there already: it is now {aside}", err=True)
 
 
 KERNELS_TO_ESTIMATE = 5

@@ -1,19 +1,23 @@
 """`teamslam launch`: one command, and a whole team of processes maps a place and ends by itself."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import pytest_asyncio
 
+from central.kept import KeptSet
 from team.keys.authority import make_keys
 from team.keys.roster import nodes_of
 from team.recording.reader import open_log
 from team.wire import channels as ch
+from team.wire.arrays import floats, from_floats
 from team.wire.bus import opened
-from team.wire.messages import Configuration
+from team.wire.codec import encoded
+from team.wire.messages import Configuration, Submap
 from tests.system.conftest import Launched
 from tests.system.processes import PROGRAM, Processes, Terminal
 from tests.system.scenarios import STEPS, final_map, map_in_memory, sha256, short
@@ -165,11 +169,26 @@ def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(
     assert watched.result["final_map_sha256"] == launched.result["final_map_sha256"]
 
 
-async def test_a_launch_with_keys_sends_the_same_bytes_as_final_map(
+def keep_another_runs_set(launched: Launched, file: Path) -> None:
+    """The set of a centre that has heard the same names of submaps with other numbers."""
+    file.parent.mkdir()
+    kept = KeptSet(file)
+    for sample in open_log(launched.log).samples((ch.SUBMAP,)):
+        submap = opened(sample)[2]
+        assert isinstance(submap, Submap)
+        other = from_floats(floats(submap.mean, "mean") + 1.0)
+        payload = encoded(msgspec.structs.replace(submap, mean=other))
+        kept.note([replace(sample, payload=payload)])
+    kept.close()
+
+
+async def test_a_launch_with_keys_in_another_runs_folder_sends_the_same_bytes_as_final_map(
     team: Processes, launched: Launched
 ) -> None:
+    keep_another_runs_set(launched, team.folder / "run" / "central.set")
     make_keys(team.folder / "keys", "short", nodes_of(["r1", "r2"]))
     result = await launch(team, launched.scenario, "--keys", "keys")
     assert result["final_map_sha256"] == launched.result["final_map_sha256"]
     said = (team.folder / "run" / "router.log").read_text()
     assert "listening at tls/127.0.0.1:" in said
+    assert (team.folder / "run" / "central.set.1").exists()
