@@ -4,16 +4,20 @@ A case that fails or whose process dies loses itself only. With a scheduler the 
 workers, on a cluster too (decision 0058).
 """
 
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from joblib import Memory, Parallel, delayed, parallel_config
-from joblib.externals.loky.process_executor import TerminatedWorkerError
+from joblib.externals.loky.process_executor import (
+    TerminatedWorkerError,
+    _ExecutorManagerThread,
+)
 
 from sim.studies.experiments.task import Task
 
@@ -71,8 +75,7 @@ class Cases:
                 for task in waiting.values():
                     yield self._alone(task)
             finally:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # that cases are cancelled is what is asked
+                with _cancelling():
                     finished.close()
 
     def _parallel(
@@ -112,6 +115,29 @@ def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
     except (OSError, ValueError) as error:
         raise SchedulerError(f"--scheduler {scheduler}: no Dask scheduler there: {error}") from None
     return [client, parallel_config("dask")]
+
+
+@contextmanager
+def _cancelling() -> Iterator[None]:
+    """While this lasts, what the pool says of cases that are cancelled on request is not told.
+
+    Loky kills the workers first; its thread then stumbles over a case that was handed over at that
+    moment, and ends with a KeyError instead of by itself (joblib/loky, pull request 663).
+    """
+    told = threading.excepthook
+
+    def hook(error: threading.ExceptHookArgs) -> None:
+        ours = isinstance(error.thread, _ExecutorManagerThread)
+        if not (ours and error.exc_type is KeyError):
+            told(error)
+
+    threading.excepthook = hook
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        threading.excepthook = told
 
 
 def _attempt(kept: Kept, task: Task) -> Done:

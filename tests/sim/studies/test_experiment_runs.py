@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from joblib.externals.loky.process_executor import _ExecutorManagerThread
 
 from sim.datasets.tables import DatasetError
 from sim.scenarios.scenario import Scenario, load, with_options
@@ -155,6 +156,21 @@ def test_leaving_early_ends_the_long_run_too(tmp_path: Path) -> None:
     assert next(runs).task == counted(1.0)
     runs.close()  # type: ignore[attr-defined] # a generator
     assert time.monotonic() - begun < 30.0
+
+
+def test_leaving_while_a_case_is_handed_over_leaves_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = _ExecutorManagerThread.is_shutting_down
+
+    def later(self: _ExecutorManagerThread) -> bool:
+        time.sleep(0.3)  # until the main thread has left, with the next case in the pool's queue
+        return bool(asked(self))
+
+    monkeypatch.setattr(_ExecutorManagerThread, "is_shutting_down", later)
+    runs = Cases(tmp_path).run([counted(float(each)) for each in range(6)], 2)
+    next(runs)
+    runs.close()  # type: ignore[attr-defined] # a generator
 
 
 def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path: Path) -> None:
