@@ -1,8 +1,9 @@
-"""Where one map lies in the frame of another, from the points that both know.
+"""Aligns two maps: where one lies in the frame of the other, from the points that both contain.
 
-Weighted Procrustes by singular values gives the first guess (Downs' thesis on map joining; Arun,
-Huang & Blostein 1987), Gauss-Newton in the metric of both joint covariances the rest. Whether the
-two maps agree is asked of the joint cost, which is not linearised about a drifted map.
+Weighted Procrustes alignment by singular values gives the first guess (Downs' thesis on map
+joining; Arun, Huang & Blostein 1987); Gauss-Newton in the metric of both joint covariances refines
+it. Whether the two maps agree is tested on the joint cost, which is not linearised about a drifted
+map.
 """
 
 from typing import NamedTuple
@@ -16,17 +17,18 @@ from team.estimation.geometry import wrapped
 
 ITERATIONS = 10
 NEEDED = 2
-"""Points that determine a rigid motion in the plane."""
+"""Number of points that determine a rigid motion in the plane."""
 
 
 class Alignment(NamedTuple):
-    """a_from_b (x [m], y [m], theta [rad]) with its covariance, and χ² of the landmarks left over.
+    """The rigid motion a_from_b (x [m], y [m], theta [rad]), its covariance and the χ² of its
+    residuals.
 
-    dof: 2 per shared landmark less the 3 of the motion.
-    heading_sigma: how well the shape of the shared landmarks gives a heading [rad]. Unlike the
-        covariance it leaves out how far each map may be turned as a whole: with the difference's
-        covariance S and the projection Π off the rigid motions it is
-        √(tr(Π S Π)/dof / Σ‖bᵢ − b̄‖²), σ/√Σ‖bᵢ − b̄‖² for independent landmarks.
+    dof: degrees of freedom of `chi2`: 2 per shared landmark less the 3 of the motion.
+    heading_sigma: standard deviation [rad] of the heading that the shape of the shared landmarks
+        gives. Unlike `covariance` it leaves out how far each map may be rotated as a whole: with
+        the difference's covariance S and the projection Π off the rigid motions it is √(tr(Π S
+        Π)/dof / Σ‖bᵢ − b̄‖²), which is σ/√Σ‖bᵢ − b̄‖² for independent landmarks.
     """
 
     a_from_b: Float[np.ndarray, "3"]
@@ -92,7 +94,7 @@ def aligned(
 
 
 def _at_one_place(shift: Float[np.ndarray, "2"], n: int) -> Alignment:
-    """What points at one place say: a shift, and no heading."""
+    """Aligns points that all lie at one place: they determine the translation and no heading."""
     unknown = np.full((3, 3), np.inf)
     return Alignment(np.array([*shift, 0.0]), unknown, np.inf, 2 * n - 3, np.inf)
 
@@ -131,7 +133,9 @@ def _linearised(
     in_b: Float[np.ndarray, "n 2"],
     covariance_b: Float[np.ndarray, "m m"],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"], Float[np.ndarray, "m 3"]]:
-    """d, (P_a + R P_b Rᵀ)⁻¹ and ∂(R b + t)/∂(t, θ)."""
+    """The differences d, their information (P_a + R P_b Rᵀ)⁻¹ and the Jacobian ∂(R b + t)/∂(t,
+    θ).
+    """
     n = len(in_a)
     c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
     rotation = np.array([[c, -s], [s, c]])
@@ -147,7 +151,9 @@ def _linearised(
 
 
 class Shared(NamedTuple):
-    """How many points two maps share: landmarks, and teammates seen from one of them."""
+    """Numbers of points that two maps share: landmarks, and teammates observed from one of the
+    maps.
+    """
 
     landmarks: int
     sightings: int = 0
@@ -160,9 +166,9 @@ class Shared(NamedTuple):
 
 
 def refusal(shared: Shared, alignment: Alignment | None, heading_sigma: float) -> str | None:
-    """Why the shared points can not place one map in the other, or None if they can.
+    """Says why the shared points can not place one map in the other; None if they can.
 
-    `alignment` is None where there are too few.
+    `alignment` is None where there are fewer than NEEDED points.
     """
     if alignment is None:
         return f"{shared}, {NEEDED} needed"
@@ -177,10 +183,12 @@ def refusal(shared: Shared, alignment: Alignment | None, heading_sigma: float) -
 
 
 def disagreement(shared: Shared, chi2: float, confidence: float) -> str | None:
-    """Why two maps that share these points are not of one place, or None.
+    """Says why two maps that share these points can not show the same place; None if they can.
 
-    chi2: the rise of the joint cost when their landmarks are made one and the inter-robot
-    measurements taken; χ² of 2 per point less the 3 of the motion for maps that agree.
+    chi2: the rise of the joint cost when the shared landmarks are made one and the inter-robot
+        measurements are added. For maps that agree it is χ²-distributed with 2 degrees of freedom
+        per point less the 3 of the motion; `confidence` is the quantile above which it counts as a
+        disagreement.
     """
     limit = float(chdtri(2 * sum(shared) - 3, 1.0 - confidence))
     if chi2 > limit:

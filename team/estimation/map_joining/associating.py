@@ -1,10 +1,11 @@
-"""Data association in the fold: after each tick, which landmarks of its islands are one.
+"""Data association in the fold: decides after each tick which landmarks of an island are one.
 
-Every submap has founded its unnamed landmarks as nodes of their own; here nodes become one. In the
-order of a tick: tracking (the last submaps of the robot), near ones (older, where the standard
-deviation of the difference is small), sweeping (landmarks that were split), closures (elsewhere in
-the map, by map matching), and merges of islands. Each step is a function of the fold, which is one
-of the set in its canonical order; so are its decisions.
+Every submap adds its unnamed landmarks to the graph as nodes of their own; here nodes are merged.
+The steps of a tick, in their order: tracking (against the last submaps of the same robot), nearby
+landmarks (of older submaps, where the standard deviation of the difference is small), sweeping
+(landmarks that were split), closures (anywhere else in the map, by map matching), and merges of
+islands. Each step is a function of the fold alone, and the fold is a function of the set of submaps
+in its canonical order; so are the decisions.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,21 +40,21 @@ from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.submap_graph import Graph, tied
 
 OVERLOOKED = 0.4
-"""How often a window sees a landmark and overlooks one beside it …"""
+"""Upper bound of the probability that a window which sees a landmark misses one beside it."""
 LEAST_OVERLOOKED = 0.1
-"""… and how much that is believed at the most: some are seen from one side alone."""
+"""Lower bound of the same probability: some landmarks can be seen from one side only."""
 
 AGAIN = 8
-"""So many older submaps, of which landmarks are alone, are looked at again in a tick …"""
+"""Number of older submaps with unmatched landmarks that a tick examines again …"""
 AGAIN_WITHIN = 10.0
-"""… if they lie within so many radii of one object of what has come."""
+"""… if they lie within this many object radii of a landmark that the tick brings."""
 
 
 class View:
-    """An island's landmarks as a joint Gaussian, and what is merged in it, step by step.
+    """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
-    ids, nodes: of each landmark, by its node. seen_by: of each submap of the graph, the places of
-    its landmarks in `ids`.
+    ids, nodes: the identity and the node of each landmark, in the order of the nodes.
+    seen_by: for each submap of the graph, the indices of its landmarks in `ids`.
     """
 
     def __init__(self, island: Island, landmarks: Landmarks) -> None:
@@ -78,13 +79,13 @@ class View:
         self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
 
     def views(self, k: int) -> list[Indices]:
-        """The unnamed landmarks that keyframes of a submap saw together, by their places."""
+        """Indices of the unnamed landmarks that each keyframe of submap k observed together."""
         local = self.island.graph.submaps[k].contribution.local
         places = self.seen_by[k][local.ids >= UNNAMED]
         return [places[each] for each in local.unnamed.views]
 
     def take(self, pairs: Iterable[Pair], joint: Joint, kind: str) -> None:
-        """Note pairs that have become one."""
+        """Records the pairs that were merged, and the step (`kind`) that merged them."""
         self.joint = joint
         for pair in pairs:
             tie = Tie(kind, self.ids[pair.second], pair.llr, pair.rival, pair.sd, self.stamp_ns)
@@ -99,7 +100,9 @@ class View:
         most_sd: float,
         joint_sd: float | None = None,
     ) -> None:
-        """Grow from nothing with the pairs of two lists of landmarks, as far as it is sure."""
+        """Merges pairs out of two lists of landmarks, growing from the most certain pair
+        onwards.
+        """
         first, second = first[~self.gone[first]], second[~self.gone[second]]
         if not len(first) or not len(second):
             return
@@ -111,7 +114,9 @@ class View:
             self.assign(kind, first, second, joint_sd)
 
     def assign(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
-        """Of two lists of landmarks, what their joint assignments agree on."""
+        """Merges the pairs of two lists of landmarks on which all likely joint assignments
+        agree.
+        """
         first, second = first[~self.gone[first]], second[~self.gone[second]]
         if not len(first) or not len(second):
             return
@@ -127,7 +132,9 @@ class View:
             self.take(found.pairs, found.joint, kind)
 
     def sweep(self) -> None:
-        """Landmarks at one place that are known well to one another and never seen together."""
+        """Merges landmarks at one place that are well known relative to each other and never seen
+        together.
+        """
         at = np.flatnonzero(~self.gone)
         mean = self.joint.mean[at]
         away = np.abs(mean[:, None] - mean[None]).max(axis=2)
@@ -139,7 +146,9 @@ class View:
             self._grow("sweep", one[close], two[close], self.profile.tight)
 
     def _left_apart(self, one: Indices, two: Indices) -> Bool[np.ndarray, " k"]:
-        """Pairs that one window had and did not make one, unless all speaks for it by now."""
+        """Marks pairs that one window observed and kept apart, unless the evidence now favours one
+        landmark.
+        """
         own = np.zeros((len(self.ids), len(self.ids)), np.bool_)
         for places in self.seen_by:
             own[np.ix_(places, places)] = True
@@ -147,7 +156,7 @@ class View:
         return np.asarray(own[one, two] & (at.llr < self.profile.odds))
 
     def agreed(self, landmarks: Landmarks) -> None:
-        """What an operator has said to be one."""
+        """Merges the landmarks that an operator has declared to be one."""
         for first, second, same in landmarks.verdicts:
             one, two = (
                 self.place_of.get(landmarks.identity(each) or -1) for each in (first, second)
@@ -161,7 +170,7 @@ class View:
 def _unseen(
     points: Float[np.ndarray, "n 2"], seen_by: Sequence[Indices], radius: float
 ) -> Float[np.ndarray, " n"]:
-    """How likely it is that a landmark beside each one has been overlooked by all that saw it."""
+    """Probability, for each landmark, that all windows that saw it missed another one beside it."""
     counts = np.zeros(len(points))
     for places in seen_by:
         away = np.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
@@ -176,7 +185,9 @@ def _apart(
     landmarks: Landmarks,
     place_of: Mapping[int, int],
 ) -> Bool[np.ndarray, "n n"]:
-    """Which landmarks can not be one: seen by one keyframe, of two names, or said to be two."""
+    """Marks pairs of landmarks that can not be one: observed by one keyframe, named differently, or
+    declared to be two by an operator.
+    """
     named = np.array(ids) < UNNAMED
     apart = named[:, None] & named[None, :]
     for submap, places in zip(graph.submaps, seen_by, strict=True):
@@ -198,7 +209,7 @@ def _apart(
 
 
 def associated(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
-    """The fold after tracking, near ones and sweeping of a tick's submaps."""
+    """The fold after tracking, nearby landmarks and sweeping for the submaps of one tick."""
     arrived: dict[Stream, list[Contribution]] = {}
     for contribution in contributions:
         arrived.setdefault(fold.home[contribution.stream], []).append(contribution)
@@ -208,7 +219,7 @@ def associated(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
 
 
 def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
-    """Tracking, near ones, sweeping: of the news of one island."""
+    """Tracks, merges nearby landmarks and sweeps, for the new submaps of one island."""
     island = fold.islands[key]
     view = View(island, fold.landmarks)
     order = {id(each.contribution): k for k, each in enumerate(island.graph.submaps)}
@@ -233,8 +244,8 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
 
 
 def _doubtful(view: View, order: Mapping[int, int], arrived: Sequence[Contribution]) -> list[int]:
-    """The places of the newest submaps with two landmarks or more that nobody else has, near the
-    news: what was not to be decided may be so now.
+    """Indices of the newest submaps near the tick's submaps that have two or more landmarks which
+    no other submap has: a pair that was undecided may be decidable now.
     """
     fresh = [k for each in arrived if (k := order.get(id(each))) is not None]
     near = union(view.seen_by[k] for k in fresh)
@@ -250,7 +261,7 @@ def _doubtful(view: View, order: Mapping[int, int], arrived: Sequence[Contributi
 
 
 def applied(fold: Fold, key: Stream, view: View) -> Fold:
-    """The fold with what a view has made one, iterated once more."""
+    """The fold with the landmarks that a view has merged, after one further iteration."""
     if not view.ties:
         return fold
     landmarks, becomes = united(fold.landmarks, view.ties)
@@ -264,7 +275,7 @@ def applied(fold: Fold, key: Stream, view: View) -> Fold:
 
 
 def recent(graph: Graph, stream: Stream, sequence: int, count: int) -> list[int]:
-    """The places in the graph of a stream's last submaps before one."""
+    """Indices in the graph of the last `count` submaps of a stream before this sequence number."""
     return [
         k
         for k, each in enumerate(graph.submaps)
@@ -280,6 +291,6 @@ def _unnamed(view: View, k: int) -> Int64[np.ndarray, " _"]:
 
 
 def union(of: Iterable[Indices]) -> Int64[np.ndarray, " _"]:
-    """The places in any of these lists, ascending."""
+    """The indices that are in any of these lists, ascending."""
     places: Int64[np.ndarray, " _"] = np.unique(np.concatenate([np.zeros(0, np.int64), *of]))
     return places

@@ -1,10 +1,11 @@
-"""A fold that takes back a closure which what comes later speaks against.
+"""Takes back a closure that later submaps contradict.
 
-For some ticks after a closure, or a merge of robots, the share of the landmarks near its places
-that both sides have is asked again. Where it falls below the profile's bound the fold goes back to
-before the closure and takes the same ticks again without it: what is left is what there would be
-had it never been accepted. The fold before a closure and the ticks since are part of the fold, so
-this too depends on the set alone.
+For some ticks after a closure, or after a merge of robots, the share of the landmarks near its
+places that both sides have observed is computed again. Where it falls below the bound of the
+settings, the fold returns to the state before the closure and takes the same ticks again without
+it; the result is the fold that there would be had the closure never been accepted. The fold before
+a closure and the ticks since are part of the fold, so the outcome depends on the set of submaps
+alone.
 """
 
 from dataclasses import replace
@@ -19,7 +20,7 @@ from team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
 
 
 def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """The fold with the tick; closures that it speaks against are undone."""
+    """The fold with the tick; closures that the tick contradicts are undone."""
     if tick.verdicts:
         verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
         fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))
@@ -42,7 +43,7 @@ def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def _without(audit: Audit, after: Fold, share: float, settings: JoinSettings) -> Fold:
-    """The ticks since a closure, taken again without it."""
+    """Takes the ticks since a closure again, without the closure."""
     opened = audit.opened
     words = f"share {share:.2f} < {settings.association.undone_below:g} after {len(audit.ticks)}"
     stamp_ns = max((each.end_ns for each in after.contributions[-1:]), default=0)
@@ -58,7 +59,9 @@ def _without(audit: Audit, after: Fold, share: float, settings: JoinSettings) ->
 
 
 def share_now(fold: Fold, opened: Opened) -> float | None:
-    """The share of what lies near a closure's places that both sides have; None: there is none."""
+    """Share of the landmarks near a closure's places that both sides have observed; None without
+    any.
+    """
     places = {fold.landmarks.identity(one) for one, _ in opened.pairs}
     if not places:
         return None

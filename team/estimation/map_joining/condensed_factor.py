@@ -1,11 +1,11 @@
-"""What old submaps say, as one quadratic over the nodes of a graph that are left of them.
+"""The condensed factor: old submaps as one quadratic cost over the nodes that remain in the graph.
 
-Around the state `at` at which they were taken up,
+Linearised at the state `at` that the nodes had when the submaps were condensed,
 
     cost(x) = cost + 2 slopeᵀ d + dᵀ information d,   d = x − at (headings wrapped),
 
-with the poses that only they had eliminated (Schur's complement): exact but for the linearisation,
-which stays that of `at`, and the robust weights, which stay those that they had there.
+where the poses that occur in no other factor are eliminated (Schur complement). This is exact but
+for the linearisation point, which stays `at`, and the robust weights, which keep their values.
 """
 
 from collections.abc import Mapping
@@ -23,11 +23,12 @@ Values = Float[np.ndarray, " _"]
 
 
 class SubmapCost(NamedTuple):
-    """How one submap agrees with the rest: χ² should be near dof.
+    """How well one submap agrees with the rest of the map: χ² should be close to dof.
 
-    chi2 is unweighted, nothing discounted; dof = dim − w tr(JᵀP⁻¹J Σ) is the part of its dimension
-    that the solution does not take up (its redundancy, Baarda 1968); weight w is robust, 1 without
-    a robust loss.
+    chi2: unweighted χ² of the submap, without discounting any landmark.
+    dof: dim − w tr(JᵀP⁻¹J Σ), the part of the submap's dimension that the solution does not absorb
+        (its redundancy, Baarda 1968).
+    weight: the robust weight w; 1 without a robust loss.
     """
 
     stream: Stream
@@ -38,9 +39,10 @@ class SubmapCost(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where the eliminated start and end poses of a stream were when they left.
+    """The first and the last eliminated pose of a stream, at the state in which they were
+    eliminated.
 
-    is_fixed: whether the start is a constant.
+    is_fixed: whether the first pose is a constant.
     """
 
     poses: Float[np.ndarray, "K 3"]
@@ -48,11 +50,12 @@ class Path(NamedTuple):
 
 
 class Departed(NamedTuple):
-    """What the agreement keeps of factors that were taken up, as they agreed at that moment.
+    """Statistics of the factors that were condensed, as they were at that moment.
 
-    robots: Σ w χ² and Σ dof of each robot. submaps: the newest of each stream, oldest first.
-    believed: how many submaps that are believed have each landmark. paths: for when they are
-    linearised again.
+    robots: Σ w χ² and Σ dof of each robot.
+    submaps: costs of the newest condensed submaps of each stream, oldest first.
+    believed: for each landmark the number of believed submaps that contain it.
+    paths: the eliminated poses, from which the submaps are linearised again.
     """
 
     robots: Mapping[str, tuple[float, float]]
@@ -66,10 +69,11 @@ NOBODY = Departed({}, (), {}, {})
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """The quadratic (see above) over `nodes`, ascending, none of them fixed.
+    """The quadratic cost of the module's equation over `nodes`, ascending, none of them fixed.
 
-    headings: which of its numbers are headings. submaps: how many it stands for. redundancy: the
-    numbers that were measured less the unknowns that were eliminated.
+    headings: which of its numbers are headings.
+    submaps: the number of submaps that it replaces.
+    redundancy: the number of measured quantities less the number of eliminated unknowns.
     """
 
     nodes: Indices
@@ -83,7 +87,9 @@ class Condensed:
     departed: Departed = field(default=NOBODY)
 
     def moved(self, state: Values, offset: Indices) -> Values:
-        """d: how far the state is from where this was linearised."""
+        """Difference d = state − at, headings wrapped: the distance from the linearisation
+        point.
+        """
         d: Values = state[places(offset, self.nodes)] - self.at
         turn = d[self.headings]
         d[self.headings] = turn + 2.0 * np.pi * np.floor((np.pi - turn) / (2.0 * np.pi))
@@ -95,7 +101,7 @@ class Condensed:
         return self.cost + float(2.0 * (self.slope @ d) + d @ (self.information @ d))
 
     def gradient_at(self, state: Values, offset: Indices) -> Values:
-        """Half of the derivative: slope + information d."""
+        """Half of the cost's derivative: slope + information d."""
         gradient: Values = self.slope + self.information @ self.moved(state, offset)
         return gradient
 
@@ -108,14 +114,16 @@ class Condensed:
         entry: Indices,
         value_start: Indices,
     ) -> None:
-        """Add to the normal equations; entry: those of the pattern of each pair of `nodes`."""
+        """Adds the factor to the normal equations; `entry`: the pattern's entries of each pair of
+        `nodes`.
+        """
         gradient[places(offset, self.nodes)] += self.gradient_at(state, offset)
         sizes = np.diff(offset)[self.nodes]
         add_blocks(values, self.information, sizes, entry, value_start)
 
 
 def places(offset: Indices, nodes: Indices) -> Indices:
-    """Where the numbers of some nodes lie in the state, in their order."""
+    """Indices in the state of the numbers of some nodes, node after node."""
     sizes = offset[nodes + 1] - offset[nodes]
     first = np.repeat(offset[nodes] - np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes)
     found: Indices = first + np.arange(len(first))

@@ -1,13 +1,15 @@
-"""The bounded fold: what is old is condensed once, by rules on sequence numbers only.
+"""The bounded fold: old submaps are condensed into one quadratic, by sequence numbers only.
 
-The last LAG submaps of each stream of the main island stay as they are. Older ones are linearised
-at the state that the fold has when they leave, with the robust weights that they have there, and
-become one quadratic over landmarks, biases and the pose at each stream's boundary
-(`condensed_factor`); their poses are eliminated. So the cost of a tick depends on the landmarks and
-the robots, not on how long the team has been at work. A fold stays a pure function of its ticks.
+The last LAG submaps of each stream of the main island stay as factors of their own. Older ones are
+linearised at the state that the fold has when they are condensed, with their robust weights at that
+moment, and become one quadratic over landmarks, biases and the pose at each stream's boundary
+(`condensed_factor`); their other poses are eliminated. The cost of a tick therefore depends on the
+number of landmarks and robots, not on the duration of the run. A fold stays a pure function of its
+ticks.
 
-Nothing leaves before the fold has BEGIN submaps, nor before the robust scale of a submap has come
-to its end. Islands that wait for a place stay raw, since their frame is to turn.
+No submap is condensed before the fold has BEGIN submaps, nor before the submap's robust scale has
+reached its final value. Islands that are not merged yet are not condensed, since their frame will
+still be transformed.
 """
 
 from collections import defaultdict
@@ -41,18 +43,19 @@ Matrix = Float[np.ndarray, "n n"]
 T = TypeVar("T")
 
 LAG = 8
-"""So many submaps of each stream stay raw."""
+"""Number of submaps of each stream that are never condensed."""
 BEGIN = 128
-"""A fold of fewer submaps is taken in full."""
+"""A fold of fewer submaps than this is not condensed."""
 HISTORY = 50
-"""Of each stream the costs of so many departed submaps are kept."""
+"""Number of condensed submaps of each stream whose costs are stored."""
 
 
 def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN) -> Fold:
-    """The fold with what is old of its main island condensed; itself where nothing is.
+    """Condenses the old submaps of the fold's main island; returns the same fold where there are
+    none.
 
-    What can not be eliminated stays raw, and so does a team with unnamed landmarks: which of them
-    are one is asked of the submaps themselves, again and again.
+    Nothing is condensed whose poses can not be eliminated, or while the team has unnamed landmarks:
+    their data association examines the submaps themselves, at every tick.
     """
     key = fold.main_key
     if key is None or fold.size <= begin or fold.landmarks.number:
@@ -78,7 +81,9 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN) -> Fold:
 
 
 def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
-    """Which submaps are old: more than `lag` behind their stream's last, at their final scale."""
+    """Marks the submaps to be condensed: more than `lag` behind their stream's last, at their final
+    robust scale.
+    """
     graph, c = island.graph, island.settings.robust_c
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
     narrow = np.ones(len(graph.submaps), np.bool_) if c is None else island.scale <= c
@@ -137,7 +142,7 @@ def _condensed(island: Island, leaving: Bool[np.ndarray, " F"]) -> Island:
 
 
 def _eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " _"]:
-    """The nodes that nothing will be said of any more: poses of old submaps but the last."""
+    """Marks the nodes that no later factor can contain: poses of old submaps but the last one."""
     eliminated = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(leaving):
         contribution, nodes, _ = graph.submaps[f]
@@ -153,7 +158,9 @@ def _quadratic(
     seen: Bool[np.ndarray, " S"],
     prior: Bool[np.ndarray, " priors"],
 ) -> tuple[Matrix, Values, float]:
-    """A and half the gradient over the union of nodes, and the cost, of what leaves."""
+    """Matrix A, half the gradient and the cost of the condensed factors, over the union of their
+    nodes.
+    """
     graph, state = island.graph, island.state
     sizes = np.diff(graph.offset)[union]
     place = np.full(len(graph.fixed), -1, np.int64)
@@ -202,7 +209,9 @@ def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) 
 def _schur(
     H: Matrix, g: Values, out: Bool[np.ndarray, " n"]
 ) -> tuple[float, Values, Float[np.ndarray, "m m"]]:
-    """The quadratic without some of its numbers: gᵀA⁻¹g over them, slope and matrix of the rest."""
+    """Eliminates some numbers from a quadratic: returns gᵀA⁻¹g over them, and the remaining slope
+    and matrix.
+    """
     if not out.any():
         return 0.0, g, H
     kept = ~out
@@ -279,7 +288,7 @@ def _chosen(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
 
 
 def _newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
-    """The last HISTORY of each stream, in their order."""
+    """The costs of the last HISTORY submaps of each stream, in their order."""
     counts: dict[Stream, int] = defaultdict(int)
     kept = []
     for each in reversed(submaps):

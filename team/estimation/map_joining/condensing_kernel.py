@@ -1,4 +1,6 @@
-"""The kernels of condensing: submaps added to a dense quadratic, a dense one to a pattern."""
+"""Compiled kernels of condensing: add submaps to a dense quadratic, and a dense quadratic to a
+pattern.
+"""
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -23,7 +25,10 @@ def add_submaps(
     chosen: Indices,
     weights: Values,
 ) -> None:
-    """Add w JᵀP⁻¹J and w JᵀP⁻¹r of some submaps; place: of each node in H, −1: a constant."""
+    """Adds w JᵀP⁻¹J to H and w JᵀP⁻¹r to g for the chosen submaps.
+
+    place: for each node its first row in H, −1 for a constant.
+    """
     for f in chosen:
         nodes, at, mean, information, sensitivity = kernel.submap_of(offset, factors, f)
         hessian, slope, _ = biased_normal(state, at, mean, information, sensitivity)
@@ -54,7 +59,9 @@ def add_blocks(
     entry: Indices,
     value_start: Indices,
 ) -> None:
-    """Add the blocks of a dense matrix over some nodes to the numbers of a pattern."""
+    """Adds the blocks of a dense information matrix over some nodes to the values of a block
+    pattern.
+    """
     count = len(sizes)
     row = 0
     for a in range(count):

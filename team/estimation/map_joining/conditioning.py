@@ -1,14 +1,16 @@
 """A robot's pose in the team's map: the broadcast prior times the robot's own later submaps.
 
 The prior (the joint marginal of the robot's last joined end pose and the landmarks) and the submaps
-that are not in it are independent, so their product is exact; what the centre knows of the errors
-that all of a robot's submaps share is applied to them first. It is one least-squares problem, the
-centre's own with the prior in the place of all earlier submaps, and linearised where they all
-agree: joined one after the other, each on the guess before, the first of them would be linearised
-where a poor prior has the robot (decision 0031). A landmark that a submap sees where everything
-else contradicts it (a misread barcode) is left out of that submap, for this solution only: the next
-submap and the next prior judge all of them anew, so nobody is locked out. The result is for display
-and control; it never enters anything that the robot sends for fusion.
+that it does not contain are independent, so their product is exact; the errors that all submaps of
+a robot share are corrected first by the centre's estimates of them. The product is one
+least-squares problem: the centre's own, with the prior in the place of all earlier submaps. It is
+solved at once, so that every submap is linearised where all of them agree; joined one after the
+other, the first one would be linearised at the pose of a poor prior (decision 0031).
+
+A landmark observation of a submap that everything else contradicts (a misread barcode) is left out
+of that submap, for this solution only; the next submap and the next prior judge all of them anew,
+so that no landmark is excluded for good. The result is for display and control; it never enters a
+message that is fused.
 """
 
 import math
@@ -33,36 +35,47 @@ from team.estimation.map_joining.whole_map import WholeMap, end_pose, without
 from team.estimation.submap import LocalMap
 
 GATE = float(chi2_quantile(0.9999, 2))
-"""χ² beyond which what a submap says of a landmark is taken for another landmark's: some twenty are
-tested for each pose, and a good one that is left out costs little."""
+"""χ² beyond which a submap's observation of a landmark is attributed to another landmark. Some
+twenty are tested for each pose, and a correct one that is left out costs little.
+"""
 CONTRADICTED = 1e-6
-"""A prior and submaps agree so badly by chance once in a million times: then they contradict."""
+"""Probability below which the cost of a prior and submaps counts as a contradiction, not as
+chance.
+"""
 TRUSTING = JoinSettings()
-"""Least squares."""
+"""Settings of plain least squares."""
 DOUBTING = JoinSettings(robust_c=1e3, landmark_gate=GATE)
-"""Each landmark of a submap is discounted beyond the gate, which narrows; no submap as a whole."""
+"""Settings that discount each landmark of a submap beyond the gate, which narrows; no submap as a
+whole.
+"""
 DISPUTED = JoinSettings(robust_c=2.0, landmark_gate=GATE)
-"""Where they contradict each other a whole submap, or the map, is wrong: it counts for less."""
+"""Settings for contradictory input: a whole submap, or the map, may be wrong and is
+down-weighted.
+"""
 FEWEST = 2
-"""One landmark that is refused is a misread one, whatever else is seen."""
+"""Number of rejected landmarks from which a submap as a whole is in doubt; a single one was
+misread.
+"""
 SELF = ("self", 0)
-"""The stream of the prior and the robot's submaps in the graph that is solved."""
+"""The stream of the prior and of the robot's submaps in the graph that is solved."""
 
 
 class Shared(NamedTuple):
-    """How the centre takes a robot's submaps: their covariances times a factor f, their biases.
+    """The centre's corrections of a robot's submaps: a covariance factor f, and the shared biases.
 
-    biases: of each error b that they share its name, the centre's estimate and its sigma.
+    biases: for each shared error b its name, the centre's estimate of it and the standard
+        deviation.
     """
 
     covariance_factor: float = 1.0
     biases: tuple[tuple[Bias, float, float], ...] = ()
 
     def taken(self, local: LocalMap) -> LocalMap:
-        """N(mean + Sᵀ b, f P + Sᵀ diag(σ²) S): a submap as the centre takes it, S its sensitivity.
+        """The corrected submap N(mean + Sᵀ b, f P + Sᵀ diag(σ²) S) with the submap's sensitivity S.
 
-        What is not known of b is taken as independent of the map; the map is correlated with it
-        such that this is rather too much than too little. A bias that is not named is zero.
+        The remaining uncertainty of b is taken as independent of the map. In truth the map is
+        correlated with it in the sense that makes this covariance rather too large than too small.
+        A bias without an estimate is zero.
         """
         mean, covariance = local.mean, self.covariance_factor * local.covariance
         for name, value, sigma in self.biases:
@@ -74,10 +87,11 @@ class Shared(NamedTuple):
 
 
 class RobotPrior(NamedTuple):
-    """A robot's last joined end pose and landmarks: joint covariance of (x, y, θ, x₁, y₁, …).
+    """A robot's last joined end pose and landmarks: the joint covariance of (x, y, θ, x₁, y₁, …).
 
-    In the frame of the robot's island [m, rad]; ids ascending. A row of zeros is a known constant.
-    shared: how the submaps that are in it were taken, and those that are not are to be.
+    In the frame of the robot's island [m, rad], landmark ids ascending. A row of zeros is a known
+    constant.
+    shared: corrections of the submaps that the prior contains, and of those that it does not.
     """
 
     pose: Float[np.ndarray, "3"]
@@ -88,15 +102,19 @@ class RobotPrior(NamedTuple):
 
     @property
     def whole(self) -> WholeMap:
-        """The same as a map."""
+        """The prior as a `WholeMap`."""
         return WholeMap(self.ids, np.concatenate([self.pose, self.means.ravel()]), self.covariance)
 
 
 class Followed(NamedTuple):
-    """A robot's map behind some submaps. known: landmarks of each submap that others or the map
-    have, too; refused: how many of them everything else contradicts. cost: χ² of least squares over
-    the map and what is left of the submaps, in `dof` degrees of freedom; disputed: it is too much,
-    or most of a submap would have to go: something larger than a landmark is wrong.
+    """A robot's map after its later submaps, and how well they agree.
+
+    known: for each submap the number of its landmarks that the map or another submap contains, too.
+    refused: how many of those everything else contradicts.
+    cost: χ² of the least squares over the map and the submaps without the refused landmarks, in
+        `dof` degrees of freedom.
+    disputed: whether that χ² is too large, or most of a submap would be refused: something larger
+        than a single landmark is wrong.
     """
 
     whole: WholeMap
@@ -108,7 +126,9 @@ class Followed(NamedTuple):
 
 
 class Posed(NamedTuple):
-    """N(pose, covariance), and of the window's landmarks: how many the map has, and refuses."""
+    """N(pose, covariance); of the window's landmarks, how many the map contains and how many it
+    refuses.
+    """
 
     pose: PoseGaussian
     known: int = 0
@@ -116,15 +136,15 @@ class Posed(NamedTuple):
 
 
 def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
-    """A robot's map times its submaps behind the map's pose, in order.
+    """A robot's map times the submaps that follow the map's pose, in their order.
 
-    Of the team's prior and the submaps that are not in it: the robot's team map. Least squares; if
-    then a landmark of a submap lies beyond the gate, the landmarks are discounted one by one as the
-    gate narrows, those that end beyond it are left out, and what remains is solved again. Where
-    most of a submap would be left out, or what remains is contradictory still, no single landmark
-    is at fault: Cauchy's loss on whole submaps and on the map, with all landmarks, finds what is,
-    and the covariance is that of its weights.
-    Raises NotACovarianceError, or NotDeterminedError where the numbers are beyond solving.
+    Of the team's prior and the submaps that are not in it, this is the robot's team map. It is
+    solved by least squares. If a landmark of a submap then lies beyond the gate, the landmarks are
+    discounted one by one as the gate narrows, those that end beyond it are left out, and the rest
+    is solved again. Where most of a submap would be left out, or the rest is contradictory still,
+    no single landmark is at fault: Cauchy's loss on whole submaps and on the map, with all
+    landmarks, finds the factor that is, and the covariance is that of its weights.
+    Raises NotACovarianceError, or NotDeterminedError where the normal equations can not be solved.
     """
     submaps = [each.without_nodes for each in pending]
     if not submaps:
@@ -153,7 +173,7 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
 
 
 def is_majority(refused: int, known: int) -> bool:
-    """Whether so many of the known landmarks are refused that it is not they that are wrong."""
+    """Whether so many known landmarks are refused that the fault is not with single landmarks."""
     return refused >= FEWEST and 2 * refused > known
 
 
@@ -162,12 +182,14 @@ def _degrees(island: Island) -> int:
 
 
 def _most(dof: int) -> float:
-    """The cost beyond which a map and submaps contradict each other."""
+    """The cost above which a map and submaps contradict each other: the χ² quantile of
+    CONTRADICTED.
+    """
     return float(chdtri(dof, CONTRADICTED)) if dof > 0 else math.inf
 
 
 def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
-    """The graph of the map, as a submap that begins at the origin of its frame, and of submaps."""
+    """The island of the map, as a submap that begins at its frame's origin, and of the submaps."""
     chain = [LocalMap(whole.ids, whole.mean, whole.covariance), *submaps]
     taken = [Contribution(*SELF, k, k, each) for k, each in enumerate(chain)]
     graph, state = extended(EMPTY_GRAPH, np.zeros(0), taken, {}, {})
@@ -175,7 +197,7 @@ def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings
 
 
 def _beyond_gate(island: Island) -> list[Bool[np.ndarray, " L"]]:
-    """Which landmarks of each submap lie beyond the gate, by their own covariance."""
+    """Marks the landmarks of each submap that lie beyond the gate, by their own covariance."""
     factors = island.graph.factors
     beyond = landmark_chi2(island.state, island.graph.offset, factors, 1.0) > GATE
     return np.split(beyond, factors.block_start[1:-1])[1:]
@@ -188,7 +210,7 @@ def _without(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
 
 
 def _shared(whole: WholeMap, submaps: Sequence[LocalMap]) -> Iterator[int]:
-    """How many landmarks of each submap the map or another submap has, too."""
+    """For each submap, how many of its landmarks the map or another submap contains, too."""
     ids, counts = np.unique(
         np.concatenate([whole.ids, *(each.ids for each in submaps)]), return_counts=True
     )
@@ -197,9 +219,10 @@ def _shared(whole: WholeMap, submaps: Sequence[LocalMap]) -> Iterator[int]:
 
 
 def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
-    """N(pose, covariance) of the robot: a map's pose times the window in progress.
+    """N(pose, covariance) of the robot: a map's pose composed with the window in progress.
 
-    Of the map only the marginal of the landmarks that the window sees is used, which is exact.
+    Only the marginal of the landmarks that the window observes is taken from the map, which is
+    exact.
     """
     if open_window is None:
         return Posed(PoseGaussian(whole.mean[:3], whole.covariance[:3, :3]))
@@ -210,10 +233,10 @@ def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
 def curved(pose: PoseGaussian) -> PoseGaussian:
     """The covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ = (f, l, φ) ~ N(0, S), to second order.
 
-    A robot whose heading is known badly lies on an arc, not in an ellipse: the position is
-    (f, l) + φ/2 (−l, f) to second order, so what is known to σ_f along the way is spread across it
-    by E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4, and so on (moments of a Gaussian; Isserlis 1918). Far
-    from where the heading was known that is larger than σ_f². The mean stays the most likely pose.
+    A robot with an uncertain heading lies on an arc, not in an ellipse: its position is (f, l) +
+    φ/2 (−l, f) to second order, which adds E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 to the variance of
+    f, and so on (moments of a Gaussian; Isserlis 1918). Far from where the heading was known this
+    exceeds σ_f². The mean stays the most likely pose.
     """
     T = tangent(float(pose.mean[2]))
     S = T.T @ pose.covariance @ T

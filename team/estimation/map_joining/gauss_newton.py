@@ -1,14 +1,14 @@
 """The solution of a submap graph: Gauss-Newton, shortened or damped where the cost would rise.
 
-Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖start − prior‖² + Σ ρ(bias − prior),
-where ρ is the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting. A
-robust factor enters with a wide scale that narrows with each iteration it has lived through, so a
-true loop closure is not taken for an outlier before the chain has bent.
+Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initial pose − prior‖² + Σ ρ(bias −
+prior), where ρ is the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting.
+A robust factor enters with a wide scale that narrows with each iteration since it was added, so
+that a true loop closure is not taken for an outlier before the chain has adapted to it.
 
-With a robust loss each landmark of a submap has a weight of its own besides, so that a landmark
-that was mistaken for another does not break the robot's chain: beyond the gate g its χ² counts
-g (1 + log(χ²/g)), whose slope, the weight, is g/χ². The weight enters as additional variance of
-that landmark alone (`joining_kernel.discounted_information`).
+With a robust loss each landmark of a submap has a weight of its own as well, so that a landmark
+that was mistaken for another does not break the robot's chain: beyond the gate g its χ² counts g (1
++ log(χ²/g)), whose slope, the weight, is g/χ². The weight enters as additional variance of that
+landmark alone (`joining_kernel.discounted_information`).
 """
 
 import math
@@ -31,9 +31,9 @@ from team.estimation.map_joining.submap_graph import CommonBias, Graph
 from team.estimation.sparse_cholesky import sparse
 
 LEAST_WEIGHT = 1e-6
-"""No landmark is discounted more, so that each stays determined."""
+"""Lower bound of a landmark's weight, so that each landmark stays determined."""
 FULL_AGE = 1_000_000
-"""Iterations after which every robust scale has come to its end."""
+"""Number of iterations after which every robust scale has reached its final value."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,20 @@ class JoinSettings:
     iterations_per_tick: Gauss-Newton iterations of `folded`.
     robust_c: Cauchy's scale on √(χ²/dim) of a factor; None for least squares. The scale begins at
         robust_start · c and is multiplied by robust_decay with each iteration until it is c.
-    landmark_gate: χ² (2 numbers) from which a submap's landmark is discounted by itself, when there
-        is a robust loss; it narrows like the scale.
-    covariance_factor: every submap's covariance is taken times this.
-    max_iterations, step_tolerance: a full solve ends when no unknown moves by more [m, rad].
-    alignment_confidence: quantile of the χ² test before a free island is merged.
-    alignment_heading_sigma: the shape of the shared landmarks must give a heading this well [rad].
-    bias_sigma: how large the errors are that a robot's submaps share, before they are estimated.
-    common_bias_sigma: the same of errors that all robots share, as of a calibration of their kind;
-        they add to each robot's own. "marker": by what share of the range a landmark reads too far
-        for all of them, each landmark by itself.
-    joined_ranges: errors of ranges are proportional to the range, and it is taken from the joined
-        map (`joining_kernel.with_joined_ranges`).
+    landmark_gate: χ² of two numbers from which a submap's landmark is discounted by itself, when
+        there is a robust loss; it narrows with the scale.
+    covariance_factor: factor on every submap's covariance.
+    max_iterations, step_tolerance: a full solve ends when no unknown changes by more than
+        step_tolerance [m, rad], or after max_iterations.
+    alignment_confidence: quantile of the χ² test that an island must pass before it is merged.
+    alignment_heading_sigma: largest standard deviation [rad] of the heading that the shape of the
+        shared landmarks gives; islands with a larger one are not merged.
+    bias_sigma: prior standard deviation of each error that a robot's submaps share.
+    common_bias_sigma: the same for errors that all robots share, as of a calibration of their kind;
+        they add to each robot's own. "marker": the share of the range by which all robots measure
+        one landmark too far, for each landmark by itself.
+    joined_ranges: whether errors of ranges are proportional to the range in the joined map
+        (`joining_kernel.with_joined_ranges`).
     association: when landmarks without names count as one.
     """
 
@@ -83,15 +85,15 @@ class NotDeterminedError(ValueError):
 
 
 UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
-"""What a solution raises where its numbers do not allow one: a value to decide on, no defect."""
+"""What a solve raises where the numbers allow no solution: a case to decide on, not a defect."""
 
 
 @dataclass(frozen=True, eq=False)
 class Island(least_squares.Point):
-    """One frame: its graph, the state (poses and landmarks by node) and the factors' ages.
+    """One frame: its graph, the state (poses and landmarks by node) and the ages of the factors.
 
-    age, sighting_age: iterations that each submap and each inter-robot measurement has lived
-    through; the robust scale follows from it.
+    age, sighting_age: number of iterations since each submap and each inter-robot measurement was
+        added; the robust scale follows from it.
     """
 
     graph: Graph
@@ -116,7 +118,7 @@ class Island(least_squares.Point):
 
     @cached_property
     def _submaps(self) -> kernel.Factors:
-        """The submaps with the noise that they have at this state."""
+        """The submaps, with their noise taken at this state."""
         factors = self.graph.factors
         if not self.settings.joined_ranges:
             return factors
@@ -124,7 +126,7 @@ class Island(least_squares.Point):
 
     @cached_property
     def _landmark_chi2_and_gate(self) -> tuple[Values, Values]:
-        """χ² of each landmark of each submap by itself, and its gate."""
+        """χ² of each landmark of each submap by itself, and the gate of each."""
         factors, settings = self._submaps, self.settings
         if settings.robust_c is None:
             return np.zeros(len(factors.block)), np.ones(len(factors.block))
@@ -144,7 +146,7 @@ class Island(least_squares.Point):
 
     @cached_property
     def factors(self) -> kernel.Factors:
-        """The submaps with their landmarks discounted."""
+        """The submaps with the covariances of discounted landmarks enlarged."""
         return self._discounted(self.landmark_weight)
 
     def _discounted(self, weight: Values) -> kernel.Factors:
@@ -155,7 +157,7 @@ class Island(least_squares.Point):
 
     @cached_property
     def dimensions(self) -> Float[np.ndarray, " F"]:
-        """Numbers in each submap, discounted ones as far as they count."""
+        """Dimension of each submap, a discounted landmark counting by its weight."""
         factors = self.graph.factors
         of = np.repeat(np.arange(len(self.graph.submaps)), np.diff(factors.block_start))
         lost = np.bincount(of, 2.0 * (1.0 - self.landmark_weight), len(self.graph.submaps))
@@ -163,22 +165,22 @@ class Island(least_squares.Point):
 
     @cached_property
     def chi2(self) -> Float[np.ndarray, " F"]:
-        """rᵀ(f P)⁻¹r of each submap, landmarks discounted."""
+        """rᵀ(f P)⁻¹r of each submap, with discounted landmarks."""
         factor = self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, self.factors, factor)
 
     @cached_property
     def whole_chi2(self) -> Float[np.ndarray, " F"]:
-        """rᵀ(f P)⁻¹r of each submap, nothing discounted."""
+        """rᵀ(f P)⁻¹r of each submap, without discounting."""
         factor = self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, self._submaps, factor)
 
     @cached_property
     def counted_chi2(self) -> Float[np.ndarray, " F"]:
-        """χ² of each submap with each landmark's share w χ² counted w times.
+        """χ² of each submap in which each landmark's share w χ² counts w times.
 
-        In `dimensions` its numbers count by the same share: down-weighted terms are left out of
-        the agreement test.
+        `dimensions` counts its numbers by the same weight: down-weighted terms are left out of the
+        agreement test.
         """
         factors, factor = self._discounted(self.landmark_weight**2), self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, factors, factor)
@@ -201,16 +203,17 @@ class Island(least_squares.Point):
 
     @cached_property
     def prior_chi2(self) -> Float[np.ndarray, " priors"]:
-        """χ² of each prior on a start."""
+        """χ² of each prior, of an initial pose or of a bias."""
         return np.array([prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
 
     @cached_property
     def prior_weight(self) -> Float[np.ndarray, " priors"]:
-        """Robust weight of each prior: that of a bias as of a submap, of all else 1.
+        """Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.
 
         A sensor that was changed since its calibration is one robot's: its prior is an outlier, and
-        must not draw the others, by what they have in common, away from theirs. Markers are not
-        changed, and one that is seen from one side only is told from its landmark by its prior.
+        must not draw the other robots' biases away from theirs through the errors in common.
+        Markers are not changed; the error of a marker that is seen from one side only is
+        distinguished from its landmark's position by its prior alone.
         """
         if self.settings.robust_c is None:
             return np.ones(len(self.graph.priors))
@@ -219,7 +222,9 @@ class Island(least_squares.Point):
         return np.where(of_bias, weight, 1.0)
 
     def cost_of(self, other: "Island") -> float:
-        """The cost of another state with the weights of this one: what an iteration lowers."""
+        """The cost of another state with the weights of this one: the quantity that an iteration
+        lowers.
+        """
         state = other.state
         factor, offset = self.settings.covariance_factor, self.graph.offset
         chi2 = float((self.weight * kernel.costs(state, offset, self.factors, factor)).sum())
@@ -230,7 +235,7 @@ class Island(least_squares.Point):
 
     @cached_property
     def cost(self) -> float:
-        """What is minimised, at the present scales."""
+        """The cost that is minimised, at the present robust scales."""
         graph = self.graph
         sizes = len(self.age), len(self.sighting_age), len(graph.priors)
         submaps, seen, priors = (np.ones(size, np.bool_) for size in sizes)
@@ -244,7 +249,7 @@ class Island(least_squares.Point):
         sightings: Bool[np.ndarray, " S"],
         priors: Bool[np.ndarray, " priors"],
     ) -> float:
-        """The cost of some of the factors."""
+        """The cost of the marked factors."""
         if self.settings.robust_c is None:
             chi2 = float(self.chi2[submaps].sum() + self.prior_chi2[priors].sum())
             return chi2 + float(self.sighting_chi2[sightings].sum())
@@ -267,7 +272,9 @@ class Island(least_squares.Point):
 
     @cached_property
     def normal_equations(self) -> tuple[Values, Values]:
-        """A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and the gradient Σ w JᵀP⁻¹r."""
+        """A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w
+        JᵀP⁻¹r.
+        """
         graph, pattern = self.graph, self.graph.pattern
         values, gradient, _ = kernel.normal_equations(
             self.state,
@@ -307,7 +314,7 @@ class Island(least_squares.Point):
 
     @property
     def diagonal(self) -> Int64[np.ndarray, " n"]:
-        """The places of the information matrix' diagonal among its values."""
+        """Indices of the information matrix' diagonal among its values."""
         return self.graph.pattern.diagonal
 
     @cached_property
@@ -323,7 +330,7 @@ class Island(least_squares.Point):
             raise NotDeterminedError(self.graph.name(error.variable)) from error
 
     def moved(self, step: Values) -> "Island":
-        """The state a step further, its headings in (−π, π]."""
+        """The island with `step` added to its state, headings wrapped to (−π, π]."""
         state = self.state + step
         headings = state[self.graph.headings]
         state[self.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
@@ -336,7 +343,7 @@ class Island(least_squares.Point):
 
 
 def aged(island: Island, iterations: int | None) -> Island:
-    """The island so many iterations older; None: every factor begins anew."""
+    """The island with every factor so many iterations older; None: every factor begins anew."""
     if iterations is None:
         age, sighting_age = np.zeros_like(island.age), np.zeros_like(island.sighting_age)
     else:
@@ -345,7 +352,7 @@ def aged(island: Island, iterations: int | None) -> Island:
 
 
 def final_cost(island: Island) -> float:
-    """The cost with every robust scale at its end, so that islands can be compared."""
+    """The cost with every robust scale at its final value, so that islands can be compared."""
     return aged(island, FULL_AGE).cost
 
 
@@ -379,7 +386,7 @@ def prior_terms(
 
 
 def iterated(island: Island) -> Island:
-    """The iterations of one tick."""
+    """The island after the iterations of one tick."""
     damping = 0.0
     for _ in range(island.settings.iterations_per_tick):
         island, (damping, _) = least_squares.iterated(island, _eased(damping))
@@ -388,15 +395,15 @@ def iterated(island: Island) -> Island:
 
 
 def _eased(damping: float) -> float:
-    """What the next iteration begins with: a robust cost is another one at its next scale."""
+    """The damping with which the next iteration begins: the next robust scale changes the cost."""
     return 0.0 if damping == STUCK else damping
 
 
 def settled(island: Island) -> tuple[Island, int, float]:
-    """The full solution from here, the iterations it took and the last change [m, rad].
+    """The full solution from this state, the number of iterations and the last change [m, rad].
 
-    A robust scale is annealed anew for all factors. Ends at `max_iterations` at the latest, or
-    where no step lowers the cost: the last change tells whether it converged.
+    The robust scale of every factor is annealed anew. The solve ends when converged, after
+    `max_iterations`, or where no step lowers the cost; the last change tells whether it converged.
     """
     settings = island.settings
     island = aged(island, None)
@@ -413,10 +420,11 @@ def settled(island: Island) -> tuple[Island, int, float]:
 
 
 def solved_with_fixed(island: Island, unknown: int, by: float, iterations: int) -> Island:
-    """One number of the state moved by so much, everything else solved for given that.
+    """Moves one number of the state by `by` and solves for all others given that.
 
-    With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose part
-    along w is what is missing: the point of the constraint with the least cost to second order.
+    With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose
+    component along w is what remains to be moved: the point on the constraint with the least cost
+    to second order.
     """
     missing = by
     for _ in range(iterations):
@@ -429,7 +437,9 @@ def solved_with_fixed(island: Island, unknown: int, by: float, iterations: int) 
 
 
 def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:
-    """Mean and joint covariance of some nodes in their order; a fixed node has covariance 0."""
+    """Mean and joint covariance of some nodes, in the order of `nodes`; a fixed node has covariance
+    0.
+    """
     graph = island.graph
     spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
     unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])

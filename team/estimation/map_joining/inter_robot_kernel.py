@@ -1,6 +1,6 @@
-"""The kernels of sightings: range-bearing factors between two poses, and their normal equations.
+"""Compiled kernels of inter-robot measurements: range-bearing factors between two poses.
 
-An observer at pose a sees a teammate at pose b: with v = p_b − p_a and ρ = ‖v‖
+An observer at pose a measures a teammate at pose b: with v = p_b − p_a and ρ = ‖v‖
 
     r = z − (ρ, wrap(atan2(v_y, v_x) − θ_a)) ~ N(0, R),
 
@@ -25,10 +25,11 @@ Values = Float[np.ndarray, " _"]
 
 class Sightings(NamedTuple):
     """All inter-robot measurements of a graph in flat arrays, in the order in which they were
-    taken.
+    added.
 
-    nodes: observer's and teammate's pose node. first_pair: where the inter-robot measurements'
-    pairs of members begin in the pattern's entries; each has 2 × 2.
+    nodes: pose nodes of the observer and of the teammate.
+    first_pair: where the pairs of members of these factors begin in the pattern's entries; each
+        factor has 2 × 2.
     """
 
     nodes: Int64[np.ndarray, "S 2"]
@@ -97,7 +98,9 @@ def add_sightings(
     entry: Indices,
     value_start: Indices,
 ) -> None:
-    """Add Σ w JᵀR⁻¹J on the pattern and Σ w JᵀR⁻¹r; scale: each one's robust c."""
+    """Adds Σ w JᵀR⁻¹J to the pattern's values and Σ w JᵀR⁻¹r to the gradient; scale: robust c of
+    each.
+    """
     pair = sightings.first_pair
     for f in range(len(sightings.nodes)):
         nodes = sightings.nodes[f]
@@ -135,7 +138,7 @@ def explained_by_sightings(
     value_start: Indices,
     inverse: Values,
 ) -> Values:
-    """tr(JᵀR⁻¹J Σ) of each sighting: the part of its 2 numbers that the solution takes up."""
+    """tr(JᵀR⁻¹J Σ) of each factor: the part of its 2 numbers that the solution absorbs."""
     result = np.zeros(len(sightings.nodes))
     pair = sightings.first_pair
     for f in range(len(result)):

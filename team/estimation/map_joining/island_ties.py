@@ -1,8 +1,8 @@
-"""What ties two islands: points that are known in the frames of both.
+"""The points that are known in the frames of two islands, and the alignments that they allow.
 
-A shared landmark is such a point. So is a teammate that is seen from a pose node: in the observer's
-island it lies at pose ∘ (range, bearing), in its own at its pose node. One inter-robot measurement
-and its reverse are two points.
+A shared landmark is such a point. So is a teammate that is observed from a pose node: in the
+observer's island it lies at pose ∘ (range, bearing), in its own island at its pose node. An
+inter-robot measurement and the reverse one are two points.
 """
 
 import math
@@ -22,16 +22,20 @@ Points = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
 """n points [m] and their joint covariance, m = 2n."""
 HEADINGS = 24
 MOST_POINTS = 24
-"""More points than these do not fit at two headings, and would make the search slow."""
+"""With more points than this only the best heading is tried: so many points do not fit at two
+headings, and would make the search slow.
+"""
 HOPELESS = 100.0
-"""A heading whose χ² is higher by this much than the best one's is not looked at."""
+"""Headings whose χ² exceeds the best one's by more than this are not tried."""
 
 
 class Tie(NamedTuple):
-    """A point: its node in the main island and in the other one; how it is seen, if it is.
+    """One point: its node in the main island and in the other one, and the measurement that ties
+    them.
 
-    seen: the inter-robot measurement. from_main: its observer is in the main island, whose node is
-    then the observer's.
+    seen: the inter-robot measurement; None for a shared landmark.
+    from_main: whether the observer is in the main island; that island's node is then the
+        observer's.
     """
 
     main: int
@@ -41,7 +45,9 @@ class Tie(NamedTuple):
 
 
 def ties(main: Graph, other: Graph, sightings: Sequence[Sighting]) -> list[Tie]:
-    """Shared landmarks by id, then the inter-robot measurements across in their order."""
+    """The shared landmarks by id, then the inter-robot measurements between the islands in their
+    order.
+    """
     shared = sorted(main.landmarks.keys() & other.landmarks.keys())
     found = [Tie(main.landmarks[id_], other.landmarks[id_]) for id_ in shared]
     for each in sightings:
@@ -55,7 +61,7 @@ def ties(main: Graph, other: Graph, sightings: Sequence[Sighting]) -> list[Tie]:
 
 
 def aligned_by(main: Island, other: Island, tied: Sequence[Tie]) -> alignment.Alignment | None:
-    """Where the other island lies in the main one; None with too few ties."""
+    """Where the other island lies in the main one; None where the points do not suffice."""
     if len(tied) < alignment.NEEDED:
         return None
     in_main = _points(main, [(t.main, t.seen if t.from_main else None) for t in tied])
@@ -64,7 +70,9 @@ def aligned_by(main: Island, other: Island, tied: Sequence[Tie]) -> alignment.Al
 
 
 def _points(island: Island, at: Sequence[tuple[int, Sighting | None]]) -> Points:
-    """The positions of nodes, or of what is seen from them, with their joint covariance."""
+    """The positions of nodes, or of the teammates measured from them, with their joint
+    covariance.
+    """
     mean, covariance = joint_marginal(island, [node for node, _ in at])
     points = np.empty((len(at), 2))
     J = np.zeros((2 * len(at), len(mean)))
@@ -90,10 +98,11 @@ def _points(island: Island, at: Sequence[tuple[int, Sighting | None]]) -> Points
 def headings_that_fit(
     main: Island, other: Island, tied: Sequence[Tie]
 ) -> list[Float[np.ndarray, "3"]]:
-    """Every main_from_other at whose heading the tied points fit better than at its neighbours'.
+    """Every main_from_other whose heading is a local minimum of the χ² of the shared points.
 
     The best translation at each heading of a grid follows in closed form from the joint covariance
-    of the points. Hopeless headings are left out, and with many points all but the best one are.
+    of the points. Headings that are worse by more than HOPELESS are left out; with more than
+    MOST_POINTS points only the best one is returned.
     """
     if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
         return []

@@ -1,11 +1,10 @@
 """The team's map as a fold over its submaps in their canonical order.
 
 Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over all submaps of
-all robots, and over the inter-robot measurements between their pose nodes. The fold
-takes the submaps by ticks, each with the inter-robot measurements from it; it is a pure function of
-their order and of the ticks' boundaries. Streams whose start in the common frame is unknown are
-islands of their own until shared landmarks and inter-robot measurements tie them to the main
-island.
+all robots, and over the inter-robot measurements between their pose nodes. The fold takes the
+submaps by ticks, each with the inter-robot measurements from it; it is a pure function of their
+order and of the ticks' boundaries. A stream whose initial pose in the common frame is unknown is an
+island of its own until shared landmarks and inter-robot measurements tie it to the main island.
 """
 
 import math
@@ -80,7 +79,7 @@ class NotCanonicalError(ValueError):
 
 
 class GapError(ValueError):
-    """Submaps of a stream are missing before this one, so its start pose is not in the graph."""
+    """Submaps of a stream are missing before this one, so the graph lacks its start pose."""
 
     def __init__(self, contribution: Contribution, expected: int) -> None:
         super().__init__(
@@ -91,7 +90,7 @@ class GapError(ValueError):
 
 
 class LateStartError(ValueError):
-    """A start was given to a stream that the fold has submaps of already."""
+    """An initial pose was given for a stream of which the fold already contains submaps."""
 
     def __init__(self, start: InitialPoseFactor) -> None:
         super().__init__(
@@ -103,13 +102,15 @@ class LateStartError(ValueError):
 
 @dataclass(frozen=True)
 class Tick:
-    """The members that one tick brings, in canonical order.
+    """The contents of one tick, in canonical order.
 
-    contributions: the submaps. sightings: the inter-robot measurements from them.
+    contributions: the submaps.
+    sightings: the inter-robot measurements from the poses of those submaps.
     starts: the initial poses of the streams whose first submap is among them.
-    outside: why a submap is refused before it is tried (it lies beyond what is sensible).
-    set_aside: in words, what else was refused before.
-    verdicts: an operator's, on landmarks of these submaps or of earlier ones.
+    outside: for a submap that is refused before it is tried, the reason (it exceeds a sensible
+        bound).
+    set_aside: messages about everything else that was refused before.
+    verdicts: an operator's decisions on landmarks of these submaps or of earlier ones.
     """
 
     contributions: Sequence[Contribution]
@@ -122,7 +123,9 @@ class Tick:
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """A closure that may still be undone: the fold before it, and the ticks from its own on."""
+    """A closure that may still be undone: the fold before it, and the ticks since, its own
+    included.
+    """
 
     opened: Opened
     before: "Fold"
@@ -131,24 +134,26 @@ class Audit:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """The state of the fold: the islands solved so far, and what is known about them.
+    """The state of the fold: the islands solved so far, and the bookkeeping of their submaps.
 
-    home:       island (a key of `islands`) of each stream.
-    reasons:    why an island other than the main one is not merged, by its frame.
-    joined:     how an island was merged into another one and how certain that is, by its old frame.
-    warnings:   of the full solution, what speaks for another minimum, in words.
-    waiting:    inter-robot measurements whose pose nodes are not both in one island, in canonical
-                order.
-    judged:     number of submaps of two islands at their last failed merge attempt, and the reason
-                for the failure.
-    looked:     number of submaps of an island at its last failed search for a lower minimum.
-    iterations, change: of the main island's last full solution: how many, the last step [m, rad].
-    refused:    submaps that came and are not in the map, in canonical order, and why (`taken`).
-    set_aside:  in words, what else was refused: initial poses, inter-robot measurements, and the
-                landmarks of submaps of which only the motion is in the map.
-    landmarks:  which unnamed landmarks of which submaps are one, and why (`associating`).
-    audits:     closures that may still be undone (`auditing`).
-    departed:   submaps that are condensed (`condensing`), no more among `contributions`.
+    home: island (a key of `islands`) of each stream.
+    reasons: why an island other than the main one is not merged, by its frame.
+    joined: how an island was merged into another one and how certain that is, by its former frame.
+    warnings: the signs of another minimum that the full solution found, in words.
+    waiting: inter-robot measurements whose pose nodes are not both in one island, in canonical
+        order.
+    judged: number of submaps of two islands at their last failed merge attempt, and the reason for
+        the failure.
+    looked: number of submaps of an island at its last failed search for a lower minimum.
+    iterations, change: the number of iterations and the last step [m, rad] of the main island's
+        last full solution.
+    refused: submaps that were received and are not in the map, in canonical order, with the reason
+        (`taken`).
+    set_aside: in words, what else was refused: initial poses, inter-robot measurements, and the
+        landmarks of submaps of which only the motion is in the map.
+    landmarks: which unnamed landmarks of which submaps are one, with the evidence (`associating`).
+    audits: closures that may still be undone (`auditing`).
+    departed: number of condensed submaps (`condensing`), which are no longer among `contributions`.
     """
 
     contributions: tuple[Contribution, ...]
@@ -171,12 +176,14 @@ class Fold:
 
     @property
     def size(self) -> int:
-        """How many submaps it has."""
+        """Number of submaps in the fold, condensed ones included."""
         return self.departed + len(self.contributions)
 
     @property
     def main_key(self) -> Stream | None:
-        """Key of the island with the known starts, else of the one with the smallest stream."""
+        """Key of the island with the known initial poses, else of the one with the smallest
+        stream.
+        """
         started = sorted(stream for stream in self.home if stream in self.starts)
         streams = started or sorted(self.home)
         return self.home[streams[0]] if streams else None
@@ -198,7 +205,7 @@ class Fold:
         return self.islands[self.home[(robot, incarnation)]]
 
     def next_sequence(self, stream: Stream) -> int:
-        """Sequence of the submap that the fold takes next from a stream."""
+        """Sequence number of the next submap that the fold takes from a stream."""
         if stream not in self.home:
             return 0
         return self.islands[self.home[stream]].graph.next_sequence(stream)
@@ -208,7 +215,7 @@ EMPTY_FOLD = Fold((), {}, {}, {}, {})
 
 
 def started(fold: Fold, start: InitialPoseFactor) -> Fold:
-    """The fold that knows where a stream starts; before that stream's first submap."""
+    """The fold with a stream's initial pose; to be called before the stream's first submap."""
     if start.stream in fold.home:
         raise LateStartError(start)
     return replace(fold, starts={**fold.starts, start.stream: start})
@@ -220,12 +227,14 @@ def folded(
     settings: JoinSettings,
     sightings: Sequence[Sighting] = (),
 ) -> Fold:
-    """One tick: take the submaps, place what is new, iterate, merge islands that can be.
+    """Takes one tick: adds the submaps, places new landmarks, iterates, and merges islands where
+    possible.
 
-    Contributions stand in canonical order, behind all that the fold has, without a gap in a
-    stream; else NotCanonicalError or GapError. Islands without news keep their state. sightings:
-    those from the submaps of this tick; each is a factor from the tick on in which both of its pose
-    nodes are in one island.
+    contributions: submaps in canonical order, behind all that the fold contains and without a gap
+        in a stream; else NotCanonicalError or GapError is raised. Islands without new submaps keep
+        their state.
+    sightings: the inter-robot measurements from the submaps of this tick; each is a factor from the
+        tick on in which both of its pose nodes are in one island.
     """
     _check(fold, contributions)
     home = dict(fold.home)
@@ -265,10 +274,10 @@ def folded(
 
 
 def compacted(fold: Fold) -> Fold:
-    """The same fold without what can be computed again from it: a checkpoint to keep.
+    """The same fold without the values that can be computed again from it: a checkpoint to store.
 
-    It shares the submaps with the folds before and after it; its own are the state and the graph's
-    nodes, a hundredth of what a fold holds that was solved.
+    It shares the submaps with the folds before and after it. Of its own it has the state and the
+    graph's nodes, a hundredth of the size of a solved fold.
     """
     islands = {
         key: replace(island, graph=replace(island.graph)) for key, island in fold.islands.items()
@@ -277,10 +286,10 @@ def compacted(fold: Fold) -> Fold:
 
 
 def converged(fold: Fold, settings: JoinSettings) -> Fold:
-    """The full solution of every island; `iterations` and `change` tell how it ended.
+    """The full solution of every island; `iterations` and `change` describe how it ended.
 
-    Wrong minima are looked for; what is found stands in `warnings`. An island that has no full
-    solution stays as the last tick has left it, and `warnings` says so.
+    Other minima are searched for and reported in `warnings`. An island that has no full solution
+    keeps the state of the last tick, and `warnings` reports that.
     """
     if fold.main_key is None:
         return fold
@@ -316,7 +325,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
 
 
 def _search(island: Island) -> Search:
-    """The search for the island's full solution; where there is none, the island as it is."""
+    """The search for the island's full solution; where there is none, the island unchanged."""
     with suppress(*UNSOLVABLE):
         found = searched([island])
         if is_solvable(found.best.island):
@@ -338,9 +347,10 @@ def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
 
 
 def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
-    """Merge islands while any two can be; the smallest frame stays, that of known starts before it.
+    """Merges islands while any two can be merged, into the one with known initial poses or the
+    smallest frame.
 
-    A pair that was judged is judged again when it has grown by PATIENCE, or `at_last`.
+    A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
     """
     main_key = fold.main_key
     keys = sorted(
@@ -370,7 +380,9 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
 
 
 def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
-    """The fold with one island less; how that came about stands under the frame that is gone."""
+    """The fold with two islands merged; the record of the merge is filed under the frame that is
+    gone.
+    """
     islands = {at: each for at, each in fold.islands.items() if at != other_key}
     islands[key] = found.best.island
     gone = min(fold.islands[other_key].graph.streams)
@@ -388,7 +400,9 @@ def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> 
 
 
 def _looked(fold: Fold) -> Fold:
-    """Islands whose cost is suspicious are searched for a lower minimum, now and then."""
+    """Searches islands of suspicious cost for a lower minimum, each time they have grown by
+    PATIENCE.
+    """
     islands, looked = dict(fold.islands), dict(fold.looked)
     for key, island in fold.islands.items():
         size = len(island.graph.submaps)

@@ -1,4 +1,4 @@
-"""The kernels of map joining: the sparse normal equations of all submaps, and their costs."""
+"""Compiled kernels of map joining: the sparse normal equations of all submaps, and their costs."""
 
 import math
 from typing import NamedTuple
@@ -18,22 +18,26 @@ from team.estimation.map_joining.submap_factor import (
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 LARGEST_RATIO = 1.25
-"""Of a landmark's distance in the joined map to the measured one, or its inverse: what differs by
-more is an outlier, whose covariance is not to grow with it."""
+"""Largest ratio of a landmark's distance in the joined map to the measured one, and of its inverse.
+A landmark beyond it is an outlier, whose covariance must not grow with the distance.
+"""
 LARGEST_TURN_RAD = 0.2
-"""Of a landmark's direction in the joined map to the measured one: more is an outlier's."""
+"""Largest angle between a landmark's direction in the joined map and the measured one; a landmark
+beyond it is an outlier.
+"""
 NO_POWER = -1
 
 
 class Factors(NamedTuple):
-    """All submaps of a graph in flat arrays, in the order in which they were taken.
+    """All submaps of a graph in flat arrays, in the order in which they were added.
 
     member[member_start[f] : member_start[f + 1]] are the nodes of submap f: start pose, end pose,
     pose nodes by stamp, landmarks by id, biases. mean, information (P⁻¹, row-major) and sensitivity
-    (a row per bias) lie likewise from mean_start, information_start and sensitivity_start on.
-    block: each landmark's own covariance (xx, xy, yy), those of submap f from block_start[f] on.
-    range_power: of each row of the sensitivities, those of submap f from row_start[f] on, the power
-    of a landmark's range with which it moves that landmark, along or across; NO_POWER: neither.
+    (a row per bias) begin likewise at mean_start, information_start and sensitivity_start.
+    block: each landmark's own covariance (xx, xy, yy); those of submap f begin at block_start[f].
+    range_power: for each row of the sensitivities, beginning at row_start[f], the power of a
+        landmark's range with which the bias moves that landmark, along or across; NO_POWER:
+        neither.
     """
 
     member: Indices
@@ -75,10 +79,10 @@ def _pairs(
 def block_pattern(
     fixed: Bool[np.ndarray, " _"], member: Indices, member_start: Indices
 ) -> tuple[Indices, Indices, Indices]:
-    """Pattern of Σ JᵀP⁻¹J, and the entry that each pair of members of each factor adds to.
+    """Pattern of Σ JᵀP⁻¹J, and the entry of it to which each pair of members of each factor adds.
 
-    Returns column_start, rows (as in `sparse.Pattern`) and, factor by factor, a k × k table over
-    the members: entry for (a, b) if node a ≥ node b, else −1; −1 too if one of them is fixed.
+    Returns column_start and rows (as in `sparse.Pattern`) and, factor by factor, a k × k table over
+    the members: the entry for (a, b) if node a ≥ node b, else −1; also −1 if one of them is fixed.
     """
     n = len(fixed)
     pair_row, pair_column = _pairs(fixed, member, member_start)
@@ -128,24 +132,27 @@ def _places(offset: Indices, nodes: Indices) -> Indices:
 
 @compiled
 def _turn_and_stretch(values: Values, i: int, j: int, c: float, s: float, stretch: float) -> None:
-    """In place: the two numbers at i and j are a point, which is turned and made longer."""
+    """Rotates the point stored at indices i and j, and scales it by `stretch`, in place."""
     x, y = values[i], values[j]
     values[i], values[j] = stretch * (c * x - s * y), stretch * (s * x + c * y)
 
 
 @compiled
 def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Factors:
-    """The submaps as if their noise had been taken at the ranges of the joined map.
+    """The submaps, with their noise recomputed at the ranges of the joined map.
 
-    Where the error of a range is proportional to the range, q is the distance that the state gives
-    a landmark from where its submap saw it (the middle of the submap's poses), over the one that
-    the submap measured, and φ the angle between the two. Its errors are turned with it and taken
-    times q, P' = T P Tᵀ with T = blkdiag(1, …, q R(φ), …), and its derivatives by the sensor's
-    errors are those at the place that the map gives it: S' = qᵏ R(φ) S with k = 0 of an offset of
-    ranges, 1 of their scale. At the measured distance d(1 + e) what came out short weighs more, by
-    (1 + e)⁻² (Peelle's puzzle), and in a scale b that is a state the noise, e along and ε across,
-    meets itself: a map and all ranges that are smaller by s have χ² smaller by 2 s for each number
-    that was measured. Both make maps smaller, the second by more the more submaps there are.
+    For errors proportional to the range: q is the distance of a landmark, in the state, from where
+    its submap saw it (the middle of the submap's poses), over the distance that the submap
+    measured, and φ the angle between the two. The landmark's errors are rotated by φ and multiplied
+    by q, P' = T P Tᵀ with T = blkdiag(1, …, q R(φ), …), and its derivatives by the sensor's errors
+    are those at the place that the map gives it: S' = qᵏ R(φ) S with k = 0 for an offset of ranges
+    and 1 for their scale.
+
+    With the noise of the measured distance d(1 + e) instead, a measurement that came out short
+    weighs more, by (1 + e)⁻² (Peelle's puzzle); and where the scale b of the ranges is a state, the
+    noise (e along, ε across) couples to itself: a map and all ranges that are smaller by s have a
+    χ² that is smaller by 2 s for each measured number. Both make maps smaller, the second by more
+    the more submaps there are.
     """
     information, block = factors.information.copy(), factors.block.copy()
     columns = factors.sensitivity.copy()
@@ -235,8 +242,8 @@ def landmark_chi2(
 def discounted_information(factors: Factors, weight: Values) -> Values:
     """(P + blkdiag(0, (1/w_l − 1) P_ll))⁻¹ of each submap, in the layout of `information`.
 
-    A landmark with weight w_l counts as if its own error were that much larger; the rest of the
-    submap keeps what it says. By Woodbury's identity, a landmark after the other.
+    A landmark with weight w_l counts as if its own covariance were that much larger; the rest of
+    the submap keeps its information. By Woodbury's identity, one landmark after the other.
     """
     result = factors.information.copy()
     for f in range(len(factors.member_start) - 1):
@@ -281,7 +288,7 @@ def _sensitivity(factors: Factors, f: int, n: int) -> Float[np.ndarray, "B n"]:
 def submap_of(
     offset: Indices, factors: Factors, f: int
 ) -> tuple[Indices, Indices, Values, Float[np.ndarray, "n n"], Float[np.ndarray, "B n"]]:
-    """A submap's nodes, their places in the state, its mean, its P⁻¹ and its sensitivity."""
+    """Submap f: its nodes, their indices in the state, its mean, its P⁻¹ and its sensitivity."""
     nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
     mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
     n, begin = len(mean), factors.information_start[f]
@@ -328,10 +335,10 @@ def normal_equations(
     column_start: Indices,
     value_start: Indices,
 ) -> tuple[Values, Values, Values]:
-    """Σ w JᵀP⁻¹J on the pattern, Σ w JᵀP⁻¹r, and χ² of each submap (unweighted).
+    """Σ w JᵀP⁻¹J on the pattern, Σ w JᵀP⁻¹r, and the unweighted χ² of each submap.
 
-    scale: the robust c of each submap. A fixed node keeps an identity block without couplings and
-    a zero gradient, so that its step is zero.
+    scale: the robust c of each submap. A fixed node has an identity block without couplings and a
+        zero gradient, so that its step is zero.
     """
     values = np.zeros(value_start[-1])
     gradient = np.zeros(offset[-1])
@@ -377,10 +384,10 @@ def explained(
     value_start: Indices,
     inverse: Values,
 ) -> Values:
-    """tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution takes up.
+    """tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.
 
     inverse: the entries of Σ on the pattern. For a solution with these weights the sum over all
-    factors is the number of unknowns.
+        factors is the number of unknowns.
     """
     result = np.zeros(len(factors.member_start) - 1)
     pair = 0

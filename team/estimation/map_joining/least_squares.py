@@ -1,8 +1,8 @@
 """Nonlinear least squares: one iteration of Gauss-Newton, shortened or damped where the cost rises.
 
 Robust losses enter by iterated re-weighting: a point's cost is quadratic in the residuals, with the
-weights that it has itself. A robust scale begins wide and narrows with the iterations that its
-factor has lived through, so that what is far off at first is not taken for an outlier.
+weights of that same point. A robust scale begins wide and narrows with the number of iterations
+since its factor was added, so that a residual that is large at first is not taken for an outlier.
 """
 
 import math
@@ -16,18 +16,19 @@ from team.estimation.sparse_cholesky import sparse
 
 Values = Float[np.ndarray, " _"]
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
-"""Of an undamped step, tried before damping: odometry makes long curved valleys, in which a damped
-step crawls."""
+"""Shares of an undamped step that are tried before damping: odometry makes long curved valleys, in
+which damped steps are very short.
+"""
 LEAST_DAMPING = 1e-4
 MOST_DAMPING = 1e8
 STUCK = math.inf
-"""The damping that says that no step lowers the cost."""
+"""The damping of a point from which no step lowers the cost."""
 ROUNDING = 1e-10
-"""A cost may rise by this part of itself: rounding near the minimum is no reason to damp."""
+"""Relative rise of the cost that is accepted: rounding near the minimum is no reason to damp."""
 
 
 class Point(ABC):
-    """An estimate of all unknowns, with the cost's parabola there."""
+    """An estimate of all unknowns, with the quadratic approximation of the cost there."""
 
     @property
     @abstractmethod
@@ -37,7 +38,7 @@ class Point(ABC):
     @property
     @abstractmethod
     def diagonal(self) -> Int64[np.ndarray, " n"]:
-        """The places of A's diagonal entries among its values."""
+        """Indices of A's diagonal entries among its values."""
 
     @property
     @abstractmethod
@@ -50,32 +51,35 @@ class Point(ABC):
 
     @abstractmethod
     def cost_of(self, other: Self) -> float:
-        """Σ w χ² of another point with this one's weights and noise: what a step lowers.
+        """Σ w χ² of another point with this one's weights and noise: the quantity that a step
+        lowers.
 
-        Its fall is a fall of the robust cost too, since each loss lies below its parabola.
+        Where it falls the robust cost falls too, since each loss lies below its parabola.
         """
 
     @abstractmethod
     def moved(self, step: Values) -> Self:
-        """The point a step further."""
+        """The point with `step` added to its unknowns."""
 
 
 P = TypeVar("P", bound=Point)
 
 
 class Iteration(NamedTuple):
-    """One step's change: damping for the next one (or STUCK), the whole step's largest change."""
+    """The outcome of one step: the damping for the next one (or STUCK), the full step's largest
+    change.
+    """
 
     damping: float
     change: float
 
 
 def iterated(point: P, damping: float) -> tuple[P, Iteration]:
-    """The next point, and how the step went.
+    """Takes one step: returns the next point and the outcome of the step.
 
-    A step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, undamped, a share of it;
-    else one more damped. None is taken where no damping helps: the point stays, the change is that
-    of the first step.
+    The step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, if undamped, a share
+    of it; else a more damped one. Where no damping helps the point is returned unchanged, with the
+    change of the first step.
     """
     values, gradient = point.normal_equations
     before = point.cost_of(point)
@@ -104,7 +108,7 @@ def _largest(step: Values) -> float:
 def robust_scale(
     age: Int64[np.ndarray, " k"], robust_c: float | None, start: float, decay: float
 ) -> Float[np.ndarray, " k"]:
-    """Cauchy's scale c of factors after `age` iterations: c · max(1, start · decay^age).
+    """Cauchy's scale c of factors after `age` iterations: robust_c · max(1, start · decay^age).
 
     Infinite without a robust loss.
     """

@@ -1,8 +1,8 @@
-"""Closures and merges by map matching: where the last submaps of a robot lie in what is known.
+"""Closures and merges by map matching: finds a robot's last submaps elsewhere in the map.
 
-A patch, the landmarks of a stream's last submaps, is compared with all else of its island, and with
-every other island, in which its place is unknown. An alignment that passes all tests makes the
-landmarks one (and the islands); one that does not waits, and its record says which test failed.
+A patch, the landmarks of a stream's last submaps, is compared with the rest of its island, and with
+every other island, in which its place is unknown. An alignment that passes all tests merges the
+landmarks (and the islands); one that fails is deferred, and its record names the test that failed.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,11 +49,15 @@ from team.estimation.map_joining.minima import minimum
 from team.estimation.map_joining.submap_graph import tied
 
 PART = 15
-"""So many neighbouring landmarks vote by themselves for where they lie."""
+"""Number of neighbouring landmarks in a part of the patch that votes for an alignment of its
+own.
+"""
 
 
 def recognised(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
-    """The fold after the association of a tick's submaps; itself where none has unnamed ones."""
+    """The fold after data association of a tick's submaps; unchanged where no landmark is
+    unnamed.
+    """
     if not fold.landmarks.sets:
         return fold
     fold = replace(fold, landmarks=replace(fold.landmarks, opened=()))
@@ -77,13 +81,13 @@ def matched(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
 
 
 class Views:
-    """The views of a tick's islands, made once of each as long as it stays as it is."""
+    """The views of the islands, each computed once for as long as its island does not change."""
 
     def __init__(self) -> None:
         self._of: dict[Stream, View] = {}
 
     def of(self, fold: Fold, key: Stream) -> View:
-        """Of an island."""
+        """The view of the island with this key."""
         known = self._of.get(key)
         if known is None or known.island is not fold.islands[key]:
             known = self._of[key] = View(fold.islands[key], fold.landmarks)
@@ -91,7 +95,7 @@ class Views:
 
 
 def _patch(view: View, stream: Stream, last: int) -> list[int]:
-    """The places in the graph of the submaps of a stream up to `last` that are to be matched."""
+    """Indices in the graph of the stream's submaps up to `last` that make up the patch."""
     first = last - view.profile.recent
     return [
         k
@@ -101,7 +105,7 @@ def _patch(view: View, stream: Stream, last: int) -> list[int]:
 
 
 def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
-    """A closure of a stream's last submaps inside its island, if there is one."""
+    """The fold with a closure of the stream's last submaps inside their island, if there is one."""
     key = fold.home[stream]
     view = View(fold.islands[key], fold.landmarks)
     profile = view.profile
@@ -132,7 +136,7 @@ def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
 
 
 def _not_undone(found: Closure, landmarks: Landmarks, pairs: Sequence[tuple[int, int]]) -> Closure:
-    """A closure that was undone before is not accepted again."""
+    """Rejects a closure that was undone before; returns every other one as it is."""
     if found.why or not landmarks.was_undone(pairs):
         return found
     return found._replace(why="it was undone before")
@@ -144,7 +148,7 @@ def _waiting(fold: Fold, of: tuple[Stream, Stream], decision: Decision) -> Fold:
 
 
 def _opened(fold: Fold, opened: Opened) -> Fold:
-    """The fold with a closure that is to be audited; nothing of its own waits any more."""
+    """The fold with a closure that is to be audited; its deferred decisions are removed."""
     waits = {
         of: each for of, each in fold.landmarks.waits.items() if each.about != opened.decision.about
     }
@@ -155,7 +159,7 @@ def _opened(fold: Fold, opened: Opened) -> Fold:
 def _by_members(
     landmarks: Landmarks, pairs: Sequence[tuple[int, int]]
 ) -> tuple[tuple[Member, Member], ...]:
-    """Pairs of identities by their smallest members; without those of which one has a name only."""
+    """Pairs of landmarks by their smallest members; pairs with one named landmark are left out."""
     sets = landmarks.sets
     return tuple(
         (sets[one][0], sets[two][0]) for one, two in pairs if sets.get(one) and sets.get(two)
@@ -163,9 +167,10 @@ def _by_members(
 
 
 def _reachable(view: View, patch: Indices) -> Indices:
-    """What else a patch may lie at, by the joint covariance; nothing where all is known well.
+    """Landmarks with which those of the patch may coincide by the joint covariance; empty where all
+    are well known.
 
-    What no landmark of the patch may be is no rival either: `grow` would refuse its seeds.
+    An alignment with any other landmark is no rival: `grow` would reject its seeds.
     """
     others = np.setdiff1d(np.arange(len(view.ids)), patch)
     one, two = (each.ravel() for each in np.meshgrid(patch, others, indexing="ij"))
@@ -177,7 +182,7 @@ def _reachable(view: View, patch: Indices) -> Indices:
 
 
 def _made(fold: Fold, key: Stream, view: View, found: Closure, decision: Decision) -> Fold:
-    """The fold with a closure, solved anew, and what is now near to one another made one."""
+    """The fold with a closure, solved anew, and with nearby landmarks merged afterwards."""
     view.take(found.pairs, view.joint, decision.kind)
     fold = applied(fold, key, view)
     fold = replace(fold, landmarks=fold.landmarks.decided(decision))
@@ -191,7 +196,7 @@ def _solved(fold: Fold, key: Stream) -> Fold:
 
 
 def _tidied(fold: Fold, key: Stream) -> Fold:
-    """What a closure has brought near is made one: all against all."""
+    """Merges the landmarks that a closure has brought close to each other: all against all."""
     view = View(fold.islands[key], fold.landmarks)
     everything = np.arange(len(view.ids))
     view.step("near", everything, everything, view.profile.near)
@@ -200,7 +205,7 @@ def _tidied(fold: Fold, key: Stream) -> Fold:
 
 
 def _side(view: View, at: Indices, submaps: Sequence[int]) -> Side:
-    """Landmarks of an island, and what the keyframes of some of its submaps saw of them."""
+    """Landmarks of an island, with the observations of them by keyframes of some of its submaps."""
     P = view.joint.covariance.reshape(len(view.ids), 2, len(view.ids), 2)
     own = P[at, :, at]
     sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))
@@ -212,7 +217,9 @@ def _side(view: View, at: Indices, submaps: Sequence[int]) -> Side:
 
 
 def _patch_side(view: View, patch: Indices, submaps: Sequence[int]) -> Side:
-    """A patch, with the landmarks from each of its submaps on, until they are PART or more."""
+    """A patch of at least PART landmarks where possible: those of its submaps from the last one
+    backwards.
+    """
     parts = []
     for first in range(len(submaps)):
         part = union([])
@@ -241,7 +248,7 @@ def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
 
 
 def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Views) -> Fold:
-    """The stream's island and another one as one, if the stream's last submaps are found there."""
+    """Merges the stream's island with another one, if the stream's last submaps are found there."""
     key = fold.home[stream]
     mine, theirs = (views.of(fold, at) for at in (key, other_key))
     profile = mine.profile
@@ -295,7 +302,9 @@ def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Vie
 
 
 def _is_identity(found: Alignment, patch: Indices) -> bool:
-    """Whether an alignment of a patch with its own map lays a third of it on itself."""
+    """Whether an alignment of a patch with its own map places a third of its landmarks on
+    themselves.
+    """
     of = dict(zip(found.there.at.tolist(), found.there.names.tolist(), strict=True))
     pairs = found.grown.pairs
     same = sum(of[pair.second] == int(patch[pair.first]) for pair in pairs)
@@ -310,7 +319,9 @@ def _merged(
     two_from_one: Float[np.ndarray, "3"],
     decision: Decision,
 ) -> Fold:
-    """Two islands as one; the one with the team's frame stays, else that of the smallest stream."""
+    """Two islands as one, in the team's frame if one of them has it, else in that of the smallest
+    stream.
+    """
     (key, mine), (other_key, theirs) = one, two
     landmarks, becomes = united(
         fold.landmarks,

@@ -1,6 +1,6 @@
-"""What a joined map says: means and marginal covariances, and how well its submaps agree.
+"""Marginals of a joined map: means and covariances, and how well its submaps agree.
 
-Everything is in the frame of an island: the main one, or the one that a stream is in.
+All values are in the frame of an island: the main one, or the one that a stream is in.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from team.estimation.map_joining.inter_robot_kernel import explained_by_sighting
 from team.estimation.map_joining.joining import Fold
 
 BELIEVED = 0.5
-"""A submap whose landmark has at least this weight is believed."""
+"""A submap is believed as to a landmark whose weight in it is at least this."""
 
 
 class LandmarkMap(NamedTuple):
@@ -49,8 +49,8 @@ class Trajectory(NamedTuple):
 class EndPoses(NamedTuple):
     """End poses of a stream's submaps in their order, each with its covariance.
 
-    start, start_covariance: where the first one begins. crosses: the covariance of each pose with
-    the one before it, of the first with the start.
+    start, start_covariance: the start pose of the first submap.
+    crosses: covariance of each pose with the pose before it, of the first one with the start.
     """
 
     poses: Float[np.ndarray, "K 3"]
@@ -61,7 +61,7 @@ class EndPoses(NamedTuple):
 
 
 class BiasEstimate(NamedTuple):
-    """An error that the submaps of a stream share, ± one sigma."""
+    """The estimate of an error that the submaps of a stream share, and its standard deviation."""
 
     stream: Stream
     bias: Bias
@@ -70,12 +70,12 @@ class BiasEstimate(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """Joint cost Σ w χ² and its degrees of freedom, in all, per robot and per submap.
+    """Joint cost Σ w χ² and its degrees of freedom: in total, per robot and per submap.
 
-    An inter-robot measurement counts with its observer, a discounted landmark as far as it is
-    believed. Without a robust loss the joint dof is the sum of the submaps' dimensions (and of the
-    inter-robot measurements' and the priors') less the number of unknowns. A lasting chi2/dof above
-    1.1 is a warning, above 1.3 the covariances are not to be trusted.
+    An inter-robot measurement counts for its observer, a discounted landmark by its weight. Without
+    a robust loss the total dof is the sum of the dimensions of submaps, inter-robot measurements
+    and priors less the number of unknowns. A chi2/dof that stays above 1.1 is a warning; above 1.3
+    the covariances can not be trusted.
     """
 
     chi2: float
@@ -85,9 +85,10 @@ class Agreement(NamedTuple):
 
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
-    """The errors that each stream's submaps share, in the island that the stream is in.
+    """The estimates of the errors that each stream's submaps share, in the island that the stream
+    is in.
 
-    A robot's own and what the team has in common, together.
+    Each is the sum of the robot's own error and of the one that the team has in common.
     """
     return sorted(each for island in fold.islands.values() for each in _biases_in(island))
 
@@ -106,11 +107,11 @@ def _biases_in(island: Island) -> list[BiasEstimate]:
 
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
-    """The main island's landmarks, by id, that so many submaps or more have and are believed in;
-    of those without a name `unnamed`, if that is more.
+    """Ids of the main island's landmarks that `submaps` believed submaps or more contain; of
+    unnamed landmarks as many as the larger of `submaps` and `unnamed`.
 
-    A submap is believed where the robust loss does not discount its landmark below BELIEVED: of
-    two that contradict each other one is left, and nothing confirms it.
+    A submap is believed where the robust loss does not discount its landmark below BELIEVED: of two
+    contradictory observations only one is believed, and nothing confirms it.
     """
     island = fold.main
     if submaps <= 1 and unnamed <= 1:
@@ -129,16 +130,18 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
-    """The main island's landmarks (all, or those asked for) with their joint covariance."""
+    """The main island's landmarks (all, or those with the given ids) with their joint
+    covariance.
+    """
     chosen = sorted(fold.main.graph.landmarks if ids is None else ids)
     mean, covariance = joint_marginal(fold.main, _nodes(fold.main, chosen))
     return LandmarkMap(np.array(chosen, dtype=np.uint32), mean.reshape(-1, 2), covariance)
 
 
 def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
-    """The main island's landmarks (all, or those asked for), each with its own covariance.
+    """The main island's landmarks (all, or those with the given ids), each with its own covariance.
 
-    By selected inversion.
+    By selected inversion of the information matrix.
     """
     island = fold.main
     chosen = sorted(island.graph.landmarks if ids is None else ids)
@@ -152,14 +155,16 @@ def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlo
 def prior_for(
     fold: Fold, robot: str, incarnation: int, ids: Sequence[int] | None = None
 ) -> RobotPrior:
-    """What a robot needs to place itself: its last end pose and the landmarks, jointly."""
+    """The prior with which a robot computes its pose: its last end pose and the landmarks,
+    jointly.
+    """
     stream, island = (robot, incarnation), fold.island(robot, incarnation)
     chosen = sorted(island.graph.landmarks if ids is None else ids)
     return _priors_in(island, {stream: chosen})[stream]
 
 
 def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
-    """Where the last submap of a stream ends, in the frame of its island."""
+    """The end pose of the stream's last submap, in the frame of its island."""
     island = fold.islands[fold.home[stream]]
     return _mean(island, island.graph.streams[stream][-1])
 
@@ -170,11 +175,12 @@ def main_priors(
     most: int | None = None,
     chosen: Sequence[int] | None = None,
 ) -> dict[Stream, RobotPrior]:
-    """`prior_for` of some streams of the main island.
+    """The priors (`prior_for`) of some streams of the main island.
 
-    chosen: the landmarks by ascending id; None: all. most: of more than these each prior has those
-    nearest to its pose only. What a robot has no prior of is new to it until the next one: less
-    accurate, and as consistent.
+    chosen: the landmarks by ascending id; None: all.
+    most: largest number of landmarks of a prior, which are then those nearest to its pose. A
+        landmark that is not in a robot's prior is new to the robot until the next one: its pose is
+        less accurate, and as consistent.
     """
     island = fold.main
     ids = np.array(sorted(island.graph.landmarks) if chosen is None else chosen)
@@ -190,7 +196,7 @@ def main_priors(
 
 
 def _priors_in(island: Island, wanted: Mapping[Stream, Sequence[int]]) -> dict[Stream, RobotPrior]:
-    """A prior of each stream with some landmarks, ascending; solved for once, all together."""
+    """A prior of each stream with the given landmarks, ascending; one solve for all of them."""
     chosen = sorted({id_ for ids in wanted.values() for id_ in ids})
     poses = [island.graph.streams[stream][-1] for stream in wanted]
     mean, covariance = joint_marginal(island, [*poses, *_nodes(island, chosen)])
@@ -213,7 +219,7 @@ def _priors_in(island: Island, wanted: Mapping[Stream, Sequence[int]]) -> dict[S
 
 
 def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
-    """Where the submaps of a stream end, in the frame of its island."""
+    """The end poses of a stream's submaps, in the frame of its island."""
     island = fold.island(robot, incarnation)
     nodes = island.graph.streams[(robot, incarnation)]
     (start, start_covariance), *ends = (_own_marginal(island, node) for node in nodes)
@@ -227,16 +233,17 @@ def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
 
 
 def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
-    """The covariance between two poses that a submap ties."""
+    """Covariance between two poses that one submap connects."""
     if island.graph.fixed[row] or island.graph.fixed[column]:
         return np.zeros((3, 3))
     return island.graph.pattern.block(island.selected_covariance, row, column)
 
 
 class Terms(NamedTuple):
-    """The agreement factor by factor, in the graph's order.
+    """The agreement of each factor, in the graph's order.
 
-    submaps: nothing discounted. counted, priors, sightings: (robot, w χ², dof) as they count.
+    submaps: costs without discounting.
+    counted, priors, sightings: (robot, w χ², dof) as they enter the joint cost.
     """
 
     submaps: list[SubmapCost]
@@ -246,7 +253,7 @@ class Terms(NamedTuple):
 
 
 def terms(island: Island) -> Terms:
-    """How each factor of an island agrees with the rest."""
+    """How well each factor of an island agrees with the rest."""
     graph = island.graph
     explained = kernel.explained(
         island.state,
@@ -276,7 +283,8 @@ def terms(island: Island) -> Terms:
 def joint_cost(fold: Fold) -> Agreement:
     """The agreement of the main island's submaps, at the present estimate.
 
-    What is condensed counts as it agreed when that was done; of its submaps the newest are told.
+    Condensed submaps count with their costs at the moment of condensing; only the newest of them
+    are listed.
     """
     found = terms(fold.main)
     old = fold.main.graph.condensed
@@ -308,7 +316,7 @@ def _own_marginal(
 
 
 def _sightings(island: Island) -> list[tuple[str, float, float]]:
-    """(observer, w χ², dof) of the inter-robot measurements."""
+    """(observer, w χ², dof) of each inter-robot measurement."""
     graph, weight = island.graph, island.sighting_weight
     explained = explained_by_sightings(
         island.state,
@@ -324,7 +332,9 @@ def _sightings(island: Island) -> list[tuple[str, float, float]]:
 
 
 def _priors(island: Island) -> list[tuple[str, float, float]]:
-    """(robot, χ², dof) of the priors on starts and biases; the team's counts with its frame."""
+    """(robot, χ², dof) of each prior on an initial pose or a bias; a common bias counts for the
+    frame's robot.
+    """
     robots = {nodes[0]: stream[0] for stream, nodes in island.graph.streams.items()}
     robots |= {node: stream[0] for (stream, _), node in island.graph.biases.items()}
     robots |= dict.fromkeys(island.graph.common.values(), min(island.graph.streams)[0])

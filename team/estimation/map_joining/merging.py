@@ -1,10 +1,11 @@
-"""Two islands become one when the points that both know leave one likely place for the other.
+"""Merges two islands when the points that both know leave a single likely place for one in the
+other.
 
-A merge is tried from every place that the tied points propose: all of them, the landmarks alone,
-the inter-robot measurements alone, and every heading at which the points fit well. Each is solved
-in full, and so is a start that owes nothing to any of them (`minima`). The lowest cost is taken if
-the two maps do not disagree there and no other place is about as likely; else the merge waits and
-says why.
+A merge is tried from every place that the shared points propose: from all of them, from the
+landmarks alone, from the inter-robot measurements alone, and at every heading at which the points
+fit well. Each attempt is solved in full, and so is a start that does not depend on any of them
+(`minima`). The solution of lowest cost is accepted if the two maps do not disagree there and no
+other place is about as likely; else the merge is deferred, with the reason.
 """
 
 from collections.abc import Sequence
@@ -25,11 +26,11 @@ from team.estimation.map_joining.minima import Minimum, Search, minimum, searche
 from team.estimation.map_joining.submap_graph import encounter_of, merged
 
 WORTH_TELLING = 1.0
-"""A search that gained less than this in χ² found the place that the first guess led to."""
+"""Gain in χ² below which a search is not reported: it found the place of the first guess."""
 
 
 class Merge(NamedTuple):
-    """The islands as one, the inter-robot measurements that still wait, and how sure it is, in
+    """The merged island, the inter-robot measurements that still wait, and the certainty in
     words.
     """
 
@@ -39,20 +40,20 @@ class Merge(NamedTuple):
 
 
 class Waits(NamedTuple):
-    """Why two islands stay apart; after_search: places were solved for, which took its time."""
+    """Why two islands stay apart; after_search: whether that took a (slow) search over places."""
 
     why: str
     after_search: bool
 
 
 def ages(count: int) -> Int64[np.ndarray, " count"]:
-    """The ages of so many new factors."""
+    """The ages of `count` new factors: 0."""
     return np.zeros(count, dtype=np.int64)
 
 
 def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[Sighting, ...]]:
-    """The island with the inter-robot measurements that it has both pose nodes of, and those that
-    still wait.
+    """The island with the inter-robot measurements between its own pose nodes, and the remaining
+    ones.
     """
     candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
     found = [between for _, between in candidates if between is not None]
@@ -65,9 +66,9 @@ def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[
 
 
 def merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | Waits:
-    """The other island in the main one's frame, or why it waits.
+    """Merges the other island into the main one's frame, or returns why that has to wait.
 
-    Where the numbers of the shared points allow no solution, they wait as well.
+    It waits, too, where the numbers of the shared points allow no solution.
     """
     try:
         with np.errstate(all="ignore"):
@@ -105,14 +106,14 @@ def placed(
     main_from_other: Float[np.ndarray, "3"],
     waiting: Sequence[Sighting],
 ) -> tuple[Island, tuple[Sighting, ...]]:
-    """Both islands as one, every factor's robust scale anew."""
+    """Both islands as one, with every factor's robust scale at its beginning."""
     graph, state = merged(main.graph, main.state, other.graph, other.state, main_from_other)
     new = ages(len(graph.submaps)), ages(len(graph.sightings))
     return sighted(Island(graph, state, *new, main.settings), waiting)
 
 
 def _places(main: Island, other: Island, tied: Sequence[Tie]) -> list[Float[np.ndarray, "3"]]:
-    """Further places of the other island that its points propose."""
+    """Further places of the other island that its shared points propose."""
     by_landmarks = [tie for tie in tied if tie.seen is None]
     by_sightings = [tie for tie in tied if tie.seen is not None]
     proposed: list[Alignment | None] = []
@@ -130,7 +131,7 @@ def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
 
 
 def _ambiguous(shared: Shared, search: Search, second: Minimum, node: int) -> str:
-    """Why a merge waits: another place is about as likely."""
+    """The reason to defer a merge: another place is about as likely."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
         f"{shared} leave two places {np.hypot(away[0], away[1]):.1f} m apart: "
@@ -139,7 +140,7 @@ def _ambiguous(shared: Shared, search: Search, second: Minimum, node: int) -> st
 
 
 def _words(other: Island, shared: Shared, search: Search, rise: float) -> str:
-    """How an island was joined and how sure its place is."""
+    """Describes how an island was merged and how certain its place is."""
     stream = min(other.graph.streams)
     node = search.best.island.graph.streams[stream][0]
     _, covariance = joint_marginal(search.best.island, [node])

@@ -1,9 +1,9 @@
-"""The search for wrong minima: the same island solved from several starts, the lowest cost kept.
+"""The search for the lowest minimum: the same island solved from several starts.
 
-Headings make joining a problem with many minima: after a long way without a landmark Gauss-Newton
-may fold a chain wrongly and stay there. A cost far above its degrees of freedom betrays that; so
-does another start that ends lower. What ends about as low elsewhere is a second map that the same
-submaps allow.
+Headings make map joining a problem with many minima: after a long way without a landmark
+Gauss-Newton may fold a chain wrongly and stay there. A cost far above its degrees of freedom
+reveals that; so does another start that ends lower. A second minimum of about the same cost is a
+second map that the same submaps allow.
 """
 
 import math
@@ -33,21 +33,25 @@ from team.estimation.sparse_cholesky import sparse_kernel
 Values = Float[np.ndarray, " _"]
 
 LIKELY = 0.999
-"""Quantile of χ² that a cost must exceed to be suspicious, and a second minimum to be unlikely."""
+"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a second minimum
+unlikely.
+"""
 SUSPICIOUS = 1.3
-"""… and by this factor its degrees of freedom: submaps are Gaussian only nearly."""
+"""Factor by which a suspicious cost also exceeds its degrees of freedom: submaps are only nearly
+Gaussian.
+"""
 SETTLED_M = 1e-3
-"""A solution whose last step was longer [m, rad] is no minimum yet."""
+"""Length of the last step [m, rad] above which a solution is not a minimum yet."""
 MORE_SOLUTIONS = 4
-"""So often the best one is solved on before it is said not to settle."""
+"""Number of further solutions of the best start before it is reported that it does not settle."""
 FEW_LANDMARKS = 6
-"""With so few a chain may fold wrongly at a cost that is not suspicious."""
+"""Number of landmarks up to which a chain may fold wrongly at a cost that is not suspicious."""
 WIDE = 30.0
 """Cauchy's scale at which the annealed start begins."""
 
 
 class Minimum(NamedTuple):
-    """A full solution, the iterations that it took, its last change [m, rad] and its cost."""
+    """A full solution with its number of iterations, its last change [m, rad] and its cost."""
 
     island: Island
     iterations: int
@@ -56,7 +60,8 @@ class Minimum(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The lowest minimum; by how much it lies below the first start's, and below a second place.
+    """The lowest minimum; how far it lies below that of the first start, and below a second
+    minimum.
 
     second: None where no second minimum was found.
     """
@@ -78,7 +83,7 @@ def minimum(island: Island) -> Minimum:
 
 
 def degrees_of_freedom(island: Island) -> int:
-    """What is measured less what is unknown."""
+    """Number of measured quantities less the number of unknowns."""
     graph = island.graph
     priors = sum(len(prior.mean) for prior in graph.priors)
     measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
@@ -98,17 +103,17 @@ def _quantile(dof: int) -> float:
 
 
 def likely_rise() -> float:
-    """A place in the plane whose cost is higher by more than this is unlikely: χ² of 3."""
+    """Rise of the cost above which another place in the plane is unlikely: quantile of χ² of 3."""
     return _quantile(3)
 
 
 def searched(starts: Sequence[Island]) -> Search:
-    """The lowest minimum from some starts of one graph, and from the relaxation of its headings.
+    """The lowest minimum from several starts of one graph, and from the relaxation of its headings.
 
-    The first start is the one that would be taken without a search. While the lowest cost is
-    suspicious, and always with few landmarks, starts that leave the inter-robot measurements out or
-    doubt every factor are tried as well. A start that leads to no solution is left out; raises
-    NotDeterminedError where none leads to one.
+    The first start is the one that would be used without a search. While the lowest cost is
+    suspicious, and always with few landmarks, two more kinds of starts are tried: without the
+    inter-robot measurements, and with every factor's robust scale wide. A start that leads to no
+    solution is left out; raises NotDeterminedError where none leads to one.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
     found = list(_minima(starts))
@@ -122,7 +127,9 @@ def searched(starts: Sequence[Island]) -> Search:
 
 
 def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
-    """The minima of those starts that lead to one: no start of a search can end it."""
+    """The minima of the starts that have a solution: a start without one does not end the
+    search.
+    """
     for start in starts:
         found = None
         with suppress(*UNSOLVABLE), np.errstate(all="ignore"):
@@ -132,12 +139,11 @@ def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
 
 
 def widened(search: Search) -> Search:
-    """The search with the minima beside the best one; with few landmarks.
+    """The search extended by the minima next to the best one, where landmarks are few.
 
-    Each heading of a first or last pose that is known badly is moved as far as is likely, and each
-    stream is mirrored where it goes from one landmark to another, as a chain folds over to the
-    other side of the line between two points. A solution that does not come back has crossed into
-    another valley.
+    Each uncertain heading of a first or last pose is moved as far as is likely, and each stream is
+    mirrored between two landmarks, since a chain may fold over to the other side of the line
+    through them. A solution that does not return to the best one has crossed into another valley.
     """
     best = search.best.island
     if len(best.graph.landmarks) > FEW_LANDMARKS:
@@ -152,7 +158,7 @@ def widened(search: Search) -> Search:
 
 
 def _mirrored(island: Island) -> Iterator[Island]:
-    """The island with a stream's poses on the other side of a line through two landmarks.
+    """The island with a stream's poses mirrored at the line through two landmarks.
 
     With the line's direction α: p' = a + R(2α) conj(p − a), θ' = 2α − θ.
     """
@@ -175,7 +181,9 @@ def _mirrored(island: Island) -> Iterator[Island]:
 
 
 def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
-    """The pairs of landmarks, as places in the state, that a stream sees one after the other."""
+    """Pairs of landmarks, by their indices in the state, that a stream observes one after the
+    other.
+    """
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
     for submap in graph.submaps:
@@ -188,7 +196,9 @@ def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
 
 
 def _lowest(found: Sequence[Minimum]) -> Search:
-    """Of minima of one graph, the first of them the one that would be taken without a search."""
+    """The lowest of the minima of one graph; the first is the one of the start used without a
+    search.
+    """
     best = _at_rest(min(found, key=lambda each: each.cost))
     others = [each for each in found if each.change < SETTLED_M and is_another_minimum(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
@@ -196,9 +206,9 @@ def _lowest(found: Sequence[Minimum]) -> Search:
 
 
 def _further(island: Island) -> Iterator[Island]:
-    """Starts that owe nothing to the island's state, the most promising first.
+    """Starts that do not depend on the island's state, the most promising first.
 
-    What is condensed owes everything to it: then there are none.
+    There are none where submaps are condensed, since the condensed factor depends on that state.
     """
     graph = island.graph
     if graph.condensed is not None:
@@ -221,7 +231,7 @@ def _further(island: Island) -> Iterator[Island]:
 
 
 def _at_rest(best: Minimum) -> Minimum:
-    """The minimum after further solutions from where it is, while it has not settled."""
+    """The minimum after further solutions from its own state, until it has settled."""
     for _ in range(MORE_SOLUTIONS):
         if best.change <= SETTLED_M:
             break
@@ -231,10 +241,10 @@ def _at_rest(best: Minimum) -> Minimum:
 
 
 def is_another_minimum(one: Minimum, best: Minimum) -> bool:
-    """Whether a minimum is another map, not one that the best one's covariance allows for.
+    """Whether a minimum is another map, rather than a state that the best one's covariance allows.
 
-    With the difference d of the states and the information A at the best one, A alone would raise
-    the cost by dᵀAd on the way from one to the other.
+    With the difference d of the states and the information A at the best one, A alone predicts a
+    rise of the cost by dᵀAd between them.
     """
     difference = _difference(one.island, best.island)
     return _quadratic(best.island, difference) > likely_rise()
@@ -256,7 +266,7 @@ def _quadratic(island: Island, x: Values) -> float:
 
 
 def warnings(search: Search) -> list[str]:
-    """What a map's user must know of its minimum, in words; empty where it is the only one."""
+    """Warnings for the map's user about its minimum, in words; empty where it is the only one."""
     island, found = search.best.island, []
     dof = degrees_of_freedom(island)
     if suspicious(island, search.best.cost):
@@ -293,7 +303,7 @@ def warnings(search: Search) -> list[str]:
 
 
 def _heading_sigmas(island: Island) -> dict[Stream, float]:
-    """Of each stream the standard deviation [rad] of the heading that is known best."""
+    """For each stream the standard deviation [rad] of its best known heading."""
     graph, covariance = island.graph, island.selected_covariance
     return {
         stream: 0.0

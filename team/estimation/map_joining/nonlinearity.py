@@ -1,9 +1,10 @@
-"""Where a pose covariance understates the uncertainty: a curved valley of the cost.
+"""Detects a pose covariance that understates the uncertainty: a curved valley of the cost.
 
-One heading is moved away from its best value, everything else solved for given that: the profile of
-the cost (Bates & Watts 1988, chapter 6). For a quadratic cost its rise is the χ² by which the
-pose's own covariance says that it has moved. After a long way without a landmark that χ² may be ten
-times the rise: the robot may well be where its covariance excludes it, though the minimum is right.
+One heading is moved away from its best value and everything else is solved for given that: the
+profile of the cost (Bates & Watts 1988, chapter 6). For a quadratic cost its rise equals the χ² of
+the displacement by the pose's own covariance. After a long way without a landmark that χ² may be
+ten times the rise: the robot may well be at a place that its covariance excludes, though the
+minimum is right.
 """
 
 from collections.abc import Iterator
@@ -24,18 +25,22 @@ from team.estimation.map_joining.gauss_newton import (
 )
 
 STEPS = (1.0, 2.0, 3.0)
-"""How far a heading is moved, in its standard deviations."""
+"""Displacements of a heading, in its standard deviations."""
 ITERATIONS = 4
 STRAIGHT_RAD = 0.1
-"""A heading known so well moves nothing far enough to bend."""
+"""Standard deviation [rad] of a heading below which the cost is taken as quadratic."""
 BENT = 4.0
-"""χ² by the covariance over the rise of the cost: from here on the ellipse is too short by half."""
+"""Ratio of χ² by the covariance to the rise of the cost that is reported: the ellipse is too short
+by half.
+"""
 UNLIKELY = float(chdtri(1, 1e-3))
-"""Where the cost has risen by more is not looked at: χ² of 1, 99.9 %."""
+"""Rise of the cost beyond which a place is not considered: 99.9 % quantile of χ² of 1."""
 
 
 class UnderstatedUncertainty(NamedTuple):
-    """A place of a pose so far [m] away: the rise of the cost, and χ² by the pose's covariance."""
+    """A displacement [m] of a pose with the rise of the cost there, and the χ² by the pose's
+    covariance.
+    """
 
     distance: float
     rise: float
@@ -43,14 +48,14 @@ class UnderstatedUncertainty(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """1 where the cost is quadratic."""
+        """χ² by the covariance over the rise of the cost; 1 where the cost is quadratic."""
         return self.chi2 / max(self.rise, 1.0)
 
 
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
-    """The likely islands with the heading of a pose moved, and by how much their cost is higher.
+    """The likely islands with one pose's heading displaced, each with the rise of its cost.
 
-    None where the heading is known too well for a bend.
+    Empty where the heading is known too well for a curved valley.
     """
     _, covariance = joint_marginal(island, [node])
     sigma = float(np.sqrt(covariance[2, 2]))
@@ -69,7 +74,7 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
 
 
 def ends(island: Island) -> list[tuple[Stream, str, int]]:
-    """Every stream's first and last pose that is not given, with the word for it."""
+    """First and last pose of every stream that are not given, each with the word for it."""
     return [
         (stream, where, nodes[k])
         for stream, nodes in sorted(island.graph.streams.items())
@@ -79,9 +84,9 @@ def ends(island: Island) -> list[tuple[Stream, str, int]]:
 
 
 def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty | None:
-    """Of a pose of an island at its minimum: the likely place that its covariance denies most.
+    """The likely place of a pose that its covariance underrates most, for an island at its minimum.
 
-    None where it denies none.
+    None where the covariance allows for all of them.
     """
     mean, covariance = joint_marginal(island, [node])
     # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
@@ -103,7 +108,7 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
 def nonlinearity_warnings(island: Island) -> list[str]:
     """Warns where the covariance of a first or last pose understates its uncertainty.
 
-    Asked of every stream without a given initial pose: profile cost against chi-square.
+    Examines every stream without a given initial pose: profile cost against chi-square.
     """
     said = []
     for stream, where, node in ends(island):

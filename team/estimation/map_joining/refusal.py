@@ -1,14 +1,15 @@
-"""A fold that is total: whatever a tick's members say, they are taken or refused with a reason.
+"""A total fold: every member of a tick is either taken or refused with a reason.
 
-What the numbers of a set allow to be solved is not known before it is tried. So a tick is taken as
-it is; only if that has no solution are its members taken one after the other in canonical order,
-and those left out with which there is none. That depends on the fold before and on the tick's
-members alone, hence on the set (law 2): any order of arrival gives the same refusals.
+Whether the normal equations of a set can be solved is not known before it is tried. A tick is
+therefore taken as a whole; only if that has no solution are its members taken one after the other
+in canonical order, and those that make it unsolvable are left out. The outcome depends on the fold
+before and on the tick's members alone, hence on the set (law 2): any order of arrival gives the
+same refusals.
 
-Of a submap that can not be taken as it is, its motion is tried alone, the marginal of its end pose,
+Of a submap that can not be taken as it is, the motion alone is tried, the marginal of its end pose,
 so that the robot's later submaps keep their place. Where that fails too, the robot's chain ends:
-what lies behind has no place in any frame, and is not in the map. An initial pose that can not be
-taken is taken as unknown; an inter-robot measurement is left out.
+later submaps have no place in any frame and are not in the map. An initial pose that can not be
+taken is treated as unknown; an inter-robot measurement is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -27,7 +28,9 @@ T = TypeVar("T")
 
 
 def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """The fold with the tick; `refused` and `set_aside` say what of it is not in the map."""
+    """The fold with the tick; `refused` and `set_aside` list the parts of it that are not in the
+    map.
+    """
     fold = replace(fold, set_aside=(*fold.set_aside, *tick.set_aside))
     fold, members = _in_reach(fold, tick.contributions, tick.outside)
     streams = {each.stream for each in members}
@@ -42,7 +45,9 @@ def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def refusals(fold: Fold) -> list[str]:
-    """In words: per chain the submap at which it ended and how many lie behind, then the rest."""
+    """Messages: for each chain the submap at which it ended and how many follow it, then all other
+    refusals.
+    """
     ended: dict[Stream, list[int]] = {}
     for _, robot, incarnation, sequence in fold.refused:
         ended.setdefault((robot, incarnation), []).append(sequence)
@@ -58,7 +63,9 @@ def refusals(fold: Fold) -> list[str]:
 def _in_reach(
     fold: Fold, contributions: Sequence[Contribution], outside: Mapping[Key, str]
 ) -> tuple[Fold, list[Contribution]]:
-    """The submaps to be tried; those outside, and what lies behind a refused one, are refused."""
+    """The submaps to be tried; those out of bounds, and those that follow a refused one, are
+    refused.
+    """
     refused = dict(fold.refused)
     ended = {(robot, incarnation) for _, robot, incarnation, _ in refused}
     members = []
@@ -85,7 +92,7 @@ def _attempt(
     sightings: Sequence[Sighting],
     settings: JoinSettings,
 ) -> Fold | None:
-    """One tick with these members; None where it has no solution."""
+    """The fold after one tick with these members; None where it has no solution."""
     for start in starts:
         fold = started(fold, start)
     try:
@@ -102,7 +109,9 @@ def _attempt(
 
 
 class _OneByOne:
-    """A tick that has no solution as a whole: grown by what has one, in canonical order."""
+    """A tick that has no solution as a whole: takes the members that have one, in canonical
+    order.
+    """
 
     def __init__(
         self, fold: Fold, settings: JoinSettings, starts: Mapping[Stream, InitialPoseFactor]
@@ -115,7 +124,9 @@ class _OneByOne:
         self._set_aside = list(fold.set_aside)
 
     def taken(self, members: Sequence[Contribution], sightings: Sequence[Sighting]) -> Fold:
-        """The submaps first, then the inter-robot measurements, those that waited among them."""
+        """Takes the submaps first, then the inter-robot measurements, earlier ones that waited
+        included.
+        """
         unseen = replace(self._fold, waiting=())
         self._grow(unseen, members)
         base = replace(unseen, refused=dict(sorted(self._refused.items())))
@@ -144,7 +155,7 @@ class _OneByOne:
         return _attempt(fold, members, self._of(members), (), self._settings) is not None
 
     def _grow(self, fold: Fold, block: Sequence[Contribution]) -> None:
-        """Take a block, or its halves, or refuse the one submap that it is."""
+        """Takes a block of submaps, or its halves, or refuses a single submap."""
         ended = {(robot, incarnation) for _, robot, incarnation, _ in self._refused}
         for each in block:
             if each.stream in ended:
@@ -162,7 +173,9 @@ class _OneByOne:
             self._grow_by_less(fold, block[0])
 
     def _grow_by_less(self, fold: Fold, whole: Contribution) -> None:
-        """Of one submap what can be taken: without its initial pose, its motion alone, nothing."""
+        """Takes a part of one submap: without its initial pose, then its motion alone, else
+        nothing.
+        """
         start = self._starts.pop(whole.stream, None) if whole.sequence == 0 else None
         if start is not None and self._solves(fold, [*self._members, whole]):
             self._members.append(whole)
@@ -185,7 +198,9 @@ class _OneByOne:
 
 
 def _greatest(items: Sequence[T], works: Callable[[Sequence[T]], bool]) -> tuple[list[T], list[T]]:
-    """The items kept one after the other while `works`, by halves; and those that are left out."""
+    """Adds items one after the other while `works`, by halves; returns the accepted and the
+    rejected ones.
+    """
     kept: list[T] = []
     bad: list[T] = []
 

@@ -1,12 +1,13 @@
-"""A first guess of a whole graph that depends on no earlier guess: headings as vectors.
+"""A first guess of a whole graph that needs no earlier guess: headings as free vectors.
 
-With (c, s) = (cos θ, sin θ) of each pose as two free numbers, what a submap says is linear,
+With (c, s) = (cos θ, sin θ) of each pose as two free numbers, a submap's equations are linear,
 
     p − p_s − [[c_s, −s_s], [s_s, c_s]] z = 0,   (c, s)_e − R(z_θ) (c, s)_s = 0,
 
-so least squares over all of it have one minimum, which no long way without a landmark can hide
-(the chordal relaxation: Martinec & Pajdla 2007, Carlone et al. 2015). Headings are read off at the
-end. Weights are the variances of each point, correlations left out: it is a start, not an estimate.
+so least squares over all of them has one minimum, however long the way without a landmark (the
+chordal relaxation: Martinec & Pajdla 2007, Carlone et al. 2015). Headings follow from the
+solution's vectors. Weights are the variances of each point, correlations left out: it is a start,
+not an estimate.
 """
 
 import math
@@ -23,7 +24,7 @@ Indices = Int64[np.ndarray, " _"]
 
 
 class _Rows(NamedTuple):
-    """R rows Σ coefficient · number = right, of T terms each, with weights 1/σ."""
+    """R linear equations Σ coefficient · number = right, of T terms each, with weights 1/σ."""
 
     numbers: Int64[np.ndarray, "R T"]
     coefficients: Float[np.ndarray, "R T"]
@@ -32,7 +33,9 @@ class _Rows(NamedTuple):
 
 
 def relaxed(graph: Graph, state: Values) -> Values | None:
-    """A state of the graph; fixed nodes and biases stay. None where it is not determined."""
+    """A state of the graph, in which fixed nodes and biases keep their values; None where
+    undetermined.
+    """
     sizes = np.diff(graph.offset).tolist()
     at = np.concatenate([[0], np.cumsum([4 if size == 3 else size for size in sizes])])
     numbers = np.zeros(at[-1])
@@ -61,7 +64,9 @@ def _lifted(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
 def _least_squares(
     rows: Sequence[_Rows], numbers: Values, free: Bool[np.ndarray, " _"]
 ) -> Values | None:
-    """The free numbers that solve the rows best, given the others."""
+    """The free numbers that minimise the weighted residuals, given the other numbers; None:
+    undetermined.
+    """
     from scipy.sparse import csc_array  # slow to import, and no robot uses it
     from scipy.sparse.linalg import splu
 
@@ -84,7 +89,7 @@ def _least_squares(
 
 
 def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
-    """What submaps, inter-robot measurements and priors say; `at`: first of the numbers of each
+    """The equations of submaps, inter-robot measurements and priors; `at`: first number of each
     node.
     """
     for contribution, nodes, _ in graph.submaps:
@@ -119,7 +124,7 @@ def _points(
     places: Float[np.ndarray, "n 2"],
     weights: Float[np.ndarray, " n"],
 ) -> _Rows:
-    """Points at these places in the frame of a start."""
+    """The equations of points with these coordinates in the frame of a start pose."""
     n = len(points)
     numbers = np.empty((2 * n, 4), dtype=np.int64)
     numbers[0::2, 0], numbers[1::2, 0] = points, points + 1
@@ -138,7 +143,7 @@ def _turns(
     angles: Float[np.ndarray, " n"],
     weights: Float[np.ndarray, " n"],
 ) -> _Rows:
-    """Headings of these poses relative to a start's."""
+    """The equations of headings of these poses relative to a start pose's."""
     n = len(poses)
     c, s = np.cos(angles), np.sin(angles)
     numbers = np.empty((2 * n, 3), dtype=np.int64)

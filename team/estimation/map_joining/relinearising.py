@@ -1,8 +1,9 @@
-"""What is condensed is linearised again, at a few sizes of the fold.
+"""Linearises the condensed submaps again, at a few sizes of the fold.
 
-While a team knows little of where it is, headings still move, and what was linearised at different
-ones contradicts itself: it claims too much. So at BEGIN · GROWTH^k submaps, up to SETTLED of them,
-all that is condensed is taken raw again, solved, and condensed anew where it then is.
+While poses are uncertain, headings still change, and submaps that were linearised at different
+headings contradict each other: the map becomes overconfident. At BEGIN · GROWTH^k submaps, up to
+SETTLED of them, all condensed submaps are therefore restored, solved, and condensed at the new
+state.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,11 +31,13 @@ from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 Values = Float[np.ndarray, " _"]
 
 GROWTH = 1.5
-"""Of the sizes at which the fold is linearised again."""
+"""Ratio of successive sizes at which the fold is linearised again."""
 SETTLED = 1000
-"""A fold of more submaps than this is not linearised again."""
+"""Number of submaps above which the fold is not linearised again."""
 SOLVED = 3
-"""So many times the iterations of a tick solve what is linearised again."""
+"""Number of times that the iterations of a tick are repeated for a fold that is linearised
+again.
+"""
 
 
 def is_due(before: int, after: int, begin: int = BEGIN) -> bool:
@@ -50,10 +53,11 @@ def is_due(before: int, after: int, begin: int = BEGIN) -> bool:
 def relinearised(
     fold: Fold, contributions: Sequence[Contribution], sightings: Sequence[Sighting]
 ) -> Fold:
-    """The fold with nothing condensed: its main island solved again from where it is.
+    """The fold with nothing condensed, and its main island solved again from its present state.
 
-    contributions, sightings: all of the island's, in canonical order. Itself where what it has is
-    not what they say (a refused one among them), or where they allow no solution.
+    contributions, sightings: all of the island's, in canonical order. The fold is returned
+        unchanged where a part of it is not in them as it was sent (a refused submap among them), or
+        where they allow no solution.
     """
     key = fold.main_key
     old = None if key is None else fold.islands[key].graph.condensed
@@ -84,7 +88,9 @@ def relinearised(
 def _raw(
     island: Island, fold: Fold, contributions: Sequence[Contribution], paths: Mapping[Stream, Path]
 ) -> Island:
-    """The graph of all submaps, each node where the island has it or where it was when it left."""
+    """The graph of all submaps, each node at its state in the island or where it was when
+    condensed.
+    """
     graph, settings = island.graph, island.settings
     full, state = extended(
         EMPTY_GRAPH,

@@ -1,19 +1,19 @@
 """A submap as a factor between its start pose, its other poses and its landmarks.
 
-A submap that starts at pose s, has the poses e (its end, then its pose nodes) and sees landmarks l
-says, with the rotation R of the heading of s,
+For a submap that starts at pose s, has the poses e (its end, then its pose nodes) and observes
+landmarks l, with the rotation R of the heading of s,
 
     r = (Rᵀ(p_e − p_s), wrap(θ_e − θ_s), …, Rᵀ(l₁ − p_s), …) − mean ~ N(0, P).
 
-Seen in the map frame, r' = T r with T = blkdiag(R, 1, …, R, …), its Jacobian is the identity for
-(e, …, l₁, …) and
+In the map frame, r' = T r with T = blkdiag(R, 1, …, R, …), its Jacobian is the identity for (e, …,
+l₁, …) and
 
     G = [−I | (v_y, −v_x)ᵀ] per point v = p − p_s,  [0 0 −1] for the heading
 
 for s, and its metric is M = T P⁻¹ Tᵀ. The state is additive in (x, y, θ).
 
 A submap with sensitivities S (a row per bias) has the mean mean + Sᵀ b; the Jacobian of r' for a
-bias is −T S_b. Its biases, one number each, stand behind the other members.
+bias is −T S_b. Its biases, one number each, follow the other members.
 """
 
 import math
@@ -30,7 +30,7 @@ Values = Float[np.ndarray, " _"]
 
 @compiled
 def poses_of(points: int, numbers: int) -> int:
-    """How many of a submap's points are poses: 3 numbers each, the other points have 2."""
+    """How many of a submap's points are poses: a pose has 3 numbers, every other point 2."""
     return numbers - 2 * points
 
 
@@ -40,7 +40,8 @@ def submap_residual(
 ) -> tuple[Values, Float[np.ndarray, "n 2"]]:
     """The residual r' in the map frame, and v = p − p_s of each point (end pose first).
 
-    at: first number in `state` of the start pose, of the other poses and of each landmark.
+    at: index in `state` of the first number of the start pose, of the other poses and of each
+        landmark.
     """
     start = at[0]
     poses = poses_of(len(at) - 1, len(mean))
@@ -63,7 +64,7 @@ def submap_residual(
 def rotated_information(
     information: Float[np.ndarray, "n n"], heading: float, poses: int
 ) -> Float[np.ndarray, "n n"]:
-    """M = T P⁻¹ Tᵀ: the metric of a submap with so many poses, turned into the map frame."""
+    """M = T P⁻¹ Tᵀ: the information of a submap with `poses` poses, rotated into the map frame."""
     c, s = math.cos(heading), math.sin(heading)
     turned = information.copy()
     n = len(information)
@@ -129,7 +130,7 @@ def submap_normal(
 def shifted_mean(
     state: Values, at: Indices, mean: Values, sensitivity: Float[np.ndarray, "B n"]
 ) -> Values:
-    """The mean given the biases, mean + Sᵀ b: `at` ends with the places of the biases."""
+    """The mean given the biases, mean + Sᵀ b: `at` ends with the indices of the biases."""
     shifted = mean.copy()
     first = len(at) - len(sensitivity)
     for b in range(len(sensitivity)):

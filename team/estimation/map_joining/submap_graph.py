@@ -1,8 +1,8 @@
-"""The factor graph of one frame: poses and landmarks, submaps and inter-robot measurements, priors
-on starts.
+"""The factor graph of one frame: poses, landmarks and biases; submaps, inter-robot measurements and
+priors.
 
-A `Graph` is the structure; it stays while the state moves. Every function returns new values. The
-value of a node that is added is found by composition from the nodes that are there.
+A `Graph` is the structure; it is the same while the state changes. Every function returns new
+values. The value of an added node is composed from the nodes that are in the graph already.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,10 +29,11 @@ Values = Float[np.ndarray, " _"]
 
 
 CommonBias = Bias | Literal["marker"]
-"""What the team has in common: the errors of all sensors, and those of each landmark's marker."""
+"""Errors that the team has in common: those of all sensors, and those of each landmark's marker."""
 CommonError = Bias | int
-"""One of them: a bias of all sensors, or the share of the range that a landmark, by its number,
-reads too far for everyone."""
+"""One error in common: a bias of all sensors, or, by a landmark's number, the share of the range by
+which all robots measure that landmark too far.
+"""
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
 
@@ -40,13 +41,14 @@ NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
 RANGE_POWER: Mapping[Bias, int] = MappingProxyType(
     {"bearing": 1, "range_offset": 0, "range_scale": 1, "forward_scale": NO_POWER}
 )
-"""With which power of a landmark's range each bias moves it."""
+"""The power of a landmark's range with which each bias moves it."""
 
 
 class Prior(NamedTuple):
     """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹).
 
-    A robust join weighs that of a sensor's bias, as a submap, by how far the state is from it.
+    A robust join weighs the prior of a sensor's bias, like a submap, by its distance from the
+    state.
     """
 
     node: int
@@ -57,8 +59,8 @@ class Prior(NamedTuple):
 class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
 
-    common: the errors that have a node of the whole team, which stand last: of its biases, and of
-        the markers of its landmarks.
+    common: the errors with a node of the whole team, which stand last: of its biases, and of its
+        landmarks' markers.
     """
 
     contribution: Contribution
@@ -79,9 +81,11 @@ class Joined(NamedTuple):
 
     @property
     def sensitivity(self) -> Float[np.ndarray, "B _"]:
-        """∂mean/∂b, a row for each bias node: a robot's own error and the team's add.
+        """∂mean/∂b, one row for each bias node: a robot's own error and the team's common one add
+        up.
 
-        A marker's is that of the scale of the ranges, as far as it moves this landmark.
+        The row of a marker is that of the scale of the ranges, restricted to that marker's
+        landmark.
         """
         local = self.contribution.local
         if not self.common:
@@ -100,9 +104,7 @@ def _scaling(error: CommonError) -> Bias:
 
 
 class Encounter(NamedTuple):
-    """An inter-robot measurement in the graph, between the pose nodes of the observer and of the
-    teammate.
-    """
+    """An inter-robot measurement in the graph, between the pose nodes of observer and teammate."""
 
     sighting: Sighting
     observer: int
@@ -111,18 +113,18 @@ class Encounter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Nodes in the order in which they came, and what ties them.
+    """The nodes in the order in which they were added, and the factors between them.
 
-    streams:   nodes of each stream: its start, then the end pose of submap 0, 1, …
+    streams: nodes of each stream: its start, then the end pose of submap 0, 1, …
     landmarks: node of each landmark id.
-    poses:     node of each further pose, by (stream, stamp).
-    biases:    node of each error that the submaps of a stream share.
-    common:    node of each error that all streams share; these and `biases` have one number.
-    offset:    first number of each node in the state; the last is the state's length.
-    fixed:     nodes that are constants (exact starts, the gauge).
-    submaps, sightings: in the order in which they were taken.
-    condensed: what older ones say, if some are condensed (`condensing`).
-    gone:      how many of a stream's submaps are in `condensed`; `streams` begins behind them.
+    poses: node of each further pose, by (stream, stamp).
+    biases: node of each error that the submaps of a stream share.
+    common: node of each error that all streams share; these and `biases` have one number.
+    offset: index in the state of each node's first number; the last entry is the state's length.
+    fixed: nodes that are constants (exactly known initial poses, the gauge).
+    submaps, sightings: in the order in which they were added.
+    condensed: the quadratic that replaces older submaps, if some are condensed (`condensing`).
+    gone: number of a stream's submaps that are in `condensed`; `streams` begins after them.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -165,8 +167,8 @@ class Graph:
 
     @cached_property
     def sighting_factors(self) -> Sightings:
-        """The inter-robot measurements in flat arrays, for the kernels; their entries follow the
-        submaps'.
+        """The inter-robot measurements in flat arrays, for the kernels; their entries follow those
+        of the submaps.
         """
         return Sightings(
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
@@ -205,13 +207,15 @@ class Graph:
 
     @cached_property
     def dimensions(self) -> Indices:
-        """Numbers in each submap."""
+        """Dimension of each submap."""
         dimensions: Indices = np.diff(self.factors.mean_start)
         return dimensions
 
     @cached_property
     def of_bias(self) -> Bool[np.ndarray, " priors"]:
-        """Which priors are of one robot's bias, not of a pose or of what the team has in common."""
+        """Marks the priors of single robots' biases, as opposed to those of poses and of common
+        errors.
+        """
         common = set(self.common.values())
         return np.array(
             [len(each.mean) == 1 and each.node not in common for each in self.priors], np.bool_
@@ -219,12 +223,12 @@ class Graph:
 
     @cached_property
     def headings(self) -> Indices:
-        """Where the headings lie in the state."""
+        """Indices of the headings in the state."""
         headings: Indices = self.offset[:-1][np.diff(self.offset) == 3] + 2
         return headings
 
     def next_sequence(self, stream: Stream) -> int:
-        """Sequence of the submap that comes next of a stream."""
+        """Sequence number of a stream's next submap."""
         return self.gone.get(stream, 0) + len(self.streams[stream]) - 1
 
     @property
@@ -233,7 +237,7 @@ class Graph:
         return int(np.diff(self.offset)[~self.fixed].sum())
 
     def name(self, node: int) -> str:
-        """What a node is, for messages."""
+        """Names a node, for messages."""
         for stream, nodes in self.streams.items():
             if node == nodes[0]:
                 return f"the start of {named(stream)}"
@@ -267,12 +271,12 @@ EMPTY_GRAPH = Graph(
 
 
 def _starts(lengths: Sequence[int]) -> Indices:
-    """Where pieces of these lengths begin, one behind the other; the last is the end."""
+    """The offsets at which consecutive pieces of these lengths begin; the last entry is the end."""
     return np.cumsum(np.array([0, *lengths], dtype=np.int64))
 
 
 class _Growth:
-    """The nodes that are being added to a graph, with their values; alive inside `extended`."""
+    """The nodes that are being added to a graph, with their values; used inside `extended` only."""
 
     def __init__(self, graph: Graph, state: Values) -> None:
         self.streams = dict(graph.streams)
@@ -308,13 +312,14 @@ def extended(
     common_bias_sigma: Mapping[CommonBias, float] = NONE_IN_COMMON,
     numbers: Mapping[Key, Sequence[int]] = NO_NUMBERS,
 ) -> tuple[Graph, Values]:
-    """The graph with more submaps, in the given order; a stream without a start begins at 0.
+    """The graph with more submaps, in the given order; a stream without an initial pose begins at
+    0.
 
     A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
-    first submap that sees it. A stream that has no start given is fixed at (0, 0, 0): the gauge of
-    its frame. A bias is N(0, bias_sigma²), what the team has in common N(0, common_bias_sigma²).
-    numbers: of submaps with unnamed landmarks, the team's number of each of its landmarks; of all
-    others they are those in the submap.
+    first submap that observes it. A stream without an initial pose is fixed at (0, 0, 0): the gauge
+    of its frame. A bias is N(0, bias_sigma²), an error in common N(0, common_bias_sigma²).
+    numbers: for submaps with unnamed landmarks, the team's number of each of their landmarks; all
+        other submaps contain the numbers themselves.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -374,9 +379,10 @@ def extended(
 def _in_common(
     local: LocalMap, common_bias_sigma: Mapping[CommonBias, float]
 ) -> dict[CommonError, float]:
-    """The errors of a submap that the whole team has, each with its sigma, in their order.
+    """The errors of a submap that the whole team has in common, each with its sigma, in their
+    order.
 
-    Landmarks without names have no marker that could be known again.
+    Unnamed landmarks have no marker that could be recognised.
     """
     found: dict[CommonError, float] = {
         bias: common_bias_sigma[bias] for bias in local.biases if bias in common_bias_sigma
@@ -388,7 +394,7 @@ def _in_common(
 
 
 class CondensedError(ValueError):
-    """An island whose old submaps are condensed would have to be moved into another frame."""
+    """An island with condensed submaps would have to be transformed into another frame."""
 
     def __init__(self, stream: Stream) -> None:
         super().__init__(f"the island of {named(stream)} is condensed in a frame of its own")
@@ -402,9 +408,10 @@ def without_nodes(
     sightings: Bool[np.ndarray, " S"],
     priors: Bool[np.ndarray, " _"],
 ) -> tuple[Graph, Indices]:
-    """The graph without some poses, with the factors that stay, and each node's new number.
+    """The graph without the eliminated poses, with the factors that stay, and each node's new
+    number.
 
-    What is eliminated of a stream is its first poses. What is condensed is left out.
+    The eliminated poses of a stream are its first ones. Condensed factors are left out.
     """
     node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
     streams, gone = {}, dict(graph.gone)
@@ -441,7 +448,7 @@ def without_nodes(
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
-    """The robot's pose node at this stamp, of its first incarnation that has one; None: there is
+    """The robot's pose node at this stamp, in its first incarnation that has one; None if there is
     none.
     """
     incarnations = sorted(incarnation for name, incarnation in graph.streams if name == robot)
@@ -450,8 +457,8 @@ def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
 
 
 def encounter_of(graph: Graph, sighting: Sighting) -> Encounter | None:
-    """The inter-robot measurement between its pose nodes; None while one of them is not in the
-    graph.
+    """The inter-robot measurement between its pose nodes; None while the graph lacks one of
+    them.
     """
     observer = graph.poses.get((sighting.stream, sighting.stamp_ns))
     teammate = pose_node(graph, sighting.teammate, sighting.stamp_ns)
@@ -469,10 +476,11 @@ def merged(
     other_state: Values,
     main_from_other: Float[np.ndarray, "3"],
 ) -> tuple[Graph, Values]:
-    """Both graphs in the main frame; landmarks with equal ids become one, at the main's value.
+    """Both graphs in the main frame; landmarks with equal ids become one, at the main graph's
+    value.
 
-    What was fixed in the other frame (its gauge) becomes free. Raises CondensedError where old
-    submaps of the other graph are condensed, in a frame that would have to turn.
+    The other frame's fixed nodes (its gauge) become free. Raises CondensedError where submaps of
+    the other graph are condensed, since their frame would have to be transformed.
     """
     if other.condensed is not None:
         raise CondensedError(min(other.streams))
@@ -528,10 +536,10 @@ def merged(
 
 
 def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:
-    """The graph in which landmarks have become others, or have another number.
+    """The graph with landmarks renumbered; landmarks with the same new number become one node.
 
-    becomes: the new number of each landmark that gets one; those with one number are one node, the
-    first of them, at its value.
+    becomes: the new number of each landmark that gets one. Landmarks with one number become the
+        node of the first of them, at its value.
     """
     first: dict[int, int] = {}
     kept = np.ones(len(graph.fixed), np.bool_)
@@ -562,7 +570,7 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
 
 
 def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:
-    """A node's value in the main frame: a pose, a landmark, or a bias, which has no frame."""
+    """A node's value in the main frame: of a pose, a landmark, or a bias, which has no frame."""
     if len(value) == 3:
         return compose(main_from_other, value)
     return transformed(main_from_other, value) if len(value) == 2 else value

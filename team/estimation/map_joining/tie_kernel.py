@@ -1,4 +1,6 @@
-"""Landmarks that two Gaussian maps share, as constraints without noise: their multipliers."""
+"""Compiled kernel for landmarks that two Gaussian maps share: noise-free constraints and their
+multipliers.
+"""
 
 import math
 from typing import NamedTuple
@@ -11,10 +13,11 @@ from team.estimation.geometry import wrapped
 
 
 class Tie(NamedTuple):
-    """The constraints R(θ) bₗ + t − aₗ = 0 of k landmarks at the result of the iterations.
+    """The constraints R(θ) bₗ + t − aₗ = 0 of k landmarks, linearised at the result of the
+    iterations.
 
-    (cos, sin) of θ; lever: ∂(R bₗ)/∂θ; multiplier z = S⁻¹ y of the innovation y with covariance
-    S = H P Hᵀ, and S⁻¹. The state moves by −P Hᵀ z, its covariance by −P Hᵀ S⁻¹ H P.
+    (cos, sin) of θ; lever: ∂(R bₗ)/∂θ; multiplier z = S⁻¹ y of the innovation y with covariance S =
+    H P Hᵀ, and S⁻¹. The state moves by −P Hᵀ z, its covariance by −P Hᵀ S⁻¹ H P.
     """
 
     cos: float
@@ -32,10 +35,10 @@ def tied(
     seen_covariance: Float[np.ndarray, "m m"],
     iterations: int,
 ) -> tuple[Tie, bool]:
-    """The iterated EKF update by the constraints; whether S is positive definite.
+    """The iterated EKF update by the constraints; returns also whether S is positive definite.
 
     mean: (t, θ, a₁, a₂, …), a map's pose and the landmarks; seen: (b₁, b₂, …), the same landmarks
-    in the frame of that pose, independent of the map. m = 2k, p = 3 + m.
+        in the frame of that pose, independent of the map. m = 2k, p = 3 + m.
     """
     m = len(seen)
     state, local = mean.copy(), seen.copy()
@@ -99,7 +102,7 @@ def _of_seen(covariance: Float[np.ndarray, "q m"], c: float, s: float) -> Float[
 def _multiply(
     A: Float[np.ndarray, "q m"], x: Float[np.ndarray, " m"], out: Float[np.ndarray, " q"]
 ) -> None:
-    """Into `out`: A x."""
+    """Writes A x into `out`."""
     for row in range(len(A)):
         total = 0.0
         for column in range(len(x)):
@@ -114,7 +117,7 @@ def _step(
     z: Float[np.ndarray, " m"],
     out: Float[np.ndarray, " q"],
 ) -> None:
-    """Into `out`: mean − gain z."""
+    """Writes mean − gain z into `out`."""
     _multiply(gain, z, out)
     for row in range(len(mean)):
         out[row] = mean[row] - out[row]
@@ -132,7 +135,7 @@ def tied_pose(
     """(pose ∘ end pose) of the tied maps and its covariance; mean and covariance as in `tied`.
 
     end: N(end pose, covariance) in the frame of the map's pose; end_of_seen: its covariance with
-    the landmarks that were seen.
+        the observed landmarks.
     """
     gain = np.concatenate(
         (_of_map(covariance[:3], tie.lever), _of_seen(end_of_seen, tie.cos, tie.sin))
@@ -164,7 +167,7 @@ def tied_pose(
 
 @compiled
 def _invert(S: Float[np.ndarray, "m m"]) -> bool:
-    """S ← S⁻¹ by Cholesky, exactly symmetric; whether it is positive definite."""
+    """S ← S⁻¹ by Cholesky, exactly symmetric; returns whether S is positive definite."""
     m = len(S)
     for k in range(m):
         for j in range(k):

@@ -1,9 +1,9 @@
 """The Gaussian back end of one robot: submaps joined one after the other into one Gaussian.
 
 Hybrid-SLAM's map joining (Brooks & Bailey 2008, "HybridSLAM"), with the constraints of Williams'
-constrained local submap filter (2001): the whole map and the local map stand side by side as
-independent Gaussians, and "these two landmarks are the same" is an observation without noise.
-Earlier submaps are not linearised again, so the map is over-confident after many joins.
+constrained local submap filter (2001): the whole map and the local map are independent Gaussians,
+and "these two landmarks are the same" is an observation without noise. Earlier submaps are not
+linearised again, so the map is overconfident after many joins.
 """
 
 import math
@@ -41,14 +41,14 @@ def joined(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> WholeMap
     """The local map composed onto the current pose: known landmarks fused, new ones added.
 
     With s = (whole, local) and the constraint h(s) = pose ∘ local landmark − whole landmark = 0 for
-    each known landmark: the iterated EKF update of s, then (pose ∘ end pose, landmarks,
-    pose ∘ new landmarks) with its Jacobian. The update has rank 2k for k known landmarks and the
-    Jacobian is the identity for the landmarks of the whole map: O(n²k) for its n numbers.
+    each known landmark: the iterated EKF update of s, then (pose ∘ end pose, landmarks, pose ∘ new
+    landmarks) with its Jacobian. The update has rank 2k for k known landmarks and the Jacobian is
+    the identity for the landmarks of the whole map: O(n²k) for its n numbers.
 
-    gate: known landmarks whose constraint the rest contradicts by more, worst first, are left out
-    of the local map. By Baarda's test of one of them, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with the multiplier
-    z = S⁻¹ y, is by how much the cost falls without that constraint; χ² with two degrees of
-    freedom.
+    gate: the known landmarks whose constraints the others contradict by more than this are left out
+        of the local map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹
+        zₗ with the multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is
+        χ²-distributed with two degrees of freedom.
     """
     local, in_whole, in_local, tie = _agreeing(whole, local.without_nodes, gate)
     n, m = len(whole.mean), len(local.mean)
@@ -84,7 +84,9 @@ def joined(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> WholeMap
 
 
 def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> tuple[PoseGaussian, int]:
-    """The pose of `joined`, without the landmarks, and how many of them the gate left out."""
+    """The pose of `joined`, without the landmarks, and the number of landmarks that the gate left
+    out.
+    """
     seen = len(local.ids)
     local, in_whole, in_local, tie = _agreeing(whole, local, gate)
     place, sights = _entries(in_whole), _sights(local, in_local)
@@ -102,7 +104,9 @@ def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> tuple[
 def _agreeing(
     whole: WholeMap, local: LocalMap, gate: float
 ) -> tuple[LocalMap, Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Tie]:
-    """The local map without what the gate leaves out, its known landmarks here and there."""
+    """The local map without the landmarks that the gate leaves out; the indices of its known
+    landmarks in both maps; their constraints.
+    """
     while True:
         _, in_whole, in_local = np.intersect1d(
             whole.ids, local.ids, assume_unique=True, return_indices=True
@@ -124,7 +128,9 @@ def _agreeing(
 
 
 def _worst(tie: Tie, gate: float) -> int | None:
-    """The place of the constraint that the rest contradicts most; None within the gate."""
+    """Index of the constraint that the others contradict most; None where all are within the
+    gate.
+    """
     if not len(tie.multiplier) or gate == math.inf:
         return None
     z = tie.multiplier.reshape(-1, 2)
@@ -140,7 +146,7 @@ def _worst(tie: Tie, gate: float) -> int | None:
 
 
 def without(local: LocalMap, place: int) -> LocalMap:
-    """The map as if it had not seen its landmark at this place."""
+    """The local map without its landmark at this index."""
     rows = np.delete(np.arange(len(local.mean)), _sights(local, np.array([place])))
     ids = np.delete(local.ids, place)
     covariance = local.covariance[np.ix_(rows, rows)]
@@ -153,11 +159,11 @@ def absorbed(
     means: Float[np.ndarray, "K 2"],
     covariance: Float[np.ndarray, "k k"],
 ) -> WholeMap:
-    """The fused map replaces the landmarks' marginal; pose and other landmarks follow it.
+    """Replaces the marginal of the landmarks by the fused map; pose and other landmarks are updated
+    by regression.
 
-    They follow by regression (see `carried_along`). Landmarks that were unknown are added. What the
-    fused map holds of this robot's own measurements is counted again if the result is sent for
-    fusion.
+    See `carried_along` for the regression. Landmarks that were unknown are added. The fused map
+    contains this robot's own measurements: they are counted twice if the result is sent for fusion.
     """
     _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)
     mean, joint = carried_along(
@@ -174,17 +180,17 @@ def absorbed(
 
 
 def _sights(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Places of the coordinates of a submap's landmarks, behind its poses."""
+    """Indices of the coordinates of some of a submap's landmarks, behind its poses."""
     return len(local.mean) - 2 * len(local.ids) + _points(index)
 
 
 def _entries(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Places of the pose and of the landmarks with these indices."""
+    """Indices of the pose's numbers and of those of the landmarks with these indices."""
     return np.concatenate([np.arange(3), 3 + _points(index)])
 
 
 def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Places of the coordinates of the points with these indices."""
+    """Indices of the coordinates of the points with these indices."""
     return (2 * index[:, None] + np.arange(2)).ravel()
 
 
