@@ -58,6 +58,18 @@ UNITS = {
 }  # fmt: skip
 """A unit at a name's end, and what one of it is in ours."""
 KINDS = ("odometry", "observations", "sightings", "truth", "landmarks", "start")
+FILE_NAMES: Mapping[str, Sequence[str]] = {
+    "odometry": ("odom", "wheel", "encoder"),
+    "observations": ("observ", "tags", "detection", "marker"),
+    "sightings": ("sighting",),
+    "truth": ("truth", "mocap", "vicon", "optitrack"),
+    "landmarks": ("landmark",),
+    "start": ("start",),
+}
+"""What a file's name says of its kind."""
+PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "truth", "gt", "tag",
+            "marker", "landmark")  # fmt: skip
+"""Words before a column's name that say nothing more than its file: odom_x, pose.position.y."""
 
 
 def load_map(path: Path) -> Map:
@@ -91,8 +103,8 @@ def mapped(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, li
         if told.scale == 1.0 and told.offset == 0.0:
             found[ours] = cells
         elif ours == "t_s":
-            table.stamps(told.column)
             scale, offset = Decimal(repr(told.scale)), Decimal(repr(told.offset))
+            table.stamps(told.column, scale)
             found[ours] = [f"{Decimal(cell) * scale + offset:f}" for cell in cells]
         else:
             numbers = table.numbers(told.column)[:, 0] * told.scale + told.offset
@@ -104,11 +116,16 @@ def proposed(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
     """A map in TOML for these files as far as their columns' names tell; and what it lacks."""
     lines: list[str] = []
     lacking: list[str] = []
+    kinds: set[str] = set()
     for name, table in files.items():
         kind, columns = _kind(name, list(table.columns))
         if kind is None:
             lacking.append(f"{name}: no table of ours: it has {', '.join(table.columns)}")
             continue
+        if kind in kinds:
+            lacking.append(f"{name}: might be {kind}, too")
+            continue
+        kinds.add(kind)
         lines += [f"[{kind}]", f'files = ["{name}"]', f"[{kind}.columns]"]
         lines += [f"{ours} = {text}" for ours, text in columns.items()] + [""]
         lacking += [f"{name}: nothing for {ours}" for ours in REQUIRED[kind] if ours not in columns]
@@ -131,7 +148,7 @@ def _kind(name: str, header: Sequence[str]) -> tuple[str | None, dict[str, str]]
         if "range_m" in columns:
             columns = {key: columns[key] for key in columns if key not in ("x_m", "y_m")}
         complete = all(ours in columns for ours in REQUIRED[kind]) and len(columns) > 2
-        named = kind[:5] in name.lower()
+        named = any(word in name.lower() for word in FILE_NAMES[kind])
         score = (2 * complete + 2 * named, len(columns), kind, columns)
         if complete and (best is None or score[:2] > best[:2]):
             best = score
@@ -142,7 +159,8 @@ def _near(ours: str, header: Sequence[str]) -> str | None:
     """The text for our column: one of these, if its name is near."""
     for theirs in header:
         bare, scale = _without_unit(theirs)
-        if theirs == ours or bare in SYNONYMS.get(ours, ()) or bare == _without_unit(ours)[0]:
+        names = {*SYNONYMS.get(ours, ()), _without_unit(ours)[0]}
+        if theirs == ours or bare in names or _without_prefix(bare) in names:
             if scale == "1" or theirs == ours:
                 return f'"{theirs}"'
             return f'{{ column = "{theirs}", scale = {scale} }}'
@@ -156,3 +174,8 @@ def _without_unit(name: str) -> tuple[str, str]:
         if plain.endswith(f"_{unit}"):
             return plain.removesuffix(f"_{unit}"), UNITS[unit]
     return plain, "1"
+
+
+def _without_prefix(name: str) -> str:
+    first, _, rest = name.partition("_")
+    return _without_prefix(rest) if rest and first in PREFIXES else name

@@ -16,17 +16,22 @@ QUATERNION = 8
 
 
 def imported_files(
-    paths: Sequence[Path], columns: Map | None, robot: str, everyones: Collection[str] = ()
+    paths: Sequence[Path],
+    columns: Map | None,
+    robot: str,
+    everyones: Collection[str] = (),
+    command: str = "",
 ) -> tuple[RobotTables, list[str]]:
     """One robot's tables from CSV files; what was taken and left out, in words.
 
-    everyones: the names of all robots' files; a table that only others have is left out. Raises
-    DatasetError; without a map it proposes one, unless every name is ours.
+    everyones: the names of all robots' files; a table that only others have is left out. command:
+    what to type with a map. Raises DatasetError; without a map it proposes one, unless every name
+    is ours.
     """
     files = {path.name: read_table(path, str(path)) for path in paths}
     if len(files) < len(paths):
         raise DatasetError("two files have the same name: import them for one robot each")
-    chosen = _by_names(files) if columns is None else columns
+    chosen = _by_names(files, command) if columns is None else columns
     tables = RobotTables(robot)
     said: list[str] = []
     used: set[str] = set()
@@ -40,7 +45,7 @@ def imported_files(
     return tables, said
 
 
-def _by_names(files: dict[str, CsvTable]) -> Map:
+def _by_names(files: dict[str, CsvTable], command: str) -> Map:
     """The map of files whose columns are ours; raises DatasetError with a proposal."""
     found: Map = {}
     for name, table in files.items():
@@ -53,9 +58,7 @@ def _by_names(files: dict[str, CsvTable]) -> Map:
                 "Write it into a file, as columns.toml, beginning with this:\n\n"
                 + text
                 + "".join(f"# {line}\n" for line in lacking)
-                + "\nand type: teamslam import "
-                + " ".join(each.name for each in files.values())
-                + " -o FOLDER --columns columns.toml"
+                + f"\nand type: {command} --columns columns.toml"
             )
         found[kind] = Table((name,), {column: column for column in table.columns})
     return found

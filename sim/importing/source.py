@@ -145,9 +145,11 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
 def _csv(files: Mapping[str, Sequence[Path]], request: Request, folder: Path) -> Report:
     columns = load_map(request.columns) if request.columns else None
     everyones = {path.name for paths in files.values() for path in paths}
+    command = f"teamslam import {' '.join(map(str, request.sources))} -o {folder}"
+    command += f" --robot {request.robot}" if request.robot else ""
     tables, said = [], []
     for robot, paths in files.items():
-        of, notes = imported_files(paths, columns, robot, everyones)
+        of, notes = imported_files(paths, columns, robot, everyones, command)
         tables.append(of)
         said += notes if len(files) == 1 else [f"{robot}: {note}" for note in notes]
     return _written(tables, said, request, folder)

@@ -188,6 +188,30 @@ def test_csv_files_with_other_names_come_by_a_map(tmp_path: Path) -> None:
     assert (seen.ids.tolist(), seen.ranges.tolist(), seen.bearings.tolist()) == ([7], [2.5], [-0.5])
 
 
+@pytest.mark.parametrize(("unit", "a_second"), [("ns", 10**9), ("us", 10**6), ("ms", 1000)])
+def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_exactly(
+    tmp_path: Path, unit: str, a_second: int
+) -> None:
+    logs, first = tmp_path / "logs", 1763800000 * a_second
+    (logs / "ann").mkdir(parents=True)
+    (logs / "ann" / "mocap.csv").write_text("t_s,x_m,y_m,theta_rad\n1763800000,0,0,0\n")
+    (logs / "ann" / "wheel_odom.csv").write_text(
+        f"stamp_{unit},odom.x,odom.y,odom.yaw_deg\n{first},0,0,0\n{first + 7},1,0,90\n"
+    )
+    refused = str(run(logs, "-o", tmp_path / "set").exception)
+    columns = tmp_path / "columns.toml"
+    columns.write_text(refused.partition("with this:\n\n")[2].partition("\nand type")[0])
+    assert f"\nand type: teamslam import {logs} -o {tmp_path / 'set'} --columns" in refused
+    result = run(logs, "-o", tmp_path / "set", "--columns", columns)
+    assert result.exit_code == 0, result.output
+    (stream,) = read(tmp_path / "set").streams
+    assert stream.intervals.end_ns.tolist() == [1763800000 * S + 7 * S // a_second]
+    assert stream.truth is not None
+    columns.write_text(columns.read_text().replace("scale = 1e-", "scale = 1e+"))
+    refused = str(run(logs, "-o", tmp_path / "x", "--columns", columns).exception)
+    assert "is out of bounds" in refused
+
+
 def test_a_map_is_proposed_from_the_columns_names(tmp_path: Path) -> None:
     wheels, *_ = files(tmp_path)
     tags = tmp_path / "tags.csv"
